@@ -1,19 +1,19 @@
-"""The data that flow through the pipeline.
+"""The data types of the pipeline.
 
 Conventions, used everywhere:
 
-- metres, seconds, radians;
-- camera axes x right, y down, z forward; pixel centres at integer coordinates, so that (0, 0) is the centre of
-  the first pixel and the image covers [-0.5, width - 0.5] x [-0.5, height - 0.5];
-- `T_a_b` maps coordinates in b to coordinates in a, so that neighbouring names cancel:
+- meters, seconds, radians;
+- camera axes x right, y down, z forward; pixel centers at integer coordinates: the image covers
+  [-0.5, width - 0.5] x [-0.5, height - 0.5];
+- `T_a_b` maps coordinates in b to coordinates in a, so that adjacent names cancel:
   `p_world = T_world_camera @ p_camera`;
-- depth is float32 metres along z (not along the ray), 0 = no reading;
-- colour is uint8 RGB;
+- depth is float32 meters along z, not along the ray, 0 = no reading;
+- color is uint8 RGB;
 - instance 0 = no instance; class index -1 = no class; cluster -1 = the point belongs to no cluster;
-- `None` in place of a pose or of ground truth = not known.
+- `None` in place of a pose or of ground truth = unknown.
 
-Every dataclass here is frozen and checks shapes, dtypes and finiteness where it is made: data enter the pipeline
-through these types, and the code behind them trusts what it gets.
+Every dataclass here is frozen and validates shapes, dtypes and finiteness. Data enter the pipeline through these types,
+and the code behind them trusts them.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]
 Bool = npt.NDArray[np.bool_]
 
-ROTATION_TOLERANCE = 1e-3  # largest entry of |R R^T - I| that still counts as rigid: published poses carry 4 digits
+ROTATION_TOLERANCE = 1e-3  # largest entry of |R R^T - I| of a rigid transform: published poses have 4 digits
 MOST_PIXELS = 2**25  # of an image: 8K video
-WIDEST = 10.0  # m sideways for each m of depth, that a camera sees: 168 degrees; no lens without distortion has more
+WIDEST = 10.0  # most m sideways per m of depth: a field of view of 168 degrees
 LONGEST_FOCAL_LENGTH = 1e6  # px
 UNIT_TOLERANCE = 1e-3  # largest | |v| - 1 | of a unit vector
-LONGEST_EMBEDDING = 65_536  # numbers in one; published networks have some 500 to 4,000
-LONGEST_SPACE = 300  # characters of the name of a space of embeddings
+LONGEST_EMBEDDING = 65_536  # dimensions; published networks have 500 to 4,000
+LONGEST_SPACE = 300  # characters of the name of an embedding space
 PROBABILITY_TOLERANCE = 1e-3  # a row of probabilities sums to 1 within this: softmax in half precision
 
 
@@ -57,12 +57,11 @@ class Camera:
     height: int  # px
     fx: float  # px
     fy: float  # px
-    cx: float  # px, of the pixel centre
-    cy: float  # px, of the pixel centre
+    cx: float  # px, pixel centers at integers
+    cy: float  # px, pixel centers at integers
 
     def __post_init__(self) -> None:
-        for name in ("width", "height", "fx", "fy", "cx", "cy"):
-            value = getattr(self, name)
+        for name, value in vars(self).items():
             kind: type = Integral if name in ("width", "height") else Real
             if isinstance(value, bool) or not isinstance(value, kind):
                 expected = "a whole number of px" if kind is Integral else "a number of px"
@@ -76,12 +75,14 @@ class Camera:
             raise DataError(f"Camera: fx, fy must be positive and cx, cy finite; found fx, fy, cx, cy = {numbers}")
         if max(self.fx, self.fy) > LONGEST_FOCAL_LENGTH:
             raise DataError(f"Camera: fx, fy are at most {LONGEST_FOCAL_LENGTH:g} px; found fx, fy, cx, cy = {numbers}")
-        across = max(self.cx, self.width - 1 - self.cx, -self.cx)  # px, of the outermost pixels from the ray ahead
-        along = max(self.cy, self.height - 1 - self.cy, -self.cy)
-        if across > WIDEST * self.fx or along > WIDEST * self.fy:
+        horizontal = max(
+            self.cx, self.width - 1 - self.cx, -self.cx
+        )  # px, of the outermost pixels from the principal point
+        vertical = max(self.cy, self.height - 1 - self.cy, -self.cy)
+        if horizontal > WIDEST * self.fx or vertical > WIDEST * self.fy:
             raise DataError(
                 f"Camera: {self.width}x{self.height} px with fx, fy, cx, cy = {numbers} reach more than {WIDEST:g} m "
-                "sideways for each m of depth; are these numbers in px, and not shares of width and height?"
+                "sideways per m of depth; give them in px, not as fractions of width and height"
             )
 
     @property
@@ -95,7 +96,7 @@ class Camera:
         return self.height, self.width
 
     def scaled(self, factor: float) -> Camera:
-        """The camera of the image resized by `factor`, with the pixel centres kept at integers."""
+        """Return the camera of the image resized by `factor`, with pixel centers at integers."""
         width, height = round(self.width * factor), round(self.height * factor)
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
@@ -103,10 +104,10 @@ class Camera:
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """The instances that are really visible in a frame: for ground-truth detectors and for evaluation only."""
+    """The true instances visible in a frame, for ground-truth detectors and evaluation only."""
 
     instance_ids: Int32 = field(repr=False)  # (H, W)
-    class_names: Mapping[int, str | None]  # instance id -> class name; None = the class is not known, do not evaluate
+    class_names: Mapping[int, str | None]  # by instance id; None = the class is unknown, do not evaluate
 
     def __post_init__(self) -> None:
         check_array("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
@@ -118,18 +119,17 @@ class FrameTruth:
 
 
 class DeferredTruth(FrameTruth):
-    """A FrameTruth that renders its ids when somebody first asks for them: once, from whatever thread.
+    """A FrameTruth that renders its ids on first access: once, from any thread.
 
-    What `render` raises is raised where the ids are asked for, each time. Raises DataError there when it returns
-    anything but (H, W) int32 of `shape`.
+    Each access raises what `render` raises, and DataError if it does not return (H, W) int32 of `shape`.
     """
 
     def __init__(
         self,
         render: Callable[[], Int32],
-        shape: tuple[int, int],  # (height, width) of what it will return
+        shape: tuple[int, int],  # (height, width) of the ids
         class_names: Mapping[int, str | None],
-        origin: str,  # a hash of all that the ids depend on: it tells two of them apart before there are any
+        origin: str,  # a hash of all that the ids depend on, which identifies them before they are rendered
     ) -> None:
         self._render = render
         self._shape = shape
@@ -154,19 +154,19 @@ class DeferredTruth(FrameTruth):
 
 @dataclass(frozen=True)
 class Frame:
-    """One RGB-D image, colour and depth registered to each other."""
+    """One RGB-D image, color and depth registered to each other."""
 
-    index: int  # the frame's number in its sequence, counted before start, stop and stride choose from it
+    index: int  # in the sequence, before start, stop and stride select frames
     timestamp: float  # s
     color: UInt8  # (H, W, 3) RGB
     depth: Float32  # (H, W) m along z, 0 = no reading
     camera: Camera
     T_world_camera: Float64 | None = None  # (4, 4) ground truth
     truth: FrameTruth | None = None
-    up: Float64 | None = None  # (3,) unit vector against gravity, in the camera, by a sensor; None = none tells
+    up: Float64 | None = None  # (3,) unit vector against gravity by a sensor, in the camera; None = no sensor
 
     def __post_init__(self) -> None:
-        index, camera = cast(object, self.index), cast(object, self.camera)  # whatever a caller gave
+        index, camera = cast(object, self.index), cast(object, self.camera)  # of any type
         if isinstance(index, bool) or not isinstance(index, int | np.integer) or index < 0:
             raise DataError(f"Frame.index must be a whole number, 0 or more, found {index!r}")
         where = f"frame {self.index}: "
@@ -184,7 +184,7 @@ class Frame:
             check_array(where + "up", self.up, (3,), np.float64)
             if abs(np.linalg.norm(self.up) - 1) > UNIT_TOLERANCE:
                 raise DataError(f"{where}up must be a unit vector, found one of length {np.linalg.norm(self.up):.4g}")
-        # the kernels are compiled for this; a view such as bgr[..., ::-1], or what is read only, is copied
+        # the kernels are compiled for these; views such as bgr[..., ::-1] and read-only arrays are copied
         object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
         object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))
         if self.truth is not None and not isinstance(cast(object, self.truth), FrameTruth):
@@ -195,9 +195,9 @@ class Frame:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a tracker believes the camera to be. A lost pose is never integrated into the map."""
+    """The camera pose estimated by a tracker. Frames with a lost pose are never integrated."""
 
-    T_world_camera: Float64  # (4, 4); for a lost pose the last one that was trusted
+    T_world_camera: Float64  # (4, 4); for a lost pose the last reliable one
     lost: bool = False
     reason: str = ""  # why it is lost, for the log
 
@@ -207,32 +207,29 @@ class Pose:
 
 @dataclass(frozen=True)
 class Detections:
-    """The N objects that a detector found in one image, best first. Masks may overlap; N may be 0."""
+    """The N objects detected in one image, best first. Masks may overlap; N may be 0."""
 
     masks: Bool  # (N, H, W)
     boxes: Float32  # (N, 4) x1 y1 x2 y2, px
     scores: Float32  # (N,) in [0, 1]
     class_probabilities: Float32  # (N, C), each row a distribution over `classes`
     classes: tuple[str, ...]  # names of the C columns
-    exact: bool = False  # the masks are the objects' true outlines: refiners have nothing to clean
-    embeddings: Float32 | None = None  # (N, D) unit rows, 0 = not computed for this one; None = for none of them
-    embedding_space: str = ""  # what they are of, "MODEL@REVISION": only those of one space compare; "" = none
+    exact: bool = False  # the masks are ground truth, which refiners do not change
+    embeddings: Float32 | None = None  # (N, D) unit vectors, 0 = not computed; None = none were computed
+    embedding_space: str = ""  # "MODEL@REVISION"; only embeddings of one space are comparable; "" = none
 
     def __post_init__(self) -> None:
         n, c = len(self.scores), len(self.classes)
         check_array("Detections.masks", self.masks, (n, None, None), np.bool_)
         check_array("Detections.boxes", self.boxes, (n, 4), np.float32)
-        check_array("Detections.scores", self.scores, (n,), np.float32)
-        _check_scores("Detections.scores", self.scores)
-        _check_distributions("Detections.class_probabilities", self.class_probabilities, (n, c))
-        _check_embeddings("Detections.embeddings", self.embeddings, self.embedding_space, n)
+        _check_objects(self, n, c)
 
     def __len__(self) -> int:
         return len(self.scores)
 
     @classmethod
     def none(cls, shape: tuple[int, int], classes: tuple[str, ...]) -> Detections:
-        """No detection in an image of `shape` (height, width)."""
+        """Return no detections in an image of `shape` (height, width)."""
         return cls(
             masks=np.zeros((0, *shape), np.bool_),
             boxes=np.zeros((0, 4), np.float32),
@@ -244,19 +241,19 @@ class Detections:
 
 @dataclass(frozen=True)
 class PointClusters:
-    """The detections of one frame lifted to 3D: P points in N clusters.
+    """The detections of one frame lifted to 3D: P points in N clusters, one for each mask.
 
-    A pixel under several masks appears once for each, so that every mask is a cluster of its own.
+    A pixel under several masks has a point in each cluster.
     """
 
     points_world: Float32  # (P, 3) m
-    pixels: Int32  # (P, 2) (u, v), where the points were seen
+    pixels: Int32  # (P, 2) (u, v) of each point
     cluster: Int32  # (P,) in [0, N), -1 = none
     class_probabilities: Float32  # (N, C), each row a distribution over `classes`
     scores: Float32  # (N,) in [0, 1]
     classes: tuple[str, ...]  # names of the C columns
     exact: bool = False  # as in Detections
-    structure: Bool | None = None  # (H, W) pixels on floors and walls, which are of no object; None = none is known
+    structure: Bool | None = None  # (H, W) pixels on floors and walls, which belong to no object; None = unknown
     embeddings: Float32 | None = None  # (N, D), as in Detections
     embedding_space: str = ""  # as in Detections
 
@@ -265,10 +262,7 @@ class PointClusters:
         check_array("PointClusters.points_world", self.points_world, (p, 3), np.float32)
         check_array("PointClusters.pixels", self.pixels, (p, 2), np.int32)
         check_array("PointClusters.cluster", self.cluster, (p,), np.int32)
-        check_array("PointClusters.scores", self.scores, (n,), np.float32)
-        _check_scores("PointClusters.scores", self.scores)
-        _check_distributions("PointClusters.class_probabilities", self.class_probabilities, (n, c))
-        _check_embeddings("PointClusters.embeddings", self.embeddings, self.embedding_space, n)
+        _check_objects(self, n, c)
         if p and (self.cluster.min() < -1 or self.cluster.max() >= n):
             raise DataError(
                 f"PointClusters.cluster must be in [-1, {n}), found {self.cluster.min()} to {self.cluster.max()}"
@@ -282,7 +276,7 @@ class PointClusters:
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """The surface that the map shows to a camera: the model side of tracking."""
+    """The surface of a map as seen by a camera, for tracking."""
 
     camera: Camera
     T_world_camera: Float64  # (4, 4)
@@ -293,7 +287,7 @@ class SurfaceView:
 
 @dataclass(frozen=True)
 class View(SurfaceView):
-    """What the map shows to a camera, labels included."""
+    """A map as seen by a camera, with labels."""
 
     instance_ids: Int32  # (H, W), 0 = no instance
     class_ids: Int32  # (H, W) index into the map's classes, -1 = no class
@@ -301,7 +295,7 @@ class View(SurfaceView):
 
 @dataclass(frozen=True)
 class Box:
-    """An oriented box. `rotation`'s columns are its axes in the world; identity for an axis-aligned one."""
+    """An oriented box. The columns of `rotation` are its axes in the world; the identity for an axis-aligned box."""
 
     center: Float64  # (3,) m
     extent: Float64  # (3,) m, full side lengths
@@ -316,18 +310,18 @@ class Instance:
     class_probabilities: Float32  # (C,) a distribution over the map's classes
     confidence: float  # in [0, 1], ranks instances in the evaluation
     observations: int  # frames in which it was detected
-    first_frame: int  # `Frame.index` of the first and of the last one
+    first_frame: int  # `Frame.index` of the first and the last of them
     last_frame: int
     vertices: Int32  # (M,) indices of its vertices in the map's InstanceMesh
     aabb: Box
     obb: Box
-    embedding: Float32 | None = None  # (D,) unit vector in the map's `embedding_space`; None = nothing was embedded
-    embedding_spread: float | None = None  # in [0, 1], 1 - |mean of its unit vectors|: 0 = all alike
+    embedding: Float32 | None = None  # (D,) unit vector in the map's `embedding_space`; None = none
+    embedding_spread: float | None = None  # in [0, 1], 1 - |mean of the unit vectors|: 0 = all equal
 
 
 @dataclass(frozen=True)
 class InstanceMesh:
-    """The map's surface."""
+    """The surface of a map."""
 
     vertices: Float32  # (V, 3) m, world
     triangles: Int32  # (F, 3)
@@ -345,10 +339,10 @@ class InstanceMesh:
         check_array("InstanceMesh.class_ids", self.class_ids, (v,), np.int32)
 
     def of(self, instance: Instance) -> InstanceMesh:
-        """The instance's own mesh: its vertices, in their order, and the triangles between them."""
-        number = np.full(len(self.vertices), -1, np.int32)
-        number[instance.vertices] = np.arange(len(instance.vertices), dtype=np.int32)
-        triangles = number[self.triangles]
+        """Return the mesh of an instance: its vertices, in order, and the triangles between them."""
+        new_index = np.full(len(self.vertices), -1, np.int32)
+        new_index[instance.vertices] = np.arange(len(instance.vertices), dtype=np.int32)
+        triangles = new_index[self.triangles]
         return InstanceMesh(
             self.vertices[instance.vertices],
             triangles[(triangles >= 0).all(axis=1)],
@@ -361,12 +355,12 @@ class InstanceMesh:
 
 @dataclass(frozen=True)
 class SceneTruth:
-    """The true instances of a sequence as labelled surface points: what a map is evaluated against."""
+    """The true instances of a sequence as labeled surface points, for evaluation."""
 
-    points_world: Float32  # (V, 3) m, on the surface that the camera has seen
+    points_world: Float32  # (V, 3) m, on the visible surface
     instance_ids: Int32  # (V,), 0 = no instance
     class_names: Mapping[int, str | None] = field(default_factory=dict)  # as in FrameTruth; None = not evaluated
-    classes: tuple[str, ...] | None = None  # all that were looked for; None = whatever a detector may know
+    classes: tuple[str, ...] | None = None  # all annotated classes; None = unknown
 
     def __post_init__(self) -> None:
         v = len(self.points_world)
@@ -375,7 +369,7 @@ class SceneTruth:
 
 
 def check_rigid(name: str, T: Float64) -> None:
-    """Raises DataError, naming `name`, unless `T` is a finite (4, 4) float64 rigid transform."""
+    """Raise DataError, naming `name`, unless `T` is a finite (4, 4) float64 rigid transform."""
     check_array(name, T, (4, 4), np.float64)
     R = T[:3, :3]
     error = float(np.abs(R @ R.T - np.eye(3)).max())
@@ -384,19 +378,19 @@ def check_rigid(name: str, T: Float64) -> None:
 
 
 def check_view(camera: Camera, T_world_camera: Float64) -> None:
-    """Raises DataError unless a map can be seen from there."""
+    """Raise DataError unless `camera` and its pose are valid."""
     if not isinstance(cast(object, camera), Camera):
         raise DataError(f"camera must be a Camera, found {type(camera).__name__}")
     check_rigid("T_world_camera", T_world_camera)
 
 
 def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: npt.DTypeLike) -> None:
-    """Raises DataError unless `array` has this shape (None = any length) and dtype and only finite values."""
+    """Raise DataError unless `array` has this shape (None = any length), this dtype, and finite values."""
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
         found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
         raise DataError(f"{name} must be an array of {np.dtype(dtype)}, found {found}")
     if isinstance(array, np.ma.MaskedArray):
-        raise DataError(f"{name} is a masked array, whose mask would get lost; fill what is masked: {name}.filled(0)")
+        raise DataError(f"{name} is a masked array, whose mask would get lost; fill it: {name}.filled(0)")
     matches = len(array.shape) == len(shape) and all(
         want in (None, have) for have, want in zip(array.shape, shape, strict=True)
     )
@@ -407,9 +401,14 @@ def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: n
         raise DataError(f"{name} holds values that are not finite")
 
 
-def _check_scores(name: str, scores: Float32) -> None:
-    if scores.size and (scores.min() < 0 or scores.max() > 1):
-        raise DataError(f"{name} must be in [0, 1], found {scores.min()} to {scores.max()}")
+def _check_objects(found: Detections | PointClusters, n: int, c: int) -> None:
+    """Raise DataError unless scores, class probabilities and embeddings are those of n objects and c classes."""
+    name, scores = type(found).__name__, found.scores
+    check_array(f"{name}.scores", scores, (n,), np.float32)
+    if n and (scores.min() < 0 or scores.max() > 1):
+        raise DataError(f"{name}.scores must be in [0, 1], found {scores.min()} to {scores.max()}")
+    _check_distributions(f"{name}.class_probabilities", found.class_probabilities, (n, c))
+    _check_embeddings(f"{name}.embeddings", found.embeddings, found.embedding_space, n)
 
 
 def _check_embeddings(name: str, rows: Float32 | None, space: str, n: int) -> None:

@@ -1,4 +1,4 @@
-"""Rigid motions and the pinhole camera, as pure functions. Conventions: see `framework.data`."""
+"""Rigid motions and the pinhole camera. Conventions: see `framework.data`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from framework.data import Camera, Float32, Float64, Int32, PointClusters
 from framework.errors import DataError
 
-RIGID_WITHIN = 1e-2  # largest entry of |R R^T - I| that is rounding: published poses have six digits, lost ones R = 0
-EXACT_WITHIN = 1e-12  # such a rotation is as exact as float64 writes it, and stays as it is
+RIGID_WITHIN = 1e-2  # largest entry of |R R^T - I| due to rounding: published poses have six digits, lost ones R = 0
+EXACT_WITHIN = 1e-12  # such a rotation has the precision of float64, and is not changed
 
 
 def inverse(T_a_b: Float64) -> Float64:
-    """T_b_a of a rigid (4, 4) transform, exactly rigid again."""
+    """Return T_b_a (4, 4) of a rigid transform."""
     T_b_a = np.eye(4)
     T_b_a[:3, :3] = T_a_b[:3, :3].T
     T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
@@ -24,25 +24,25 @@ def inverse(T_a_b: Float64) -> Float64:
 
 
 def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """The points (..., 3) of frame b in frame a, in the dtype that they came in."""
+    """Return the points (..., 3) of frame b in frame a, with their dtype."""
     moved = points_b @ T_a_b[:3, :3].T.astype(points_b.dtype) + T_a_b[:3, 3].astype(points_b.dtype)
     return np.asarray(moved, points_b.dtype)
 
 
 def skew(v: Float64) -> Float64:
-    """The (3, 3) matrix with skew(v) @ w = v x w."""
+    """Return the (3, 3) matrix with skew(v) @ w = v x w."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def exp_se3(xi: Float64) -> Float64:
-    """The rigid motion exp(xi^) of a twist xi = (translation part, rotation part), (6,) m and rad."""
+    """Return the rigid motion exp(xi^) of a twist xi (6,) = (translation, rotation), m and rad."""
     rho, phi = np.asarray(xi[:3], np.float64), np.asarray(xi[3:], np.float64)
     theta = math.sqrt(phi @ phi)
     W = skew(phi)
     WW = W @ W
     A = _sinc(theta)
     B = _sinc(theta / 2) ** 2 / 2  # (1 - cos(theta)) / theta^2, which would cancel
-    # (theta - sin(theta)) / theta^3, as a series where the difference would cancel: what it leaves out is theta^6
+    # (theta - sin(theta)) / theta^3; a series, with an error of theta^6, where the difference would cancel
     C = (theta - math.sin(theta)) / theta**3 if theta > 1e-2 else 1 / 6 - theta**2 / 120 + theta**4 / 5040
     T = np.eye(4)
     T[:3, :3] += A * W + B * WW
@@ -55,28 +55,25 @@ def _sinc(x: float) -> float:
 
 
 def rotation_angle(R: Float64) -> float:
-    """The angle of a (3, 3) rotation, rad, accurate for small angles too."""
+    """Return the angle of a (3, 3) rotation, rad, also accurate for small angles."""
     sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
     return float(np.arctan2(sine, (np.trace(R) - 1) / 2))
 
 
 def nearest_rotation(R: Float64) -> Float64:
-    """The rotation nearest to a (3, 3) matrix in the Frobenius norm (orthogonal Procrustes)."""
+    """Return the rotation nearest to a (3, 3) matrix in the Frobenius norm (orthogonal Procrustes)."""
     U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """The rigid motion that a published (4, 4) matrix means: without its rotation's rounding errors.
-
-    Raises DataError, which only says why, when it means none.
-    """
+    """Remove the rounding errors of the rotation of a (4, 4) pose. Raises DataError if it is not rigid."""
     if not np.isfinite(matrix).all():
         raise DataError("the pose is not finite")
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
         raise DataError("the last row of the pose is not 0 0 0 1")
     R = matrix[:3, :3]
-    with np.errstate(all="ignore"):  # numbers of any size come from files
+    with np.errstate(all="ignore"):  # files may contain numbers of any size
         error, determinant = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
     if not (error <= RIGID_WITHIN and determinant > 0):
         raise DataError(f"the pose is not rigid: |R R^T - I| is {error:.2g}, det R {determinant:.2g}")
@@ -86,33 +83,30 @@ def nearest_rigid(matrix: Float64) -> Float64:
     return T
 
 
-def interpolate(T_world_a: Float64, T_world_b: Float64, share: float) -> Float64:
-    """The pose (4, 4) a `share` in [0, 1] of the way from a to b: evenly along a line and about one axis (slerp)."""
+def interpolate(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
+    """Return the pose (4, 4) at a fraction in [0, 1] between a and b: linear translation, slerp of rotation."""
     R_a, R_b = T_world_a[:3, :3], T_world_b[:3, :3]
     T = np.eye(4)
-    T[:3, :3] = R_a @ Rotation.from_rotvec(share * Rotation.from_matrix(R_a.T @ R_b).as_rotvec()).as_matrix()
-    T[:3, 3] = (1 - share) * T_world_a[:3, 3] + share * T_world_b[:3, 3]
+    T[:3, :3] = R_a @ Rotation.from_rotvec(fraction * Rotation.from_matrix(R_a.T @ R_b).as_rotvec()).as_matrix()
+    T[:3, 3] = (1 - fraction) * T_world_a[:3, 3] + fraction * T_world_b[:3, 3]
     return T
 
 
 def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Pixel coordinates (..., 2) (u, v) of points (..., 3) in front of the camera."""
+    """Return the pixel coordinates (..., 2) (u, v) of points (..., 3) in front of the camera."""
     x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
 
 
 def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Float32:
-    """Points (P, 3) in camera coordinates of pixels (P, 2) (u, v) with depths (P,) along z."""
+    """Return the points (P, 3) m, in the camera, of pixels (P, 2) (u, v) with depths (P,) m along z."""
     x = (pixels[:, 0] - np.float32(camera.cx)) * (depth / np.float32(camera.fx))
     y = (pixels[:, 1] - np.float32(camera.cy)) * (depth / np.float32(camera.fy))
     return np.stack([x, y, depth], axis=1).astype(np.float32, copy=False)
 
 
 def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raises DataError when a cluster's pixel lies outside the (height, width) image.
-
-    Whoever made it up is told so here: kernels do not check bounds, and NumPy takes -1 for the last row.
-    """
+    """Raise DataError if a pixel of a cluster is outside the (height, width) image; kernels do not check bounds."""
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
         raise DataError(

@@ -47,6 +47,7 @@ class ClassEvidence(NamedTuple):
 
 
 ROW_ARRAYS = ClassEvidence._fields[1:]
+NO_EVIDENCE = (NO_CLASS, 0, 0, 0, -1, -1)  # values of ROW_ARRAYS in a new row
 
 
 class MaskClasses(NamedTuple):
@@ -137,11 +138,8 @@ class ClassRows:
                 **{name: grown(getattr(self.evidence, name), capacity) for name in ROW_ARRAYS}
             )
         new = slice(self.row_count, needed)
-        self.evidence.class_ids[new] = NO_CLASS
-        for array in (self.evidence.log_ratio, self.evidence.rest, self.evidence.masked):
-            array[new] = 0
-        self.evidence.first_frame[new] = -1
-        self.evidence.last_frame[new] = -1
+        for name, value in zip(ROW_ARRAYS, NO_EVIDENCE, strict=True):
+            getattr(self.evidence, name)[new] = value
         self.voxels.grid.label_row[blocks] = np.arange(self.row_count, needed, dtype=np.int32)
         self.row_count = needed
 

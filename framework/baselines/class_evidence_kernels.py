@@ -86,7 +86,7 @@ def find_blocks_under_masks(grid, seen, cluster, wants_row):
     """Fill wants_row (A,) with whether a block has no row, and a voxel under a mask."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
-        start = seen.near_first[a]
+        start = seen.near_start[a]
         if grid.label_row[seen.blocks[a]] < 0:
             for i in range(start, start + seen.near_count[a]):
                 if cluster[seen.near_pixel[i]] >= 0:
@@ -102,7 +102,7 @@ def update_classes(grid, seen, evidence, masks, evicted):
         evicted[a] = 0
         block = seen.blocks[a]
         row = grid.label_row[block]
-        start = seen.near_first[a]
+        start = seen.near_start[a]
         for i in range(start, start + seen.near_count[a]):
             n = seen.near_voxel[i]
             k = masks.cluster[seen.near_pixel[i]]

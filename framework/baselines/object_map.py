@@ -23,7 +23,7 @@ from framework.interfaces import Gravity, MapStatistics
 from framework.mapping.instances.instance_list import Confirmation, InstanceTableMap
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.label_evidence_kernels import Combine
-from framework.mapping.labels.vertex_labels import vertex_colors
+from framework.mapping.labels.vertex_labels_kernels import color_vertices
 from framework.mapping.storage.map_file import (
     check_like,
     faults_of,
@@ -229,7 +229,9 @@ def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids:
     """Return the chosen (V,) vertices of a surface and the triangles between them."""
     new_index = np.cumsum(chosen, dtype=np.int32) - np.int32(1)
     triangles = surface.triangles[chosen[surface.triangles].all(axis=1)]
-    colors = vertex_colors(voxels.grid, surface.voxels[chosen])
+    nearest = surface.voxels[chosen]
+    colors = np.empty((len(nearest), 3), np.uint8)
+    color_vertices(voxels.grid.color, nearest, colors)
     return surface.vertices[chosen], new_index[triangles], colors, instance_ids[chosen]
 
 

@@ -12,7 +12,7 @@ from framework.mapping.labels.vertex_labels_kernels import CHUNK, CORNERS, corne
 from framework.mapping.voxels.integration_parameters import Pinhole
 from framework.mapping.voxels.raycasting_kernels import voxel_seen
 from framework.mapping.voxels.voxel_grid import Grid
-from framework.mapping.voxels.voxel_grid_kernels import device
+from framework.mapping.voxels.voxel_grid_kernels import NO_LOOK_UP, device
 
 
 class MaskCounts(NamedTuple):
@@ -37,7 +37,7 @@ def count_masks(seen, mask, counts):
     inside = mask.ravel()
     for a in prange(seen.blocks.shape[0]):
         block = seen.blocks[a]
-        start = seen.near_first[a]
+        start = seen.near_start[a]
         for i in range(start, start + seen.near_count[a]):
             n = seen.near_voxel[i]
             if observed[block, n] < largest:
@@ -64,8 +64,7 @@ def look_up_object(
     """
     top, left, bottom, right = window
     for row in prange(top, bottom):
-        key = np.int64(-2)
-        region = np.int32(-1)
+        key, region = NO_LOOK_UP
         for column in range(left, right):
             z = depth[row * stride, column * stride]
             if z > np.float32(0.0):

@@ -1,7 +1,6 @@
-"""Open3D's VoxelBlockGrid, asked in such a way that its answers are right.
+"""Open3D's VoxelBlockGrid, with workarounds for errors in Open3D 0.20.
 
-Dong et al. 2022, "ASH: A modern framework for parallel spatial hashing in 3D perception". What Open3D 0.20 does is left
-as it is where it is only slow; where it is wrong, the call is made so that the answer is right, and the place says how.
+Dong et al. 2022, "ASH: A modern framework for parallel spatial hashing in 3D perception".
 """
 
 from __future__ import annotations
@@ -25,28 +24,28 @@ from framework.mapping.storage.map_header import MapHeader
 from framework.mapping.voxels.integration_parameters import BOUNDS
 from framework.mapping.voxels.voxel_grid import MOST_BLOCKS
 
-ATTRIBUTES = {  # name: (type, channels) of what a voxel holds; the first three as Open3D's `integrate` wants them
+ATTRIBUTES = {  # name: (type, channels) of a voxel; `integrate` of Open3D expects the first three
     "tsdf": (o3d.core.float32, 1),  # in truncation distances
     "weight": (o3d.core.float32, 1),  # frames
     "color": (o3d.core.float32, 3),  # in [0, 255]
     "instance": (o3d.core.int32, 1),  # 0 = no instance
-    "votes": (o3d.core.float32, 1),  # for that instance, less those against it
+    "votes": (o3d.core.float32, 1),  # for that instance, minus those against it
 }
-FIRST_BLOCKS = 1000  # room at the start; Open3D's memory follows what is asked for, not what is used ...
+FIRST_BLOCKS = 1000  # initial capacity; Open3D allocates it at once ...
 FIRST_VOXELS = 2**23  # ... and at most so many voxels, 0.2 GB
-METRES = 1.0  # Open3D's depth_scale: units of a float image for each metre
-TOUCH_STRIDE = 4  # px between the pixels that Open3D asks which blocks they touch
+METERS = 1.0  # depth_scale of Open3D: units of a float image per meter
+TOUCH_STRIDE = 4  # px between the pixels with which Open3D finds blocks
 NEAR = 0.05  # m, where rays start
-RANGE_TILE = 8  # px of the image for one of the map of ranges that rays search, Open3D's default
-FRAGMENTS = 2**18  # pieces of blocks in view that the map of ranges has room for; a view of 10,000 blocks takes 20,000
-FRAGMENT = 16 * 16  # pixels of the map of ranges in a piece
-MOST_RANGE_PIXELS = 2**24  # of that first image: coarse voxels need fewer fragments
+RANGE_TILE = 8  # px of the image per px of the range map that bounds rays, Open3D's default
+FRAGMENTS = 2**18  # capacity of the range map; a view of 10,000 blocks has 20,000 fragments
+FRAGMENT = 16 * 16  # pixels of the range map in a fragment
+MOST_RANGE_PIXELS = 2**24  # of the first range map: coarse voxels need fewer fragments
 CPU = o3d.core.Device("CPU:0")
 
 
 @dataclass(frozen=True)
 class BlockGridSettings:
-    """What a grid is made with."""
+    """The parameters of a grid."""
 
     voxel_size: float  # m
     block_resolution: int  # voxels a side
@@ -54,14 +53,14 @@ class BlockGridSettings:
     min_depth: float  # m
     max_depth: float  # m
     max_blocks: int
-    min_weight: float  # frames that must have seen a voxel for it to be surface
+    min_weight: float  # frames that must have seen a voxel of the surface
 
     def __post_init__(self) -> None:
         check_bounds(self, block_resolution=(2, 64), max_blocks=(1, MOST_BLOCKS), min_weight=(1.0, 1e6))
 
     @classmethod
     def of(cls, saved: MapHeader) -> BlockGridSettings:
-        """Those that a map's header tells. Raises DataError or ConfigError where they cannot be."""
+        """Return the settings in a map's header. Raises DataError or ConfigError if they are invalid."""
         return cls(
             voxel_size=saved.number("voxel_size", BOUNDS["voxel_size"]),
             block_resolution=saved.whole("block_resolution"),
@@ -74,7 +73,7 @@ class BlockGridSettings:
 
 
 class BlockGrid:
-    """Blocks of voxels with a signed distance, a colour and labels. A voxel's number is its place in `flat`."""
+    """Blocks of voxels with a signed distance, a color and labels. The index of a voxel is that in `flat`."""
 
     def __init__(self, settings: BlockGridSettings) -> None:
         self.settings = settings
@@ -88,17 +87,17 @@ class BlockGrid:
             block_count=min(FIRST_BLOCKS, settings.max_blocks, FIRST_VOXELS // settings.block_resolution**3),
             device=CPU,
         )
-        self._make_room_for_ranges()
+        self._reserve_range_map()
 
-    def _make_room_for_ranges(self) -> None:
-        """Lets the first ray-cast be of an image so large that the map of ranges has room for every later one.
+    def _reserve_range_map(self) -> None:
+        """Ray-cast a large image first, because Open3D sizes the buffer of the range map by the first image.
 
-        Open3D sizes that buffer by the first image. Where it is too small, a view has holes, and stdout a warning.
+        If it is too small, views have holes.
         """
         side = int(np.ceil(np.sqrt(min(FRAGMENTS * FRAGMENT * self.settings.voxel_size, MOST_RANGE_PIXELS))))
         nowhere = Tensor(np.zeros((1, 3), np.int32))
         self.blocks.ray_cast(
-            nowhere, Tensor(np.eye(3)), Tensor(np.eye(4)), side, side, ["depth"], METRES, range_map_down_factor=1
+            nowhere, Tensor(np.eye(3)), Tensor(np.eye(4)), side, side, ["depth"], METERS, range_map_down_factor=1
         )
 
     @property
@@ -111,27 +110,26 @@ class BlockGrid:
 
     @property
     def byte_count(self) -> int:
-        """Of the blocks in use; Open3D's hash map holds up to twice as many ready."""
-        a_voxel = sum(dtype.byte_size() * channels for dtype, channels in ATTRIBUTES.values())
-        return self.voxel_count * a_voxel
+        """Bytes of the blocks in use; the hash map of Open3D has capacity for up to twice as many."""
+        return self.voxel_count * sum(dtype.byte_size() * channels for dtype, channels in ATTRIBUTES.values())
 
     @property
     def min_weight(self) -> float:
-        """As Open3D's own SLAM does: the first frames alone must be enough for a surface."""
+        """The least weight of the surface, lower in the first frames, as in Open3D's SLAM."""
         return min(self.settings.min_weight, float(self.frames))
 
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Adds the depth and the colour of `frame`. Raises MapFullError, and adds nothing, at the end of the budget."""
+        """Integrate `frame`. Raises MapFullError if the block budget is reached; nothing is integrated then."""
         s = self.settings
         depth = self._usable(frame.depth)
         if not depth.any():
-            return  # Open3D raises an error of its own
+            return  # Open3D would raise an error
         blocks = self._touched(depth, frame.camera, T_world_camera, s.truncation)
         self._make_room(blocks)
         view = _tensors(frame.camera, T_world_camera, 0.5)
         image = _image(depth)
-        color = _image(frame.color.astype(np.float32) / np.float32(255))  # Open3D takes both as float or neither
-        self.blocks.integrate(blocks, image, color, *view, METRES, s.max_depth, s.truncation)
+        color = _image(frame.color.astype(np.float32) / np.float32(255))  # Open3D requires both images as float
+        self.blocks.integrate(blocks, image, color, *view, METERS, s.max_depth, s.truncation)
         self.frames += 1
 
     def _usable(self, depth: Float32) -> Float32:
@@ -139,24 +137,24 @@ class BlockGrid:
         return np.where((depth >= s.min_depth) & (depth <= s.max_depth), depth, np.float32(0))
 
     def _touched(self, depth: Float32, camera: Camera, T_world_camera: Float64, band: float) -> Tensor:
-        """The coordinates (B, 3) of the blocks within `band` voxels of a reading of `depth` (H, W), along its ray.
+        """Return the blocks (B, 3) within `band` voxels of a reading of `depth` (H, W), along its ray.
 
-        Open3D looks at every 4th pixel of every 4th row. Where these are more than half a block apart the image is
-        enlarged, or the map would have holes.
+        Open3D samples every 4th pixel of every 4th row. If these are more than half a block apart, the image is
+        enlarged, because the map would have holes.
         """
         s = self.settings
-        apart = TOUCH_STRIDE * float(depth.max()) / min(camera.fx, camera.fy)
-        larger = min(int(np.ceil(apart / (s.block_resolution * s.voxel_size / 2))), TOUCH_STRIDE)
-        if not depth[::TOUCH_STRIDE, ::TOUCH_STRIDE].any():  # it would raise an error
-            larger = TOUCH_STRIDE
-        if larger > 1:
-            depth = depth.repeat(larger, axis=0).repeat(larger, axis=1)
-            camera = camera.scaled(larger)
+        distance = TOUCH_STRIDE * float(depth.max()) / min(camera.fx, camera.fy)
+        scale = min(int(np.ceil(distance / (s.block_resolution * s.voxel_size / 2))), TOUCH_STRIDE)
+        if not depth[::TOUCH_STRIDE, ::TOUCH_STRIDE].any():  # Open3D would raise an error
+            scale = TOUCH_STRIDE
+        if scale > 1:
+            depth = depth.repeat(scale, axis=0).repeat(scale, axis=1)
+            camera = camera.scaled(scale)
         view = _tensors(camera, T_world_camera)
-        return self.blocks.compute_unique_block_coordinates(_image(depth), *view, METRES, s.max_depth, band)
+        return self.blocks.compute_unique_block_coordinates(_image(depth), *view, METERS, s.max_depth, band)
 
     def _make_room(self, blocks: Tensor) -> None:
-        """Lets the hash map grow to hold `blocks` (B, 3), which Open3D would do as well, without an end."""
+        """Grow the hash map for `blocks` (B, 3), up to the block budget, which Open3D does not have."""
         hashmap = self.blocks.hashmap()
         new = blocks.shape[0]
         if hashmap.size():
@@ -171,9 +169,9 @@ class BlockGrid:
             hashmap.reserve(min(max(needed, 2 * hashmap.capacity()), self.settings.max_blocks))
 
     def voxels_seen(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> tuple[Int64, Int64]:
-        """The voxels (V,) within `band` voxels of the reading at their pixel, and that pixel (V,), as flat numbers.
+        """Return the voxels (V,) within `band` voxels of the reading at their pixel (V,), both as flat indices.
 
-        Only pixels in `mask` (H, W) count. After Open3D's example integrate_custom.py, but for the blocks under them.
+        Only pixels in `mask` (H, W) count. After integrate_custom.py of Open3D's examples.
         """
         camera = frame.camera
         usable = self._usable(frame.depth)
@@ -182,8 +180,8 @@ class BlockGrid:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
         around = cv2.dilate(mask.astype(np.uint8), np.ones((2 * TOUCH_STRIDE - 1,) * 2, np.uint8))
         blocks = self._touched(usable * around, camera, T_world_camera, band)
-        numbers, known = self.blocks.hashmap().find(blocks)
-        points, voxels = self.blocks.voxel_coordinates_and_flattened_indices(numbers[known])
+        indices, known = self.blocks.hashmap().find(blocks)
+        points, voxels = self.blocks.voxel_coordinates_and_flattened_indices(indices[known])
         K, T_camera_world = (tensor.to(o3d.core.float32) for tensor in _tensors(camera, T_world_camera))
         uvz = K @ (T_camera_world[:3, :3] @ points.T() + T_camera_world[:3, 3:])
         z = uvz[2].numpy()
@@ -196,22 +194,22 @@ class BlockGrid:
         return voxels.numpy().ravel()[inside[near]], pixels[near]
 
     def voxels_at(self, points_world: Float32) -> Int64:
-        """(P,) the voxel nearest to each of the points (P, 3) m, as a flat number; -1 where there is none."""
+        """Return the flat index (P,) of the voxel nearest to each of points (P, 3) m, -1 = none."""
         if not len(points_world) or not self.block_count:
             return np.full(len(points_world), -1)
         r = self.settings.block_resolution
         nearest = np.rint(points_world / np.float32(self.settings.voxel_size)).astype(np.int32)
         blocks = nearest // r
-        numbers, known = (tensor.numpy() for tensor in self.blocks.hashmap().find(Tensor(blocks)))
+        indices, known = (tensor.numpy() for tensor in self.blocks.hashmap().find(Tensor(blocks)))
         x, y, z = (nearest - r * blocks).T
-        return np.where(known, numbers.astype(np.int64) * r**3 + (z * r + y) * r + x, -1)  # x runs fastest
+        return np.where(known, indices.astype(np.int64) * r**3 + (z * r + y) * r + x, -1)  # x runs fastest
 
     def flat(self, attribute: str) -> npt.NDArray[Any]:
-        """One attribute (block capacity * voxels a block,) of all voxels, as a view that writes through."""
+        """Return a writable view of one attribute (block capacity * voxels per block,) of all voxels."""
         return np.asarray(self.blocks.attribute(attribute).numpy()).reshape(-1)
 
     def ray_cast(self, camera: Camera, T_world_camera: Float64) -> SurfaceView:
-        """The surface that `camera` sees. Raises DataError where the camera or its pose is none."""
+        """Return the visible surface. Raises DataError if the camera or its pose is invalid."""
         check_view(camera, T_world_camera)
         depth, normals, color = _blank(camera)
         blocks, far = self._blocks_in_view(camera, T_world_camera)
@@ -219,7 +217,7 @@ class BlockGrid:
             found = self._cast(blocks, far, camera, T_world_camera)
             z = found["depth"][..., 0]
             length = np.linalg.norm(found["normal"], axis=-1)
-            seen = (z > 0) & (length > 0.5)  # Open3D normalises what is not 0
+            seen = (z > 0) & (length > 0.5)  # Open3D normalizes all others
             behind = self._distance(found["index"][seen], found["interp_ratio"][seen] * found["mask"][seen])
             depth[seen] = np.maximum(z[seen] + behind, NEAR)
             normals[seen] = _towards(camera, T_world_camera, found["normal"] / np.maximum(length, 0.5)[..., None])[seen]
@@ -227,9 +225,9 @@ class BlockGrid:
         return SurfaceView(camera, T_world_camera, depth, normals, color)
 
     def _cast(self, blocks: Int32, far: float, camera: Camera, T_world_camera: Float64) -> dict[str, npt.NDArray[Any]]:
-        """What Open3D's rays find, each (H, W, channels).
+        """Return what Open3D's rays find, each (H, W, channels).
 
-        Its map of ranges leaves out the last rows and columns of an image whose sides are no multiples of its tile.
+        The image is padded to multiples of RANGE_TILE, because the range map omits other last rows and columns.
         """
         names = ("depth", "normal", "color", "index", "mask", "interp_ratio")
         width, height = (RANGE_TILE * int(np.ceil(side / RANGE_TILE)) for side in (camera.width, camera.height))
@@ -239,7 +237,7 @@ class BlockGrid:
             width,
             height,
             names,
-            METRES,
+            METERS,
             NEAR,
             far,
             self.min_weight,
@@ -248,45 +246,46 @@ class BlockGrid:
         )
         return {name: hit[name].numpy()[: camera.height, : camera.width] for name in names}
 
-    def _distance(self, corners: Int64, shares: Float32) -> Float32:
-        """(P,) m, the trilinear field at points with voxels `corners` (P, 8), of which `shares` (P, 8) were seen.
+    def _distance(self, corners: Int64, weights: Float32) -> Float32:
+        """Return the trilinear field (P,) m at points with voxels `corners` (P, 8), with `weights` (P, 8) of seen ones.
 
-        Open3D's rays see the field in steps of whole voxels, rounded down: they end half a voxel too far along each
-        axis, and ragged. The field is 0 at the surface and falls by about 1 m for each m behind it, so adding it is a
-        Newton step: 1 mm instead of 12 mm at 2 cm voxels, in the median.
+        Open3D's rays sample the field at voxels, rounded down, and end half a voxel too far along each axis. The field
+        falls by about 1 m per m behind the surface, so adding it is a Newton step.
         """
-        total = np.maximum(shares.sum(axis=1), np.float32(1e-6))
-        tsdf = (self.flat("tsdf")[corners] * shares).sum(axis=1) / total
+        total = np.maximum(weights.sum(axis=1), np.float32(1e-6))
+        tsdf = (self.flat("tsdf")[corners] * weights).sum(axis=1) / total
         return np.asarray(tsdf * np.float32(self.settings.truncation * self.settings.voxel_size), np.float32)
 
     def _blocks_in_view(self, camera: Camera, T_world_camera: Float64) -> tuple[Int32, float]:
-        """The coordinates (B, 3) of the blocks of which `camera` sees something, and the depth (m) where they end."""
+        """Return the coordinates (B, 3) of the blocks in view, and the depth (m) where they end."""
         coords = self.block_coords()
         side = self.settings.block_resolution * self.settings.voxel_size
         radius = side * np.sqrt(3) / 2
         T_camera_world = inverse(T_world_camera)
         x, y, z = T_camera_world[:3, :3] @ ((coords + 0.5) * side).T + T_camera_world[:3, 3:]
         seen = z > -radius
-        # the distance of the centre from each side of the pyramid of view, inwards
-        for across, focal, center, size in (
+        # distance of the center from each side of the view frustum, inwards
+        for sideways, focal, center, size in (
             (x, camera.fx, camera.cx, camera.width),
             (y, camera.fy, camera.cy, camera.height),
         ):
             low, high = (-0.5 - center) / focal, (size - 0.5 - center) / focal
-            seen &= (across - low * z > -radius * np.hypot(1, low)) & (high * z - across > -radius * np.hypot(1, high))
+            seen &= (sideways - low * z > -radius * np.hypot(1, low)) & (
+                high * z - sideways > -radius * np.hypot(1, high)
+            )
         return coords[seen], float(z[seen].max(initial=0) + radius)
 
     def block_coords(self) -> Int32:
-        """(B, 3) of the blocks in use, in Open3D's order, which differs between runs."""
+        """Return the coordinates (B, 3) of the blocks in use, in Open3D's order, which differs between runs."""
         if not self.block_count:
             return np.zeros((0, 3), np.int32)
         hashmap = self.blocks.hashmap()
         return np.asarray(hashmap.key_tensor().numpy()[hashmap.active_buf_indices().numpy()], np.int32)
 
     def extract(self) -> tuple[Float32, Int32, UInt8]:
-        """Vertices (V, 3) m, triangles (F, 3) and colours (V, 3) by marching cubes, the same in every run."""
+        """Return vertices (V, 3) m, triangles (F, 3) and colors (V, 3) by marching cubes, in a deterministic order."""
         if self.block_count:
-            # weights are whole numbers; marching cubes asks for more than the threshold, ray-casting for as much
+            # weights are whole; marching cubes requires weights above the threshold, ray-casting at least equal ones
             mesh = self.blocks.extract_triangle_mesh(self.min_weight - 0.5)
             if mesh.triangle.indices.shape[0]:
                 colors = np.rint(255 * mesh.vertex.colors.numpy()).astype(np.uint8)
@@ -294,9 +293,9 @@ class BlockGrid:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8)
 
     def arrays(self) -> dict[str, Array]:
-        """The blocks' coordinates and what their voxels hold, in the same order in every run.
+        """Return the coordinates of the blocks and the attributes of their voxels, in a deterministic order.
 
-        For a file of our own: Open3D's `save` ends the process on a full disk.
+        `save` of Open3D terminates the process if the disk is full.
         """
         coords = self.block_coords()
         order = np.lexsort(coords.T)
@@ -305,7 +304,7 @@ class BlockGrid:
         return {"block_coords": coords[order], **values}
 
     def fill(self, arrays: Mapping[str, Array]) -> None:
-        """Takes over what `arrays` of another grid gave, into one that is empty."""
+        """Copy the saved arrays of another grid into an empty one."""
         values = {name: self.blocks.attribute(name).numpy() for name in ATTRIBUTES}
         expected = {"block_coords": np.zeros((0, 3), np.int32), **values}
         check_like(arrays, expected, len(arrays["block_coords"]))
@@ -319,10 +318,9 @@ class BlockGrid:
 
 
 def _tensors(camera: Camera, T_world_camera: Float64, half: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Intrinsics (3, 3) and T_camera_world (4, 4), float64 as Open3D wants them.
+    """Return the intrinsics (3, 3) and T_camera_world (4, 4), float64.
 
-    Its `integrate` cuts pixel coordinates off where it should round them; with the principal point `half` = 0.5 px on
-    that is the same. Its rays go through integer pixel centres.
+    `integrate` of Open3D truncates pixel coordinates instead of rounding; `half` = 0.5 px compensates for that.
     """
     K = camera.K
     K[:2, 2] += half
@@ -334,13 +332,13 @@ def _image(pixels: Float32) -> o3d.t.geometry.Image:
 
 
 def _blank(camera: Camera) -> tuple[Float32, Float32, UInt8]:
-    """Depth, normals and colour of a camera that sees nothing."""
+    """Return empty depth, normals and color."""
     shape = camera.shape
     return np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.uint8)
 
 
 def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
-    """(H, W, 3), in the world: the way of each pixel's ray for each m of depth."""
+    """Return the rays (H, W, 3) of the pixels, world, m per m of depth."""
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     x, y = (u - np.float32(camera.cx)) / np.float32(camera.fx), (v - np.float32(camera.cy)) / np.float32(camera.fy)
     R = T_world_camera[:3, :3].astype(np.float32)
@@ -348,7 +346,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """(H, W, 3) m, in the world."""
+    """Return the points (H, W, 3) m, world, of a surface."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)
@@ -356,7 +354,7 @@ def points_of(surface: SurfaceView) -> Float32:
 
 
 def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -> Float32:
-    """Open3D's normals (H, W, 3), which are the camera's and point away from it, in the world and towards it."""
+    """Return Open3D's normals (H, W, 3), which are in camera axes, in the world and towards the camera."""
     normals = normals_camera @ T_world_camera[:3, :3].T.astype(np.float32)
     away = np.einsum("hwi,hwi->hw", normals, _rays(camera, T_world_camera)) > 0
     normals[away] *= -1
@@ -364,17 +362,14 @@ def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -
 
 
 def _in_order(vertices: Float32, triangles: Int32, colors: UInt8) -> tuple[Float32, Int32, UInt8]:
-    """The mesh with vertices and triangles sorted, and vertices at one place made one.
-
-    Open3D's order depends on its threads.
-    """
+    """Sort vertices and triangles, whose order depends on Open3D's threads, and merge equal vertices."""
     order = np.lexsort(vertices.T)
     sorted_vertices = vertices[order]
-    first = np.ones(len(order), np.bool_)
-    first[1:] = (sorted_vertices[1:] != sorted_vertices[:-1]).any(axis=1)
-    number = np.empty(len(order), np.int32)
-    number[order] = np.cumsum(first, dtype=np.int32) - 1
-    joined = number[triangles]
+    is_new = np.ones(len(order), np.bool_)
+    is_new[1:] = (sorted_vertices[1:] != sorted_vertices[:-1]).any(axis=1)
+    new_index = np.empty(len(order), np.int32)
+    new_index[order] = np.cumsum(is_new, dtype=np.int32) - 1
+    joined = new_index[triangles]
     a, b, c = joined.T
     joined = joined[(a != b) & (b != c) & (c != a)]
-    return sorted_vertices[first], joined[np.lexsort(joined.T)], colors[order][first]
+    return sorted_vertices[is_new], joined[np.lexsort(joined.T)], colors[order][is_new]

@@ -83,7 +83,7 @@ class SemanticMap(SceneMap):
         return self.volume.mesh(self._labeled)
 
     def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
-        """Return the surface with instances and classes, elected as those of `vertex_labels`."""
+        """Return the surface with instances and classes, elected as in an InstanceMap."""
         colors, class_ids = np.empty((len(surface.voxels), 3), np.uint8), np.empty(len(surface.voxels), np.int32)
         label_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface, colors, class_ids)
         min_vertices = vertices_of_area(self.min_area, self.volume.voxel_size)

@@ -9,7 +9,7 @@ from framework.baselines.class_evidence_kernels import best_class
 from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.vertex_labels_kernels import CHUNK, CORNERS, color_of, corner_voxels, keep_near, majority
 from framework.mapping.voxels.raycasting_kernels import voxel_seen
-from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, device
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, NO_LOOK_UP, device
 from framework.refinement.segmentation.union_find import root, unite
 
 
@@ -17,8 +17,7 @@ from framework.refinement.segmentation.union_find import root, unite
 def label_view(grid, evidence, log_missed, view, depth, class_ids):
     """Fill class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W) m."""
     for v in prange(depth.shape[0]):
-        key = np.int64(-2)
-        region = np.int32(-1)
+        key, region = NO_LOOK_UP
         for u in range(depth.shape[1]):
             class_ids[v, u] = -1
             if depth[v, u] > 0:

@@ -17,7 +17,7 @@ from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.label_evidence import Evidence
 from framework.mapping.labels.label_evidence_kernels import Combine
-from framework.mapping.labels.vertex_labels import vertex_labels
+from framework.mapping.labels.vertex_labels_kernels import label_vertices
 from framework.mapping.storage.map_file import (
     check_known,
     check_like,
@@ -93,7 +93,9 @@ class InstanceMap(InstanceTableMap):
 
     def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
         grid, counts = self.volume.voxels.grid, self.confirmation.counts(self.table)
-        colors, instance_ids, class_ids = vertex_labels(grid, self.labels.evidence, counts, surface)
+        colors = np.empty((len(surface.voxels), 3), np.uint8)
+        instance_ids, class_ids = np.empty((2, len(surface.voxels)), np.int32)
+        label_vertices(grid, self.labels.evidence, counts, surface, colors, instance_ids, class_ids)
         too_small = self.confirmation.too_small(instance_ids, self.volume.voxel_size)
         instance_ids[too_small] = 0
         class_ids[too_small] = -1

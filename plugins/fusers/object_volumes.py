@@ -1,4 +1,4 @@
-"""The rival with one volume an object: a re-implementation, in the manner of Fusion++ and MaskFusion."""
+"""The baseline with one volume per object, after Fusion++ and MaskFusion."""
 
 from __future__ import annotations
 
@@ -15,29 +15,27 @@ from framework.mapping.instances.association import Matches, OverlapRule, Overla
 from framework.mapping.instances.instance_list import Confirmation
 from framework.mapping.instances.instance_table import InstanceRecord
 from framework.mapping.labels.pixel_lists import list_points_by_pixel
-from framework.mapping.voxels.tsdf import VoxelHashing
+from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 
 def existence(record: InstanceRecord) -> float:
-    """The probability that an object exists: the mean of Beta(1 + frames that detected it, 1 + other frames that saw
-    where it is), as in Fusion++.
-    """
+    """Return the existence probability of Fusion++: the mean of Beta(1 + frames detected, 1 + other frames in view)."""
     return (1 + record.observations) / (2 + max(record.visible, record.observations))
 
 
 @dataclass
 class ObjectVolumes(MapFuser):
-    """A TSDF for each object, with the probability of each voxel to be of the object, before one of everything.
+    """A TSDF with foreground probabilities for each object, and one of the whole scene.
 
-    A detection belongs to the object that it overlaps most with, several may belong to one, and an object's masks of a
-    frame are taken together. The defaults are Fusion++'s rule; MaskFusion's is `overlap_rule=CLUSTER overlap=0.05
-    same_class=true`. How the maps differ from the originals': framework/baselines/object_map.py.
+    A detection belongs to the object with the largest overlap; several may belong to one, with the union of their
+    masks. The defaults are the rule of Fusion++; that of MaskFusion is `overlap_rule=CLUSTER min_overlap=0.05
+    require_same_class=true`. `framework/baselines/object_map.py` lists differences from the original systems.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     min_overlap: float = 0.2  # in [0, 1]: a detection may belong to an object above this overlap
     overlap_rule: OverlapRule = OverlapRule.IOU  # what an overlap is counted over
-    require_same_class: bool = False  # whether their likeliest classes must be the same
+    require_same_class: bool = False  # whether their most likely classes must be the same
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an object; any may update one
     create_points: int = 50  # pixels, >= 1: and this many; an object is seen, or missed, with this many in view
     min_existence: float = 0.1  # in [0, 1]: an object that exists with less probability is forgotten
@@ -62,54 +60,53 @@ class ObjectVolumes(MapFuser):
         matches = self._associate(overlaps, clusters, frame)
         masks = _masks(clusters, matches.instance_ids, frame.depth.shape)
         self.scene.integrate(frame, pose.T_world_camera, masks, self.hashing.near)
-        self._take_back_empty(matches.instance_ids)
+        self._remove_empty(matches.instance_ids)
         observe(self.scene.table, matches, clusters.class_probabilities.astype(np.float64), self.create_points)
-        self._forget()
+        self._remove_unlikely()
 
     def _look_up(self, frame: Frame, T_world_camera: Float64, clusters: PointClusters) -> Overlaps:
-        """How the clusters lie on the objects that the map has at the measured surface."""
+        """Return the overlaps of the clusters with the objects of the map at the measured surface."""
         stride = vote_stride(frame.camera)
         points = list_points_by_pixel(clusters, frame.depth.shape)
-        return count_overlaps(
-            points, self.scene.instances_seen(frame.camera, T_world_camera, frame.depth, stride), stride
-        )
+        seen = self.scene.instances_seen(frame.camera, T_world_camera, frame.depth, stride)
+        return count_overlaps(points, seen, stride)
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
-        """Gives each cluster the object that it overlaps most with, or creates one where it is good enough."""
-        shares = overlaps.by(self.overlap_rule, self.create_points)
-        shares[~self._agree(clusters, overlaps.instance_ids)] = 0
+        """Match each cluster with the object of the largest overlap, or create one if its score and size suffice."""
+        ratios = overlaps.by(self.overlap_rule, self.create_points)
+        ratios[~self._agree(clusters, overlaps.instance_ids)] = 0
         instance_ids = np.zeros(len(clusters), np.int32)
-        if shares.size:
-            best = shares.argmax(axis=1)
-            instance_ids[:] = np.where(shares.max(axis=1) > self.min_overlap, overlaps.instance_ids[best], 0)
+        if ratios.size:
+            best = ratios.argmax(axis=1)
+            instance_ids[:] = np.where(ratios.max(axis=1) > self.min_overlap, overlaps.instance_ids[best], 0)
         may_create = (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         for k in np.flatnonzero((instance_ids == 0) & may_create):
             instance_ids[k] = self.scene.create(frame.index)
         return Matches(frame.index, clusters, overlaps, instance_ids)
 
     def _agree(self, clusters: PointClusters, instance_ids: Int32) -> Bool:
-        """(N, M) whether a cluster may be an object, by their classes."""
+        """Return (N, M) whether the classes of a cluster and an object allow a match."""
         if not self.require_same_class or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.array([self.scene.table.records[k].class_evidence.argmax() for k in instance_ids.tolist()])
         return np.asarray(clusters.class_probabilities.argmax(axis=1)[:, None] == known[None, :])
 
-    def _take_back_empty(self, instance_ids: Int32) -> None:
-        """Removes new objects of which no reading was in range: without voxels they are never seen again."""
+    def _remove_empty(self, instance_ids: Int32) -> None:
+        """Remove new objects without readings in range: without voxels, they are never seen again."""
         for instance_id in set(instance_ids[instance_ids > 0].tolist()):
             if not self.scene.volumes[instance_id].block_count:
                 self.scene.remove(instance_id)
                 instance_ids[instance_ids == instance_id] = 0
 
-    def _forget(self) -> None:
-        """Removes the objects that hardly exist."""
+    def _remove_unlikely(self) -> None:
+        """Remove the objects with a low existence probability."""
         for record in list(self.scene.table.records.values()):
             if existence(record) < self.min_existence:
                 self.scene.remove(record.id)
 
 
 def _masks(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> dict[int, Bool]:
-    """(H, W) for each object that the frame's clusters belong to, by id: the pixels of all its clusters."""
+    """Return the union (H, W) of the clusters' masks of each object, by id."""
     masks: dict[int, Bool] = {}
     for k in np.flatnonzero(instance_ids):
         u, v = clusters.pixels[clusters.cluster == k].T

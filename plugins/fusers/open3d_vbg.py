@@ -1,4 +1,4 @@
-"""The off-the-shelf fuser: Open3D's VoxelBlockGrid, whose voxels vote for an instance."""
+"""The off-the-shelf baseline: Open3D's VoxelBlockGrid with one vote counter per voxel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from framework.mapping.instances.association import Association
 from framework.mapping.instances.instance_list import Confirmation
 from framework.mapping.labels.label_rule import floored_log
 from framework.mapping.labels.pixel_lists import list_points_by_pixel
-from framework.mapping.voxels.tsdf import Tsdf
+from framework.mapping.voxels.tsdf_volume import Tsdf
 
 if TYPE_CHECKING:
     from framework.baselines.open3d_map import Open3DMap
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Open3DVoxelBlockGrid(MapFuser):
-    """Open3D's TSDF; a voxel keeps the instance that most frames gave it, an instance the product of its classes."""
+    """Open3D's TSDF. The majority of frames labels a voxel; classes of an instance are the product over detections."""
 
     tsdf: Tsdf = field(default_factory=Tsdf)
     association: Association = field(default_factory=Association)
@@ -62,7 +62,7 @@ class Open3DVoxelBlockGrid(MapFuser):
 
 
 def _paint(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> Int32:
-    """(H, W) the instance seen at each pixel, 0 = none; under overlapping clusters that of the best score."""
+    """Return the instance (H, W) at each pixel, 0 = none; where clusters overlap, that of the best score."""
     image = np.zeros(shape, np.int32)
     for k in np.argsort(clusters.scores, kind="stable"):
         if instance_ids[k]:

@@ -1,4 +1,4 @@
-"""A rival: fusion of classes alone, with connected components for instances, in the manner of SemanticFusion."""
+"""The semantic baseline: class fusion after SemanticFusion, with connected components as instances."""
 
 from __future__ import annotations
 
@@ -12,21 +12,17 @@ from framework.config.validation import check_bounds
 from framework.data import Float64, Frame, PointClusters, Pose
 from framework.interfaces import MapFuser
 from framework.mapping.labels.pixel_lists import list_points_by_pixel
-from framework.mapping.voxels.tsdf import VoxelHashing
+from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 
 @dataclass
 class SemanticComponents(MapFuser):
-    """Voxels keep a distribution over classes and background, and nothing else: there is no data association.
+    """Voxels store a distribution over classes and background only; there is no data association.
 
-    A re-implementation after SemanticFusion (McCormac et al. 2017) and Pham et al. (2019). Theirs are distributions of
-    a network that labels every pixel; ours come from masks. A pixel has the distribution of the mask with the best
-    score over it, in which the background has what the network gave to no class. Under no mask it is background,
-    unless the detector missed an object. Two objects of one class that touch are one instance: the idea's limit.
-
-    The smoothing by a CRF, which both have, is left out; majorities over mesh neighbours in its place changed the mean
-    AP50 of three synthetic rooms by 0.01 at most. `missed` was tuned on two of them, from 0.1 to 1: this value is best
-    for masks as detected, and with refiner=chain 0.01 AP50 below the best.
+    After SemanticFusion (McCormac et al. 2017) and Pham et al. (2019), which label every pixel; here distributions come
+    from masks. A pixel has the distribution of the mask with the best score over it, in which the background has the
+    probability that the detector gave to no class. Under no mask it is background, unless the detector missed an
+    object. Two touching objects of one class are one instance. The smoothing by a CRF of both systems is left out.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
@@ -46,10 +42,10 @@ class SemanticComponents(MapFuser):
         self.scene.labels.update(seen, masks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
-        """(N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, as eq. [7] takes it, with a floor.
+        """Return (N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, for eq. [7], with a floor.
 
-        A detector's score is its probability of the best class, and its distribution leaves the background out: the
-        share of the classes together is what scales the one to the other.
+        A score is the probability of the best class, but the distribution excludes the background: their ratio is the
+        probability of all classes together.
         """
         p = clusters.class_probabilities.astype(np.float64)
         objects = np.minimum(clusters.scores[:, None] / p.max(axis=1, keepdims=True, initial=1e-6), 1.0)

@@ -12,7 +12,7 @@ from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 from framework.mapping.voxels.integration_parameters import Pinhole
 from framework.mapping.voxels.raycasting_kernels import voxel_seen
 from framework.mapping.voxels.voxel_grid import Grid
-from framework.mapping.voxels.voxel_grid_kernels import device
+from framework.mapping.voxels.voxel_grid_kernels import NO_LOOK_UP, device
 from framework.mapping.voxels.voxel_walk import prefetch_element
 
 
@@ -25,8 +25,7 @@ def look_up_instances(
     """
     columns = instance_ids.shape[2]
     for row in prange(instance_ids.shape[1]):
-        key = np.int64(-2)
-        region = np.int32(-1)
+        key, region = NO_LOOK_UP
         rows, voxels = np.empty(columns, np.int32), np.empty(columns, np.int32)
         for column in range(columns):
             rows[column] = -1

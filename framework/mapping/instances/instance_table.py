@@ -1,4 +1,4 @@
-"""What the map knows about each instance beside its voxels: class evidence, observations, confidence."""
+"""The instance table: class evidence, observations and confidence of each instance."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 
 
 class FrameSet:
-    """Numbers of frames as spans, which grow at their end: frames in a row are one, of some 120 bytes.
-
-    What is in view for an hour of 30 frames/s is one span, and where only every other frame is mapped 54,000, 6 MB.
-    """
+    """A set of frame indices, stored as spans of consecutive frames."""
 
     def __init__(self, spans: Iterable[list[int]] = ()) -> None:
         self.spans: list[list[int]] = []  # first and last frame of each, ascending, with a gap between any two
@@ -38,7 +35,7 @@ class FrameSet:
             self._append(frame, frame)
 
     def _append(self, first: int, last: int) -> None:
-        """Adds a span that begins in the last one or after it."""
+        """Add a span that begins in the last one or after it."""
         if not self.spans or first > self.spans[-1][1] + 1:
             self.spans.append([first, first - 1])
         self._count += max(last - self.spans[-1][1], 0)
@@ -47,7 +44,7 @@ class FrameSet:
 
 @dataclass
 class InstanceRecord:
-    """One instance's history. `class_evidence` (C,) is what its observations said, combined by the fuser's rule."""
+    """The history of one instance. `class_evidence` (C,) is that of its detections, combined by the fuser's rule."""
 
     id: int
     class_evidence: Float64
@@ -57,11 +54,11 @@ class InstanceRecord:
     in_view: FrameSet = field(default_factory=FrameSet)  # frames in which it could have been detected
     score_sum: float = 0.0  # over its detections
     detections: int = 0
-    embedding: ObjectEmbedding | None = None  # of those of its detections that have one
+    embedding: ObjectEmbedding | None = None  # over its detections with one
 
     @property
     def observations(self) -> int:
-        """Frames in which it was detected; a merged instance may have had two detections in one."""
+        """Frames in which it was detected, once or more."""
         return len(self.observed_in)
 
     @property
@@ -71,44 +68,44 @@ class InstanceRecord:
 
     @property
     def confidence(self) -> float:
-        """Mean score of its detections times the share of frames in view in which it was detected, in [0, 1]."""
+        """Mean score of its detections times the fraction of frames in view with a detection, in [0, 1]."""
         mean_score = self.score_sum / max(self.detections, 1)
         return mean_score * self.observations / max(self.visible, self.observations, 1)
 
 
 class InstanceTable:
-    """All instances ever created, by id; ids count from 1 and are never used again.
+    """The instances of a map by id; ids start at 1 and are never reused.
 
-    Class evidence is combined as in the voxels, and `logarithmic` or proportional to what it says of the classes.
+    Class evidence is combined as in the voxels; it is log-likelihoods if `logarithmic`, otherwise proportional.
     """
 
     def __init__(self, combine: Combine = Combine.SUM, logarithmic: bool = True) -> None:
         self.records: dict[int, InstanceRecord] = {}
         self.last_id = 0
-        self._last_before = -1  # frame of the recordings before this one
-        self._counted_on = 0  # frames, that this recording's numbers are moved by
+        self._last_before = -1  # last frame of the previous recordings
+        self._offset = 0  # of the frame indices of this recording
         self.combine = combine
         self.logarithmic = logarithmic
-        self.embedding_space = ""  # what the embeddings of its instances are of; "" = there is none yet
+        self.embedding_space = ""  # of the embeddings of its instances; "" = there are none
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
-        """A new instance without observations."""
+        """Create an instance without observations."""
         self.last_id += 1
         record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
         self.records[self.last_id] = record
         return record
 
     def begin_recording(self) -> None:
-        """What comes now is of another recording, whose frames may have numbers that have been before."""
+        """Start another recording, whose frames may have the indices of previous ones."""
         spans = [span[1] for record in self.records.values() for span in record.in_view.spans[-1:]]
         self._last_before = max([*spans, *(record.last_frame for record in self.records.values())], default=-1)
-        self._counted_on = 0
+        self._offset = 0
 
     def number_of(self, frame_index: int) -> int:
-        """A frame's number in this map: its own, or where a recording before had that or a later one, counted on."""
-        if frame_index + self._counted_on <= self._last_before:
-            self._counted_on = self._last_before + 1
-        return frame_index + self._counted_on
+        """Return the index of a frame in this map, offset so that it is above those of previous recordings."""
+        if frame_index + self._offset <= self._last_before:
+            self._offset = self._last_before + 1
+        return frame_index + self._offset
 
     def observe(
         self,
@@ -118,7 +115,7 @@ class InstanceTable:
         frame_index: int,
         embedding: ObjectEmbedding | None = None,
     ) -> None:
-        """Counts one detection with the evidence (C,) for its classes."""
+        """Add one detection with the evidence (C,) for its classes."""
         record = self.records[instance_id]
         record.class_evidence = _combined(record.class_evidence, class_evidence, self.combine)
         record.last_frame = max(record.last_frame, frame_index)
@@ -128,7 +125,7 @@ class InstanceTable:
         record.embedding = added(record.embedding, embedding)
 
     def merge(self, kept: int, dropped: int) -> None:
-        """Adds the history of `dropped` to `kept` and forgets it."""
+        """Add the history of `dropped` to `kept` and remove it."""
         a, b = self.records[kept], self.records.pop(dropped)
         earlier, later = (a, b) if a.last_frame <= b.last_frame else (b, a)
         a.class_evidence = _combined(earlier.class_evidence, later.class_evidence, self.combine)
@@ -141,16 +138,14 @@ class InstanceTable:
         a.last_frame = max(a.last_frame, b.last_frame)
 
     def class_probabilities(self, record: InstanceRecord) -> Float32:
-        """(C,) what an instance is: the normalised product of the observed distributions where evidence is logarithmic,
-        else the share of each class in the evidence.
-        """
+        """Return the class distribution (C,) of an instance: its normalized likelihood, or the normalized evidence."""
         evidence = record.class_evidence
         likelihood = np.exp(evidence - evidence.max()) if self.logarithmic else evidence
         total = likelihood.sum()
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)
 
     def class_ids(self) -> Int32:
-        """(ids + 1,) the most likely class of each instance, by id; -1 for none."""
+        """Return the most likely class (ids + 1,) of each instance, by id; -1 = no such instance."""
         class_ids = np.full(self.last_id + 1, -1, np.int32)
         for record in self.records.values():
             class_ids[record.id] = record.class_evidence.argmax()

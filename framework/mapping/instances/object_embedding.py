@@ -1,4 +1,4 @@
-"""What an object's pictures mean, as one vector: the mean of the embeddings of its detections."""
+"""Object embeddings: the mean of the embeddings of an object's detections."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from framework.errors import DataError
 from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader
 
 ARRAYS = ("embedding_ids", "embedding_sums", "embedding_weights", "embedding_counts")
-"""Of a saved map, where its objects have embeddings: (M,) ids int32, (M, D) float64, (M,) float64, (M,) int64."""
+"""Arrays of a map file with embeddings: (M,) int32, (M, D) float64, (M,) float64, (M,) int64."""
 
-SPACE = "embedding_space"  # the key of a saved table that names what its embeddings are of
+SPACE = "embedding_space"  # the key of a saved table with the space of its embeddings
 MOST_WEIGHT = 1e12  # of one object
 
 
@@ -24,56 +24,56 @@ class ObjectEmbedding:
     """A weighted sum of unit vectors."""
 
     sum: Float64  # (D,)
-    weight: float  # > 0, of all of them
-    count: int  # how many, >= 1
+    weight: float  # > 0, the sum of the weights
+    count: int  # of vectors, >= 1
 
     @classmethod
     def of(cls, embedding: Float32, weight: float) -> ObjectEmbedding:
-        """Of one unit vector (D,)."""
+        """Return the sum of one unit vector (D,)."""
         return cls(weight * embedding.astype(np.float64), weight, 1)
 
     def __add__(self, other: ObjectEmbedding) -> ObjectEmbedding:
         if self.sum.shape != other.sum.shape:
             raise DataError(
-                f"an object has embeddings of {len(self.sum)} numbers and of {len(other.sum)}, both said to be of one "
-                "space; map again with one model"
+                f"an object has embeddings of {len(self.sum)} numbers and of {len(other.sum)} in the same space; "
+                "map again with one model"
             )
         return ObjectEmbedding(self.sum + other.sum, self.weight + other.weight, self.count + other.count)
 
     @property
     def mean(self) -> Float32:
-        """(D,) the unit vector along the sum; 0 where its vectors cancel out."""
+        """The unit vector (D,) along the sum; 0 if its vectors cancel out."""
         length = float(np.linalg.norm(self.sum))
         return np.asarray(self.sum / length if length > 0 else self.sum, np.float32)
 
     @property
     def spread(self) -> float:
-        """1 - |mean of the unit vectors|, in [0, 1]: 0 = all alike, near 1 = they have nothing in common."""
+        """1 - |mean of the unit vectors|, in [0, 1]: 0 = all equal."""
         return float(np.clip(1 - np.linalg.norm(self.sum) / self.weight, 0, 1))
 
 
 def added(known: ObjectEmbedding | None, new: ObjectEmbedding | None) -> ObjectEmbedding | None:
-    """The sum of what two say, of which either may say nothing."""
+    """Return the sum of two embeddings, either of which may be missing."""
     if known is None or new is None:
         return known or new
     return known + new
 
 
 def agreed_space(known: str, found: str) -> str:
-    """The space of a map's embeddings, which is that of the first ones: `known` is "" before.
+    """Return the embedding space of a map, that of its first embeddings; `known` is "" before.
 
-    Raises DataError unless a frame's embeddings are of that one.
+    Raises DataError if later embeddings are of another space.
     """
     if known and known != found:
         raise DataError(
-            f"the map has embeddings of {known} and this frame's detections have others, of {found}; choose the model "
-            "that the map was made with, or map again"
+            f"the map has embeddings of {known}, and the detections of this frame of {found}; use the "
+            "model of the map, or map again"
         )
     return found
 
 
 def embedding_arrays(embeddings: Mapping[int, ObjectEmbedding]) -> dict[str, Array]:
-    """What a map's file has of its objects' embeddings, by id; nothing where none has one."""
+    """Return the arrays of a map file for embeddings by id; empty if there are none."""
     if not embeddings:
         return {}
     values = list(embeddings.values())
@@ -86,7 +86,7 @@ def embedding_arrays(embeddings: Mapping[int, ObjectEmbedding]) -> dict[str, Arr
 
 
 def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, dict[int, ObjectEmbedding]]:
-    """The space and the embeddings by id that a map's file has. Raises DataError where they cannot be."""
+    """Return the space and the embeddings by id of a map file. Raises DataError if they are invalid."""
     if SPACE not in plain.values:
         return "", {}
     space = plain.values[SPACE]
@@ -110,7 +110,7 @@ def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, d
         raise DataError(f"embedding_weights must be in (0, {MOST_WEIGHT:g}], found {weights.min()} to {weights.max()}")
     if n and not (counts.min() >= 1 and counts.max() <= LARGEST_COUNT):
         raise DataError(f"embedding_counts must be at least 1, found {counts.min()}")
-    with np.errstate(over="ignore"):  # of what cannot be
+    with np.errstate(over="ignore"):  # of invalid values
         lengths = np.linalg.norm(sums / weights[:, None], axis=1)
     if n and lengths.max() > 1 + 1e-3:
         raise DataError(f"embedding_sums must be no longer than their weights, found {lengths.max():.4g} of one")

@@ -70,7 +70,7 @@ def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evi
             after = grid.label_row[seen.blocks[min(a + 1, blocks - 1)]]
             if after >= 0:
                 prefetch_row(evidence.labeled, np.int64(after))
-            start, end = seen.near_first[a], seen.near_first[a] + seen.near_count[a]
+            start, end = seen.near_start[a], seen.near_start[a] + seen.near_count[a]
             evictions = without_slots = count = np.int32(0)
             bits = np.uint64(0)
             for i in range(start, end):
@@ -115,7 +115,7 @@ def label_new(grid, seen, evidence, measurement, list_bits, row_bits, new, free_
     for a in prange(seen.blocks.shape[0]):
         voxel, row = new.starts[a], new.rows[a]
         row_of[seen.blocks[a]] = row
-        start = seen.near_first[a]
+        start = seen.near_start[a]
         for i in range(start, start + seen.near_count[a] if new.counts[a] > 0 else start):
             list_id, n = list_ids[seen.near_pixel[i]], seen.near_voxel[i]
             if evidence.labeled[row, n] < 0 and _has_clusters(measurement, list_id):

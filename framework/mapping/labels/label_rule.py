@@ -26,8 +26,7 @@ from framework.mapping.labels.label_evidence import (
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, remove_supports
 from framework.mapping.voxels.integration_parameters import Sensor
-from framework.mapping.voxels.tsdf import VoxelHashing
-from framework.mapping.voxels.tsdf_volume import NO_BLOCKS
+from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VoxelHashing
 
 OTHER_CLASS = 0.3  # Bhattacharyya coefficient below which two distributions are of different objects
 EXACT_BITS = 16  # by which class scores of exact storage are finer

@@ -1,4 +1,4 @@
-"""Kernels of vertex_labels.py."""
+"""Kernels for color, instance and class of the vertices of the map's mesh."""
 
 from __future__ import annotations
 
@@ -6,7 +6,14 @@ import numpy as np
 from numba import njit, prange
 
 from framework.mapping.labels.label_evidence_kernels import best_class, best_counted_instance, labeled_voxel
-from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, UNSEEN, device, find_block, unpack_color
+from framework.mapping.voxels.voxel_grid_kernels import (
+    BLOCK_VOXELS,
+    NO_LOOK_UP,
+    UNSEEN,
+    device,
+    find_block,
+    unpack_color,
+)
 from framework.mapping.voxels.voxel_walk import voxel_number
 
 CORNERS = 8  # voxels around a vertex
@@ -23,8 +30,7 @@ def corner_voxels(grid, vertex, blocks, voxels, weights):
     x, y, z = vertex[0] * scale, vertex[1] * scale, vertex[2] * scale
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     x, y, z = x - i, y - j, z - k
-    key = np.int64(-2)
-    region = np.int32(-1)
+    key, region = NO_LOOK_UP
     labeled = False
     for c in range(CORNERS):
         dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
@@ -89,12 +95,18 @@ def color_of(color, voxel, out):
 
 @njit(cache=True, nogil=True, parallel=True)
 def color_vertices(color, voxels, colors):
+    """Fill colors (V, 3) with the RGB of voxels (V,), numbered as in an UnlabeledMesh."""
     for v in prange(len(voxels)):
         color_of(color, voxels[v], colors[v])
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_vertices(grid, evidence, counts, surface, colors, instance_ids, class_ids):
+    """Fill colors (V, 3), instance_ids (V,) and class_ids (V,) of the vertices of an UnlabeledMesh.
+
+    The color is that of the nearest voxel. The instance is the majority of the eight surrounding voxels, weighted
+    trilinearly, each with its most likely instance that has counts[id]. Vertices without an instance have no class.
+    """
     vertices = surface.vertices
     for chunk in prange(-(-len(vertices) // CHUNK)):
         blocks, voxels = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)

@@ -1,4 +1,4 @@
-"""A saved map: one .npz with a header of plain numbers and the map's arrays, written whole or not at all."""
+"""Map files: one .npz with a JSON header and the arrays of the map, written atomically."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,18 +23,18 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader, whole
 from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 
-DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.savez_compressed has, in half its time
+DEFLATE_LEVEL = 1  # of zlib: files are at most a tenth larger than with level 6, in half the time
 
 HEADER = "header"
-LARGEST_HEADER = 2**28  # bytes, of an hour with thousands of instances some 10 MB
+LARGEST_HEADER = 2**28  # bytes; an hour with thousands of instances takes about 10 MB
 LARGEST_ID = 2**24  # of an instance
 MOST_EVIDENCE = 1e12  # for a class
-MOST_ARRAYS = 100  # of a file that says itself which it has
-SHARE_OF_MEMORY = 0.5  # of the machine, that a map may take when it is loaded
+MOST_ARRAYS = 100  # of a file that lists its arrays
+SHARE_OF_MEMORY = 0.5  # of the machine, that a loaded map may take
 
 
 def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-    """Writes an .npz as np.load reads it, lightly compressed: a third of the arrays' size. It has no time in it."""
+    """Write an .npz for np.load, lightly compressed, without timestamps."""
     if not isinstance(cast(object, path), str | Path):
         raise DataError(f"a map is saved to a path, found {path!r:.60}")
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
@@ -49,15 +48,15 @@ def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, 
 
 
 def read_map(path: Path | str, expected_format: object, names: Sequence[str]) -> tuple[MapHeader, dict[str, Any]]:
-    """The header and the named arrays of a saved map, and those of its objects' embeddings where it has any.
+    """Return the header and the named arrays of a map file, and its embeddings, if there are any.
 
-    Raises DataError for a file that is none, for another format, for a checksum that fails, and before memory is asked
-    for where the arrays do not have the sizes that they claim or are more than this machine holds.
+    Raises DataError for other files and formats, and for wrong checksums. Array sizes are checked against the file and
+    the memory of the machine before memory is allocated.
     """
     with faults_of(path), _opened(path) as archive:
         header = _header(archive)
         found = header.values.get("format")
-        if found != expected_format:  # its arrays may have other names
+        if found != expected_format:
             raise DataError(f"it has map format {found!r:.60}, this version reads {expected_format}")
         damaged = archive.testzip()
         if damaged is not None:
@@ -68,26 +67,26 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
 
 
 def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
-    """All that is in a file besides its header, which lists their `names`. Raises DataError, likewise."""
+    """Return the arrays that the header of a file lists as `names`. Raises DataError as read_map()."""
     with faults_of(path), _opened(path) as archive:
         names = _header(archive).items("names")
     return read_map(path, expected_format, [str(name) for name in names[:MOST_ARRAYS]])[1]
 
 
 def read_format(path: Path | str) -> str:
-    """What a saved map says that it is. Raises DataError for a file that is none."""
+    """Return the format of a map file. Raises DataError for other files."""
     with faults_of(path), _opened(path) as archive:
         return str(_header(archive).values.get("format"))
 
 
 @contextmanager
 def faults_of(path: Path | str) -> Iterator[None]:
-    """Turns what goes wrong while a map is made from a file into a DataError that names the file."""
+    """Convert errors while a map file is read into a DataError that names the file."""
     try:
         yield
     except InstanceMapError as error:
         raise DataError(f"{path}: {error}; map again") from error
-    except Exception as error:  # of damaged archives, zipfile and numpy raise almost anything
+    except Exception as error:  # zipfile and numpy raise many kinds for damaged archives
         raise DataError(f"{path} is not a map that can be read: {in_one_line(error)}; map again") from error
 
 
@@ -109,7 +108,7 @@ def _header(archive: zipfile.ZipFile) -> MapHeader:
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Array:
-    """Reads an array whose member of the archive is as long as its shape says."""
+    """Read an array, if its size in the archive agrees with its shape."""
     info = archive.getinfo(f"{name}.npy")
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
@@ -123,7 +122,7 @@ def _array(archive: zipfile.ZipFile, name: str) -> Array:
 
 
 def machine_memory() -> int:
-    """Bytes of this machine; a usual number where the system does not tell."""
+    """Return the bytes of memory of this machine, 2^34 if unknown."""
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
@@ -131,22 +130,20 @@ def machine_memory() -> int:
 
 
 def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], length: int, prefix: str = "") -> None:
-    """Raises DataError unless the arrays, which kernels read without looking, have the expected types, and the expected
-    shapes but for the `length`.
-    """
+    """Raise DataError unless the arrays have the types and shapes of the expected ones, with another `length`."""
     for name, like in expected.items():
         check_array(prefix + name, arrays[prefix + name], (length, *like.shape[1:]), like.dtype)
 
 
 def check_known(name: str, array: Array, known: Iterable[int]) -> None:
-    """Raises DataError unless all numbers in the array, which kernels take for places in others, are known ones."""
+    """Raise DataError unless all values of the array, which kernels use as indices, are known."""
     unknown = array[~np.isin(array, list(known))]
     if unknown.size:
         raise DataError(f"{name} has {unknown[0]}, which is none of the map's")
 
 
 def check_numbers(name: str, numbers: Array, count: int) -> None:
-    """Raises DataError unless the array has each of the numbers 0 to `count` - 1 once, and -1 for none."""
+    """Raise DataError unless the array has each of the numbers 0 to `count` - 1 once, and otherwise -1."""
     used = numbers[numbers != -1]
     beyond = used[(used < 0) | (used >= count)]
     if beyond.size:
@@ -156,7 +153,7 @@ def check_numbers(name: str, numbers: Array, count: int) -> None:
 
 
 def check_blocks(coords: Any) -> None:
-    """Raises DataError unless blocks (B, 3) lie where the map has any, and each is named once."""
+    """Raise DataError unless blocks (B, 3) are unique and in range."""
     if len(coords) and np.abs(coords, dtype=np.int64).max() >= FARTHEST_BLOCK:
         raise DataError(f"block_coords must be within {FARTHEST_BLOCK} of 0, found {coords.min()} to {coords.max()}")
     if len(np.unique(coords, axis=0)) < len(coords):
@@ -164,41 +161,36 @@ def check_blocks(coords: Any) -> None:
 
 
 def plain_table(table: InstanceTable) -> dict[str, Any]:
-    """The table of instances as JSON can hold it; the vectors are in `table_arrays`."""
+    """Return an instance table as JSON values; `table_arrays` has the embeddings."""
     space = {SPACE: table.embedding_space} if table_arrays(table) else {}
     return {
         "combine": table.combine.name,
         "logarithmic": table.logarithmic,
         "last_id": table.last_id,
         **space,
-        "instances": [
-            {
-                **_numbers(record),
-                "class_evidence": record.class_evidence.tolist(),
-                "observed_in": sorted(record.observed_in),
-                "in_view": record.in_view.spans,
-            }
-            for record in table.records.values()
-        ],
+        "instances": [_plain_record(record) for record in table.records.values()],
     }
 
 
-def _numbers(record: InstanceRecord) -> dict[str, Any]:
-    """Of an instance, all but its embedding."""
-    return {name: value for name, value in asdict(replace(record, embedding=None)).items() if name != "embedding"}
+def _plain_record(record: InstanceRecord) -> dict[str, Any]:
+    plain = {
+        **vars(record),
+        "class_evidence": record.class_evidence.tolist(),
+        "observed_in": sorted(record.observed_in),
+        "in_view": record.in_view.spans,
+    }
+    del plain["embedding"]
+    return plain
 
 
 def table_arrays(table: InstanceTable) -> dict[str, Array]:
-    """The arrays of a table: its objects' embeddings, where there are any."""
+    """Return the arrays of an instance table: its embeddings, if there are any."""
     embeddings = {k: record.embedding for k, record in table.records.items() if record.embedding is not None}
     return embedding_arrays(embeddings)
 
 
 def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> InstanceTable:
-    """The table that `plain_table` and `table_arrays` wrote down, of a map with so many classes.
-
-    Raises DataError where it cannot be.
-    """
+    """Return the instance table of a map file with so many classes. Raises DataError if it is invalid."""
     table = InstanceTable(plain.option("combine", Combine), plain.flag("logarithmic"))
     table.last_id = plain.whole("last_id", 0, LARGEST_ID)
     for entry in plain.parts("instances"):

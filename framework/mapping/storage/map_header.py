@@ -1,4 +1,4 @@
-"""The header of a saved map, which anybody may have written: plain values read by name, each within its bounds."""
+"""The header of a map file: values read by key and validated, because the file is untrusted."""
 
 from __future__ import annotations
 
@@ -12,43 +12,43 @@ from framework.errors import DataError
 
 MOST_CLASSES = 10_000  # that a map names; LVIS has 1,200
 LONGEST_NAME = 200  # characters of a class
-LARGEST_COUNT = 2**53  # of frames, evictions and the like: every program has these exactly
+LARGEST_COUNT = 2**53  # of frames, evictions and the like: the integers that JSON readers represent exactly
 
 Option = TypeVar("Option", bound=Enum)
 
 
 @dataclass(frozen=True)
 class MapHeader:
-    """An object of the header. Each method reads one key; it raises DataError unless that holds what it should."""
+    """An object of the header. Each method reads one key and raises DataError if its value is invalid."""
 
     values: Mapping[str, Any]
     name: str = "header"
 
     @classmethod
     def of(cls, found: object, name: str = "header") -> MapHeader:
-        """What should be an object."""
+        """Return a value that must be an object."""
         if not isinstance(found, dict):
             raise DataError(f"{name} must be an object, found {found!r:.60}")
         return cls(found, name)
 
     def part(self, key: str) -> MapHeader:
-        """An object in this one."""
+        """Return a nested object."""
         return MapHeader.of(self._value(key), f"{self.name}.{key}")
 
     def parts(self, key: str) -> Iterator[MapHeader]:
-        """The objects of a list."""
+        """Yield the objects of a list."""
         for k, found in enumerate(self.items(key)):
             yield MapHeader.of(found, f"{self.name}.{key}[{k}]")
 
     def items(self, key: str) -> list[Any]:
-        """A list of whatever."""
+        """Return a list of any values."""
         found = self._value(key)
         if not isinstance(found, list):
             raise self._fault(key, "a list", found)
         return found
 
     def number(self, key: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> float:
-        """A finite number in [low, high]; a part in a million beyond counts as rounded to float32."""
+        """Return a finite number in [low, high], with a tolerance of 1e-6 for rounding to float32."""
         found, (low, high) = self._value(key), bounds
         is_number = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
         if not is_number or not low - 1e-6 * abs(low) <= found <= high + 1e-6 * abs(high):
@@ -56,25 +56,25 @@ class MapHeader:
         return float(found)
 
     def whole(self, key: str, low: int = 0, high: int = LARGEST_COUNT) -> int:
-        """A whole number in [low, high]."""
+        """Return a whole number in [low, high]."""
         return whole(f"{self.name}.{key}", self._value(key), low, high)
 
     def flag(self, key: str) -> bool:
-        """True or false."""
+        """Return a Boolean."""
         found = self._value(key)
         if not isinstance(found, bool):
             raise self._fault(key, "true or false", found)
         return found
 
     def option(self, key: str, options: type[Option]) -> Option:
-        """An option by its name."""
+        """Return a member of an enumeration by its name."""
         found = self._value(key)
         if not isinstance(found, str) or found not in options.__members__:
             raise self._fault(key, f"one of {', '.join(options.__members__)}", found)
         return options[found]
 
     def classes(self) -> tuple[str, ...]:
-        """The names of the map's classes."""
+        """Return the names of the map's classes."""
         found = self.items("classes")
         names = [name for name in found if isinstance(name, str) and len(name) <= LONGEST_NAME]
         if len(names) < len(found) or len(found) > MOST_CLASSES:
@@ -91,7 +91,7 @@ class MapHeader:
 
 
 def whole(name: str, found: object, low: int = 0, high: int = LARGEST_COUNT) -> int:
-    """A whole number in [low, high]. Raises DataError, naming it, for anything else."""
+    """Return a whole number in [low, high]. Raises DataError, naming it, for anything else."""
     if isinstance(found, bool) or not isinstance(found, int) or not low <= found <= high:
         raise DataError(f"{name} must be a whole number in [{low}, {high}], found {found!r:.60}")
     return found

@@ -1,7 +1,7 @@
-"""The blocks that a frame updates: along the truncation band of its readings, and those that it sees through.
+"""Allocation: the blocks that a frame updates, along the truncation bands of its readings and in free space.
 
-Candidates are gathered in chunks of image rows whose number does not depend on the number of threads, and blocks are
-numbered in a serial pass, so that the map is the same with any number of threads.
+Candidates are gathered in a fixed number of chunks of image rows, and blocks are numbered serially, so that the map
+does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, FARTHEST_BLOCK
 
-MOST_SAMPLES = 4096  # along the band of a reading, half a block apart; the defaults have 6
-REPEATS = 8  # times that a chunk may pass on a block, in the mean: it remembers the latest ones
-FEWEST_KEYS = 2**20  # that a frame may always ask for, 8 MB, so that a map's own limit tells of small ones
+MOST_SAMPLES = 4096  # along the band of a reading, half a block apart; 6 by default
+REPEATS = 8  # mean times that a chunk may report a block; it remembers the latest ones
+FEWEST_KEYS = 2**20  # that a frame may always ask for, 8 MB; the budget of the map limits smaller requests
 
 
 class Allocator:
-    """Finds the blocks that a frame updates and allocates those that do not exist yet."""
+    """Finds the blocks that a frame updates, and allocates new ones."""
 
     def __init__(self, voxels: VoxelGrid, sensor: Sensor) -> None:
         self.voxels = voxels
         self.sensor = sensor
         self._frames = 0
-        self._stamp = np.zeros(0, np.int32)  # (B,) the last frame, counted from 1, in which a block was active
+        self._stamp = np.zeros(0, np.int32)  # (B,) last frame, from 1, in which a block was active
         self._found = np.empty((CHUNKS, 4096), np.int64)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For pickling: without what is only reserved."""
+        """Return the state without unused capacity."""
         return {**vars(self), "_stamp": self._stamp[: self.voxels.block_count]}
 
     def active_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
-        """(A,) the blocks around the surface that the frame sees, allocated here, and those that it sees through.
+        """Allocate and return the blocks (A,) around the measured surface, and existing ones in front of it.
 
-        Raises MapFullError when the block budget is reached.
+        Raises MapFullError if the block budget is reached.
         """
         self._frames += 1
         found = self.allocate(frame.camera, frame.depth, T_world_camera)
@@ -48,33 +48,25 @@ class Allocator:
         if len(self._stamp) < capacity:
             self._stamp = grown(self._stamp, capacity, zeros=True)
         active = np.empty(self.voxels.block_count, np.int32)
-        count = choose_blocks(
-            self.voxels.grid,
-            found,
-            self.voxels.region_count,
-            frame.depth,
-            pinhole(frame.camera, inverse(T_world_camera)),
-            self.sensor,
-            self._stamp,
-            self._frames,
-            active,
-        )
+        grid, regions, view = self.voxels.grid, self.voxels.region_count, pinhole(frame.camera, inverse(T_world_camera))
+        count = choose_blocks(grid, found, regions, frame.depth, view, self.sensor, self._stamp, self._frames, active)
         return active[:count].copy()
 
     def allocate(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
-        """(N,) the blocks along the truncation band of the readings `depth` (H, W) m, allocated here; some repeatedly.
+        """Allocate and return the blocks (N,), with repeats, along the truncation bands of `depth` (H, W) m.
 
-        Raises MapFullError when the block budget is reached, and before memory is asked for where a single frame asks
-        for more than it; FrameError for a pose beyond where blocks can be.
+        Raises:
+            MapFullError: the block budget is reached, or a single frame needs more; no memory is allocated then.
+            FrameError: the pose is outside the range of block coordinates.
         """
         return self.voxels.allocate(self._surface_coords(camera, depth, T_world_camera))
 
     def _surface_coords(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
         block_size = BLOCK_SIDE * float(self.voxels.grid.voxel_size)
-        # readings this far apart are at most a quarter of a block apart at the greatest depth
+        # samples at most a quarter of a block apart at the largest depth
         footprint = float(self.sensor.max_depth) / camera.fx
         stride = max(1, min(8, int(0.25 * block_size / footprint)))
-        # samples at most half a block apart along the ray of a corner, at the frame's greatest depth
+        # samples at most half a block apart along the ray of a corner, at the largest depth of the frame
         farthest = min(float(depth.max()), float(self.sensor.max_depth))
         band = float(self.sensor.truncation) + float(self.sensor.truncation_slope) * farthest
         longest = _longest_ray(camera)
@@ -90,18 +82,9 @@ class Allocator:
                 f"the camera sees {reach:.6g} m from the origin, and a map of {self.voxels.grid.voxel_size:g} m voxels "
                 f"ends at {FARTHEST_BLOCK * block_size:.6g} m"
             )
-        counts = np.zeros(CHUNKS, np.int64)
+        counts, view, size = np.zeros(CHUNKS, np.int64), pinhole(camera, T_world_camera), np.float32(block_size)
         while True:
-            surface_blocks(
-                depth,
-                pinhole(camera, T_world_camera),
-                self.sensor,
-                np.float32(block_size),
-                stride,
-                samples,
-                self._found,
-                counts,
-            )
+            surface_blocks(depth, view, self.sensor, size, stride, samples, self._found, counts)
             if counts.max() <= self._found.shape[1]:
                 break
             if counts.sum() > max(REPEATS * self.voxels.max_blocks, FEWEST_KEYS):
@@ -118,7 +101,7 @@ class Allocator:
 
 
 def _longest_ray(camera: Camera) -> float:
-    """The length of the ray to depth 1 through the corner of the image farthest from the principal point."""
+    """Return the length of the ray to depth 1 through the corner farthest from the principal point."""
     x = max(camera.cx, camera.width - camera.cx) / camera.fx
     y = max(camera.cy, camera.height - camera.cy) / camera.fy
     return float(np.sqrt(1 + x * x + y * y))

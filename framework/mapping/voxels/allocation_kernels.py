@@ -1,4 +1,4 @@
-"""Kernels of allocation.py."""
+"""Kernels of allocation.py: blocks along truncation bands, and blocks in the view frustum."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import numpy as np
 from numba import njit, prange
 
 from framework.mapping.voxels.bit_slices import ONE, lowest_bit
-from framework.mapping.voxels.frustum_kernels import solid_blocks_in_view
-from framework.mapping.voxels.voxel_grid_kernels import NO_KEY, device, pack_key, unpack_key
+from framework.mapping.voxels.voxel_grid import REGION_BLOCKS, REGION_SIDE
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, NO_KEY, device, pack_key, unpack_key
 from framework.mapping.voxels.voxel_walk import ray_direction
 
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
 WORD = 64  # bits
-RECENT = 1024  # block keys that a chunk remembers, to pass on each block about once
-PROBES = 4  # pixels along each side of a block in the image, to tell whether the frame sees through it
+RECENT = 1024  # block keys that a chunk remembers, to report each block about once
+PROBES = 4  # pixels along each side of a block in the image that tell whether the frame sees through it
 
 
 @device
 def _remembered(recent, key):
-    """True when the key was passed to `recent` (RECENT,) lately; remembers it otherwise."""
+    """Return whether the key is in `recent` (RECENT,); add it otherwise."""
     slot = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(54)
     if recent[slot] == key:
         return True
@@ -28,10 +28,9 @@ def _remembered(recent, key):
 
 @device
 def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
-    """The keys of the blocks at `samples` places along the truncation band of a row's readings, into keys[1:], place by
-    place.
+    """Write the keys of the blocks at `samples` points along the truncation bands of a row of readings to keys[1:].
 
-    All that the loop reads stands in local variables, so that the compiler vectorises it.
+    The loop reads local variables only, so that the compiler vectorizes it.
     """
     width = readings.shape[0]
     first_x, first_y, first_z = ray_direction(view, 0, v)
@@ -41,11 +40,11 @@ def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
     nearest, farthest = sensor.min_depth, sensor.max_depth
     truncation, slope = sensor.truncation, sensor.truncation_slope
     for s in range(samples):
-        place = np.float32(2.0) * np.float32(s) / np.float32(samples - 1) - np.float32(1.0)
+        offset = np.float32(2.0) * np.float32(s) / np.float32(samples - 1) - np.float32(1.0)
         for n in range(width):
             column = np.float32(np.int32(n))
             d = readings[n]
-            z = d + place * (truncation + slope * d)
+            z = d + offset * (truncation + slope * d)
             bx = np.int32(np.floor((tx + z * (first_x + column * step_x)) * inverse_size))
             by = np.int32(np.floor((ty + z * (first_y + column * step_y)) * inverse_size))
             bz = np.int32(np.floor((tz + z * (first_z + column * step_z)) * inverse_size))
@@ -55,9 +54,9 @@ def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def surface_blocks(depth, view, sensor, block_size, stride, samples, found, counts):
-    """Keys of blocks along the band of every stride-th reading, chunk by chunk, into `found` (CHUNKS, M).
+    """Write the keys of blocks along the band of every stride-th reading to `found` (CHUNKS, M), by chunk.
 
-    Counts (CHUNKS,) above M mean that there was no room for all.
+    Counts (CHUNKS,) above M mean that `found` was too small.
     """
     height, width = depth.shape
     rows, columns = (height + stride - 1) // stride, (width + stride - 1) // stride
@@ -72,12 +71,12 @@ def surface_blocks(depth, view, sensor, block_size, stride, samples, found, coun
             for column in range(columns):
                 readings[column] = depth[row * stride, column * stride]
             _band_keys(readings, row * stride, view, sensor, inverse_size, stride, samples, keys)
-            for first in range(0, words * WORD, WORD):
-                word = np.uint64(0)  # a bit where the key is another than the one before, which the compiler vectorises
+            for start in range(0, words * WORD, WORD):
+                word = np.uint64(0)  # bits of the keys that differ from the previous one; the compiler vectorizes it
                 for i in range(WORD):
-                    word |= np.uint64(keys[first + i + 1] != keys[first + i]) << np.uint64(i)
+                    word |= np.uint64(keys[start + i + 1] != keys[start + i]) << np.uint64(i)
                 while word != np.uint64(0):
-                    key = keys[1 + first + lowest_bit(word)]
+                    key = keys[1 + start + lowest_bit(word)]
                     word &= word - ONE
                     if key != NO_KEY and not _remembered(recent, key):
                         if n < found.shape[1]:
@@ -92,9 +91,81 @@ def unpack(keys, coords):
         coords[i, 0], coords[i, 1], coords[i, 2] = unpack_key(keys[i])
 
 
+@device
+def _extent(camera, size, margin):
+    """Return half the sides, m, along the camera axes, of the bounding box of a cube in the world."""
+    half = np.float32(0.5) * size
+    return (
+        half * (abs(camera.R[0, 0]) + abs(camera.R[0, 1]) + abs(camera.R[0, 2])) + margin,
+        half * (abs(camera.R[1, 0]) + abs(camera.R[1, 1]) + abs(camera.R[1, 2])) + margin,
+        half * (abs(camera.R[2, 0]) + abs(camera.R[2, 1]) + abs(camera.R[2, 2])) + margin,
+    )
+
+
+@device
+def _bounds(camera, x, y, z, extent, near, far, shape):
+    """Return (visible, z0, z1, u0, u1, v0, v1): depths (m) and pixels, inclusive, of the box around a world point."""
+    height, width = shape
+    pz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
+    z0, z1 = max(pz - extent[2], near), min(pz + extent[2], far)
+    if z0 > z1:
+        return False, z0, z1, 0, 0, 0, 0
+    px = camera.R[0, 0] * x + camera.R[0, 1] * y + camera.R[0, 2] * z + camera.t[0]
+    py = camera.R[1, 0] * x + camera.R[1, 1] * y + camera.R[1, 2] * z + camera.t[1]
+    left, right = px - extent[0], px + extent[0]
+    top, bottom = py - extent[1], py + extent[1]
+    u0 = camera.fx * min(left / z0, left / z1) + camera.cx
+    u1 = camera.fx * max(right / z0, right / z1) + camera.cx
+    v0 = camera.fy * min(top / z0, top / z1) + camera.cy
+    v1 = camera.fy * max(bottom / z0, bottom / z1) + camera.cy
+    if u1 < 0 or v1 < 0 or u0 > width - 1 or v0 > height - 1:
+        return False, z0, z1, 0, 0, 0, 0
+    u0, v0 = max(u0, np.float32(0.0)), max(v0, np.float32(0.0))
+    u1, v1 = min(u1, np.float32(width - 2)), min(v1, np.float32(height - 2))
+    return True, z0, z1, int(u0), int(u1) + 1, int(v0), int(v1) + 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solid_blocks_in_view(grid, region_count, block_count, camera, near, far, shape):
+    """Return blocks (N,), depths (N, 2) m and pixels (N, 4) u0, u1, v0, v1 inclusive of blocks with a surface in view.
+
+    `camera` holds T_camera_world. Tests every region of the map, and every block of the regions in view.
+    """
+    blocks = np.empty(block_count, np.int32)
+    depths = np.empty((block_count, 2), np.float32)
+    pixels = np.empty((block_count, 4), np.int32)
+    voxel = grid.voxel_size
+    block_size = np.float32(BLOCK_SIDE) * voxel
+    region_size = np.float32(REGION_SIDE) * block_size
+    block_extent = _extent(camera, block_size, voxel)
+    region_extent = _extent(camera, region_size, voxel)
+    half = np.float32(0.5)
+    found = 0
+    for region in range(region_count):
+        x = (np.float32(grid.region_coords[region, 0]) + half) * region_size
+        y = (np.float32(grid.region_coords[region, 1]) + half) * region_size
+        z = (np.float32(grid.region_coords[region, 2]) + half) * region_size
+        if not _bounds(camera, x, y, z, region_extent, near, far, shape)[0]:
+            continue
+        for child in range(REGION_BLOCKS):
+            block = grid.region_blocks[region, child]
+            if block < 0 or not grid.solid[block]:
+                continue
+            x = (np.float32(grid.block_coords[block, 0]) + half) * block_size
+            y = (np.float32(grid.block_coords[block, 1]) + half) * block_size
+            z = (np.float32(grid.block_coords[block, 2]) + half) * block_size
+            visible, z0, z1, u0, u1, v0, v1 = _bounds(camera, x, y, z, block_extent, near, far, shape)
+            if visible:
+                blocks[found] = block
+                depths[found, 0], depths[found, 1] = z0, z1
+                pixels[found, 0], pixels[found, 1], pixels[found, 2], pixels[found, 3] = u0, u1, v0, v1
+                found += 1
+    return blocks[:found], depths[:found], pixels[:found]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sees_through(depth, sensor, z0, pixels):
-    """Whether one of some readings within the block's part of the image lies behind the block's front, at depth z0."""
+    """Return whether one of some readings in the block's window is behind the front of the block, at depth z0."""
     u0, u1, v0, v1 = pixels
     for row in range(PROBES):
         v = v0 + (v1 - v0) * row // (PROBES - 1)
@@ -107,7 +178,7 @@ def _sees_through(depth, sensor, z0, pixels):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame, active):
-    """The blocks `found` (N,) and those that the frame sees through, each once, into `active`; returns how many.
+    """Write the blocks `found` (N,) and those that the frame sees through to `active`, each once. Returns their number.
 
     `camera` holds T_camera_world.
     """
@@ -118,7 +189,7 @@ def choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame
             stamp[block] = frame
             active[n] = block
             n += 1
-    # where nothing is behind a surface, there is no surface to be carved
+    # blocks without a surface need no carving
     blocks, depths, pixels = solid_blocks_in_view(
         grid, region_count, stamp.shape[0], camera, sensor.min_depth, sensor.max_depth, depth.shape
     )

@@ -1,6 +1,6 @@
-"""A slice of a block, 8 x 8 voxels, as the bits of one word: voxel (x, y) is bit 8 y + x.
+"""Slices of a block, 8 x 8 voxels, as the bits of a word: voxel (x, y) is bit 8 y + x.
 
-Shifted words compare 64 voxels with their neighbours at once.
+Shifted words compare 64 voxels with their neighbors at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LAST_COLUMN = np.uint64(0x8080808080808080)
 
 @device
 def count_bits(word):
-    """How many bits are set; LLVM knows this idiom and makes it one instruction."""
+    """Return the number of set bits; LLVM compiles this idiom to one instruction."""
     word -= (word >> ONE) & np.uint64(0x5555555555555555)
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -28,13 +28,13 @@ def count_bits(word):
 
 @device
 def lowest_bit(word):
-    """The place of the lowest bit set."""
+    """Return the index of the lowest set bit."""
     return count_bits((word & (~word + ONE)) - ONE)
 
 
 @device
 def ahead_x(word, beyond):
-    """The bits (x + 1, y) of a slice, where `beyond` is the slice of the next block along x."""
+    """Return the bits (x + 1, y) of a slice; `beyond` is the slice of the next block along x."""
     return ((word & ~_FIRST_COLUMN) >> ONE) | ((beyond & _FIRST_COLUMN) << _TO_LAST_COLUMN)
 
 
@@ -45,7 +45,7 @@ def ahead_y(word, beyond):
 
 @device
 def behind_x(word, before):
-    """The bits (x - 1, y) of a slice, where `before` is the slice of the block before along x."""
+    """Return the bits (x - 1, y) of a slice; `before` is the slice of the previous block along x."""
     return ((word & ~_LAST_COLUMN) << ONE) | ((before & _LAST_COLUMN) >> _TO_LAST_COLUMN)
 
 

@@ -20,14 +20,14 @@ from framework.mapping.voxels.voxel_grid_kernels import (
 from framework.mapping.voxels.voxel_walk import prefetch_row
 
 LAYER_VOXELS = BLOCK_SIDE**2
-GROUP = 16  # blocks that one thread does in a row, and whose near voxels are listed one behind the other
+GROUP = 16  # blocks that one thread updates in a row, whose near voxels are contiguous
 FAR = 1e9  # m
 LEAST_BEHIND = 0.02  # of the full weight, at the far end of the truncation band: enough to have been seen
 
 
 @device
 def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
-    """The pixel number that sees each voxel of a block, eq. [6], into pixel (512,), its depth (m) into scratch[:512].
+    """Project the voxels of a block, eq. [6]: pixel indices into pixel (512,), depths (m) into scratch[:512].
 
     Voxels outside the image get pixel 0 and a depth beyond any reading.
     """
@@ -46,7 +46,7 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
     for layer in range(BLOCK_SIDE):
         z = z0 + np.float32(np.int32(layer))
         layer_x, layer_y, layer_z = R02 * z + t0, R12 * z + t1, R22 * z + t2
-        first = layer * LAYER_VOXELS
+        start = layer * LAYER_VOXELS
         for n in range(LAYER_VOXELS):
             m = np.int32(n)
             x, y = x0 + np.float32(np.int32(m & seven)), y0 + np.float32(np.int32(m >> three))
@@ -57,19 +57,19 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
             u = fx * px * w + cx
             v = fy * py * w + cy
             inside = (pz > min_depth) & (u > zero) & (v > zero) & (u < right) & (v < bottom)
-            number = np.int32(np.int32(v) * width + np.int32(u))
-            pixel[first + n] = number if inside else np.int32(0)
-            scratch[first + n] = pz if inside else np.float32(FAR)
+            index = np.int32(np.int32(v) * width + np.int32(u))
+            pixel[start + n] = index if inside else np.int32(0)
+            scratch[start + n] = pz if inside else np.float32(FAR)
 
 
 @device
 def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_band, scratch):
-    """The running average of the distances and weights (512,) of a block.
+    """Update the running averages of the distances and weights (512,) of a block.
 
-    Returns how many voxels get a colour, and how many are within near_band m of the measured surface.
+    scratch[:512] holds the depths (m) of the voxels and gets their distances to the measured surface, m; scratch[512:]
+    holds their readings (m) and gets the weights of the new observations in the color averages, 0 = no color.
 
-    scratch[512:] holds each voxel's reading (m) and gets the new observation's share in the average of the colour, 0
-    where there is none; scratch[:512] holds the depth (m) and gets the distance to the measured surface, m.
+    Returns the number of voxels that get a color, and of those within near_band m of the measured surface.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     full2 = sensor.full_weight_depth * sensor.full_weight_depth
@@ -83,8 +83,8 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         band = sensor.truncation + sensor.truncation_slope * d
         sdf = d - scratch[n]
         seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
-        # Behind the surface an observation is worth the less the deeper: there it contradicts what is seen from behind.
-        # The band has widened with the noise, and only its far end loses weight: noise would push surfaces away else.
+        # Behind the surface the weight falls with the distance, because observations from behind contradict it. Only
+        # the far end of the band, which widens with the noise, loses weight: otherwise noise would displace surfaces.
         behind = max(least, min((band + sdf) * ramp, one))
         w_new = max(one, weight_one * behind * min(one, full2 / max(d * d, np.float32(1e-6))))
         w_old = np.float32(weight[n])
@@ -92,12 +92,12 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         stored = np.float32(tsdf[n])
         target = min(sdf, band) * to_units
         value = stored + portion * (target - stored) if w_old > zero else target
-        # near 1, rounding lifts the widest distance to 32768, which would wrap round to UNSEEN
+        # rounding near 1 could raise the largest distance to 32768, which would wrap to UNSEEN
         value = max(-most, min(np.floor(value + rounding), most))
         tsdf[n] = np.int16(value) if seen else tsdf[n]
         weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
         scratch[n] = sdf if seen else np.float32(FAR)
-        # colour belongs to the surface, not to the air before it
+        # only the surface has a color, not the free space in front of it
         at_surface = seen & (sdf < band)
         scratch[n + BLOCK_VOXELS] = portion if at_surface else zero
         colored = one_more(colored, at_surface)
@@ -106,47 +106,46 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
 
 
 @device
-def _average_colors(packed, color, pixel, first, rounding, scratch, seen):
-    """The running average of the packed colours (512,) of a block, in the layer from voxel `first` on, with those
-    of its pixels (512,) in `color`, RGBA in their bytes.
+def _average_colors(packed, color, pixel, start, rounding, scratch, seen):
+    """Update the running averages of the packed colors (512,) of a block, in the layer that begins at voxel `start`.
 
-    scratch[512:] holds the share of each voxel's new observation, 0 where there is none; seen (64,) gets the colours.
+    `color` holds the RGBA bytes of pixels, `pixel` (512,) the pixels of the voxels, scratch[512:] the weights of the
+    new observations, 0 = none. `seen` (64,) is scratch memory.
     """
     byte, one_byte, two_bytes = np.int32(255), np.int32(8), np.int32(16)
     zero, one, four, brightest = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(4 * 255)
     no_color = np.uint32(0)
     for n in range(LAYER_VOXELS):
-        seen[n] = color[np.uint32(pixel[first + n])]
+        seen[n] = color[np.uint32(pixel[start + n])]
     for n in range(LAYER_VOXELS):
-        old, share = packed[first + n], scratch[first + n + BLOCK_VOXELS]
-        fresh = (share > zero) & ((old & COLORED) == no_color)  # air has weight, but no colour to average with
-        share = one if fresh else share
+        old, weight = packed[start + n], scratch[start + n + BLOCK_VOXELS]
+        fresh = (weight > zero) & ((old & COLORED) == no_color)  # free space has weight, but no color
+        weight = one if fresh else weight
         new = np.int32(seen[n])
         red, green, blue = unpack_color(old)
-        red += share * (four * np.float32(np.int32(new & byte)) - red)
-        green += share * (four * np.float32(np.int32((new >> one_byte) & byte)) - green)
-        blue += share * (four * np.float32(np.int32((new >> two_bytes) & byte)) - blue)
+        red += weight * (four * np.float32(np.int32(new & byte)) - red)
+        green += weight * (four * np.float32(np.int32((new >> one_byte) & byte)) - green)
+        blue += weight * (four * np.float32(np.int32((new >> two_bytes) & byte)) - blue)
         mean = pack_color(
             min(red + rounding, brightest), min(green + rounding, brightest), min(blue + rounding, brightest)
         )
-        packed[first + n] = mean if share > zero else old
+        packed[start + n] = mean if weight > zero else old
 
 
 @device
-def _is_colored(scratch, first):
-    """Whether the frame has a colour for a voxel of the layer that begins at voxel `first`, scratch as above."""
+def _is_colored(scratch, start):
+    """Return whether a voxel of the layer that begins at voxel `start` gets a color, by the weights scratch[512:]."""
     largest = np.float32(0.0)
     for n in range(LAYER_VOXELS):
-        largest = max(largest, scratch[first + n + BLOCK_VOXELS])
+        largest = max(largest, scratch[start + n + BLOCK_VOXELS])
     return largest > np.float32(0.0)
 
 
 @device
-def _list_near(pixel, near_band, near_voxel, near_pixel, first, scratch):
-    """Lists the voxels whose distance to the measured surface in scratch[:512] is at most near_band, with their pixels,
-    from place `first` on.
+def _list_near(pixel, near_band, near_voxel, near_pixel, entry, scratch):
+    """List the voxels whose distance to the measured surface, scratch[:512], is at most near_band, and their pixels.
 
-    A layer's comparisons are gathered in the bits of a word, which the compiler vectorises.
+    The list begins at `entry`. The comparisons of a layer are bits of a word, which the compiler vectorizes.
     """
     for layer in range(BLOCK_SIDE):
         begin = layer * LAYER_VOXELS
@@ -156,35 +155,34 @@ def _list_near(pixel, near_band, near_voxel, near_pixel, first, scratch):
         while word != np.uint64(0):
             n = begin + lowest_bit(word)
             word &= word - ONE
-            near_voxel[first] = np.uint16(n)
-            near_pixel[first] = pixel[n]
-            first += 1
+            near_voxel[entry] = np.uint16(n)
+            near_pixel[entry] = pixel[n]
+            entry += 1
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def integrate(
-    grid, active, depth, color, camera, sensor, rounding, near_band, near_first, near_count, near_voxel, near_pixel
-):
-    """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
+def integrate(grid, seen, depth, color, camera, sensor, rounding, near_band):
+    """Update distance, weight and color of the voxels of `seen.blocks` that the depth image sees.
 
-    `color` (H, W) holds a pixel's RGBA in its bytes, `camera` T_camera_world. `rounding` in [0, 1) is added before
-    values are truncated to integers. near_first (A,), near_count (A,), near_voxel (512 A,) and near_pixel (512 A,) get
-    the voxels within near_band m of the measured surface, as SeenBlocks has them.
+    `seen` gets the voxels within near_band m of the measured surface. `color` (H, W) holds the RGBA bytes of pixels,
+    `camera` T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers.
 
-    A block is done in passes over its 512 voxels that the compiler vectorises: they hold no branches, read images only
-    in loops of their own, and share one scratch array, so that few arrays have to be proved not to overlap.
+    A block is updated in passes over its 512 voxels that the compiler vectorizes: they have no branches, read images in
+    separate loops, and share one scratch array, so that the compiler can prove that arrays do not overlap.
     """
+    # numba 0.68 loses assignments to an element of a tuple's array within prange
+    active, near_start, near_count, near_voxel, near_pixel = seen
+    solid = grid.solid
     shape = depth.shape
     depth = depth.ravel()
     color = color.ravel()
-    solid = grid.solid  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
     to_units = np.float32(1.0) / grid.tsdf_unit
     last = active.shape[0] - 1
     for group in prange((active.shape[0] + GROUP - 1) // GROUP):
         pixel = np.empty(BLOCK_VOXELS, np.int32)
         scratch = np.empty(2 * BLOCK_VOXELS, np.float32)
-        seen = np.empty(LAYER_VOXELS, np.uint32)
-        first = group * GROUP * BLOCK_VOXELS
+        layer_colors = np.empty(LAYER_VOXELS, np.uint32)
+        start = group * GROUP * BLOCK_VOXELS
         for a in range(group * GROUP, min((group + 1) * GROUP, active.shape[0])):
             block = active[a]
             after = np.int64(active[min(a + 1, last)])
@@ -201,8 +199,8 @@ def integrate(
             solid[block] = is_solid(tsdf)
             for layer in range(BLOCK_SIDE if colored_voxels > 0 else 0):
                 if _is_colored(scratch, layer * LAYER_VOXELS):
-                    _average_colors(packed, color, pixel, layer * LAYER_VOXELS, rounding, scratch, seen)
+                    _average_colors(packed, color, pixel, layer * LAYER_VOXELS, rounding, scratch, layer_colors)
             if near_voxels > 0:
-                _list_near(pixel, near_band, near_voxel, near_pixel, first, scratch)
-            near_first[a], near_count[a] = first, near_voxels
-            first += near_voxels
+                _list_near(pixel, near_band, near_voxel, near_pixel, start, scratch)
+            near_start[a], near_count[a] = start, near_voxels
+            start += near_voxels

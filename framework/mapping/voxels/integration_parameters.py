@@ -1,4 +1,4 @@
-"""The camera and the depth sensor as the kernels see them."""
+"""The camera and the depth sensor as the kernels use them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64
 
-BOUNDS = {  # of what measures, and of the voxels that it fills; see Tsdf and VoxelHashing
+BOUNDS = {  # of the parameters of Tsdf and VoxelHashing
     "voxel_size": (1e-4, 1.0),
     "truncation": (1e-4, 100.0),
     "truncation_slope": (0.0, 1.0),
@@ -20,7 +20,7 @@ BOUNDS = {  # of what measures, and of the voxels that it fills; see Tsdf and Vo
 
 
 class Sensor(NamedTuple):
-    """How depth readings become distances: the parameters of integration."""
+    """The parameters of integration."""
 
     truncation: np.float32  # m at depth 0
     truncation_slope: np.float32  # m more for each m of depth
@@ -31,17 +31,17 @@ class Sensor(NamedTuple):
 
     @property
     def max_truncation(self) -> float:
-        """The widest truncation distance, m."""
+        """The largest truncation distance, m."""
         return float(self.truncation + self.truncation_slope * self.max_depth)
 
     @property
     def depth_range(self) -> tuple[float, float]:
-        """m: readings that are nearer or farther are not integrated."""
+        """(nearest, farthest) depth, m, that is integrated."""
         return float(self.min_depth), float(self.max_depth)
 
 
 class Pinhole(NamedTuple):
-    """A camera and its pose as the kernels see them, float32."""
+    """A camera and its pose, float32."""
 
     fx: np.float32
     fy: np.float32
@@ -52,7 +52,7 @@ class Pinhole(NamedTuple):
 
 
 def pinhole(camera: Camera, T: Float64) -> Pinhole:
-    """`camera` with the rotation and translation of `T`, whichever way round the kernel wants it."""
+    """Return `camera` with the pose `T`: T_world_camera or T_camera_world, as the kernel needs."""
     return Pinhole(
         fx=np.float32(camera.fx),
         fy=np.float32(camera.fy),

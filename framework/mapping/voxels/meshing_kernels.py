@@ -6,15 +6,14 @@ import numpy as np
 from numba import njit, prange
 
 from framework.mapping.voxels.bit_slices import ONE, ahead_x, ahead_y, behind_x, behind_y, count_bits, lowest_bit
-from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS, UNSEEN, device, find_block
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS, NO_LOOK_UP, UNSEEN, device, find_block
 from framework.mapping.voxels.voxel_walk import voxel_number
 
 
 @device
 def _blocks_before(grid, block, out):
-    """The numbers of the 2x2x2 blocks at offsets 0 or -1 along x, y, z, into `out` (8,); -1 = none."""
-    key = np.int64(-2)
-    region = np.int32(-1)
+    """Write the 2x2x2 blocks at offsets 0 or -1 along x, y, z to `out` (8,), -1 = none."""
+    key, region = NO_LOOK_UP
     bx, by, bz = grid.block_coords[block, 0], grid.block_coords[block, 1], grid.block_coords[block, 2]
     for o in range(8):
         out[o], key, region = find_block(grid, bx - (o & 1), by - ((o >> 1) & 1), bz - (o >> 2), key, region)
@@ -22,7 +21,7 @@ def _blocks_before(grid, block, out):
 
 @njit(cache=True, nogil=True, parallel=True)
 def pack(tsdf, blocks, inside, seen):
-    """Packs the signs of the blocks' voxels into `inside` (B + 1, 8) and what was seen of them into `seen`."""
+    """Pack which voxels of the blocks are negative into `inside` (B + 1, 8), and which were seen into `seen`."""
     for b in prange(len(blocks)):
         block = blocks[b]
         for z in range(BLOCK_SIDE):
@@ -38,7 +37,7 @@ def pack(tsdf, blocks, inside, seen):
 
 @njit(cache=True, nogil=True, parallel=True)
 def mark_stale(grid, changed, stale):
-    """Marks in `stale` (B,) the blocks with a cell that has a corner in a changed block."""
+    """Mark the blocks with a cell that has a corner in a changed block in `stale` (B,)."""
     for b in prange(len(changed)):
         before = np.empty(8, np.int32)
         _blocks_before(grid, changed[b], before)
@@ -49,7 +48,7 @@ def mark_stale(grid, changed, stale):
 
 @device
 def _any_and_all(words, around, z):
-    """Which cells of slice z have any of their four corners in that slice set, and which have all."""
+    """Return which cells of slice z have any, and which have all, of their four corners in that slice set."""
     up = 4 * (z >> 3)
     z &= 7
     here, block_x = words[around[up], z], words[around[up + 1], z]
@@ -61,7 +60,7 @@ def _any_and_all(words, around, z):
 
 @device
 def _cell_corners(tsdf, around, x, y, z, corners):
-    """The stored distances (8,) at the corners of a block's cell (x, y, z)."""
+    """Write the stored distances at the corners of a block's cell (x, y, z) to corners (8,)."""
     for c in range(8):
         i, j, k = x + (c & 1), y + ((c >> 1) & 1), z + (c >> 2)
         corners[c] = tsdf[around[(i >> 3) + 2 * (j >> 3) + 4 * (k >> 3)], voxel_number(i, j, k)]
@@ -69,7 +68,7 @@ def _cell_corners(tsdf, around, x, y, z, corners):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_cells(grid, blocks, inside, seen, most_jump, cells):
-    """Packs the cells of the blocks that have a vertex into `cells` (B + 1, 8)."""
+    """Pack which cells of the blocks have a vertex into `cells` (B + 1, 8)."""
     tsdf = grid.tsdf
     for b in prange(len(blocks)):
         block = blocks[b]
@@ -96,19 +95,19 @@ def find_cells(grid, blocks, inside, seen, most_jump, cells):
 
 
 @njit(cache=True, nogil=True)
-def number_slices(cells, first):
-    """The number of the first vertex of each slice into `first` (B, 8); returns how many there are."""
+def number_slices(cells, starts):
+    """Write the index of the first vertex of each slice to `starts` (B, 8). Returns the number of vertices."""
     total = 0
-    for block in range(len(first)):
+    for block in range(len(starts)):
         for z in range(BLOCK_SIDE):
-            first[block, z] = total
+            starts[block, z] = total
             total += count_bits(cells[block, z])
     return total
 
 
 @device
 def _crossing(a, b):
-    """(1, where) on an edge whose ends have the distances a and b of different sign, else (0, 0). Without a branch."""
+    """Return (1, fraction) of the zero crossing between distances a and b of different sign, otherwise (0, 0)."""
     crosses = (a ^ b) < 0
     where = np.float32(a) / np.float32(a - b if crosses else 1)
     return (np.float32(1.0), where) if crosses else (np.float32(0.0), np.float32(0.0))
@@ -116,7 +115,7 @@ def _crossing(a, b):
 
 @device
 def _cell_vertex(corners):
-    """(x, y, z), in voxels from the first corner: the mean zero crossing of the twelve edges of a cell."""
+    """Return (x, y, z), voxels from the first corner: the mean zero crossing of the twelve edges of a cell."""
     x = y = z = crossings = np.float32(0.0)
     for edge in range(4):  # along each axis, at (u, v) of the two others
         u, v = np.float32(edge & 1), np.float32(edge >> 1)
@@ -131,14 +130,14 @@ def _cell_vertex(corners):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def place_vertices(grid, stale, cells, first, old_first, old, vertices, voxels):
-    """Places the vertices of the stale blocks, and copies those of the others from the `old` surface."""
+def place_vertices(grid, stale, cells, starts, old_starts, old, vertices, voxels):
+    """Place the vertices of the stale blocks, and copy those of the others from the `old` surface."""
     tsdf, block_coords, voxel_size = grid.tsdf, grid.block_coords, grid.voxel_size
     half = np.float32(0.5)
     old_vertices, old_voxels = old.vertices, old.voxels
-    for block in prange(len(first)):
+    for block in prange(len(starts)):
         if not stale[block]:
-            start, stop, source = first[block, 0], first[block, 0], old_first[block, 0]
+            start, stop, source = starts[block, 0], starts[block, 0], old_starts[block, 0]
             for z in range(BLOCK_SIDE):
                 stop += count_bits(cells[block, z])
             for v in range(stop - start):
@@ -148,7 +147,7 @@ def place_vertices(grid, stale, cells, first, old_first, old, vertices, voxels):
             continue
         corners = np.empty(8, np.int32)
         around = grid.neighbors[block]
-        v = first[block, 0]
+        v = starts[block, 0]
         for z in range(BLOCK_SIDE):
             left = cells[block, z]
             while left:
@@ -168,10 +167,10 @@ def place_vertices(grid, stale, cells, first, old_first, old, vertices, voxels):
 
 @device
 def _find_quads(inside, cells, around, before, z):
-    """The edges from the voxels of slice z along x, y and z that a quad goes round: three words.
+    """Return three words, the edges from the voxels of slice z along x, y and z that have a quad.
 
-    They change sign, and the four cells around each have a vertex. `around` and `before` are the block's neighbours on
-    the positive and on the negative side.
+    They change sign, and their four cells have a vertex. `around` and `before` are the block's neighbors on the
+    positive and on the negative side.
     """
     block = around[0]
     here = inside[block, z]
@@ -198,7 +197,7 @@ def _find_quads(inside, cells, around, before, z):
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_quads(grid, inside, cells, counts):
-    """The quads of each block, into `counts` (B,)."""
+    """Write the number of quads of each block to `counts` (B,)."""
     for block in prange(len(counts)):
         before = np.empty(8, np.int32)
         counts[block] = 0
@@ -215,38 +214,38 @@ def count_quads(grid, inside, cells, counts):
 
 
 @device
-def _vertex(cells, first, before, x, y, z):
-    """The number of the vertex of a cell, which may lie one cell before the block."""
+def _vertex(cells, starts, before, x, y, z):
+    """Return the index of the vertex of a cell, which may be one cell before the block."""
     block = before[(x < 0) + 2 * (y < 0) + 4 * (z < 0)]
     n = np.uint64((y & 7) * 8 + (x & 7))
-    return first[block, z & 7] + count_bits(cells[block, z & 7] & ((ONE << n) - ONE))
+    return starts[block, z & 7] + count_bits(cells[block, z & 7] & ((ONE << n) - ONE))
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def write_triangles(grid, inside, cells, first, quad_first, counts, triangles):
-    """Two triangles for each quad; those of a block start at 2 * quad_first[block]."""
+def write_triangles(grid, inside, cells, starts, quad_starts, counts, triangles):
+    """Write two triangles for each quad; those of a block start at 2 * quad_starts[block]."""
     for block in prange(len(counts)):
         if counts[block] == 0:
             continue
         before = np.empty(8, np.int32)
         around = grid.neighbors[block]
         _blocks_before(grid, block, before)
-        t = 2 * quad_first[block]
+        t = 2 * quad_starts[block]
         for z in range(BLOCK_SIDE):
             edges = _find_quads(inside, cells, around, before, z)
             for axis in range(3):
                 left = edges[axis]
-                # the cells around the edge lie one step back along the two other axes, b and c
+                # the cells around the edge are one step back along the two other axes, b and c
                 bx, by, bz = axis == 2, axis == 0, axis == 1
                 cx, cy, cz = axis == 1, axis == 2, axis == 0
                 while left:
                     n = lowest_bit(left)
                     left &= left - ONE
                     x, y = n & 7, n >> 3
-                    p = _vertex(cells, first, before, x, y, z)
-                    q = _vertex(cells, first, before, x - bx, y - by, z - bz)
-                    r = _vertex(cells, first, before, x - bx - cx, y - by - cy, z - bz - cz)
-                    s = _vertex(cells, first, before, x - cx, y - cy, z - cz)
+                    p = _vertex(cells, starts, before, x, y, z)
+                    q = _vertex(cells, starts, before, x - bx, y - by, z - bz)
+                    r = _vertex(cells, starts, before, x - bx - cx, y - by - cy, z - bz - cz)
+                    s = _vertex(cells, starts, before, x - cx, y - cy, z - cz)
                     if not (inside[block, z] >> np.uint64(n)) & ONE:
                         q, s = s, q
                     triangles[t, 0], triangles[t, 1], triangles[t, 2] = p, q, r

@@ -6,25 +6,35 @@ import numpy as np
 from numba import njit, prange
 
 from framework.mapping.labels.label_evidence_kernels import best_class, best_instance, labeled_voxel
-from framework.mapping.voxels.row_interpolation import blend_colors, gather_corners, points_of_row, step_to_surface
 from framework.mapping.voxels.voxel_grid import REGION_SIDE
-from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, UNSEEN, device, find_block
-from framework.mapping.voxels.voxel_walk import inverses, leave_cell, ray_direction, seen_point, trilinear, voxel_number
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, NO_LOOK_UP, UNSEEN, device, find_block
+from framework.mapping.voxels.voxel_walk import (
+    blend_colors,
+    gather_corners,
+    inverses,
+    leave_cell,
+    points_of_row,
+    ray_direction,
+    seen_point,
+    step_to_surface,
+    trilinear,
+    voxel_number,
+)
 from framework.sensors.noise_models import axial_sigma_single
 
-TILE = 8  # px; one tile's rays share blocks in the cache
-REFINEMENTS = 4  # Newton steps of a ray at most: one meets a plane, two or three a curved surface
-CONVERGED = 0.2  # voxels; the field is so nearly linear that a step shorter than this ends within some hundredths
-REACH = 3.0  # voxels, from where a refinement may start to the surface that it finds
-DETAIL = 4.0  # voxels between coarse rays at most: what is narrower than the truncation band is hardly in the map
-MARGIN = 8.0  # voxels that a surface may come out from between the coarse rays that meet it
-STEEPEST = 24.0  # voxels of depth that one surface may rise between coarse rays: a floor far away does
-MAX_SHIFT = 10.0  # voxels between a reading and the map's surface that may still be one surface seen from elsewhere
+TILE = 8  # px; the rays of a tile share blocks in the cache
+REFINEMENTS = 4  # most Newton steps of a ray: one meets a plane, two or three a curved surface
+CONVERGED = 0.2  # voxels; the field is nearly linear, so a shorter step ends within some hundredths of a voxel
+REACH = 3.0  # voxels, largest distance from the start of a refinement to the surface
+DETAIL = 4.0  # most voxels between coarse rays: maps have few details below the truncation band
+MARGIN = 8.0  # voxels that a surface may protrude between the coarse rays that meet it
+STEEPEST = 24.0  # voxels of depth between coarse rays on one surface: a distant floor
+MAX_SHIFT = 10.0  # most voxels between a reading and the surface of the map that it measures
 
 
 @device
 def _ray(view, scale, u, v):
-    """(d, step): the ray of pixel (u, v) in voxels for each m of depth, and the depth (m) of a way of one voxel."""
+    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth (m) of one voxel along it."""
     dx, dy, dz = ray_direction(view, u, v)
     dx, dy, dz = dx * scale, dy * scale, dz * scale
     return (dx, dy, dz), np.float32(1.0) / np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -32,14 +42,13 @@ def _ray(view, scale, u, v):
 
 @device
 def _refined(grid, o, d, step, z, reach, key, region):
-    """(z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` of depth z, m; z = 0 if none.
+    """Return (z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` of depth z, m; z = 0 = none.
 
-    (nx, ny, nz) is the field's gradient there, in stored units for each voxel. A zero at which the field rises along
-    the ray is the back of a surface.
+    (nx, ny, nz) is the gradient, stored units per voxel. Zeros where the field rises along the ray are back faces.
     """
     zero = np.float32(0.0)
     nx = ny = nz = zero
-    first = z
+    start = z
     for _ in range(REFINEMENTS):
         x, y, w = o[0] + z * d[0], o[1] + z * d[1], o[2] + z * d[2]
         i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(w))
@@ -52,7 +61,7 @@ def _refined(grid, o, d, step, z, reach, key, region):
             break
         change = -value / slope
         z += change
-        if not abs(z - first) < reach:
+        if not abs(z - start) < reach:
             break
         if abs(change) < np.float32(CONVERGED) * step:
             return z, nx, ny, nz, key, region
@@ -61,19 +70,19 @@ def _refined(grid, o, d, step, z, reach, key, region):
 
 @device
 def _first_surface(grid, o, d, step, near, far, key, region):
-    """(z, nx, ny, nz, key, region) where the ray first meets the surface from the front; z = 0 if it does not."""
+    """Return (z, nx, ny, nz, key, region) of the first front face along the ray; z = 0 = none."""
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     to_voxels = grid.tsdf_unit / grid.voxel_size
     reach = np.float32(REACH) * step
     block_side = np.float32(BLOCK_SIDE)
     region_side = np.float32(BLOCK_SIDE * REGION_SIDE)
     inverse_d = inverses(d)
-    # the voxel nearest to a point is the cell that the point moved by half a voxel lies in
+    # the voxel nearest to a point is the cell of the point shifted by half a voxel
     shifted = (o[0] + half, o[1] + half, o[2] + half)
-    # past a border by a thousandth of a voxel, and by more than z can be rounded, or the ray would stand still
-    hair = max(np.float32(1e-3) * step, np.float32(2.5e-7) * far)
+    # beyond a border by a thousandth of a voxel, and by more than the rounding of z, or the ray would not advance
+    margin = max(np.float32(1e-3) * step, np.float32(2.5e-7) * far)
     z = near
-    from_front = False  # was the last voxel in front of a surface?
+    from_front = False  # the previous voxel was in front of a surface
     while z < far:
         i = np.int32(np.floor(shifted[0] + z * d[0]))
         j = np.int32(np.floor(shifted[1] + z * d[1]))
@@ -81,12 +90,12 @@ def _first_surface(grid, o, d, step, near, far, key, region):
         block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
         if block < 0:
             side = region_side if region < 0 else block_side
-            z = leave_cell(z, shifted, d, inverse_d, side, one / side) + hair
+            z = leave_cell(z, shifted, d, inverse_d, side, one / side) + margin
             from_front = False
             continue
         stored = grid.tsdf[np.uint32(block), np.uint32(voxel_number(i, j, k))]
         if stored == UNSEEN:
-            z += step + step  # a surface has more than one voxel before it that was seen
+            z += step + step  # more than one observed voxel is in front of a surface
             from_front = False
             continue
         distance = np.float32(stored) * to_voxels
@@ -101,7 +110,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
 
 @njit(cache=True, nogil=True)
 def bound_tiles(depths, pixels, tile_near, tile_far):
-    """Narrows tile_near and tile_far (Y, X) m to the depths between which a tile's rays can meet a block's surface."""
+    """Extend tile_near and tile_far (Y, X) m to the depths of the blocks that the rays of a tile can meet."""
     for n in range(depths.shape[0]):
         u0, u1, v0, v1 = pixels[n]
         for ty in range(v0 // TILE, v1 // TILE + 1):
@@ -112,14 +121,13 @@ def bound_tiles(depths, pixels, tile_near, tile_far):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
-    """Fills depth (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1) m of every stride-th pixel of an image
-    (H, W) and of its last ones, by a full search; 0 = no surface. `view` holds T_world_camera.
+    """Fill depth (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1) m of every stride-th pixel, and of the last
+    row and column, of an image (H, W) by a full search; 0 = no surface. `view` holds T_world_camera.
     """
     scale = np.float32(1.0) / grid.voxel_size
     for y in prange(depth.shape[0]):
         o = (view.t[0] * scale, view.t[1] * scale, view.t[2] * scale)
-        key = np.int64(-2)
-        region = np.int32(-1)
+        key, region = NO_LOOK_UP
         v = min(y * stride, shape[0] - 1)
         for x in range(depth.shape[1]):
             u = min(x * stride, shape[1] - 1)
@@ -131,11 +139,10 @@ def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
 
 @device
 def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near, far, corners):
-    """What the coarse depths of two rows (X + 1,) m, -1 = not searched, tell of the cells (X,) of pixels between them.
+    """Bound the search in the cells (X,) of pixels between two rows of coarse depths (X + 1,) m, -1 = not searched.
 
     near and far get the depths, m, between which a cell can show a surface; far 0 = nowhere. corners (4, X) gets the
-    inverse depths of that surface, in the order of the rows, where there is just one, and 0 where there is none or it
-    is not clear.
+    inverse depths of the surface, in the order of the rows, if there is exactly one; otherwise 0.
     """
     zero, one, none = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
     margin, rise = np.float32(MARGIN) * voxel, np.float32(STEEPEST) * voxel
@@ -162,7 +169,7 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
         if hits == 0 or farthest > resolved or farthest - nearest > rise:
             corners[0, x] = corners[1, x] = corners[2, x] = corners[3, x] = zero
         elif hits < 4:
-            # the inverse of depth is linear across the image of a plane: three corners tell the fourth
+            # inverse depth is linear in the image of a plane: three corners determine the fourth
             for c in range(4):
                 if corners[c, x] == zero:
                     corners[c, x] = (
@@ -172,8 +179,8 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
 
 @device
 def _start_row(corners, b, stride, limits, depth):
-    """Fills depth (W,) m with the surface between the corners (4, X) of cells, a part b of the way down; 0 where it is
-    not known.
+    """Fill depth (W,) m by interpolation between the corners (4, X) of cells, at the fraction b from the upper row;
+    0 = unknown.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     width = depth.shape[0]
@@ -181,30 +188,29 @@ def _start_row(corners, b, stride, limits, depth):
         u0, u1 = x * stride, min((x + 1) * stride, width - 1)
         left = corners[0, x] + b * (corners[2, x] - corners[0, x])
         right = corners[1, x] + b * (corners[3, x] - corners[1, x])
-        across = (right - left) / np.float32(max(u1 - u0, 1))
+        slope = (right - left) / np.float32(max(u1 - u0, 1))
         for u in range(u0, u1 + 1 if u1 == width - 1 else u1):
-            z = one / (left + across * np.float32(u - u0))
+            z = one / (left + slope * np.float32(u - u0))
             depth[u] = z if zero < z < limits[u] else zero
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, normals):
-    """Fills depth (H, W) m and normals (H, W, 3), world, of the surface that `view` (T_world_camera) sees; 0 = none.
+    """Fill depth (H, W) m and normals (H, W, 3), world, of the surface that `view` (T_world_camera) sees; 0 = none.
 
-    `coarse` is what cast_coarse() or cast_near() found. No pixel is searched beyond its limit (H, W) m. Normals are the
-    gradient of the trilinear field.
+    `coarse` is the result of cast_coarse() or cast_near(). No pixel is searched beyond its limit (H, W) m. Normals are
+    the gradient of the trilinear field.
     """
     height, width = depth.shape
     zero, one = np.float32(0.0), np.float32(1.0)
     voxel = grid.voxel_size
     scale = one / voxel
-    # the depth up to which coarse rays are near enough to each other to show all there is
+    # the depth up to which coarse rays are dense enough to resolve all details
     resolved = np.float32(DETAIL) * voxel * min(view.fx, view.fy) / np.float32(stride)
     cells = coarse.shape[1] - 1
     for y in prange(coarse.shape[0] - 1):
         o = (view.t[0] * scale, view.t[1] * scale, view.t[2] * scale)
-        key = np.int64(-2)
-        region = np.int32(-1)
+        key, region = NO_LOOK_UP
         near, far = np.empty(cells, np.float32), np.empty(cells, np.float32)
         corners = np.empty((4, cells), np.float32)
         points, gradients = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
@@ -233,7 +239,7 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
                             last = min(far[x], limits[v, u])
                             z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near[x], last, key, region)
                     norm = np.sqrt(nx * nx + ny * ny + nz * nz)
-                    norm = one / norm if z > zero else zero  # the field falls along the ray, so it is not 0
+                    norm = one / norm if z > zero else zero  # not 0, because the field falls along the ray
                     row[u] = z
                     gradients[0, u], gradients[1, u], gradients[2, u] = nx * norm, ny * norm, nz * norm
                 normals[v, u, 0] = gradients[0, u]
@@ -243,11 +249,11 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
-    """Like cast_coarse(), with the search begun at the camera's own readings (H, W) m; no pixel is searched beyond its
-    limit (H, W) m, 0 = not at all: its depth is then -1, for it may have neighbors that are.
+    """Fill depth as cast_coarse(), starting at the camera's readings (H, W) m. No pixel is searched beyond its limit
+    (H, W) m; at limit 0 its depth is -1, because its neighbors may be searched.
 
-    Readings are noisy and a wrong pose displaces them. So where a reading fits the surface that the two rays before it
-    have shown, the search begins there, and else where the last reading was displaced to.
+    Readings are noisy, and a wrong pose displaces them. So the search starts at the extrapolation of the two previous
+    rays if the reading agrees with it, otherwise at the reading plus the last displacement.
     """
     height, width = readings.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -255,10 +261,9 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
     scale = one / voxel
     for y in prange(depth.shape[0]):
         o = (view.t[0] * scale, view.t[1] * scale, view.t[2] * scale)
-        key = np.int64(-2)
-        region = np.int32(-1)
+        key, region = NO_LOOK_UP
         shift = zero
-        last = last_but_one = zero  # inverse depths of the rays before, 0 = no surface
+        last = last_but_one = zero  # inverse depths of the previous rays, 0 = no surface
         v = min(y * stride, height - 1)
         for x in range(depth.shape[1]):
             u = min(x * stride, width - 1)
@@ -269,15 +274,15 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
                 start = reading + shift
                 reach = np.float32(REACH) * voxel + np.float32(3.0) * axial_sigma_single(reading)
                 if last_but_one > zero and last > zero:
-                    ahead = one / max(last + last - last_but_one, np.float32(1e-3))
-                    if abs(ahead - start) < reach:
-                        start = ahead
+                    extrapolated = one / max(last + last - last_but_one, np.float32(1e-3))
+                    if abs(extrapolated - start) < reach:
+                        start = extrapolated
                 z, _, _, _, key, region = _refined(grid, o, d, step, start, reach, key, region)
                 if z == zero:
                     near, far = tile_near[v // TILE, u // TILE], min(tile_far[v // TILE, u // TILE], limits[v, u])
                     z, _, _, _, key, region = _first_surface(grid, o, d, step, near, far, key, region)
-                apart = z - reading
-                shift = apart if z > zero and abs(apart) < np.float32(MAX_SHIFT) * voxel else zero
+                displacement = z - reading
+                shift = displacement if z > zero and abs(displacement) < np.float32(MAX_SHIFT) * voxel else zero
             last_but_one = last
             last = one / z if z > zero else zero
             depth[y, x] = z if z > zero or limits[v, u] > zero else -one
@@ -285,7 +290,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def paint(grid, view, depth, color):
-    """Fills color (H, W, 3) with the map's colour at the surface that `depth` (H, W) m, seen from `view`, describes."""
+    """Fill color (H, W, 3) with the color of the map at the surface of `depth` (H, W) m, seen from `view`."""
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
     for v in prange(height):
@@ -298,7 +303,7 @@ def paint(grid, view, depth, color):
 
 @device
 def voxel_seen(grid, view, u, v, z, key, region):
-    """(block, number, key, region) of the voxel nearest to what pixel (u, v) sees at depth z (m), as find_block()."""
+    """Return (block, index, key, region) of the voxel nearest to pixel (u, v) at depth z (m), as find_block()."""
     scale = np.float32(1.0) / grid.voxel_size
     half = np.float32(0.5)
     x, y, w = seen_point(view, u, v, z)
@@ -311,11 +316,10 @@ def voxel_seen(grid, view, u, v, z, key, region):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label(grid, evidence, view, depth, instance_ids, class_ids):
-    """Fills instance_ids and class_ids (H, W) with the labels of the voxels nearest to the surface at `depth`."""
+    """Fill instance_ids and class_ids (H, W) with the labels of the voxels nearest to the surface at `depth`."""
     height, width = depth.shape
     for v in prange(height):
-        key = np.int64(-2)
-        region = np.int32(-1)
+        key, region = NO_LOOK_UP
         for u in range(width):
             instance_ids[v, u] = 0
             class_ids[v, u] = -1

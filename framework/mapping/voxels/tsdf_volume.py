@@ -1,12 +1,14 @@
-"""A TSDF volume: voxel blocks with integration, surface extraction, ray-casting and serialization."""
+"""A TSDF volume, with integration, surface extraction, ray-casting and serialization, and its parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Array, Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView
 from framework.interfaces import Gravity
 from framework.mapping.gravity import GravityEstimator
@@ -15,7 +17,7 @@ from framework.mapping.storage.map_header import MapHeader
 from framework.mapping.voxels.integration import Integrator, SeenBlocks
 from framework.mapping.voxels.integration_parameters import BOUNDS, Sensor
 from framework.mapping.voxels.meshing import SurfaceNets, UnlabeledMesh
-from framework.mapping.voxels.raycasting import render_near, render_surface
+from framework.mapping.voxels.raycasting import render_surface
 from framework.mapping.voxels.voxel_grid import MOST_BLOCKS, VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, find_solid_blocks
 
@@ -88,7 +90,7 @@ class TsdfVolume:
         return render_surface(self.voxels, self.sensor, camera, T_world_camera)
 
     def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        return render_near(self.voxels, self.sensor, camera, T_world_camera, depth)
+        return render_surface(self.voxels, self.sensor, camera, T_world_camera, depth)
 
     def saved(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Return the entries for the header of a map file, and the arrays."""
@@ -125,3 +127,62 @@ class TsdfVolume:
         for name in arrays.keys() & set(BLOCK_ARRAYS):
             getattr(self.voxels.grid, name)[:b] = arrays[name]
         find_solid_blocks(self.voxels.grid, b)
+
+
+@dataclass
+class Tsdf:
+    """A truncated signed distance field with labels near the measured surface."""
+
+    voxel_size: float = 0.01  # m, > 0
+    truncation: float = 4.0  # voxels, >= 1: the width of the band at depth 0
+    min_depth: float = 0.2  # m, > 0
+    max_depth: float = 5.0  # m, > min_depth: beyond it a structured-light sensor is off by voxels
+    label_band: float = 2.0  # voxels, >= 1: labels go to voxels within this distance of the measured surface
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            voxel_size=BOUNDS["voxel_size"],
+            truncation=(1.0, 100.0),
+            min_depth=BOUNDS["min_depth"],
+            max_depth=(self.min_depth, BOUNDS["max_depth"][1]),
+            label_band=(1.0, self.truncation),
+        )
+
+
+@dataclass
+class VoxelHashing:
+    """A truncated signed distance field in voxel blocks."""
+
+    tsdf: Tsdf = field(default_factory=Tsdf)
+    truncation_slope: float = 0.01  # m more for each m of depth, >= 0: noise grows with depth (VoxelHashing's value)
+    max_weight: float = 200.0  # observations, 1 to 255: how slowly an old surface gives way
+    full_weight_depth: float = 1.5  # m, > 0: farther readings weigh (full_weight_depth / depth)^2
+    max_blocks: int = 400_000  # blocks of 8^3 voxels, > 0: 1.7 GB, about 1000 m^2 of surface at 1 cm
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            truncation_slope=BOUNDS["truncation_slope"],
+            max_weight=BOUNDS["max_weight"],
+            full_weight_depth=BOUNDS["full_weight_depth"],
+            max_blocks=(1, MOST_BLOCKS),
+        )
+
+    def new_volume(self) -> TsdfVolume:
+        """Return an empty volume."""
+        tsdf = self.tsdf
+        sensor = Sensor(
+            truncation=np.float32(tsdf.truncation * tsdf.voxel_size),
+            truncation_slope=np.float32(self.truncation_slope),
+            min_depth=np.float32(tsdf.min_depth),
+            max_depth=np.float32(tsdf.max_depth),
+            max_weight=np.float32(self.max_weight),
+            full_weight_depth=np.float32(self.full_weight_depth),
+        )
+        return TsdfVolume(tsdf.voxel_size, sensor, self.max_blocks)
+
+    @property
+    def near(self) -> float:
+        """Distance from the measured surface, m, within which voxels are labeled."""
+        return self.tsdf.label_band * self.tsdf.voxel_size

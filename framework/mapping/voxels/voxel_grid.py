@@ -1,18 +1,14 @@
 """Voxel hashing: blocks of 8^3 voxels, allocated where surface is seen, found through a hash table.
 
 After Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table holds regions
-of 8^3 blocks; a region is a dense table of block numbers. Neighbouring look-ups along a ray or a row of voxels fall
-into the same region, so nearly all of them cost one comparison and one load, and a ray crosses unmapped space a region
-at a time.
+of 8^3 blocks; a region is a dense table of block indices. Neighboring look-ups along a ray or a row of voxels are in
+the same region, so nearly all of them cost one comparison and one load, and a ray skips unmapped space by region.
 
-Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory x runs fastest:
-voxel (x, y, z) of a block is number (z * 8 + y) * 8 + x.
+Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory x runs fastest: voxel (x, y, z)
+of a block has the index (z * 8 + y) * 8 + x.
 
-Bytes: 8 a voxel (distance 2, weight 2, colour 4), so 4 KiB a block. Beside its voxels a block takes 49 (neighbors 32,
-coordinates 12, label row 4, solid 1), and its region 2 KiB of block numbers, 12 of coordinates and 24 to 48 of the hash
-table for up to 512 blocks: measured 117 blocks a region in a dense room and 73 in a real kitchen, so 18 and 29 a block.
-Together 8.15 bytes a voxel. Labels take 84 more in each that has some, and 4 in the others of its block: see
-evidence_rows.py.
+A voxel takes 8 bytes (distance 2, weight 2, color 4), and with the tables of blocks and regions 8.15. Label evidence
+comes on top: see evidence_rows.py.
 """
 
 from __future__ import annotations
@@ -34,37 +30,37 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 Element = TypeVar("Element", bound=np.generic)
 Made = TypeVar("Made")
-MOST_BLOCKS = 2**31 // BLOCK_VOXELS  # of a map: the numbers of its voxels are 32-bit
+MOST_BLOCKS = 2**31 // BLOCK_VOXELS  # of a map: voxel indices are 32-bit
 REGION_SIDE = 8  # blocks
 REGION_BLOCKS = REGION_SIDE**3
 WEIGHT_ONE = 256  # weights are stored in 1/256 of an observation
-TSDF_MAX = 32767  # the stored value of the widest truncation distance
+TSDF_MAX = 32767  # the stored value of the largest truncation distance
 FIRST_RESERVED = 1024  # blocks or voxels
 
 
 class Grid(NamedTuple):
-    """The arrays of a VoxelGrid as the kernels see them. B and S are capacities; only the first so many are in use."""
+    """The arrays of a VoxelGrid, for the kernels. B and S are capacities, of which only the first part is in use."""
 
     voxel_size: np.float32  # m
-    tsdf_unit: np.float32  # m, the distance that a stored tsdf of 1 stands for
+    tsdf_unit: np.float32  # m, the distance of a stored tsdf of 1
     table_keys: npt.NDArray[np.int64]  # (T,) packed region coordinates, NO_KEY = free; T is a power of two
-    table_regions: Int32  # (T,) region number
+    table_regions: Int32  # (T,) region index
     region_coords: Int32  # (S, 3) region coordinates; its first block is 8 times that
-    region_blocks: Int32  # (S, 512) block number, -1 = not allocated
+    region_blocks: Int32  # (S, 512) block index, -1 = not allocated
     block_coords: Int32  # (B, 3) block coordinates; its first voxel is 8 times that
     neighbors: Int32  # (B, 8) the blocks at +0 or +1 along x (bit 0), y (bit 1), z (bit 2); -1 = not allocated
     tsdf: npt.NDArray[np.int16]  # (B, 512) signed distance in tsdf_unit, positive in front of the surface; UNSEEN
     weight: npt.NDArray[np.uint16]  # (B, 512) in 1/256 observations
     color: npt.NDArray[np.uint32]  # (B, 512) packed, see pack_color()
-    solid: UInt8  # (B,) 1 where a voxel of it lies behind a surface: rays skip the others until they come near one
-    label_row: Int32  # (B,) the block's row in the label evidence, -1 = nothing was ever detected there
+    solid: UInt8  # (B,) 1 = a voxel of it is behind a surface; rays skip other blocks
+    label_row: Int32  # (B,) the row of the block in the label evidence, -1 = none
 
 
 OF_BLOCKS = Grid._fields[Grid._fields.index("block_coords") :]  # (B, ...)
 
 
 def _free_blocks(count: int) -> dict[str, Any]:
-    """The OF_BLOCKS of so many blocks."""
+    """Return the arrays OF_BLOCKS for so many blocks."""
     return {
         "block_coords": np.empty((count, 3), np.int32),
         "neighbors": np.empty((count, 8), np.int32),
@@ -77,10 +73,9 @@ def _free_blocks(count: int) -> dict[str, Any]:
 
 
 def reserved(most: int, make: Callable[[int], Made]) -> Made:
-    """What `make` gives for the length `most`, or for FIRST_RESERVED, to grow, where memory is counted by what is asked
-    for: that is so on Windows, under `ulimit -v`, and where the system does not promise more than it has.
+    """Return make(most), uninitialized arrays that take no memory until they are written, and never have to grow.
 
-    It makes arrays without writing them: they cost no memory yet, and what need not grow is never copied.
+    Where address space is limited (Windows, `ulimit -v`, no overcommit), return make(FIRST_RESERVED), which can grow.
     """
     first = min(most, FIRST_RESERVED)
     if resource is None or resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
@@ -92,7 +87,7 @@ def reserved(most: int, make: Callable[[int], Made]) -> Made:
 
 
 class VoxelGrid:
-    """Owns the arrays of the grid and makes them grow. The kernels work on `self.grid`."""
+    """Owns the arrays of the grid and grows them. The kernels work on `self.grid`."""
 
     def __init__(self, voxel_size: float, max_truncation: float, max_blocks: int) -> None:
         self.max_blocks = max_blocks
@@ -110,27 +105,22 @@ class VoxelGrid:
         self._pages = PagesAhead()
 
     def __getstate__(self) -> dict[str, Any]:
-        """For pickling: without what is only reserved, which is gigabytes."""
+        """Return the state without reserved capacity, which is gigabytes."""
         blocks = {name: getattr(self.grid, name)[: self.block_count] for name in OF_BLOCKS}
         return {**vars(self), "grid": self.grid._replace(**blocks), "_pages": PagesAhead()}
 
     @property
     def byte_count(self) -> int:
-        """Of what is in use: capacity that no block has been given yet takes no memory."""
+        """Bytes in use; unused capacity takes no memory."""
         grid = self.grid
-        table = (grid.table_keys, grid.table_regions)
-        regions = (grid.region_coords, grid.region_blocks)
-        blocks: list[npt.NDArray[Any]] = [getattr(grid, name) for name in OF_BLOCKS]
-        return (
-            sum(array.nbytes for array in table)
-            + sum(array[: self.region_count].nbytes for array in regions)
-            + sum(array[: self.block_count].nbytes for array in blocks)
-        )
+        regions = sum(array[: self.region_count].nbytes for array in (grid.region_coords, grid.region_blocks))
+        blocks = sum(getattr(grid, name)[: self.block_count].nbytes for name in OF_BLOCKS)
+        return int(grid.table_keys.nbytes + grid.table_regions.nbytes + regions + blocks)
 
     def allocate(self, coords: Int32) -> Int32:
-        """The numbers (N,) of the blocks at `coords` (N, 3); those that do not exist yet get theirs in the order given.
+        """Return the blocks (N,) at `coords` (N, 3); new ones are allocated in the given order.
 
-        Raises MapFullError when that takes more than `max_blocks`; the blocks before stay.
+        Raises MapFullError if more than `max_blocks` are needed; those allocated before that stay.
         """
         done, blocks = 0, np.empty(len(coords), np.int32)
         while True:
@@ -148,7 +138,7 @@ class VoxelGrid:
             self._grow()
 
     def _grow(self) -> None:
-        """Doubles whichever capacity is used up."""
+        """Double each capacity that is used up."""
         grid = self.grid
         if self.block_count == len(grid.block_coords):
             more = min(max(2 * len(grid.block_coords), FIRST_RESERVED), self.max_blocks)
@@ -168,10 +158,7 @@ class VoxelGrid:
 
 
 def grown(array: npt.NDArray[Element], length: int, zeros: bool = False) -> npt.NDArray[Element]:
-    """A copy of `array` with its first axis made `length` long; the new part holds anything, or zeros.
-
-    It costs no memory before it is written.
-    """
+    """Return a copy of `array` with `length` rows; new rows are uninitialized, or zeros."""
     longer = (np.zeros if zeros else np.empty)((length, *array.shape[1:]), array.dtype)
     longer[: len(array)] = array
     return longer

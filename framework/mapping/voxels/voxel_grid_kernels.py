@@ -7,29 +7,29 @@ from numba import njit
 
 BLOCK_SIDE = 8  # voxels
 BLOCK_VOXELS = BLOCK_SIDE**3
-UNSEEN = -32768  # the stored distance of a voxel that no frame has seen: readers need not load the weight
+UNSEEN = -32768  # the stored distance of an unobserved voxel, so that readers need not load the weight
 NO_KEY = -1
+NO_LOOK_UP = (np.int64(-2), np.int32(-1))  # key and region before the first find_block()
 
-# What kernels call in their innermost loops. Without reference counts (_nrt): threads that count the same arrays of the
-# Grid up and down at each call wait for each other.
+# For functions that kernels call in inner loops. Without reference counts (_nrt), on whose updates threads would wait.
 device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
 
 
 @device
 def one_more(count, condition):
-    """`count`, int32, and one where the condition holds. numba adds in 64 bits, and half as many fit into a vector."""
+    """Return count + condition as int32; numba would add in 64 bits, of which half as many fit into a vector."""
     return np.int32(count + (np.int32(1) if condition else np.int32(0)))
 
 
 _KEY_BITS = 21  # of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
-FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # blocks from the origin, along any axis, where the map ends
+FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # blocks from the origin along an axis: the range of a map
 _KEY_OFFSET = FARTHEST_BLOCK
 _KEY_MASK = (1 << _KEY_BITS) - 1
 
 
 @device
 def pack_key(x, y, z):
-    """The key of the coordinates of a region or a block, never negative."""
+    """Return the key, >= 0, of the coordinates of a region or a block."""
     return (
         ((np.int64(x) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
         | ((np.int64(y) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
@@ -39,7 +39,7 @@ def pack_key(x, y, z):
 
 @device
 def unpack_key(key):
-    """The coordinates that pack_key() was given."""
+    """Return the coordinates of a key."""
     return (
         np.int32((key >> (2 * _KEY_BITS)) - _KEY_OFFSET),
         np.int32(((key >> _KEY_BITS) & _KEY_MASK) - _KEY_OFFSET),
@@ -49,14 +49,14 @@ def unpack_key(key):
 
 @device
 def _slot(key, size):
-    """Where the search for `key` starts in a table of `size` slots (Fibonacci hashing)."""
+    """Return the first slot for `key` in a table of `size` slots (Fibonacci hashing)."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64(mixed >> np.uint64(32)) & (size - 1)
 
 
 @device
 def find_region(grid, key):
-    """The number of the region with this key, -1 if there is none. Linear probing."""
+    """Return the region with this key, -1 = none. Linear probing."""
     size = grid.table_keys.shape[0]
     slot = _slot(key, size)
     while True:
@@ -70,15 +70,15 @@ def find_region(grid, key):
 
 @device
 def child_number(bx, by, bz):
-    """The place of a block in its region's table."""
+    """Return the index of a block in the table of its region."""
     return ((bz & 7) * 8 + (by & 7)) * 8 + (bx & 7)
 
 
 @device
 def find_block(grid, bx, by, bz, last_key, last_region):
-    """(block, key, region) at block coordinates; block -1 = not allocated.
+    """Return (block, key, region) at block coordinates; block -1 = not allocated.
 
-    `last_key` and `last_region` are what the previous call returned: the cache that makes neighbouring look-ups cheap.
+    `last_key` and `last_region` are those of the previous call, a cache that makes neighboring look-ups cheap.
     """
     key = pack_key(bx >> 3, by >> 3, bz >> 3)
     if key != last_key:
@@ -90,17 +90,16 @@ def find_block(grid, bx, by, bz, last_key, last_region):
 
 @njit(cache=True, nogil=True)
 def insert_blocks(grid, coords, start, region_count, block_count, blocks):
-    """Allocates the blocks of coords[start:] that do not exist yet, in order, and fills in their numbers, blocks (N,).
+    """Allocate the new blocks of coords[start:], in order, and write the index of each one to blocks (N,).
 
-    Returns (next, region_count, block_count); next < len(coords) means that a capacity was reached there: grow, call
-    again.
+    Returns (next, region_count, block_count). If next < len(coords), a capacity was reached: grow and call again.
     """
     size = grid.table_keys.shape[0]
     region, last_key = np.int32(-1), np.int64(NO_KEY)
     for i in range(start, coords.shape[0]):
         bx, by, bz = coords[i, 0], coords[i, 1], coords[i, 2]
         key = pack_key(bx >> 3, by >> 3, bz >> 3)
-        if key != last_key:  # neighbors lie in the same region, mostly
+        if key != last_key:  # neighbors are usually in the same region
             region = find_region(grid, key)
             last_key = key
         if region < 0:
@@ -138,10 +137,9 @@ def insert_blocks(grid, coords, start, region_count, block_count, blocks):
 
 @njit(cache=True, nogil=True)
 def _link_neighbors(grid, block):
-    """Tells a new block of its neighbors, and them of it."""
+    """Link a new block and its neighbors."""
     bx, by, bz = grid.block_coords[block, 0], grid.block_coords[block, 1], grid.block_coords[block, 2]
-    key = np.int64(-2)
-    region = np.int32(-1)
+    key, region = NO_LOOK_UP
     for c in range(8):
         dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
         after, key, region = find_block(grid, bx + dx, by + dy, bz + dz, key, region)
@@ -151,22 +149,22 @@ def _link_neighbors(grid, block):
             grid.neighbors[before, c] = block
 
 
-# numpy's numbers, and their results cast, because numba computes in 64 bits else: half as many fit into a vector
+# NumPy scalars and casts, because numba computes in 64 bits otherwise: half as many fit into a vector
 _CHANNEL = np.int32(1023)
 _GREEN = np.int32(10)
 _BLUE = np.int32(20)
-COLORED = np.uint32(1 << 30)  # the bit that tells a colour from none
+COLORED = np.uint32(1 << 30)  # the bit that marks a color
 
 
 @device
 def pack_color(red, green, blue):
-    """A voxel's colour from quarters of a level, 0 to 1020 each: ten bits a channel, so that averages do not stall."""
+    """Return the packed color of quarters of a level, 0 to 1020: ten bits per channel, so that averages converge."""
     return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
 
 
 @device
 def unpack_color(packed):
-    """(red, green, blue) float32 in quarters of a level."""
+    """Return (red, green, blue), float32, in quarters of a level."""
     bits = np.int32(packed)
     return (
         np.float32(np.int32(bits & _CHANNEL)),
@@ -177,7 +175,7 @@ def unpack_color(packed):
 
 @device
 def is_solid(tsdf):
-    """Whether a voxel of a block, tsdf (512,), was seen to lie behind a surface."""
+    """Return whether an observed voxel of a block, tsdf (512,), is behind a surface."""
     lowest = np.int16(0)
     for n in range(BLOCK_VOXELS):
         stored = tsdf[n]
@@ -187,7 +185,7 @@ def is_solid(tsdf):
 
 @njit(cache=True, nogil=True)
 def find_solid_blocks(grid, block_count):
-    """Fills grid.solid of the first blocks from their distances."""
+    """Fill grid.solid of the first blocks from their distances."""
     for block in range(block_count):
         grid.solid[block] = is_solid(grid.tsdf[block])
 

@@ -1,4 +1,9 @@
-"""Device functions that read the voxel grid: rays, cell borders, trilinear fields, and memory prefetch."""
+"""Device functions that read the voxel grid: rays, cell borders, trilinear fields, and memory prefetch.
+
+Functions of a whole image row are in passes that the compiler vectorizes. Look-ups wait for memory and branch,
+arithmetic does not. So one pass gathers the eight corners of each point, with many loads at once, and another does the
+arithmetic for eight pixels at a time. The last axis of their arrays is the pixel.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from framework.mapping.voxels.voxel_grid_kernels import COLORED, UNSEEN, device, unpack_color
+from framework.mapping.voxels.voxel_grid_kernels import COLORED, NO_LOOK_UP, UNSEEN, device, find_block, unpack_color
 
 CACHE_LINE = 64  # bytes
 _READ, _L2, _DATA = 0, 2, 1  # arguments of llvm.prefetch: for reading, into the L2 cache, not instructions
@@ -201,3 +206,92 @@ def prefetch_row(array, row):
         bytes_a_row = array.itemsize * (array.size // array.shape[0])
         for line in range(0, bytes_a_row, CACHE_LINE):
             prefetch_line(array, row * bytes_a_row + line)
+
+
+@device
+def directions(view, scale, v):
+    """Return the ray of pixel (0, v), voxels per m of depth, and its change per pixel. `scale` is voxels per m."""
+    x, y, z = ray_direction(view, 0, v)
+    change = scale / view.fx  # the rounding of a difference of two rays would accumulate along the row
+    return (x * scale, y * scale, z * scale), (view.R[0, 0] * change, view.R[1, 0] * change, view.R[2, 0] * change)
+
+
+@device
+def points_of_row(view, scale, v, depth, points):
+    """Fill points (3, W), voxels, with the points of the pixels of row v at `depth` (W,) m."""
+    origin, change = directions(view, scale, v)
+    tx, ty, tz = view.t[0] * scale, view.t[1] * scale, view.t[2] * scale
+    for n in range(depth.shape[0]):
+        u = np.float32(np.int32(n))
+        z = depth[n]
+        points[0, n] = tx + z * (origin[0] + u * change[0])
+        points[1, n] = ty + z * (origin[1] + u * change[1])
+        points[2, n] = tz + z * (origin[2] + u * change[2])
+
+
+@device
+def gather_corners(grid, values, depth, points, missing, found):
+    """Fill found (8, W) with `values` (B, 512) of the eight voxels around each point (3, W).
+
+    They are `missing` if there is no block, or the pixel has no depth.
+    """
+    key, region = NO_LOOK_UP
+    for n in range(depth.shape[0]):
+        s = missing, missing, missing, missing, missing, missing, missing, missing
+        if depth[n] > np.float32(0.0):
+            i = np.int32(np.floor(points[0, n]))
+            j = np.int32(np.floor(points[1, n]))
+            k = np.int32(np.floor(points[2, n]))
+            block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
+            if block >= 0:
+                s = corners(grid, values, block, i, j, k, missing)
+        found[0, n] = s[0]
+        found[1, n] = s[1]
+        found[2, n] = s[2]
+        found[3, n] = s[3]
+        found[4, n] = s[4]
+        found[5, n] = s[5]
+        found[6, n] = s[6]
+        found[7, n] = s[7]
+
+
+@device
+def step_to_surface(view, scale, v, found, points, converged, reach, limits, depth, normals):
+    """Move each depth (W,) m by one Newton step along its ray to the zero of the trilinear field.
+
+    `found` (8, W) holds the distances around `points` (3, W). depth becomes 0 if the field is unknown, does not fall
+    along the ray, or the zero is farther than `reach` voxels; it is negated if the step is longer than `converged`
+    voxels. normals (3, W) gets the direction of the gradient.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    origin, change = directions(view, scale, v)
+    for n in range(depth.shape[0]):
+        u = np.float32(np.int32(n))
+        dx, dy, dz = origin[0] + u * change[0], origin[1] + u * change[1], origin[2] + u * change[2]
+        x, y, z = points[0, n], points[1, n], points[2, n]
+        s = found[0, n], found[1, n], found[2, n], found[3, n], found[4, n], found[5, n], found[6, n], found[7, n]
+        value, nx, ny, nz = interpolate(s, x - np.floor(x), y - np.floor(y), z - np.floor(z))
+        slope = nx * dx + ny * dy + nz * dz
+        step = -value / slope
+        norm = one / np.sqrt(nx * nx + ny * ny + nz * nz)
+        normals[0, n] = nx * norm
+        normals[1, n] = ny * norm
+        normals[2, n] = nz * norm
+        after = depth[n] + step
+        length = abs(step) * np.sqrt(dx * dx + dy * dy + dz * dz)
+        good = all_seen(s) & (slope < zero) & (length < reach) & (after > zero) & (after < limits[n])
+        after = after if length < converged else -after
+        depth[n] = after if good else zero
+
+
+@device
+def blend_colors(found, points, color):
+    """Fill color (W, 3) by interpolation between the packed colors `found` (8, W) around `points` (3, W)."""
+    half = np.float32(0.5)
+    for n in range(points.shape[1]):
+        x, y, z = points[0, n], points[1, n], points[2, n]
+        p = found[0, n], found[1, n], found[2, n], found[3, n], found[4, n], found[5, n], found[6, n], found[7, n]
+        red, green, blue = blend(p, x - np.floor(x), y - np.floor(y), z - np.floor(z))
+        points[0, n], points[1, n], points[2, n] = red + half, green + half, blue + half
+    for n in range(points.shape[1]):
+        color[n, 0], color[n, 1], color[n, 2] = np.uint8(points[0, n]), np.uint8(points[1, n]), np.uint8(points[2, n])

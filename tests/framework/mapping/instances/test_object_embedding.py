@@ -140,9 +140,9 @@ def test_a_map_that_is_gone_on_with_counts_on(tmp_path: Path) -> None:
 def test_other_embeddings_than_the_maps_are_refused() -> None:
     fuser = mapped("bayesian_tsdf", embeddings=EMBEDDINGS)
     frame = room().frame(walk(4)[0], 9)
-    with pytest.raises(DataError, match=r"the map has embeddings of words@1 and .* of words@2"):
+    with pytest.raises(DataError, match=r"the map has embeddings of words@1, and .* of words@2"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=EMBEDDINGS, space="words@2")
-    with pytest.raises(DataError, match="of 2 numbers and of 3, both said to be of one"):
+    with pytest.raises(DataError, match="of 2 numbers and of 3 in the same space"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=np.eye(3))
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from framework.data import Detections, Pose
-from framework.mapping.labels.vertex_labels import vertex_labels
-from framework.mapping.labels.vertex_labels_kernels import REACH
+from framework.mapping.instance_map import InstanceMap
+from framework.mapping.labels.vertex_labels_kernels import REACH, label_vertices
 from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.voxel_grid_kernels import UNSEEN, find_block
 from framework.refinement.lifting import lift
@@ -35,6 +35,13 @@ def fuser() -> BayesianTsdf:
         detections = Detections(masks, np.zeros((n, 4), np.float32), scores, probabilities, ("chair", "bed"))
         fuser.fuse(frame, Pose(T), lift(detections, frame, Pose(T)))
     return fuser
+
+
+def labels_of(scene: InstanceMap, counts: np.ndarray, surface: UnlabeledMesh) -> tuple[np.ndarray, np.ndarray]:
+    colors = np.empty((len(surface.voxels), 3), np.uint8)
+    instances, classes = np.empty((2, len(surface.voxels)), np.int32)
+    label_vertices(scene.volume.voxels.grid, scene.labels.evidence, counts, surface, colors, instances, classes)
+    return instances, classes
 
 
 def slow_election(fuser: BayesianTsdf, counts: np.ndarray, vertex: np.ndarray) -> tuple[int, int]:
@@ -75,7 +82,7 @@ def test_agrees_with_the_slow_one(fuser: BayesianTsdf, dropped: tuple[int, ...])
     counts = np.ones(scene.table.last_id + 1, np.bool_)
     counts[list(dropped)] = False
     surface = scene.volume.surface()
-    _, instances, classes = vertex_labels(scene.volume.voxels.grid, scene.labels.evidence, counts, surface)
+    instances, classes = labels_of(scene, counts, surface)
     assert len(np.unique(instances)) >= 4 - len(dropped), "there must be something to tell apart"
     rng = np.random.default_rng(0)
     near_labels = np.flatnonzero(instances > 0)
@@ -91,6 +98,6 @@ def test_a_vertex_where_nothing_is_mapped_shows_nothing(fuser: BayesianTsdf) -> 
     scene = fuser.scene
     counts = np.ones(scene.table.last_id + 1, np.bool_)
     far = UnlabeledMesh(np.full((1, 3), 1e3, np.float32), np.zeros((0, 3), np.int32), np.zeros(1, np.int32))
-    _, instances, classes = vertex_labels(scene.volume.voxels.grid, scene.labels.evidence, counts, far)
+    instances, classes = labels_of(scene, counts, far)
     assert instances.tolist() == [0]
     assert classes.tolist() == [-1]

@@ -13,7 +13,7 @@ from framework.mapping.voxels import integration
 from framework.mapping.voxels.integration import GOLDEN, Integrator, SeenBlocks
 from framework.mapping.voxels.integration_kernels import LEAST_BEHIND
 from framework.mapping.voxels.integration_parameters import Sensor
-from framework.mapping.voxels.tsdf import VoxelHashing
+from framework.mapping.voxels.tsdf_volume import VoxelHashing
 from framework.mapping.voxels.voxel_grid import TSDF_MAX, WEIGHT_ONE, VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import UNSEEN
 from framework.registry import assemble
@@ -32,7 +32,7 @@ def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) ->
     """The blocks that a frame has updated, and the pixels that see their voxels near the surface, -1 for the others."""
     seen = integrator.integrate(frame, T_world_camera, VOXEL)
     pixels = np.full((len(seen.blocks), 512), -1)
-    for a, (first, count) in enumerate(zip(seen.near_first, seen.near_count, strict=True)):
+    for a, (first, count) in enumerate(zip(seen.near_start, seen.near_count, strict=True)):
         voxels = seen.near_voxel[first : first + count]
         assert (np.diff(voxels.astype(int)) > 0).all()
         pixels[a, voxels] = seen.near_pixel[first : first + count]
@@ -95,7 +95,7 @@ def test_a_frame_that_sees_more_blocks_takes_no_memory_that_was_reserved(
 
 def near_pixels(seen: SeenBlocks) -> list[int]:
     """The pixels that see voxels near the surface, as often as they see one."""
-    parts = zip(seen.near_first.tolist(), seen.near_count.tolist(), strict=True)
+    parts = zip(seen.near_start.tolist(), seen.near_count.tolist(), strict=True)
     return sorted(p for first, count in parts for p in seen.near_pixel[first : first + count].tolist())
 
 

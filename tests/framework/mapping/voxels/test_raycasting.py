@@ -7,7 +7,7 @@ from framework.data import Camera, Frame
 from framework.mapping.labels.evidence_rows import EvidenceRows
 from framework.mapping.voxels.integration import Integrator
 from framework.mapping.voxels.integration_parameters import Sensor, pinhole
-from framework.mapping.voxels.raycasting import cast_view, render, render_near, tile_bounds
+from framework.mapping.voxels.raycasting import cast_view, render, render_surface, tile_bounds
 from framework.mapping.voxels.raycasting_kernels import TILE, cast_coarse
 from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_walk import inverses, leave_cell
@@ -133,7 +133,7 @@ def test_what_has_a_reading_is_found_near_it(sparse: str) -> None:
         readings[:, np.arange(readings.shape[1]) % 4 != 1] = 0
     elif sparse == "one in ten":
         readings[np.random.default_rng(0).uniform(size=readings.shape) > 0.1] = 0
-    depth = render_near(voxels, SENSOR, CAMERA, T, readings).depth
+    depth = render_surface(voxels, SENSOR, CAMERA, T, readings).depth
     given = readings > 0
     assert given.sum() > 500
     assert (depth[~given] == 0).all()
