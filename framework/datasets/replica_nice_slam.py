@@ -41,5 +41,5 @@ class ReplicaNiceSlam(Recording):
                 frames.append(RecordedFrame.posed(pair, k / FRAME_RATE, poses[k].pose))
             else:
                 why = f"{pair.color_name}: traj.txt has {len(poses)} poses and none for it"
-                frames.append(RecordedFrame(pair, k / FRAME_RATE, fault=why))
+                frames.append(RecordedFrame(pair, k / FRAME_RATE, error=why))
         return Contents(camera, path, depth_scale, frames)

@@ -97,8 +97,8 @@ class RgbdFolder(Recording):
         for index in self.chosen:
             recorded = self.contents.frames[index]
             try:
-                if recorded.fault:
-                    raise FrameError(f"frame {index}: {recorded.fault}")
+                if recorded.error:
+                    raise FrameError(f"frame {index}: {recorded.error}")
                 depth, truth = self.metric_depth(index), self.truth_in(index)
             except FrameError as error:
                 log.warning("ground truth: left out %s", error)

@@ -61,12 +61,12 @@ class Written:
 
     timestamps: list[float] = field(default_factory=list)  # s, of the written frames
     poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of them, none without poses
-    faults: list[str] = field(default_factory=list)  # of each skipped frame
+    errors: list[str] = field(default_factory=list)  # of each skipped frame
     ups: list[Float64 | None] = field(default_factory=list)  # (3,) up in the camera of each before rotation
 
     def __str__(self) -> str:
         count = f"{len(self.timestamps)} frames"
-        return f"{count}; left out are {len(self.faults)}, the first: {self.faults[0]}" if self.faults else count
+        return f"{count}; left out are {len(self.errors)}, the first: {self.errors[0]}" if self.errors else count
 
 
 def check_new(directory: Path) -> None:
@@ -106,7 +106,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
             written.poses.append(turn.pose(frame.T_world_camera))
         written.ups.append(frame.up)
     if camera is None:
-        raise DataError(f"no frame can be used; the first: {written.faults[0] if written.faults else 'there is none'}")
+        raise DataError(f"no frame can be used; the first: {written.errors[0] if written.errors else 'there is none'}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
     if any(up is not None for up in written.ups):
@@ -128,7 +128,7 @@ def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int
             if written.timestamps and frame.timestamp <= written.timestamps[-1]:
                 raise DataError(f"{frame.name} is of {frame.timestamp:.6f} s, not later than the frame before")
         except DataError as error:
-            written.faults.append(str(error))
+            written.errors.append(str(error))
         else:
             yield number, frame
 

@@ -55,16 +55,16 @@ class RecordedFrame:
     images: StoredImages
     timestamp: float  # s
     T_world_camera: Float64 | None = None  # (4, 4), None = not known
-    fault: str = ""  # why the frame cannot be used; "" = it can
+    error: str = ""  # reason why the frame cannot be used; "" = it can
     up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = not known
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
-        """Return the frame with the pose that `pose` returns, or with its DataError as the fault."""
+        """Return the frame with the pose that `pose` returns, or with the DataError that it raises."""
         try:
             return cls(images, timestamp, pose())
         except DataError as error:
-            return cls(images, timestamp, fault=str(error))
+            return cls(images, timestamp, error=str(error))
 
 
 @dataclass(frozen=True)
@@ -132,13 +132,13 @@ class Recording(RGBDSequence):
     def has_poses(self) -> bool:
         frames = [self.contents.frames[index] for index in self.chosen]
         # a frame with an invalid pose raises its error when it is read
-        return any(recorded.T_world_camera is not None or recorded.fault for recorded in frames)
+        return any(recorded.T_world_camera is not None or recorded.error for recorded in frames)
 
     def __getitem__(self, k: int) -> Frame:
         index = self.chosen[k]
         recorded = self.contents.frames[index]
-        if recorded.fault:
-            raise FrameError(f"frame {index}: {recorded.fault}")
+        if recorded.error:
+            raise FrameError(f"frame {index}: {recorded.error}")
         return Frame(
             index=index,
             timestamp=recorded.timestamp,
@@ -170,8 +170,8 @@ def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[Recorde
     """Give each frame the pose of the frame `delay` later; without one, the frame cannot be used."""
     moved = []
     for frame, other in _with_later(frames, delay):
-        fault = frame.fault or (other.fault if other else f"no pose is {delay} frames away")
-        moved.append(replace(frame, T_world_camera=other.T_world_camera if other else None, fault=fault))
+        error = frame.error or (other.error if other else f"no pose is {delay} frames away")
+        moved.append(replace(frame, T_world_camera=other.T_world_camera if other else None, error=error))
     return moved
 
 
@@ -183,7 +183,7 @@ def delay_depth(frames: Sequence[RecordedFrame], delay: int) -> Sequence[Recorde
             images = replace(frame.images, depth_name=other.images.depth_name, depth=other.images.depth)
             moved.append(replace(frame, images=images))
         else:
-            moved.append(replace(frame, fault=frame.fault or f"no depth image is {delay} frames away"))
+            moved.append(replace(frame, error=frame.error or f"no depth image is {delay} frames away"))
     return moved
 
 
@@ -193,20 +193,20 @@ def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[R
 
 
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
-    """The frame with its pose converted, or with a fault if the pose is too far away to be mapped."""
+    """The frame with its pose converted, or with a error if the pose is too far away to be mapped."""
     if recorded.T_world_camera is None:
         return recorded
     T_world_camera = reading.pose(recorded.T_world_camera)
     distance = math.hypot(*T_world_camera[:3, 3])
     if distance <= FARTHEST:
         return replace(recorded, T_world_camera=T_world_camera)
-    fault = f"{recorded.images.color_name}: its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
-    return RecordedFrame(recorded.images, recorded.timestamp, fault=fault)
+    error = f"{recorded.images.color_name}: its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
+    return RecordedFrame(recorded.images, recorded.timestamp, error=error)
 
 
 def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
     """The frames, at 30 Hz if the times of the usable ones do not increase."""
-    times = [recorded.timestamp for recorded in frames if not recorded.fault]
+    times = [recorded.timestamp for recorded in frames if not recorded.error]
     if all(a < b for a, b in pairwise(times)):
         return frames
     log.warning("%s: the times do not grow from frame to frame; frames are taken to come at %g Hz", name, FRAME_RATE)

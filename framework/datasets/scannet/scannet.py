@@ -100,7 +100,7 @@ def _sens_contents(path: Path) -> Contents:
     lost = range(len(frames), header.frames)
     if lost:
         log.warning("%s lacks the last %d of %d frames: %s", path, len(lost), header.frames, file.cut)
-    frames += [RecordedFrame(frames[-1].images, k / FRAME_RATE, fault=f"{path}, {file.cut}") for k in lost]
+    frames += [RecordedFrame(frames[-1].images, k / FRAME_RATE, error=f"{path}, {file.cut}") for k in lost]
     return Contents(header.depth_camera, path, header.depth_scale, frames)
 
 

@@ -77,12 +77,11 @@ class SceneNN(LabeledRecording):
 
 
 def _recorded(images: StoredImages, pose_id: int, poses: TrajectoryLog | None, timestamp: float) -> RecordedFrame:
-    if poses is None:
-        return RecordedFrame(images, timestamp)
-    if pose_id in poses.poses:
-        return RecordedFrame(images, timestamp, poses.poses[pose_id])
+    T_world_camera = poses.poses.get(pose_id) if poses else None
+    if poses is None or T_world_camera is not None:
+        return RecordedFrame(images, timestamp, T_world_camera)
     why = poses.unusable.get(pose_id, "trajectory.log has no pose for it")
-    return RecordedFrame(images, timestamp, fault=f"{images.color_name}: {why}")
+    return RecordedFrame(images, timestamp, error=f"{images.color_name}: {why}")
 
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:

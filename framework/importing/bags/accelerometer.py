@@ -61,7 +61,7 @@ def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> 
         else:
             return found
     if reasons:
-        log.warning("%s: no accelerometer tells which way is up: %s", bag.path, "; ".join(reasons))
+        log.warning("%s: up is not known, as no accelerometer can be used: %s", bag.path, "; ".join(reasons))
     return None
 
 

@@ -40,7 +40,7 @@ def source(*frames: DeviceFrame | DataError, posed: bool = True) -> Source:
 def test_frames_that_cannot_be_used_are_counted_and_the_rest_is_written(tmp_path: Path) -> None:
     stored = source(frame(0), FrameError("one is torn"), frame(2, T_world_camera=None), frame(3))
     written = write_folder(stored, tmp_path / "out", Writing())
-    assert written.faults == ["one is torn", "frame 2 has no pose"]
+    assert written.errors == ["one is torn", "frame 2 has no pose"]
     assert str(written) == "2 frames; left out are 2, the first: one is torn"
     assert [seen.timestamp for seen in RgbdFolder(tmp_path / "out")] == pytest.approx([0, 0.1])
 

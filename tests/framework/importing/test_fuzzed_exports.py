@@ -67,6 +67,6 @@ def test_a_fuzzed_file_is_imported_or_refused(export: Path, data: st.DataObject)
             lines = [str(error)]
             assert not (out / "camera.json").exists()
         else:
-            lines = written.faults
+            lines = written.errors
             assert len(RgbdFolder(out)) == len(written.timestamps) > 0
         assert all(line.isprintable() and len(line) < 600 for line in lines), lines

@@ -84,27 +84,27 @@ def test_a_delay_pairs_color_with_the_depth_that_belongs_to_it(delay: int) -> No
     frames = delay_depth([RecordedFrame(images(k), k / 30) for k in range(5)], delay)
     for k, frame in enumerate(frames):
         if 0 <= k + delay < 5:
-            assert not frame.fault
+            assert not frame.error
             assert (frame.images.color()[0, 0, 0], frame.images.depth()[0, 0]) == (k, k + delay)
             assert (frame.images.color_name, frame.images.depth_name) == (f"color {k}", f"depth {k + delay}")
             assert frame.timestamp == k / 30
         else:
-            assert f"{delay} frames away" in frame.fault
+            assert f"{delay} frames away" in frame.error
 
 
 @pytest.mark.parametrize("delay", [-2, 0, 1])
 def test_a_delay_gives_images_the_pose_that_belongs_to_them(delay: int) -> None:
     stored = [RecordedFrame(images(k), k / 30, some_pose(k), up=np.array([0.0, -1.0, 0.0])) for k in range(5)]
-    stored[3] = RecordedFrame(images(3), 3 / 30, fault="line 3 is no pose")
+    stored[3] = RecordedFrame(images(3), 3 / 30, error="line 3 is no pose")
     for k, frame in enumerate(delay_poses(stored, delay)):
         assert (frame.images.color()[0, 0, 0], frame.timestamp) == (k, k / 30)
         if not 0 <= k + delay < 5:
-            assert frame.fault == f"no pose is {delay} frames away"
+            assert frame.error == f"no pose is {delay} frames away"
             assert frame.T_world_camera is None
         elif 3 in (k, k + delay):
-            assert frame.fault == "line 3 is no pose"
+            assert frame.error == "line 3 is no pose"
         else:
-            assert not frame.fault
+            assert not frame.error
             np.testing.assert_array_equal(frame.T_world_camera, some_pose(k + delay))
             assert frame.up is stored[k].up
 

@@ -60,7 +60,7 @@ def check_room(folder: Path, posed: bool = True, within: float = 2e-3, holes: fl
 
 
 def imported(path: Path, out: Path, **topics: str) -> list[str]:
-    return write_folder(open_source(path, Topics(**topics)), out, Writing()).faults
+    return write_folder(open_source(path, Topics(**topics)), out, Writing()).errors
 
 
 def add_poses(bag: BagWriter, topic: str = "/pose") -> None:
@@ -414,7 +414,7 @@ def test_an_accelerometer_that_cannot_tell_is_said_in_one_line(
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
     assert not (tmp_path / "out/gravity.txt").exists()
     [line] = [record.getMessage() for record in caplog.records if "accelerometer" in record.getMessage()]
-    assert re.search(f"no accelerometer tells which way is up: {said}", line)
+    assert re.search(f"no accelerometer can be used: {said}", line)
     assert "\n" not in line
 
 

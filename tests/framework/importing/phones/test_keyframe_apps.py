@@ -31,7 +31,7 @@ def export(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
 
 
 def write(path: Path, tmp_path: Path, least: int = 1) -> list[str]:
-    return write_folder(open_source(path), tmp_path / "out", Writing(confidence=least)).faults
+    return write_folder(open_source(path), tmp_path / "out", Writing(confidence=least)).errors
 
 
 @pytest.mark.parametrize("least", [0, 1, 2])

@@ -98,7 +98,7 @@ def changed(export: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 def test_a_damaged_pose_is_one_frame(export: Path, tmp_path: Path, change, said: str) -> None:
     changed(export, change)
     written = write_folder(open_source(export), tmp_path / "out", Writing())
-    [fault] = written.faults
+    [fault] = written.errors
     assert re.search(said, fault)
     assert len(RgbdFolder(tmp_path / "out")) == 3
 
@@ -128,7 +128,7 @@ def test_a_damaged_image_of_the_export_is_one_frame(export: Path, tmp_path: Path
     path = export / "depth/1.exr"
     path.write_bytes(spoil(path.read_bytes()))
     written = write_folder(open_source(export), tmp_path / "out", Writing())
-    [fault] = written.faults
+    [fault] = written.errors
     assert "depth/1.exr" in fault
 
 
@@ -164,7 +164,7 @@ def test_a_damaged_member_of_the_file_is_one_frame(
     r3d: Path, tmp_path: Path, name: str, content: bytes | None, said: str
 ) -> None:
     written = write_folder(open_source(rewritten(r3d, name, content)), tmp_path / "out", Writing())
-    [fault] = written.faults
+    [fault] = written.errors
     assert re.search(said, fault), fault
     assert len(RgbdFolder(tmp_path / "out")) == 3
 
@@ -174,7 +174,7 @@ def test_what_unpacks_to_much_is_not_unpacked(r3d: Path, tmp_path: Path) -> None
     packed = lzfse.compress(bytes(10**6))
     bomb = 100 * packed[:-4] + packed[-4:]  # the last four bytes end the stream
     written = write_folder(open_source(rewritten(r3d, "rgbd/1.depth", bomb)), tmp_path / "out", Writing())
-    assert re.search("more than the .* that it can have|more blocks", written.faults[0])
+    assert re.search("more than the .* that it can have|more blocks", written.errors[0])
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no zip at all" * 100])
@@ -201,7 +201,7 @@ def test_a_real_export(shared_data: Path, tmp_path: Path) -> None:
     if not original.is_dir():
         pytest.skip(f"{original} is not there")
     written = write_folder(open_source(original), tmp_path / "out", Writing())
-    assert (len(written.timestamps), len(written.faults)) == (REAL_FRAMES, 345 - REAL_FRAMES)
+    assert (len(written.timestamps), len(written.errors)) == (REAL_FRAMES, 345 - REAL_FRAMES)
     sequence = RgbdFolder(tmp_path / "out")
     assert (sequence.camera.width, sequence.camera.height) == (480, 640)
     assert sequence.camera.fx == pytest.approx(1404.302978515625 / 3)

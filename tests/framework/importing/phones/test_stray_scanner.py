@@ -77,7 +77,7 @@ def spoil_row(folder: Path, number: int, change) -> None:
 def test_a_damaged_row_is_one_frame(folder: Path, tmp_path: Path, change, said: str) -> None:
     spoil_row(folder, 2, change)
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
-    [fault] = written.faults if "77" not in said else written.faults[:1]
+    [fault] = written.errors if "77" not in said else written.errors[:1]
     assert re.search(said, fault), fault
     assert len(RgbdFolder(tmp_path / "out")) == len(written.timestamps)
 
@@ -88,7 +88,7 @@ def test_a_damaged_image_is_one_frame(folder: Path, tmp_path: Path, name: str) -
     path.write_bytes(path.read_bytes()[:-20])
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
     assert len(written.timestamps) == 3
-    assert name in written.faults[0]
+    assert name in written.errors[0]
     assert "left out are 1, the first: " in str(written)
     path.unlink()
     assert len(write_folder(open_source(folder), tmp_path / "again", Writing()).timestamps) == 3
@@ -97,8 +97,8 @@ def test_a_damaged_image_is_one_frame(folder: Path, tmp_path: Path, name: str) -
 def test_a_video_that_ends_early_leaves_its_frames(folder: Path, tmp_path: Path) -> None:
     write_video(folder / "rgb.mp4", [frame.color for frame in FRAMES[:2]])
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
-    assert (len(written.timestamps), len(written.faults)) == (2, 2)
-    assert "rgb.mp4 ends, or is damaged, before frame 2" in written.faults[0]
+    assert (len(written.timestamps), len(written.errors)) == (2, 2)
+    assert "rgb.mp4 ends, or is damaged, before frame 2" in written.errors[0]
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_a_real_recording(shared_data: Path, tmp_path: Path) -> None:
     assert sequence.camera.fx == pytest.approx(1327.616 / 3)
     assert sequence.camera.cx == pytest.approx((969.81036 + 0.5) / 3 - 0.5)
     assert len(sequence) == 4
-    assert len(written.faults) == len((original / "odometry.csv").read_text().splitlines()) - 1 - 4
+    assert len(written.errors) == len((original / "odometry.csv").read_text().splitlines()) - 1 - 4
     depth = sequence[0].depth
     assert (depth > 0).mean() == pytest.approx(1 - 8939 / (192 * 256), abs=0.01)  # confidence 0
     assert np.median(depth[depth > 0]) == pytest.approx(2.72, abs=0.05)
