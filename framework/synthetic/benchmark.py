@@ -30,7 +30,7 @@ from framework.synthetic.furniture.cluttered_groups import (
 from framework.synthetic.furniture.groups import Group, kitchen_group, single, toilet_group, tv_group
 from framework.synthetic.furniture.piece import Rng
 from framework.synthetic.ray_caster import RayCaster
-from framework.synthetic.renderer import ids_met
+from framework.synthetic.renderer import cast_ids
 from framework.synthetic.room import Room, furnish_with
 from framework.synthetic.walk import CameraPath, plan_path
 
@@ -169,7 +169,7 @@ def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[
     wanted = {i: name for i, name in surfaces.class_names.items() if name is not None}
 
     def labels(T_world_camera: Float64) -> Int32:
-        return ids_met(surfaces, caster, SMALL_VIEW, T_world_camera)
+        return cast_ids(surfaces, caster, SMALL_VIEW, T_world_camera)
 
     path = plan_path(room.layout, frames, labels, set(wanted), rng, stride)
     views = [labels(path.pose(k)) for k in range(0, frames, -(-frames // JUDGED_VIEWS))]

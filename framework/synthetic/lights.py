@@ -1,7 +1,7 @@
 """Light baked into the vertices: soft shadows of lamps and windows, and three diffuse bounces between surfaces.
 
-The light is static and surfaces are Lambertian, so a point looks the same from everywhere: what photometric tracking
-assumes. Vertices gather with one fixed set of directions, so that neighbours see alike and no grain appears.
+The light is static and surfaces are Lambertian, as photometric tracking assumes. All vertices gather light along the
+same directions, so that no noise appears between neighbors.
 """
 
 from __future__ import annotations
@@ -9,17 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from framework.data import Float32, Float64, Int32
+from framework.synthetic.paints import Color
 from framework.synthetic.ray_caster import RayCaster
+from framework.synthetic.shading_kernels import gather_light
 from framework.synthetic.surfaces import Surfaces
 
-GATHER_DIRECTIONS = 48  # rays a vertex for light from other surfaces
+GATHER_DIRECTIONS = 48  # rays per vertex for light from other surfaces
 BOUNCES = 3
-LIFT = 4e-3  # m, rays start this far above the surface
-CHUNK = 8192  # vertices at a time, bounds the memory for rays
-WALL_BRIGHTNESS = 0.60  # mean irradiance of the room's shell after exposure: leaves room for bright spots
+LIFT = 4e-3  # m, height above the surface from which rays start
+CHUNK = 8192  # vertices at a time, limits memory
+WALL_BRIGHTNESS = 0.60  # mean irradiance of the room's shell after exposure, with headroom for bright spots
 
 
 @dataclass(frozen=True)
@@ -27,19 +28,21 @@ class Lamp:
     """Sample points of one light source."""
 
     points: Float64  # (S, 3) m
-    normals: Float64  # (S, 3) unit, 0 = shines to all sides
-    power: tuple[float, float, float]  # linear RGB, for the whole lamp
+    normals: Float64  # (S, 3) unit, 0 = shines in all directions
+    power: Color  # linear RGB, for the whole lamp
 
 
-def globe(center: Float64, radius: float, power: tuple[float, float, float], samples: int = 16) -> Lamp:
-    """A lamp that shines to all sides."""
-    return Lamp(center + radius * _fibonacci_sphere(samples), np.zeros((samples, 3)), power)
+def globe(center: Float64, radius: float, power: Color, samples: int = 16) -> Lamp:
+    """Return a lamp that shines in all directions."""
+    k = np.arange(samples) + 0.5  # on a Fibonacci sphere
+    z, angle = 1 - 2 * k / samples, np.pi * (1 + 5**0.5) * k
+    r = np.sqrt(1 - z * z)
+    sphere = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    return Lamp(center + radius * sphere, np.zeros((samples, 3)), power)
 
 
-def rectangle(
-    corner: Float64, along: Float64, up: Float64, normal: Float64, power: tuple[float, float, float], side: int = 5
-) -> Lamp:
-    """A window of which `along` and `up` are the edges."""
+def rectangle(corner: Float64, along: Float64, up: Float64, normal: Float64, power: Color, side: int = 5) -> Lamp:
+    """Return a window with the edges `along` and `up`."""
     f = (np.arange(side) + 0.5) / side
     s, t = np.meshgrid(f, f)
     points = corner + s.reshape(-1, 1) * along + t.reshape(-1, 1) * up
@@ -47,7 +50,7 @@ def rectangle(
 
 
 def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
-    """The irradiance (V, 3) of each vertex, exposed so that the room's shell has WALL_BRIGHTNESS on average."""
+    """Return the irradiance (V, 3) of each vertex, exposed so that the mean of the shell is WALL_BRIGHTNESS."""
     origins = surfaces.vertices + np.float32(LIFT) * surfaces.normals
     direct = np.zeros((len(origins), 3))
     for begin in range(0, len(origins), CHUNK):
@@ -58,19 +61,19 @@ def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
     reflectance = surfaces.material_table[:, 1:7].reshape(-1, 2, 3).mean(axis=1)
     total = direct.astype(np.float32)
     for _ in range(BOUNCES):
-        total = direct + _collect(triangle, uv, surfaces.triangles, surfaces.materials, reflectance, total)
-        total = total.astype(np.float32)
+        bounced = gather_light(triangle, uv, surfaces.triangles, surfaces.materials, reflectance, total)
+        total = (direct + bounced).astype(np.float32)
     shell = np.unique(surfaces.triangles[surfaces.instance_ids == 0])
     return np.asarray(total * (WALL_BRIGHTNESS / max(float(total[shell].mean()), 1e-9)), np.float32)
 
 
 def _direct(origins: Float32, normals: Float32, caster: RayCaster, lamp: Lamp) -> Float64:
     to_lamp = lamp.points[None].astype(np.float32) - origins[:, None]
-    square = np.maximum((to_lamp**2).sum(axis=-1), 0.04)  # nearer than 20 cm a point sample would glare
+    square = np.maximum((to_lamp**2).sum(axis=-1), 0.04)  # point samples closer than 20 cm are too bright
     direction = to_lamp / np.sqrt(square)[..., None]
     received = np.maximum(np.einsum("vsc,vc->vs", direction, normals), 0)
     sent = np.maximum(-np.einsum("vsc,sc->vs", direction, lamp.normals.astype(np.float32)), 0)
-    sent[:, ~lamp.normals.any(axis=1)] = 0.25  # a globe of the same power sends this much to each side
+    sent[:, ~lamp.normals.any(axis=1)] = 0.25  # from a globe of the same power in each direction
     weight = received * sent / square
     vertex, sample = np.nonzero(weight > 0)
     blocked = caster.occluded(origins[vertex], lamp.points[sample].astype(np.float32))
@@ -79,7 +82,7 @@ def _direct(origins: Float32, normals: Float32, caster: RayCaster, lamp: Lamp) -
 
 
 def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int32, Float32]:
-    """What each vertex sees: triangles (V, D) and barycentric weights (V, D, 2), -1 = nothing."""
+    """Return the triangles (V, D) that each vertex sees, -1 = none, and barycentric weights (V, D, 2)."""
     local = _cosine_directions(GATHER_DIRECTIONS)
     triangle = np.empty((len(origins), len(local)), np.int32)
     uv = np.empty((*triangle.shape, 2), np.float32)
@@ -98,38 +101,8 @@ def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int3
     return triangle, uv
 
 
-@njit(cache=True, nogil=True)
-def _collect(
-    triangle: Int32, uv: Float32, triangles: Int32, materials: Int32, reflectance: Float32, irradiance: Float32
-) -> Float32:
-    """The mean of what the seen points reflect, (V, 3): with cosine-distributed rays that is the irradiance."""
-    out = np.zeros((len(triangle), 3), np.float32)
-    for v in range(len(triangle)):
-        for d in range(triangle.shape[1]):
-            f = triangle[v, d]
-            if f < 0:
-                continue
-            b, c = uv[v, d, 0], uv[v, d, 1]
-            for channel in range(3):
-                light = (
-                    (1 - b - c) * irradiance[triangles[f, 0], channel]
-                    + b * irradiance[triangles[f, 1], channel]
-                    + c * irradiance[triangles[f, 2], channel]
-                )
-                out[v, channel] += light * reflectance[materials[f], channel]
-        out[v] /= triangle.shape[1]
-    return out
-
-
-def _fibonacci_sphere(count: int) -> Float64:
-    k = np.arange(count) + 0.5
-    z, angle = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-
-
 def _cosine_directions(count: int) -> Float64:
-    """Directions (D, 3) about +z with density proportional to the cosine (Malley's method on a Fibonacci disc)."""
+    """Return directions (D, 3) about +z with a density proportional to the cosine (Malley's method)."""
     k = np.arange(count) + 0.5
     r, angle = np.sqrt(k / count), np.pi * (1 + 5**0.5) * k
     return np.stack([r * np.cos(angle), r * np.sin(angle), np.sqrt(1 - r * r)], axis=1)

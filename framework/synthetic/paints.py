@@ -1,15 +1,17 @@
-"""Colours and materials that rooms are furnished with, drawn at random."""
+"""Materials: textures and random colors. Colors are sRGB in [0, 1]."""
 
 from __future__ import annotations
 
 import colorsys
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 
-from framework.synthetic.textures import Material, Texture
+from framework.data import Float32, Float64
 
 Color = tuple[float, float, float]
+Rng = np.random.Generator
 
 WOODS: tuple[tuple[Color, Color], ...] = (
     ((0.78, 0.60, 0.40), (0.62, 0.43, 0.25)),  # oak
@@ -26,57 +28,104 @@ WALLS: tuple[Color, ...] = (
     (0.87, 0.84, 0.77), (0.78, 0.84, 0.85), (0.83, 0.86, 0.78), (0.90, 0.80, 0.72), (0.82, 0.80, 0.86),
 )  # fmt: skip
 
-
-BLACKEST = 0.35  # mean of the sRGB of a surface from which it begins to swallow a projector's infrared light
-SWALLOWED = 0.8  # share of the readings that a black surface swallows
+DARKEST = 0.35  # mean sRGB of a surface below which it absorbs a projector's infrared light
+ABSORBED = 0.8  # share of the readings that a black surface absorbs
 MATTE_SCREEN = 0.75  # `dark` of a matte screen
 POLISHED, GLAZED = 0.7, 0.5  # `shiny` of metal and of ceramics
 
-
-def swallowed(color: Color) -> float:
-    """The share of a depth camera's readings that a surface of this colour loses."""
-    return SWALLOWED * max(0.0, 1 - sum(color) / 3 / BLACKEST)
+EMISSION, DARK, SHINY = 11, 12, 13  # columns of material_table
 
 
-def pick(rng: np.random.Generator, choices: tuple[Color, ...]) -> Color:
+class Texture(IntEnum):
+    PAINT = 0
+    WOOD = 1
+    FABRIC = 2
+    STRIPES = 3
+    PLANKS = 4
+    TILES = 5
+    RUG = 6
+    PAINTING = 7
+    SCREEN = 8
+    METAL = 9
+    BOOK = 10
+    SKY = 11
+    WALLPAPER = 12
+    LEAF = 13
+    CHECKS = 14
+    PAGES = 15
+
+
+@dataclass(frozen=True)
+class Material:
+    """The appearance of a surface."""
+
+    texture: Texture
+    color: Color
+    second: Color  # mixed in by the pattern
+    scale: float = 0.1  # m, size of the pattern
+    extent: tuple[float, float] = (1.0, 1.0)  # m, of a picture
+    seed: int = 0
+    emission: float = 0.0  # relative to a white wall in the room's mean light
+    dark: float = 0.0  # in [0, 1], share of a structured-light camera's readings lost from all directions
+    shiny: float = 0.0  # in [0, 1], share of the others lost at a slant, see shading_kernels.GLANCED_OFF
+
+
+def material_table(materials: list[Material]) -> Float32:
+    """Return (M, 14) rows: texture, linear color, linear second color, scale, extent, seed, emission, dark, shiny."""
+    rows = np.zeros((len(materials), 14))
+    for row, m in zip(rows, materials, strict=True):
+        row[0] = m.texture
+        row[1:4], row[4:7] = _to_linear(np.array(m.color)), _to_linear(np.array(m.second))
+        row[7:] = m.scale, *m.extent, m.seed % 4096, m.emission, m.dark, m.shiny
+    return rows.astype(np.float32)
+
+
+def _to_linear(srgb: Float64) -> Float64:
+    """Convert sRGB to linear light (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def absorbed(color: Color) -> float:
+    """Return the share of a depth camera's readings that a surface of this color loses."""
+    return ABSORBED * max(0.0, 1 - sum(color) / 3 / DARKEST)
+
+
+def pick(rng: Rng, choices: tuple[Color, ...]) -> Color:
     return choices[int(rng.integers(len(choices)))]
 
 
 def shade(color: Color, factor: float) -> Color:
-    """The colour made darker (below 1) or lighter (above 1)."""
+    """Make the color darker (below 1) or lighter (above 1)."""
     r, g, b = (min(1.0, factor * c) for c in color)
     return r, g, b
 
 
-def vivid(rng: np.random.Generator) -> Color:
-    """A strong colour of any hue, for books, bags and pictures."""
+def vivid(rng: Rng) -> Color:
+    """Draw a saturated color, for books, bags and pictures."""
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0.55, 0.9), rng.uniform(0.35, 0.85))
 
 
-def wood(rng: np.random.Generator) -> Material:
+def wood(rng: Rng) -> Material:
     first, second = WOODS[int(rng.integers(len(WOODS)))]
     tone = rng.uniform(0.9, 1.08)
     light, veins = shade(first, tone), shade(second, tone)
-    return Material(Texture.WOOD, light, veins, rng.uniform(0.03, 0.06), seed=new_seed(rng), dark=swallowed(light))
+    return Material(Texture.WOOD, light, veins, rng.uniform(0.03, 0.06), seed=new_seed(rng), dark=absorbed(light))
 
 
-def cloth(rng: np.random.Generator, color: Color | None = None) -> Material:
-    """Upholstery of one colour."""
+def cloth(rng: Rng, color: Color | None = None) -> Material:
+    """Return upholstery of one color."""
     base = pick(rng, CLOTHS) if color is None else color
     scale = rng.uniform(0.10, 0.2)
-    return Material(Texture.FABRIC, base, shade(base, 0.72), scale, seed=new_seed(rng), dark=swallowed(base))
+    return Material(Texture.FABRIC, base, shade(base, 0.72), scale, seed=new_seed(rng), dark=absorbed(base))
 
 
-def leather(rng: np.random.Generator) -> Material:
-    """Black, and polished by use."""
-    color = shade((0.17, 0.16, 0.15), rng.uniform(0.7, 1.3))
-    return Material(
-        Texture.PAINT, color, shade(color, 0.6), 0.03, seed=new_seed(rng), dark=swallowed(color), shiny=GLAZED
-    )
+def leather(rng: Rng) -> Material:
+    """Return black, polished leather."""
+    return glaze(rng, shade((0.17, 0.16, 0.15), rng.uniform(0.7, 1.3)), 0.6, 0.03)
 
 
-def patterned_cloth(rng: np.random.Generator) -> Material:
-    """Bed linen: striped, checked or plain."""
+def patterned_cloth(rng: Rng) -> Material:
+    """Return bed linen: striped, checked or plain."""
     base, other = pick(rng, CLOTHS), (0.90, 0.88, 0.84)
     texture = (Texture.STRIPES, Texture.CHECKS, Texture.FABRIC)[int(rng.integers(3))]
     second = shade(base, 0.75) if texture is Texture.FABRIC else base
@@ -84,27 +133,27 @@ def patterned_cloth(rng: np.random.Generator) -> Material:
     return Material(texture, first, second, rng.uniform(0.10, 0.2), seed=new_seed(rng))
 
 
-def paint(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
-    return Material(Texture.PAINT, color, shade(color, contrast), scale, seed=new_seed(rng), dark=swallowed(color))
+def paint(rng: Rng, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
+    return Material(Texture.PAINT, color, shade(color, contrast), scale, seed=new_seed(rng), dark=absorbed(color))
 
 
-def glaze(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
-    """Paint on ceramics."""
+def glaze(rng: Rng, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
+    """Return glossy paint."""
     return replace(paint(rng, color, contrast, scale), shiny=GLAZED)
 
 
-def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Material:
-    dark = swallowed(color)
+def metal(rng: Rng, color: Color = (0.62, 0.63, 0.65)) -> Material:
+    dark = absorbed(color)
     return Material(Texture.METAL, color, shade(color, 0.91), seed=new_seed(rng), dark=dark, shiny=POLISHED)
 
 
-def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
-    """A painting or a screen of this size (m). No depth camera reads a glossy screen; every other screen is matte."""
+def picture(rng: Rng, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
+    """Return a painting or a screen of this size (m); depth cameras do not read the glossy half of the screens."""
     first, second, seed = vivid(rng), vivid(rng), new_seed(rng)
     dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
     return Material(texture, first, second, 0.1, (width, height), seed, emission, dark)
 
 
-def new_seed(rng: np.random.Generator) -> int:
-    """A random seed of a texture."""
+def new_seed(rng: Rng) -> int:
+    """Draw the seed of a texture."""
     return int(rng.integers(4096))

@@ -1,4 +1,4 @@
-"""Pictures of a lit room: colour, exact depth and instance ids."""
+"""Rendering of a lit room: color, exact depth and instance ids, with smooth edges between parts."""
 
 from __future__ import annotations
 
@@ -6,19 +6,29 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
 from framework.data import Camera, Float32, Float64, Int32, UInt8
-from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
+from framework.rendering.rasterizer import Rasterizer
 from framework.synthetic.lights import Lamp, bake
-from framework.synthetic.ray_caster import RayCaster, image_rays
-from framework.synthetic.shading import WHITE, lit, shade, unread
+from framework.synthetic.ray_caster import RayCaster, image_rays, pixel_rays
+from framework.synthetic.shading_kernels import (
+    WHITE,
+    LitSurfaces,
+    Viewpoint,
+    apply_tone_curve,
+    find_edges,
+    lose_readings,
+    shade,
+    smooth_edges,
+)
 from framework.synthetic.surfaces import Surfaces
+
+EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, a rotated grid
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """What a perfect camera sees."""
+    """The picture of an ideal camera."""
 
     color: UInt8  # (H, W, 3) RGB
     depth: Float32  # (H, W) m along z, 0 = nothing
@@ -33,50 +43,61 @@ class Renderer:
     def __init__(self, surfaces: Surfaces, lamps: list[Lamp]) -> None:
         self.surfaces = surfaces
         self.caster = RayCaster(surfaces.vertices, surfaces.triangles)
-        self._lit = lit(surfaces, bake(surfaces, self.caster, lamps))
+        corners = surfaces.vertices[surfaces.triangles].astype(np.float64)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        self._lit = LitSurfaces(
+            texture=surfaces.texture,
+            irradiance=bake(surfaces, self.caster, lamps),
+            triangles=surfaces.triangles,
+            normals=normals.astype(np.float32),
+            materials=surfaces.materials,
+            parts=surfaces.parts,
+            table=surfaces.material_table,
+        )
         self._rasterizer = Rasterizer(surfaces.vertices, surfaces.triangles)
 
     def render(self, camera: Camera, T_world_camera: Float64, material_table: Float32 | None = None) -> Rendering:
-        """The picture of the room, or of one with the same light and other materials (see textures.material_table)."""
+        """Return the picture of the room, also with another paints.material_table under the same light."""
         surfaces = self._lit if material_table is None else self._lit._replace(table=material_table)
         buffer = self._rasterizer.draw(camera, T_world_camera)
-        light, incidence = shade(surfaces, self.caster, buffer, camera, T_world_camera)
-        lost = unread(surfaces, buffer, incidence)
-        return Rendering(to_srgb(light), buffer.depth, self._ids(buffer), incidence, lost)
+        triangle, depth = buffer.triangle, buffer.depth
+        T = np.ascontiguousarray(T_world_camera, np.float64)
+        view = Viewpoint(T, *(float(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy)))
+        light, incidence = np.empty((*camera.shape, 3), np.float32), np.empty(camera.shape, np.float32)
+        shade(surfaces, view, triangle, depth, buffer.uv, light, incidence)
+        v, u = np.nonzero(find_edges(triangle, surfaces.parts, depth))
+        if len(u):
+            offsets = np.array(EDGE_SAMPLES)
+            rays = pixel_rays(camera, T_world_camera, u[:, None] + offsets[:, 0], v[:, None] + offsets[:, 1])
+            hits = self.caster.cast(rays)
+            samples = offsets, hits.triangle, hits.distance, hits.uv
+            smooth_edges(surfaces, view, u, v, *samples, triangle, depth, light)
+        unread = np.empty(incidence.shape, np.float32)
+        lose_readings(surfaces.materials, surfaces.table, triangle, incidence, unread)
+        return Rendering(to_srgb(light), depth, _ids_of(self.surfaces, triangle), incidence, unread)
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Exact depth and instance ids only, (H, W) each."""
+        """Return only exact depth and instance ids, (H, W) each."""
         buffer = self._rasterizer.draw(camera, T_world_camera)
-        return buffer.depth, self._ids(buffer)
-
-    def _ids(self, buffer: VisibilityBuffer) -> Int32:
-        return _of_triangles(self.surfaces.instance_ids, buffer.triangle)
+        return buffer.depth, _ids_of(self.surfaces, buffer.triangle)
 
 
-def ids_met(surfaces: Surfaces, caster: RayCaster, camera: Camera, T_world_camera: Float64) -> Int32:
-    """The instance ids (H, W) by ray-casting: for small pictures cheaper than a Renderer, and without its light."""
-    return _of_triangles(surfaces.instance_ids, caster.cast(image_rays(camera, T_world_camera)).triangle)
+def cast_ids(surfaces: Surfaces, caster: RayCaster, camera: Camera, T_world_camera: Float64) -> Int32:
+    """Return the instance ids (H, W) by ray casting: faster than a Renderer for small pictures."""
+    return _ids_of(surfaces, caster.cast(image_rays(camera, T_world_camera)).triangle)
 
 
-def _of_triangles(instance_ids: Int32, triangle: Int32) -> Int32:
-    """The instances (H, W) that triangles (H, W) belong to, 0 where nothing was met: NO_TRIANGLE is -1."""
-    return np.append(instance_ids, np.int32(0))[triangle]
+def _ids_of(surfaces: Surfaces, triangle: Int32) -> Int32:
+    """Return the instances (H, W) of triangles (H, W), 0 for NO_TRIANGLE, which is -1."""
+    return np.append(surfaces.instance_ids, np.int32(0))[triangle]
 
 
 def to_srgb(light: Float32) -> UInt8:
-    """8-bit sRGB of linear light, by Reinhard's curve with a white point (Reinhard et al. 2002, eq. 4)."""
+    """Return 8-bit sRGB of linear light by Reinhard's curve with a white point (Reinhard et al. 2002, eq. 4)."""
     color = np.empty(light.shape, np.uint8)
-    _look_up(light.reshape(-1), _tone_curve(), color.reshape(-1))
+    apply_tone_curve(light.reshape(-1), _tone_curve(), color.reshape(-1))
     return color
-
-
-@njit(cache=True, nogil=True)
-def _look_up(light: Float32, curve: UInt8, color: UInt8) -> None:
-    """Writes for each light (N,) from 0 to WHITE, or beyond, the nearest entry of the curve."""
-    white, entries = np.float32(WHITE), np.float32((len(curve) - 1) / WHITE)
-    for n in range(len(light)):
-        index = min(max(light[n], np.float32(0)), white) * entries
-        color[n] = curve[np.int32(index + np.float32(0.5))]
 
 
 @lru_cache

@@ -16,8 +16,8 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import panel, rounded_box
 from framework.synthetic.layout import Layout, arrange, place_on_wall, strew
 from framework.synthetic.lights import Lamp, globe, rectangle
+from framework.synthetic.paints import Material, Texture
 from framework.synthetic.surfaces import Surfaces, assemble
-from framework.synthetic.textures import Material, Texture
 
 HEIGHT = 2.55  # m
 WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear colour of lamps and of daylight

@@ -21,9 +21,9 @@ from framework.files.atomic_write import written_whole
 from framework.files.ply import write_ply
 from framework.geometry import transform
 from framework.synthetic.benchmark import SceneSpec, plan_scene
-from framework.synthetic.depth_camera import MIN_RANGE, DepthSensor, noisy_color
-from framework.synthetic.motion_blur import blurred
 from framework.synthetic.renderer import Renderer
+from framework.synthetic.rgbd_camera import DepthSensor, blurred, noisy_color
+from framework.synthetic.rgbd_camera_kernels import MIN_RANGE
 from framework.synthetic.room_mesh import visible_mesh
 from framework.synthetic.walk import FRAME_RATE
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO

@@ -14,8 +14,8 @@ from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_trut
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import ConfigError
 from framework.interfaces import RGBDSequence
-from framework.synthetic.depth_camera import DepthSensor, noisy_color
-from framework.synthetic.renderer import Renderer, ids_met
+from framework.synthetic.renderer import Renderer, cast_ids
+from framework.synthetic.rgbd_camera import DepthSensor, noisy_color
 from framework.synthetic.room import RoomKind, furnish
 from framework.synthetic.walk import FRAME_RATE, plan_path
 
@@ -77,7 +77,7 @@ class Synthetic(RGBDSequence):
         self.path = plan_path(
             self.room.layout,
             self.frames,
-            lambda T_world_camera: ids_met(self.room.surfaces, self._renderer.caster, small, T_world_camera),
+            lambda T_world_camera: cast_ids(self.room.surfaces, self._renderer.caster, small, T_world_camera),
             wanted,
             rng,
         )

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from framework.data import Bool, Float32, Float64, Int32
 from framework.synthetic.furniture.piece import Furniture
-from framework.synthetic.textures import DARK, Material, material_table
+from framework.synthetic.paints import DARK, Material, material_table
 
 
 @dataclass(frozen=True)

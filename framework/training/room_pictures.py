@@ -27,9 +27,9 @@ from framework.data import Bool, Camera, Float64, UInt8
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.json_file import read_json
-from framework.synthetic.depth_camera import noisy_color
 from framework.synthetic.layout import CELL
 from framework.synthetic.renderer import Renderer
+from framework.synthetic.rgbd_camera import noisy_color
 from framework.synthetic.room import Room, RoomKind, furnish
 from framework.synthetic.walk import look
 

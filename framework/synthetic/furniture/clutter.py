@@ -8,7 +8,7 @@ from framework.data import Float64
 from framework.synthetic import paints
 from framework.synthetic.furniture.piece import Furniture, Rng, corners
 from framework.synthetic.furniture.solids import Solid, cushion, cylinder, lathe, leg, panel, rounded_box, tube
-from framework.synthetic.textures import Material, Texture
+from framework.synthetic.paints import Material, Texture
 
 WEAVE = 0.04  # m, between the vertices of cloth: what a crease can follow
 LAMP_GLOW = 2.2  # emission of a lit lampshade, relative to a white wall in the room's mean light

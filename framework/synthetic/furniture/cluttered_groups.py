@@ -10,7 +10,7 @@ from framework.synthetic.furniture import clutter, fixtures, seating, small_thin
 from framework.synthetic.furniture.groups import Group, against_wall, bed_group, beside, on_top, single, size
 from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import SPACING
-from framework.synthetic.textures import Texture
+from framework.synthetic.paints import Texture
 
 PILLOWS = 0.68  # m, from the wall to where a bed is free to lie on
 BACKREST = 0.50  # m, from the wall to where a couch is free to sit on

@@ -7,7 +7,7 @@ import numpy as np
 from framework.synthetic import paints
 from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import Section, Solid, cylinder, grid_triangles, loft, rounded_box, tube
-from framework.synthetic.textures import Texture
+from framework.synthetic.paints import Texture
 
 
 def refrigerator(rng: Rng) -> Furniture:

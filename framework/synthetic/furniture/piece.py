@@ -11,7 +11,7 @@ import numpy as np
 
 from framework.data import Float64
 from framework.synthetic.furniture.solids import Solid
-from framework.synthetic.textures import Material
+from framework.synthetic.paints import Material
 
 Rng = np.random.Generator
 

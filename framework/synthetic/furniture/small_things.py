@@ -11,7 +11,7 @@ from framework.synthetic import paints
 from framework.synthetic.furniture import clutter, tabletops
 from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import Section, cylinder, lathe, loft, rounded_box
-from framework.synthetic.textures import Material, Texture
+from framework.synthetic.paints import Material, Texture
 
 MakeThing = Callable[[Rng], Furniture]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from framework.synthetic import paints
 from framework.synthetic.furniture.piece import Furniture, Rng, corners
 from framework.synthetic.furniture.solids import lathe, leg, rounded_box
-from framework.synthetic.textures import Material, Texture
+from framework.synthetic.paints import Material, Texture
 
 
 def dining_table(rng: Rng) -> Furniture:

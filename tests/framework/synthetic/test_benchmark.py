@@ -22,7 +22,7 @@ from framework.synthetic.furniture.fixtures import backpack
 from framework.synthetic.furniture.groups import single, toilet_group
 from framework.synthetic.furniture.small_things import ON_FLOORS, book_row, some
 from framework.synthetic.layout import CONTACT, WALK_RADIUS, arrange, strew
-from framework.synthetic.textures import Texture
+from framework.synthetic.paints import Texture
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 pytestmark = pytest.mark.integration

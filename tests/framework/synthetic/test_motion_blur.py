@@ -5,7 +5,8 @@ import pytest
 
 from framework.data import Camera
 from framework.geometry import inverse
-from framework.synthetic.motion_blur import MOST_SAMPLES, blurred
+from framework.synthetic.rgbd_camera import blurred
+from framework.synthetic.rgbd_camera_kernels import MAX_SAMPLES
 from framework.synthetic.walk import look
 
 CAMERA = Camera(96, 64, 80.0, 82.0, 47.3, 31.1)
@@ -80,7 +81,7 @@ def test_a_pixel_is_the_mean_of_samples_along_its_path():
             if length < 0.5:
                 np.testing.assert_array_equal(picture[v, u], color[v, u])
                 continue
-            count = min(int(np.ceil(length)) + 1, MOST_SAMPLES)
+            count = min(int(np.ceil(length)) + 1, MAX_SAMPLES)
             mean = np.zeros(3)
             for k in range(count):
                 f = (k + 0.5) / count

@@ -10,11 +10,12 @@ from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.synthetic.furniture.piece import Furniture
 from framework.synthetic.furniture.solids import panel, rounded_box
 from framework.synthetic.lights import globe
+from framework.synthetic.paints import Material, Texture
 from framework.synthetic.ray_caster import image_rays, pixel_rays
-from framework.synthetic.renderer import Renderer, ids_met, to_srgb
-from framework.synthetic.shading import EDGE_SAMPLES, EDGE_STEP, WHITE
+from framework.synthetic.renderer import EDGE_SAMPLES, Renderer, cast_ids, to_srgb
+from framework.synthetic.shading_kernels import EDGE_STEP, WHITE
 from framework.synthetic.surfaces import assemble
-from framework.synthetic.textures import Material, Texture, surface_color
+from framework.synthetic.texture_kernels import surface_color
 from framework.synthetic.walk import look
 
 pytestmark = pytest.mark.integration
@@ -163,7 +164,7 @@ def test_a_picture_is_that_of_rays_shaded_one_by_one():
     assert (difference > 0).mean() < 0.02
     for a, b in zip(renderer.depth_and_ids(CAMERA, T), (picture.depth, picture.instance_ids), strict=True):
         np.testing.assert_array_equal(a, b)
-    np.testing.assert_array_equal(ids_met(renderer.surfaces, renderer.caster, CAMERA, T), picture.instance_ids)
+    np.testing.assert_array_equal(cast_ids(renderer.surfaces, renderer.caster, CAMERA, T), picture.instance_ids)
 
 
 def test_other_materials_change_the_colours_and_nothing_else():

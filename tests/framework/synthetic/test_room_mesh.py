@@ -10,10 +10,10 @@ import pytest
 from framework.data import Camera
 from framework.synthetic.furniture.piece import Furniture
 from framework.synthetic.furniture.solids import panel, rounded_box
+from framework.synthetic.paints import Material, Texture
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.room_mesh import seen_from, tessellate, visible_mesh
 from framework.synthetic.surfaces import assemble
-from framework.synthetic.textures import Material, Texture
 from framework.synthetic.walk import look
 
 GREY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))

@@ -1,83 +1,30 @@
-"""Procedural textures, evaluated where a ray hits: no seams, no image files, enough gradient for photometric alignment.
+"""Procedural textures, evaluated per pixel: no seams, no image files, enough gradient for photometric alignment.
 
 Solid textures (wood, fabric, paint, metal) use all three texture coordinates, pictures (planks, tiles, rug, painting)
-the first two. Detail finer than a pixel is faded out, so that nothing flickers between frames.
+the first two. Detail below a pixel is faded out, so that nothing flickers between frames. `footprint` is the size of a
+pixel on the surface, m; lengths without a unit are m.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import IntEnum
-
 import numpy as np
 from numba import njit
 
-from framework.data import Float32, Float64
-
-
-class Texture(IntEnum):
-    PAINT = 0
-    WOOD = 1
-    FABRIC = 2
-    STRIPES = 3
-    PLANKS = 4
-    TILES = 5
-    RUG = 6
-    PAINTING = 7
-    SCREEN = 8
-    METAL = 9
-    BOOK = 10
-    SKY = 11
-    WALLPAPER = 12
-    LEAF = 13
-    CHECKS = 14
-    PAGES = 15
-
+from framework.data import Float32
+from framework.synthetic.paints import Texture
 
 # numba compares plain integers.
 PAINT, WOOD, FABRIC, STRIPES, PLANKS, TILES, RUG, PAINTING = (int(texture) for texture in list(Texture)[:8])
 SCREEN, METAL, BOOK, SKY, WALLPAPER, LEAF, CHECKS, PAGES = (int(texture) for texture in list(Texture)[8:])
-
-DARK, SHINY = 12, 13  # columns of material_table
 
 # Odd 64-bit constants that scatter lattice coordinates and seeds over all bits.
 STEP_X, STEP_Y = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 STEP_Z, STEP_SEED = np.uint64(0x165667B19E3779F9), np.uint64(0x27D4EB2F165667C5)
 
 
-@dataclass(frozen=True)
-class Material:
-    """How a surface looks. Colours are sRGB in [0, 1]."""
-
-    texture: Texture
-    color: tuple[float, float, float]
-    second: tuple[float, float, float]  # what the pattern mixes in
-    scale: float = 0.1  # m, the size of the pattern
-    extent: tuple[float, float] = (1.0, 1.0)  # m, of a picture
-    seed: int = 0
-    emission: float = 0.0  # light given off, relative to a white wall in the room's mean light
-    dark: float = 0.0  # in [0, 1], share of a structured-light camera's readings lost from wherever it looks
-    shiny: float = 0.0  # in [0, 1], share of the others lost where it looks at a slant, see shading.GLANCED_OFF
-
-
-def to_linear(srgb: Float64) -> Float64:
-    """sRGB in [0, 1] to linear light (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def material_table(materials: list[Material]) -> Float32:
-    """(M, 14) rows: texture, linear colour, linear second colour, scale, extent, seed, emission, dark, shiny."""
-    rows = np.zeros((len(materials), 14))
-    for row, m in zip(rows, materials, strict=True):
-        row[0] = m.texture
-        row[1:4], row[4:7] = to_linear(np.array(m.color)), to_linear(np.array(m.second))
-        row[7:] = m.scale, *m.extent, m.seed % 4096, m.emission, m.dark, m.shiny
-    return rows.astype(np.float32)
-
-
 @njit(cache=True, nogil=True)
 def _mixed(h: np.uint64) -> float:
-    """A number in [0, 1) that depends on every bit of `h`."""
+    """Return a number in [0, 1) that depends on every bit of `h`."""
     h ^= h >> np.uint64(32)
     h *= np.uint64(0xD6E8FEB86659FD93)
     h ^= h >> np.uint64(29)
@@ -86,14 +33,14 @@ def _mixed(h: np.uint64) -> float:
 
 @njit(cache=True, nogil=True)
 def _lattice(i: int, j: int, k: int, seed: int) -> float:
-    """A number in [0, 1) for each lattice point."""
+    """Return a number in [0, 1) for each lattice point."""
     h = np.uint64(i) * STEP_X ^ np.uint64(j) * STEP_Y ^ np.uint64(k) * STEP_Z ^ np.uint64(seed) * STEP_SEED
     return float(_mixed(h))
 
 
 @njit(cache=True, nogil=True)
 def _noise(x: float, y: float, z: float, seed: int) -> float:
-    """Smooth value noise in [0, 1] with lattice spacing 1, with Perlin's fade curve of 1985."""
+    """Return smooth value noise in [0, 1] with lattice spacing 1 and Perlin's fade curve of 1985."""
     i, j, k = float(np.floor(x)), float(np.floor(y)), float(np.floor(z))
     fx, fy, fz = x - i, y - j, z - k
     fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
@@ -109,13 +56,13 @@ def _noise(x: float, y: float, z: float, seed: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _visible(wavelength: float, footprint: float) -> float:
-    """How much of a detail of this size (m) a pixel of this size (m) can show, 0 to 1."""
+    """Return how much of a detail of this wavelength a pixel can show, 0 to 1."""
     return min(1.0, max(0.0, wavelength / (2.0 * footprint) - 0.75))
 
 
 @njit(cache=True, nogil=True)
 def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, footprint: float, seed: int) -> float:
-    """Noise about 0, within [-1, 1], of halving wavelengths, the ones that a pixel cannot show left out."""
+    """Return noise in [-1, 1] of halving wavelengths, without those that a pixel cannot show."""
     value, amplitude, total = 0.0, 1.0, 0.0
     x, y, z = x / wavelength, y / wavelength, z / wavelength
     for octave in range(octaves):
@@ -123,7 +70,7 @@ def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, foot
         total += amplitude
         if shown > 0.0:
             value += shown * amplitude * (2.0 * _noise(x, y, z, seed + octave) - 1)
-        x, y, z = 2 * x, 2 * y, 2 * z  # exact, and cheaper than to divide by each wavelength
+        x, y, z = 2 * x, 2 * y, 2 * z  # exact, and faster than a division by each wavelength
         wavelength *= 0.5
         amplitude *= 0.7
     return value / total
@@ -131,13 +78,14 @@ def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, foot
 
 @njit(cache=True, nogil=True)
 def _step(low: float, high: float, x: float) -> float:
+    """Return a smooth step from 0 at `low` to 1 at `high`."""
     t = min(1.0, max(0.0, (x - low) / (high - low)))
     return t * t * (3 - 2 * t)
 
 
 @njit(cache=True, nogil=True)
 def _line(x: float, width: float, footprint: float) -> float:
-    """1 on the lines at whole x, 0 between; x in periods, width and footprint in periods too."""
+    """Return 1 on the lines at whole x, else 0; x, width and footprint in periods."""
     d = abs(x - float(np.floor(x + 0.5)))
     blur = max(footprint, 0.25 * width)
     return float((1.0 - _step(0.5 * width - 0.5 * blur, 0.5 * width + 0.5 * blur, d)) * min(1.0, 2.0 * width / blur))
@@ -145,7 +93,7 @@ def _line(x: float, width: float, footprint: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _within(x: float, low: float, high: float, soft: float) -> float:
-    """1 where x lies between the two, with borders `soft` wide."""
+    """Return 1 for x between the limits, else 0, with borders `soft` wide."""
     soft = max(soft, 1e-4)
     inside = _step(low - 0.5 * soft, low + 0.5 * soft, x) * (1.0 - _step(high - 0.5 * soft, high + 0.5 * soft, x))
     return float(inside)
@@ -153,7 +101,7 @@ def _within(x: float, low: float, high: float, soft: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: int) -> float:
-    """Grain along x: growth rings bent by noise, and fibres."""
+    """Return the mix of grain along x: growth rings bent by noise, and fibers."""
     bend = 2.2 * _noise(0.9 * x, 5 * y, 5 * z, seed)
     rings = 0.5 + 0.5 * float(np.sin(2 * np.pi * (0.7 * (y + 0.6 * z) / scale + bend)))
     mix = 0.3 + 0.45 * rings * _visible(scale, footprint)
@@ -167,7 +115,7 @@ def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: in
 
 @njit(cache=True, nogil=True)
 def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """A sunset over three ranges of hills in the material's two colours."""
+    """Return the color of a sunset over three ranges of hills in the material's two colors."""
     sun_u, sun_v = 0.25 + 0.5 * _lattice(1, 2, 3, seed), 0.6 + 0.15 * _lattice(3, 2, 1, seed)
     glow = np.exp(-8 * ((u - sun_u) ** 2 + (v - sun_v) ** 2))
     disc = 1 - _step(0.055, 0.07, np.sqrt((u - sun_u) ** 2 + 0.6 * (v - sun_v) ** 2))
@@ -187,13 +135,13 @@ def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, floa
 
 @njit(cache=True, nogil=True)
 def _cloth(x: float, y: float, z: float, footprint: float, seed: int) -> float:
-    """The brightness of woven threads."""
+    """Return the gain of woven threads."""
     return 1.0 + float(0.2 * _fractal(x, y, z, 0.012, 2, footprint, seed))
 
 
 @njit(cache=True, nogil=True)
 def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tuple[float, float]:
-    """A wooden floor, (mix, gain): boards of this width along x, each cut from another tree."""
+    """Return (mix, gain) of a floor of boards along x, each cut from another tree."""
     length, gap = 1.1, 0.004
     board = np.int64(np.floor(y / width))
     shift = _lattice(board, 3, 5, seed)
@@ -206,7 +154,7 @@ def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tu
 
 @njit(cache=True, nogil=True)
 def _tiles(x: float, y: float, side: float, footprint: float, seed: int) -> tuple[float, float]:
-    """Square tiles, (mix, gain); the grout is mix = 1."""
+    """Return (mix, gain) of square tiles; the grout is mix = 1."""
     i, j = np.int64(np.floor(x / side)), np.int64(np.floor(y / side))
     grout = 0.006 / side
     mix = max(_line(x / side, grout, footprint / side), _line(y / side, grout, footprint / side))
@@ -216,7 +164,7 @@ def _tiles(x: float, y: float, side: float, footprint: float, seed: int) -> tupl
 
 @njit(cache=True, nogil=True)
 def _rug(x: float, y: float, scale: float, width: float, height: float, footprint: float) -> float:
-    """Diamonds within border bands."""
+    """Return the mix of diamonds within border bands."""
     edge = min(min(x, width - x), min(y, height - y))
     if edge < 0.16:
         return float(0.5 + 0.5 * np.sin(2 * np.pi * edge / 0.08))
@@ -228,7 +176,7 @@ def _rug(x: float, y: float, scale: float, width: float, height: float, footprin
 
 @njit(cache=True, nogil=True)
 def _book(u: float, v: float, soft: float) -> float:
-    """A cover over [0, 1]^2: a frame, a title of several lines, an emblem."""
+    """Return the mix of a cover over [0, 1]^2: a frame, a title of several lines, an emblem."""
     frame = _within(u, 0.07, 0.93, soft) * _within(v, 0.05, 0.95, soft)
     inner = _within(u, 0.10, 0.90, soft) * _within(v, 0.07, 0.93, soft)
     lines = _within(u, 0.18, 0.82, soft) * _within(v, 0.62, 0.86, soft) * _line(v * 12.5, 0.5, 12.5 * soft)
@@ -238,7 +186,7 @@ def _book(u: float, v: float, soft: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
-    """Stripes with a flower in each, every other row shifted."""
+    """Return the mix of stripes with flowers, every other row shifted."""
     u, v = x / scale, y / (1.6 * scale)
     cell = np.floor(u)
     v += 0.5 * (cell % 2)
@@ -252,7 +200,7 @@ def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """What a window shows: clouds, and trees below."""
+    """Return the color of a window: clouds, and trees below."""
     line = 0.30 + 0.22 * _noise(5 * u, 0.5, 0.5, seed) + 0.08 * _noise(23 * u, 0.5, 0.5, seed)
     tree = 1 - _step(line - 0.02, line + 0.02, v)
     leaf = 0.45 + 0.4 * _noise(40 * u, 40 * v, 0.0, seed)
@@ -266,28 +214,22 @@ def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
 
 @njit(cache=True, nogil=True)
 def _screen(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """What a television shows: a landscape with a caption."""
+    """Return the color of a television: a landscape with a caption."""
     r, g, b = _landscape(row, u, v, seed)
     caption = 1.0 if (0.07 < v < 0.16 and 0.06 < u < 0.55) else 0.0
     return r * (1 - caption) + 0.02 * caption, g * (1 - caption) + 0.05 * caption, b * (1 - caption) + 0.35 * caption
 
 
 @njit(cache=True, nogil=True)
-def surface_color(row: Float32, x: float, y: float, z: float, footprint: float) -> tuple[float, float, float]:
-    """The linear colour of material `row` (see material_table) at texture coordinates x, y, z (m).
-
-    `footprint` is the size of a pixel on the surface, m.
-    """
+def surface_color(row, x, y, z, footprint):
+    """Return the linear color of material `row` (14,), see paints.material_table, at texture coordinates x, y, z."""
     kind, scale, width, height, seed = int(row[0]), float(row[7]), float(row[8]), float(row[9]), int(row[10])
     if kind == PAINTING:
-        red, green, blue = _landscape(row, x / width, y / height, seed)
-        return red, green, blue
+        return _landscape(row, x / width, y / height, seed)
     if kind == SCREEN:
-        red, green, blue = _screen(row, x / width, y / height, seed)
-        return red, green, blue
+        return _screen(row, x / width, y / height, seed)
     if kind == SKY:
-        red, green, blue = _sky(x / width, y / height, seed)
-        return red, green, blue
+        return _sky(x / width, y / height, seed)
     mix, gain = 0.0, 1.0
     if kind == PAINT:
         mix = 0.5 + 0.5 * _fractal(x, y, z, 4 * scale, 4, footprint, seed)

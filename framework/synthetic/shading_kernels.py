@@ -1,4 +1,4 @@
-"""The light that leaves each point of a room towards a camera, with smooth edges between its parts."""
+"""Kernels of lights.py and renderer.py."""
 
 from __future__ import annotations
 
@@ -7,24 +7,19 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
-from framework.rendering.rasterizer import VisibilityBuffer
+from framework.data import Bool, Float32, Float64, Int32, Int64, UInt8
 from framework.rendering.rasterizer_kernels import NO_TRIANGLE
-from framework.synthetic.ray_caster import RayCaster, pixel_rays
-from framework.synthetic.surfaces import Surfaces
-from framework.synthetic.textures import DARK, SHINY, surface_color
+from framework.synthetic.paints import DARK, EMISSION, SHINY
+from framework.synthetic.texture_kernels import surface_color
 
-EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, a rotated grid
 EDGE_STEP = 0.04  # relative step of depth that counts as an edge
-WHITE = 2.2  # linear light that becomes full white: lamps and windows may burn out
-
-
-GLANCED_OFF = np.float32(np.deg2rad(60.0))  # rad, of incidence, from which a mirror sends the projector's light away
-GRAZING = np.float32(0.05)  # the least cosine that a pixel's footprint is computed with
+WHITE = 2.2  # linear light that becomes full white: lamps and windows may saturate
+GLANCED_OFF = np.float32(np.deg2rad(60.0))  # rad, of incidence, from which a mirror reflects the projector's light away
+GRAZING = np.float32(0.05)  # least cosine of a pixel's footprint
 
 
 class LitSurfaces(NamedTuple):
-    """What the kernels read of a room."""
+    """The triangles of a room with baked light."""
 
     texture: Float32  # (V, 3) m
     irradiance: Float32  # (V, 3) linear RGB
@@ -32,11 +27,11 @@ class LitSurfaces(NamedTuple):
     normals: Float32  # (F, 3) unit, towards no particular side
     materials: Int32  # (F,) row of the table
     parts: Int32  # (F,)
-    table: Float32  # (M, 14), see textures.material_table
+    table: Float32  # (M, 14), see paints.material_table
 
 
 class Viewpoint(NamedTuple):
-    """From where the kernels look."""
+    """The pose and intrinsics (px) of a camera."""
 
     T_world_camera: Float64
     fx: float
@@ -44,66 +39,35 @@ class Viewpoint(NamedTuple):
     cx: float
     cy: float
 
-    @classmethod
-    def of(cls, camera: Camera, T_world_camera: Float64) -> Viewpoint:
-        T = np.ascontiguousarray(T_world_camera, np.float64)
-        return cls(T, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
 
-
-def lit(surfaces: Surfaces, irradiance: Float32) -> LitSurfaces:
-    """The surfaces under this light (V, 3)."""
-    corners = surfaces.vertices[surfaces.triangles].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    return LitSurfaces(
-        texture=surfaces.texture,
-        irradiance=irradiance,
-        triangles=surfaces.triangles,
-        normals=normals.astype(np.float32),
-        materials=surfaces.materials,
-        parts=surfaces.parts,
-        table=surfaces.material_table,
-    )
-
-
-def shade(
-    surfaces: LitSurfaces, caster: RayCaster, buffer: VisibilityBuffer, camera: Camera, T_world_camera: Float64
-) -> tuple[Float32, Float32]:
-    """The light (H, W, 3) of a picture, and under which cosines (H, W) to their normals surfaces are seen.
-
-    Pixels at the border between two parts become the mean of several rays of `caster`.
-    """
-    view = Viewpoint.of(camera, T_world_camera)
-    light, incidence = np.empty((*camera.shape, 3), np.float32), np.empty(camera.shape, np.float32)
-    _shade(surfaces, view, buffer.triangle, buffer.depth, buffer.uv, light, incidence)
-    v, u = np.nonzero(edges(buffer, surfaces.parts))
-    if len(u):
-        offsets = np.array(EDGE_SAMPLES)
-        rays = pixel_rays(camera, T_world_camera, u[:, None] + offsets[:, 0], v[:, None] + offsets[:, 1])
-        hits = caster.cast(rays)
-        _smooth(
-            surfaces, view, u, v, offsets, hits.triangle, hits.distance, hits.uv, buffer.triangle, buffer.depth, light
-        )
-    return light, incidence
-
-
-def unread(surfaces: LitSurfaces, buffer: VisibilityBuffer, incidence: Float32) -> Float32:
-    """The share (H, W) of a structured-light camera's readings that what is seen swallows or mirrors away."""
-    lost = np.empty(incidence.shape, np.float32)
-    _unread(surfaces.materials, surfaces.table, buffer.triangle, incidence, lost)
-    return lost
-
-
-def edges(buffer: VisibilityBuffer, parts: Int32) -> Bool:
-    """The pixels (H, W) on either side of a border between two parts, or of a step of depth."""
-    return np.asarray(_edges(buffer.triangle, parts, buffer.depth), np.bool_)
+@njit(cache=True, nogil=True)
+def gather_light(
+    triangle: Int32, uv: Float32, triangles: Int32, materials: Int32, reflectance: Float32, irradiance: Float32
+) -> Float32:
+    """Return the mean light (V, 3) that the seen points reflect: the irradiance, for cosine-distributed rays."""
+    out = np.zeros((len(triangle), 3), np.float32)
+    for v in range(len(triangle)):
+        for d in range(triangle.shape[1]):
+            f = triangle[v, d]
+            if f < 0:
+                continue
+            b, c = uv[v, d, 0], uv[v, d, 1]
+            for channel in range(3):
+                light = (
+                    (1 - b - c) * irradiance[triangles[f, 0], channel]
+                    + b * irradiance[triangles[f, 1], channel]
+                    + c * irradiance[triangles[f, 2], channel]
+                )
+                out[v, channel] += light * reflectance[materials[f], channel]
+        out[v] /= triangle.shape[1]
+    return out
 
 
 @njit(cache=True, nogil=True)
-def _shade(
+def shade(
     s: LitSurfaces, view: Viewpoint, triangle: Int32, depth: Float32, uv: Float32, light: Float32, incidence: Float32
 ) -> None:
-    """Writes the linear light (H, W, 3) that each pixel receives, and the cosines (H, W); black where nothing is."""
+    """Write the linear light (H, W, 3) of each pixel and the cosines (H, W) of incidence; 0 without a surface."""
     texture, irradiance, triangles, normals, materials, _, table = s
     fx = np.float32(view.fx)
     for v in range(triangle.shape[0]):
@@ -120,8 +84,8 @@ def _shade(
 
 
 @njit(cache=True, nogil=True)
-def _unread(materials: Int32, table: Float32, triangle: Int32, incidence: Float32, lost: Float32) -> None:
-    """Writes the share (H, W) lost: `dark` of all, and of the rest `shiny` times how far the surface is turned away."""
+def lose_readings(materials: Int32, table: Float32, triangle: Int32, incidence: Float32, lost: Float32) -> None:
+    """Write the share (H, W) of lost readings: `dark`, and of the rest `shiny` times the slant of the surface."""
     one = np.float32(1)
     mirrored_away = one - np.cos(GLANCED_OFF)
     for v in range(triangle.shape[0]):
@@ -131,13 +95,13 @@ def _unread(materials: Int32, table: Float32, triangle: Int32, incidence: Float3
             if f == NO_TRIANGLE:
                 continue
             dark, shiny = table[materials[f], DARK], table[materials[f], SHINY]
-            turned = min((one - incidence[v, u]) / mirrored_away, one)
-            lost[v, u] = dark + (one - dark) * shiny * turned
+            slant = min((one - incidence[v, u]) / mirrored_away, one)
+            lost[v, u] = dark + (one - dark) * shiny * slant
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _cosine(view, normals, f, u, v):  # type: ignore[no-untyped-def]
-    """Of the angle between the ray through image point u, v (px) and the normal of triangle f."""
+def _cosine(view, normals, f, u, v):
+    """Return the cosine between the ray through image point u, v (px) and the normal of triangle f."""
     T, x, y = view.T_world_camera, (u - view.cx) / view.fx, (v - view.cy) / view.fy
     along = 0.0
     for axis in range(3):
@@ -146,8 +110,8 @@ def _cosine(view, normals, f, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, cosine):  # type: ignore[no-untyped-def]
-    """RGB that leaves the point of triangle f with these barycentric weights; a pixel there is `pixel` m wide."""
+def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, cosine):
+    """Return the RGB light that leaves the point of triangle f at barycentric b, c; a pixel there is `pixel` m wide."""
     i, j, k = triangles[f, 0], triangles[f, 1], triangles[f, 2]
     a = np.float32(1) - b - c
     # The footprint is an ellipse at grazing angles; its geometric mean loses the least of both axes.
@@ -160,7 +124,7 @@ def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, 
         a * texture[i, 2] + b * texture[j, 2] + c * texture[k, 2],
         footprint,
     )
-    emission = material[11]
+    emission = material[EMISSION]
     return (
         red * (a * irradiance[i, 0] + b * irradiance[j, 0] + c * irradiance[k, 0] + emission),
         green * (a * irradiance[i, 1] + b * irradiance[j, 1] + c * irradiance[k, 1] + emission),
@@ -169,7 +133,8 @@ def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, 
 
 
 @njit(cache=True, nogil=True)
-def _edges(triangle: Int32, parts: Int32, depth: Float32) -> Bool:
+def find_edges(triangle: Int32, parts: Int32, depth: Float32) -> Bool:
+    """Return the pixels (H, W) on either side of a border between two parts or of a step of depth."""
     height, width = depth.shape
     edge = np.zeros((height, width), np.bool_)
     for v in range(height):
@@ -186,7 +151,7 @@ def _edges(triangle: Int32, parts: Int32, depth: Float32) -> Bool:
 
 
 @njit(cache=True, nogil=True)
-def _smooth(
+def smooth_edges(
     s: LitSurfaces,
     view: Viewpoint,
     u: Int64,
@@ -199,10 +164,10 @@ def _smooth(
     depth: Float32,
     light: Float32,
 ) -> None:
-    """Writes to the pixels u, v (N,) of `light` (H, W, 3) the mean of their samples, none whiter than white.
+    """Write to the pixels u, v (N,) of `light` (H, W, 3) the mean of their samples, each at most white.
 
-    triangle, distance (N, S) and uv (N, S, 2): what the samples meet, `offsets` (S, 2) px from the pixel's centre. One
-    that meets the pixel's `own` part, about as far away as its centre, is as light as that. own (H, W), depth (H, W).
+    triangle, distance (N, S) and uv (N, S, 2) are the hits of the samples at `offsets` (S, 2) px from the pixel center.
+    A sample on the pixel's `own` (H, W) triangle's part, at about its `depth` (H, W), has the light of the center.
     """
     texture, irradiance, triangles, normals, materials, parts, table = s
     white, fx = np.float32(WHITE), np.float32(view.fx)
@@ -223,3 +188,12 @@ def _smooth(
                 )
             red, green, blue = red + min(r, white), green + min(g, white), blue + min(b, white)
         light[y, x, 0], light[y, x, 1], light[y, x, 2] = red / len(offsets), green / len(offsets), blue / len(offsets)
+
+
+@njit(cache=True, nogil=True)
+def apply_tone_curve(light: Float32, curve: UInt8, color: UInt8) -> None:
+    """Write the nearest entry of the curve for each light (N,), clipped to 0 to WHITE."""
+    white, entries = np.float32(WHITE), np.float32((len(curve) - 1) / WHITE)
+    for n in range(len(light)):
+        index = min(max(light[n], np.float32(0)), white) * entries
+        color[n] = curve[np.int32(index + np.float32(0.5))]

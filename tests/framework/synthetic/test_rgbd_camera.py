@@ -5,14 +5,14 @@ import pytest
 
 from framework.data import Camera
 from framework.sensors.noise_models import axial_sigma_at_angle
-from framework.synthetic.depth_camera import (
+from framework.synthetic.rgbd_camera import (
     PATCH,
     DepthSensor,
-    depth_step,
     noisy_color,
     normal_quantiles,
     random_bits,
 )
+from framework.synthetic.rgbd_camera_kernels import depth_step
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 FRONT = np.ones(CAMERA.shape, np.float32)

@@ -1,0 +1,115 @@
+"""The errors of an RGB-D camera like the Kinect v1.
+
+- Axial depth noise grows with the square of depth and towards grazing angles: see `framework.sensors.noise_models`.
+- Disparity is quantized to 1/8 px, so depth comes in steps of 2.9e-3 z^2: Khoshelham and Oude Elberink, "Accuracy and
+  Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012.
+- Lateral noise moves readings across edges by about a pixel (Nguyen et al.), applied as by Handa et al., "A Benchmark
+  for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
+- Readings are missing in the projector's shadow, at many pixels along depth edges, and at grazing angles.
+- Dark and shiny surfaces lose readings in patches, as the correlation window is wider than a pixel.
+- Color has noise and motion blur.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from statistics import NormalDist
+
+import numpy as np
+
+from framework.data import Camera, Float32, Float64, UInt8, UInt16
+from framework.geometry import inverse
+from framework.synthetic.rgbd_camera_kernels import (
+    BASELINE,
+    QUANTILE_BITS,
+    SPARE_BITS,
+    add_noise,
+    blur,
+    drop_patches,
+    read_depth,
+)
+
+LATERAL_SIGMA = 0.8  # px at 640 px width: the constant term of Nguyen et al.
+PATCH = 14.0  # px at 640 px width, between the random numbers of patches without readings
+COLOR_SIGMA = 1.5  # gray levels of 255
+
+
+@dataclass(frozen=True)
+class DepthSensor:
+    """Turns exact depth into readings."""
+
+    noise: float  # 0 = exact, 1 = as measured; scales standard deviations and probabilities
+    max_range: float  # m
+
+    def measure(
+        self,
+        depth: Float32,
+        incidence: Float32,
+        camera: Camera,
+        rng: np.random.Generator,
+        unread: Float32 | None = None,
+    ) -> Float32:
+        """Return the readings (H, W) m of exact `depth` (H, W) m at the cosines `incidence` (H, W), 0 = no reading.
+
+        `unread` (H, W) is the share of readings that materials lose, in patches; None = no loss.
+        """
+        if self.noise == 0:
+            return np.where(depth <= self.max_range, depth, np.float32(0))
+        noise, width, normal = self.noise, camera.width, normal_quantiles()
+        theta = np.arccos(np.minimum(incidence, np.float32(1)))
+        random = random_bits((*depth.shape, 4), rng)
+        lateral_sigma, disparity_scale = (
+            np.float32(noise * LATERAL_SIGMA * width / 640),
+            np.float32(camera.fx * BASELINE),
+        )
+        limit, reading = np.float32(self.max_range), np.zeros(depth.shape, np.float32)
+        read_depth(depth, theta, random, normal, np.float32(noise), lateral_sigma, disparity_scale, limit, reading)
+        if unread is not None:
+            cell = PATCH * width / 640
+            nodes = (int(depth.shape[0] / cell) + 2, int(depth.shape[1] / cell) + 2)
+            field = normal[random_bits(nodes, rng) >> SPARE_BITS]
+            drop_patches(unread, field, np.float32(cell), normal, np.float32(min(noise, 1.0)), reading)
+        return reading
+
+
+def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
+    """Return `color` with the noise of a camera indoors, scaled by `noise`."""
+    if noise == 0:
+        return color
+    noisy = np.empty_like(color)
+    bits = random_bits((color.size,), rng)
+    add_noise(color.reshape(-1), bits, normal_quantiles(), np.float32(noise * COLOR_SIGMA), noisy.reshape(-1))
+    return noisy
+
+
+def blurred(
+    color: UInt8, depth: Float32, camera: Camera, T_world_camera: Float64, T_world_open: Float64, T_world_close: Float64
+) -> UInt8:
+    """Return `color` (H, W, 3), seen from T_world_camera, with the motion blur from T_world_open to T_world_close.
+
+    Pixels move by the exact `depth` (H, W) m of the static scene; 0 = no blur.
+    """
+    picture = np.empty_like(color)
+    K = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    T_open_camera, T_close_camera = (
+        (inverse(end) @ T_world_camera).astype(np.float32) for end in (T_world_open, T_world_close)
+    )
+    blur(color, depth, K, T_open_camera, T_close_camera, picture)
+    return picture
+
+
+def random_bits(shape: tuple[int, ...], rng: np.random.Generator) -> UInt16:
+    """Return 16 random bits per element: several times faster than draws from a distribution."""
+    count = math.prod(shape)
+    words = rng.integers(0, 2**64, -(-count // 4), np.uint64)
+    return words.view(np.uint16)[:count].reshape(shape)
+
+
+@lru_cache
+def normal_quantiles() -> Float32:
+    """Return (2^QUANTILE_BITS,) equally likely values of a standard normal distribution."""
+    count = 1 << QUANTILE_BITS
+    quantiles = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
+    return np.asarray(quantiles / quantiles.std(), np.float32)

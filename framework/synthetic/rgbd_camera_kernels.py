@@ -1,0 +1,196 @@
+"""Kernels of rgbd_camera.py, in single precision."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from framework.data import Bool, Float32, UInt8, UInt16
+from framework.sensors.noise_models import axial_sigma_at_angle
+
+BASELINE = 0.075  # m, between projector and camera
+DISPARITY_STEPS = 8.0  # per px
+FOCAL_KINECT = 580.0  # px, of the depth camera at 640 px width; quantization does not depend on our image size
+MIN_RANGE = 0.4  # m
+EDGE_JUMP = 0.05  # relative step of depth at which the sensor's correlation window fails
+EDGE_DROP = 0.5  # probability of no reading next to such a step
+GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # from all readings to none
+QUANTILE_BITS = 12  # a normal error is one of 2^QUANTILE_BITS equally likely values: up to 3.7 standard deviations
+SPARE_BITS = 16 - QUANTILE_BITS
+MAX_SAMPLES = 9  # of blur along the path of a pixel; more are not visible
+SHARP = np.float32(0.5)  # px, a shorter path is not blurred
+
+_SCALE = np.float32(DISPARITY_STEPS * FOCAL_KINECT * BASELINE)  # m, depth times steps of disparity
+
+
+@njit(cache=True, nogil=True)
+def depth_step(z: np.float32) -> np.float32:
+    """Return the distance (m) between neighboring depth values at depth z (m)."""
+    return np.float32(z * z / _SCALE)
+
+
+@njit(cache=True, nogil=True)
+def read_depth(
+    depth: Float32,
+    theta: Float32,
+    random: UInt16,
+    normal: Float32,
+    noise: np.float32,
+    lateral_sigma: np.float32,
+    disparity_scale: np.float32,
+    max_range: np.float32,
+    reading: Float32,
+) -> None:
+    """Write the readings (H, W) m; pixels without a reading stay unchanged.
+
+    depth (H, W) m; theta (H, W) rad, of incidence; random (H, W, 4) bits: loss of a reading, lateral error along y and
+    x, axial error; normal (N,): normal_quantiles; lateral_sigma: px; disparity_scale: px m.
+    """
+    height, width = depth.shape
+    near_edge = _near_edge(depth)
+    largest_loss = min(noise, np.float32(1))
+    for v in range(height):
+        # The projector, to the right of the camera, sees pixel u at u - f b / z. A pixel that is not to the left of all
+        # pixels to its right is in the shadow of a nearer surface.
+        leftmost = np.float32(np.inf)
+        for u in range(width - 1, -1, -1):
+            z = depth[v, u]
+            projector_u = np.float32(u)
+            if z > 0:
+                projector_u -= disparity_scale / max(z, np.float32(0.1))
+            leftmost = min(leftmost, projector_u)
+            if projector_u > leftmost + np.float32(1) or not np.float32(MIN_RANGE) < z <= max_range:
+                continue
+            edge_loss = np.float32(EDGE_DROP) if near_edge[v, u] else np.float32(0)
+            grazing_loss = (theta[v, u] - np.float32(GRAZING_START)) / np.float32(GRAZING_END - GRAZING_START)
+            chance = np.float32(random[v, u, 0]) / np.float32(65536)
+            if chance < largest_loss * max(edge_loss, grazing_loss):
+                continue
+            lateral_v = lateral_sigma * normal[random[v, u, 1] >> SPARE_BITS]
+            lateral_u = lateral_sigma * normal[random[v, u, 2] >> SPARE_BITS]
+            noisy = _shifted(depth, v, u, lateral_v, lateral_u)
+            # Gaussian noise that has the measured deviation together with the following quantization
+            sigma, step = noise * axial_sigma_at_angle(noisy, theta[v, u]), depth_step(noisy)
+            variance = sigma * sigma - step * step / np.float32(12)
+            noisy += np.sqrt(max(variance, np.float32(0))) * normal[random[v, u, 3] >> SPARE_BITS]
+            steps = np.rint(_SCALE / max(noisy, np.float32(0.1)))
+            quantized = _SCALE / max(steps, np.float32(1))
+            if np.float32(MIN_RANGE) < quantized <= max_range:
+                reading[v, u] = quantized
+
+
+@njit(cache=True, nogil=True)
+def drop_patches(
+    unread: Float32, field: Float32, cell: np.float32, normal: Float32, largest_loss: np.float32, reading: Float32
+) -> None:
+    """Remove readings (H, W) in patches, so that a share of `largest_loss` times `unread` (H, W) is lost.
+
+    A reading is lost where a smooth random field is below the quantile of that share. The field interpolates the normal
+    numbers `field` (R, C), `cell` px apart; divided by the norm of the weights it is normal in each pixel.
+    """
+    one, count = np.float32(1), np.float32(len(normal))
+    for v in range(reading.shape[0]):
+        y = np.float32(v) / cell
+        j = int(y)
+        b = y - np.float32(j)
+        for u in range(reading.shape[1]):
+            entry = int(largest_loss * unread[v, u] * count)
+            if entry == 0 or reading[v, u] == 0:
+                continue
+            x = np.float32(u) / cell
+            i = int(x)
+            a = x - np.float32(i)
+            upper = (one - a) * field[j, i] + a * field[j, i + 1]
+            lower = (one - a) * field[j + 1, i] + a * field[j + 1, i + 1]
+            norm = np.sqrt(((one - a) * (one - a) + a * a) * ((one - b) * (one - b) + b * b))
+            if entry >= len(normal) or ((one - b) * upper + b * lower) / norm < normal[entry]:
+                reading[v, u] = 0
+
+
+@njit(cache=True, nogil=True)
+def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> np.float32:
+    """Return a pixel's depth, or that of the neighbor (dv, du) px away, rounded, across an edge.
+
+    Only across edges: within a smooth surface the axial noise already contains all measured deviation.
+    """
+    y = min(max(v + int(np.rint(dv)), 0), depth.shape[0] - 1)
+    x = min(max(u + int(np.rint(du)), 0), depth.shape[1] - 1)
+    own, neighbor = depth[v, u], depth[y, x]
+    across = abs(neighbor - own) > np.float32(EDGE_JUMP) * own
+    return np.float32(neighbor if across and neighbor > 0 else own)
+
+
+@njit(cache=True, nogil=True)
+def _near_edge(depth: Float32) -> Bool:
+    """Return the pixels (H, W) on either side of a step of depth."""
+    height, width = depth.shape
+    edge = np.zeros((height, width), np.bool_)
+    for v in range(height):
+        for u in range(width):
+            own = depth[v, u]
+            for y, x in ((v, u + 1), (v + 1, u)):
+                if y < height and x < width:
+                    other = depth[y, x]
+                    if abs(own - other) > np.float32(EDGE_JUMP) * min(own, other):
+                        edge[v, u] = edge[y, x] = True
+    return edge
+
+
+@njit(cache=True, nogil=True)
+def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, noisy: UInt8) -> None:
+    """Write `color` (N,) with normal noise added, rounded; random (N,) bits, normal: normal_quantiles."""
+    for n in range(len(color)):
+        value = np.rint(np.float32(color[n]) + sigma * normal[random[n] >> SPARE_BITS])
+        noisy[n] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))
+
+
+@njit(cache=True, nogil=True)
+def blur(
+    color: UInt8, depth: Float32, K: Float32, T_open_camera: Float32, T_close_camera: Float32, picture: UInt8
+) -> None:
+    """Write the mean of up to MAX_SAMPLES samples of `color`, evenly spaced along each pixel's path.
+
+    K is (fx, fy, cx, cy) px.
+    """
+    height, width = depth.shape
+    for v in range(height):
+        for u in range(width):
+            u0, v0 = _reprojected(T_open_camera, K, u, v, depth[v, u])
+            u1, v1 = _reprojected(T_close_camera, K, u, v, depth[v, u])
+            length = np.sqrt((u1 - u0) * (u1 - u0) + (v1 - v0) * (v1 - v0))
+            if not length >= SHARP:
+                for c in range(3):
+                    picture[v, u, c] = color[v, u, c]
+                continue
+            samples = min(int(np.ceil(length)) + 1, MAX_SAMPLES)
+            red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+            for k in range(samples):
+                along = (np.float32(k) + np.float32(0.5)) / np.float32(samples)
+                x = min(max(u0 + along * (u1 - u0), np.float32(0)), np.float32(width - 1))
+                y = min(max(v0 + along * (v1 - v0), np.float32(0)), np.float32(height - 1))
+                i, j = min(int(x), width - 2), min(int(y), height - 2)
+                a, b = x - np.float32(i), y - np.float32(j)
+                w00, w10 = (1 - a) * (1 - b), a * (1 - b)
+                w01, w11 = (1 - a) * b, a * b
+                red += w00 * color[j, i, 0] + w10 * color[j, i + 1, 0]
+                red += w01 * color[j + 1, i, 0] + w11 * color[j + 1, i + 1, 0]
+                green += w00 * color[j, i, 1] + w10 * color[j, i + 1, 1]
+                green += w01 * color[j + 1, i, 1] + w11 * color[j + 1, i + 1, 1]
+                blue += w00 * color[j, i, 2] + w10 * color[j, i + 1, 2]
+                blue += w01 * color[j + 1, i, 2] + w11 * color[j + 1, i + 1, 2]
+            weight = np.float32(1) / np.float32(samples)
+            picture[v, u, 0] = np.uint8(red * weight + np.float32(0.5))
+            picture[v, u, 1] = np.uint8(green * weight + np.float32(0.5))
+            picture[v, u, 2] = np.uint8(blue * weight + np.float32(0.5))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _reprojected(T, K, u, v, z):
+    """Return the pixel (px, px) of the other pose that shows the point of pixel u, v at depth z; u, v at z = 0."""
+    px, py = (np.float32(u) - K[2]) / K[0] * z, (np.float32(v) - K[3]) / K[1] * z
+    z_other = T[2, 0] * px + T[2, 1] * py + T[2, 2] * z + T[2, 3]
+    if z <= 0 or z_other <= 0:
+        return np.float32(u), np.float32(v)
+    x_other = T[0, 0] * px + T[0, 1] * py + T[0, 2] * z + T[0, 3]
+    y_other = T[1, 0] * px + T[1, 1] * py + T[1, 2] * z + T[1, 3]
+    return K[0] * x_other / z_other + K[2], K[1] * y_other / z_other + K[3]
