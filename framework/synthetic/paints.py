@@ -11,7 +11,6 @@ import numpy as np
 from framework.data import Float32, Float64
 
 Color = tuple[float, float, float]
-Rng = np.random.Generator
 
 WOODS: tuple[tuple[Color, Color], ...] = (
     ((0.78, 0.60, 0.40), (0.62, 0.43, 0.25)),  # oak
@@ -90,7 +89,7 @@ def absorbed(color: Color) -> float:
     return ABSORBED * max(0.0, 1 - sum(color) / 3 / DARKEST)
 
 
-def pick(rng: Rng, choices: tuple[Color, ...]) -> Color:
+def pick(rng: np.random.Generator, choices: tuple[Color, ...]) -> Color:
     return choices[int(rng.integers(len(choices)))]
 
 
@@ -100,31 +99,31 @@ def shade(color: Color, factor: float) -> Color:
     return r, g, b
 
 
-def vivid(rng: Rng) -> Color:
+def vivid(rng: np.random.Generator) -> Color:
     """Draw a saturated color, for books, bags and pictures."""
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0.55, 0.9), rng.uniform(0.35, 0.85))
 
 
-def wood(rng: Rng) -> Material:
+def wood(rng: np.random.Generator) -> Material:
     first, second = WOODS[int(rng.integers(len(WOODS)))]
     tone = rng.uniform(0.9, 1.08)
     light, veins = shade(first, tone), shade(second, tone)
     return Material(Texture.WOOD, light, veins, rng.uniform(0.03, 0.06), seed=new_seed(rng), dark=absorbed(light))
 
 
-def cloth(rng: Rng, color: Color | None = None) -> Material:
+def cloth(rng: np.random.Generator, color: Color | None = None) -> Material:
     """Return upholstery of one color."""
     base = pick(rng, CLOTHS) if color is None else color
     scale = rng.uniform(0.10, 0.2)
     return Material(Texture.FABRIC, base, shade(base, 0.72), scale, seed=new_seed(rng), dark=absorbed(base))
 
 
-def leather(rng: Rng) -> Material:
+def leather(rng: np.random.Generator) -> Material:
     """Return black, polished leather."""
     return glaze(rng, shade((0.17, 0.16, 0.15), rng.uniform(0.7, 1.3)), 0.6, 0.03)
 
 
-def patterned_cloth(rng: Rng) -> Material:
+def patterned_cloth(rng: np.random.Generator) -> Material:
     """Return bed linen: striped, checked or plain."""
     base, other = pick(rng, CLOTHS), (0.90, 0.88, 0.84)
     texture = (Texture.STRIPES, Texture.CHECKS, Texture.FABRIC)[int(rng.integers(3))]
@@ -133,27 +132,27 @@ def patterned_cloth(rng: Rng) -> Material:
     return Material(texture, first, second, rng.uniform(0.10, 0.2), seed=new_seed(rng))
 
 
-def paint(rng: Rng, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
+def paint(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
     return Material(Texture.PAINT, color, shade(color, contrast), scale, seed=new_seed(rng), dark=absorbed(color))
 
 
-def glaze(rng: Rng, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
+def glaze(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
     """Return glossy paint."""
     return replace(paint(rng, color, contrast, scale), shiny=GLAZED)
 
 
-def metal(rng: Rng, color: Color = (0.62, 0.63, 0.65)) -> Material:
+def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Material:
     dark = absorbed(color)
     return Material(Texture.METAL, color, shade(color, 0.91), seed=new_seed(rng), dark=dark, shiny=POLISHED)
 
 
-def picture(rng: Rng, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
+def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
     """Return a painting or a screen of this size (m); depth cameras do not read the glossy half of the screens."""
     first, second, seed = vivid(rng), vivid(rng), new_seed(rng)
     dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
     return Material(texture, first, second, 0.1, (width, height), seed, emission, dark)
 
 
-def new_seed(rng: Rng) -> int:
+def new_seed(rng: np.random.Generator) -> int:
     """Draw the seed of a texture."""
     return int(rng.integers(4096))

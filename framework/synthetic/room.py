@@ -101,8 +101,8 @@ def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
 
 def _shell(width: float, depth: float, rng: Rng) -> Furniture:
     """Floor, ceiling and four walls with skirting boards, one of them papered."""
-    shell = Furniture("shell", None)
-    shell.add(panel(width, depth).turned("x", np.pi / 2).moved(y=depth / 2), _floor(rng))
+    shell = Furniture("shell")
+    shell.add(panel(width, depth).turned("x", np.pi / 2), _floor(rng), y=depth / 2)
     ceiling = panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
     shell.add(ceiling, paints.paint(rng, (0.93, 0.92, 0.89), 0.93, 0.12))
     color = paints.pick(rng, paints.WALLS)
@@ -112,9 +112,9 @@ def _shell(width: float, depth: float, rng: Rng) -> Furniture:
     for wall in range(4):
         length = width if wall % 2 == 0 else depth
         x, y, angle = place_on_wall(wall, 0.0, width, depth)
-        shell.add(panel(length, HEIGHT).turned("z", angle).moved(x, y), paper if wall == papered else plain)
+        shell.add(panel(length, HEIGHT).turned("z", angle), paper if wall == papered else plain, x, y)
         board = rounded_box(length, 0.012, 0.08, 0.004).moved(y=0.006, z=0.04)
-        shell.add(board.turned("z", angle).moved(x, y), skirting)
+        shell.add(board.turned("z", angle), skirting, x, y)
     return shell
 
 

@@ -1,7 +1,4 @@
-"""One piece of furniture: parts in a local frame.
-
-It stands on z = 0 about the origin and faces +y: its back, if it has one, is at negative y.
-"""
+"""Furniture in a local frame: it stands on z = 0 about the origin and faces +y, with its back at negative y."""
 
 from __future__ import annotations
 
@@ -20,30 +17,37 @@ Rng = np.random.Generator
 class Furniture:
     """One object: its parts, each a solid of one material."""
 
-    kind: str  # what it is, for people: "office chair"
-    class_name: str | None  # COCO's name; None = not evaluated
+    kind: str  # for people: "office chair"
+    class_name: str | None = None  # COCO's name; None = not evaluated
     parts: list[tuple[Solid, Material]] = field(default_factory=list)
 
-    def add(self, solid: Solid, material: Material) -> None:
-        self.parts.append((solid, material))
+    def add(self, solid: Solid, material: Material, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> None:
+        """Add a part, moved by x, y, z m."""
+        self.parts.append((solid.moved(x, y, z), material))
+
+    def add_pair(self, solid: Solid, material: Material, x: float, y: float = 0.0, z: float = 0.0) -> None:
+        """Add the same part at -x and at x."""
+        for side in (-1, 1):
+            self.add(solid, material, side * x, y, z)
+
+    def add_legs(self, solid: Solid, material: Material, x: float, y: float) -> None:
+        """Add the same part at the four corners (±x, ±y)."""
+        for corner in ((-x, -y), (x, -y), (x, y), (-x, y)):
+            self.add(solid, material, *corner)
 
     def bounds(self) -> tuple[Float64, Float64]:
-        """The lower and upper corner (3,) of its axis-aligned box, m."""
+        """Return the lower and upper corner (3,) of the axis-aligned box, m."""
         lows = np.array([solid.vertices.min(axis=0) for solid, _ in self.parts])
         highs = np.array([solid.vertices.max(axis=0) for solid, _ in self.parts])
         return lows.min(axis=0), highs.max(axis=0)
 
     def placed(self, x: float, y: float, z: float = 0.0, angle: float = 0.0) -> Furniture:
-        """Turned by `angle` (rad, counter-clockwise from above), then moved."""
+        """Return the piece turned by `angle` (rad, counter-clockwise from above), then moved."""
         parts = [(solid.turned("z", angle).moved(x, y, z), material) for solid, material in self.parts]
         return Furniture(self.kind, self.class_name, parts)
 
     def tilted(self, angle: float) -> Furniture:
-        """Turned by `angle` rad about x, its front going up, then lifted so that it stands on z = 0 again."""
+        """Return the piece turned by `angle` rad about x, its front upwards, standing on z = 0 again."""
         parts = [(solid.turned("x", angle), material) for solid, material in self.parts]
         tilted = Furniture(self.kind, self.class_name, parts)
         return tilted.placed(0.0, 0.0, -float(tilted.bounds()[0][2]))
-
-
-def corners(x: float, y: float) -> tuple[tuple[float, float], ...]:
-    return (-x, -y), (x, -y), (x, y), (-x, y)

@@ -1,4 +1,4 @@
-"""Small things that stand and lie about, and shelves full of them. Books are of a class, nothing else here is."""
+"""Small objects, and shelves full of them. Only books have a class."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ MakeThing = Callable[[Rng], Furniture]
 
 
 def papers(rng: Rng) -> Furniture:
-    """A stack of sheets, not quite in order."""
-    piece = Furniture("papers", None)
+    """Return an untidy stack of sheets."""
+    piece = Furniture("papers")
     z = 0.0
     for _ in range(int(rng.integers(2, 5))):
         thickness = rng.uniform(0.004, 0.014)
         sheet = rounded_box(0.21, 0.297, thickness, 0.001).flat(0, 1).turned("z", rng.uniform(-0.3, 0.3))
         ink = Material(Texture.BOOK, (0.92, 0.91, 0.88), (0.30, 0.30, 0.33), 0.1, (0.21, 0.297), paints.new_seed(rng))
-        piece.add(sheet.moved(rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02), z + thickness / 2), ink)
+        piece.add(sheet, ink, rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02), z + thickness / 2)
         z += thickness
     return piece
 
 
 def bottle(rng: Rng) -> Furniture:
-    piece = Furniture("bottle", None)
+    piece = Furniture("bottle")
     r, height = rng.uniform(0.033, 0.042), rng.uniform(0.26, 0.32)
     profile = ((0.0, 0.95 * r), (0.01, r), (0.6 * height, r), (0.75 * height, 0.4 * r), (height, 0.38 * r))
     glass = replace(paints.glaze(rng, paints.vivid(rng)), shiny=paints.POLISHED)
@@ -39,19 +39,19 @@ def bottle(rng: Rng) -> Furniture:
 
 
 def waste_bin(rng: Rng) -> Furniture:
-    """A paper bin, full."""
-    piece = Furniture("bin", None)
+    """Return a full paper bin."""
+    piece = Furniture("bin")
     r, height = rng.uniform(0.11, 0.14), rng.uniform(0.27, 0.34)
     color = paints.pick(rng, ((0.12, 0.12, 0.13), (0.62, 0.63, 0.64), (0.75, 0.30, 0.22)))
     piece.add(cylinder(0.82 * r, height, r, 24), paints.metal(rng, color))
     crumpled = rounded_box(1.2 * r, 1.2 * r, 0.1, 0.045, 3).turned("z", rng.uniform(0, 1))
-    piece.add(crumpled.moved(z=height), paints.paint(rng, (0.90, 0.89, 0.86), 0.7, 0.02))
+    piece.add(crumpled, paints.paint(rng, (0.90, 0.89, 0.86), 0.7, 0.02), z=height)
     return piece
 
 
 def basket(rng: Rng) -> Furniture:
-    """A basket of laundry."""
-    piece = Furniture("basket", None)
+    """Return a basket of laundry."""
+    piece = Furniture("basket")
     a, b, height = rng.uniform(0.20, 0.26), rng.uniform(0.16, 0.20), rng.uniform(0.26, 0.36)
     wicker = Material(Texture.CHECKS, (0.66, 0.50, 0.32), (0.50, 0.36, 0.22), 0.03, seed=paints.new_seed(rng))
     piece.add(loft([Section(0.0, 0.85 * a, 0.85 * b, n=3), Section(height, a, b, n=3)], 28), wicker)
@@ -59,39 +59,36 @@ def basket(rng: Rng) -> Furniture:
     low, high = heap.bounds()
     fit = min(1.7 * a / (high - low)[0], 1.7 * b / (high - low)[1])
     for solid, material in heap.parts:
-        piece.add(solid.deformed(lambda p: p * (fit, fit, 1.0)).moved(z=height - 0.03), material)
+        piece.add(solid.deformed(lambda p: p * (fit, fit, 1.0)), material, z=height - 0.03)
     return piece
 
 
 def shoes(rng: Rng) -> Furniture:
-    piece = Furniture("shoes", None)
+    piece = Furniture("shoes")
     color = paints.vivid(rng)
     upper, sole = paints.cloth(rng, color), paints.paint(rng, (0.85, 0.84, 0.80))
+    heel = [Section(z, 0.045, 0.14, n=2.6) for z in (0.0, 0.025)]
+    shape = [Section(0.024, 0.042, 0.135, n=2.5), Section(0.06, 0.038, 0.10, y=-0.03, n=2.3)]
+    shape.append(Section(0.10, 0.032, 0.055, y=-0.07, n=2.2))
     for side in (-1, 1):
         turn, x = rng.uniform(-0.2, 0.2), 0.065 * side
-        piece.add(loft([Section(0.0, 0.045, 0.14, n=2.6), Section(0.025, 0.045, 0.14, n=2.6)], 20).turned("z", turn)
-                  .moved(x), sole)  # fmt: skip
-        shape = [
-            Section(0.024, 0.042, 0.135, n=2.5),
-            Section(0.06, 0.038, 0.10, y=-0.03, n=2.3),
-            Section(0.10, 0.032, 0.055, y=-0.07, n=2.2),
-        ]
-        piece.add(loft(shape, 20).turned("z", turn).moved(x), upper)
+        piece.add(loft(heel, 20).turned("z", turn), sole, x)
+        piece.add(loft(shape, 20).turned("z", turn), upper, x)
     return piece
 
 
 def carton_stack(rng: Rng) -> Furniture:
-    """Two cardboard boxes on each other."""
+    """Return a stack of two cardboard boxes."""
     piece, upper = clutter.carton(rng), clutter.carton(rng)
     top, angle = float(piece.bounds()[1][2]), rng.uniform(-0.15, 0.15)
     for solid, material in upper.parts:
         smaller = solid.deformed(lambda p: 0.8 * p)
-        piece.add(smaller.turned("z", angle).moved(z=top), material)
+        piece.add(smaller.turned("z", angle), material, z=top)
     return piece
 
 
 def book_row(rng: Rng) -> Furniture:
-    """Books standing side by side: one instance, as a pile is."""
+    """Return books that stand side by side: one instance, like a pile."""
     row = Furniture("row of books", "book")
     end = 0.0
     for _ in range(int(rng.integers(5, 9))):
@@ -99,32 +96,31 @@ def book_row(rng: Rng) -> Furniture:
         low, high = book.bounds()
         end += float(high[2] - low[2]) + 0.0005
         for solid, material in book.parts:
-            # Lying, a book has its back at -x and its cover up: the back comes to the front, the cover to the side.
+            # A flat book has its back at -x and its cover up: turn the back to the front and the cover to the side.
             standing = solid.turned("z", -np.pi / 2).turned("y", -np.pi / 2)
-            row.add(standing.moved(end, 0.0, float(high[1] - low[1]) / 2), material)
+            row.add(standing, material, end, 0.0, float(high[1] - low[1]) / 2)
     return row.placed(-end / 2, 0.0)
 
 
 def shelf(rng: Rng) -> Furniture:
-    """An open shelf full of books, cartons and other things, all of it one thing of no class."""
-    piece = Furniture("shelf", None)
+    """Return an open shelf with its contents: one object without a class."""
+    piece = Furniture("shelf")
     wood = paints.wood(rng)
     width, depth, height = rng.uniform(0.75, 1.0), 0.30, rng.uniform(1.5, 1.9)
     boards = int(rng.integers(4, 6))
-    for x in (-1, 1):
-        piece.add(rounded_box(0.022, depth, height, 0.002).moved(x * (width / 2 - 0.011), 0, height / 2), wood)
-    piece.add(rounded_box(width - 0.04, 0.01, height, 0.002).moved(0, -depth / 2 + 0.006, height / 2), wood)
+    piece.add_pair(rounded_box(0.022, depth, height, 0.002), wood, width / 2 - 0.011, 0, height / 2)
+    piece.add(rounded_box(width - 0.04, 0.01, height, 0.002), wood, 0, -depth / 2 + 0.006, height / 2)
     pitch = (height - 0.06) / boards
     for k in range(boards + 1):
         z = 0.03 + k * pitch
-        piece.add(rounded_box(width - 0.04, depth - 0.01, 0.022, 0.002).moved(0, 0.004, z), wood)
+        piece.add(rounded_box(width - 0.04, depth - 0.01, 0.022, 0.002), wood, 0, 0.004, z)
         if k < boards:
             _fill(piece, rng, -width / 2 + 0.04, width / 2 - 0.04, z + 0.012, 0.8 * pitch)
     return piece
 
 
 def _fill(piece: Furniture, rng: Rng, start: float, end: float, z: float, height: float) -> None:
-    """Binders, boxes and gaps side by side on one board."""
+    """Put binders, boxes and gaps side by side on one board."""
     x = start
     while True:
         wide = rng.uniform() < 0.2
@@ -145,5 +141,5 @@ ON_TOPS: tuple[MakeThing, ...] = (clutter.carton, clutter.throw_cushion, basket,
 
 
 def some(rng: Rng, makers: tuple[MakeThing, ...], count: int) -> list[Furniture]:
-    """`count` things, each by one of the makers."""
+    """Return `count` things, each by a random maker."""
     return [makers[int(rng.integers(len(makers)))](rng) for _ in range(count)]

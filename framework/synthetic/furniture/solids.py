@@ -1,21 +1,21 @@
-"""Shapes that furniture is made of: rounded boxes, lofts and tubes, as triangles with smooth normals.
+"""Shapes of furniture: rounded boxes, lofts and tubes, as triangles with smooth normals.
 
-A shape is made about the origin, z up. Its texture coordinates are its own 3D coordinates in metres, fixed when it is
-made, so that a solid texture moves along with it. Faces are subdivided, because light is baked into the vertices.
+A shape is centered on the origin, z up. Its texture coordinates are its initial 3D coordinates in meters, so that a
+solid texture moves with it. Faces are subdivided, because light is baked into the vertices.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from framework.data import Float64, Int32
 
-SPACING = 0.07  # m, between vertices on flat faces: what a baked shadow can resolve
-WELD = 1e-6  # m, vertices nearer than this are one point of the surface
+SPACING = 0.07  # m, between vertices on flat faces: the resolution of baked shadows
+WELD = 1e-6  # m, vertices closer than this are one point of the surface
 
 
 @dataclass(frozen=True)
@@ -25,25 +25,25 @@ class Solid:
     vertices: Float64  # (V, 3) m
     normals: Float64  # (V, 3) unit
     triangles: Int32  # (F, 3)
-    texture: Float64  # (V, 3) m, where to look the texture up
+    texture: Float64  # (V, 3) m, texture coordinates
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
         return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
     def turned(self, axis: str, angle: float) -> Solid:
-        """Rotated by `angle` rad about the coordinate axis x, y or z through the origin."""
+        """Return the solid rotated by `angle` rad about the axis x, y or z through the origin."""
         R = axis_rotation(axis, angle)
         return replace(self, vertices=_turn(R, self.vertices), normals=_turn(R, self.normals))
 
     def deformed(self, shape: Callable[[Float64], Float64]) -> Solid:
-        """With `shape` applied to the (V, 3) vertices, and normals to match."""
+        """Return the solid with `shape` applied to the (V, 3) vertices, and matching normals."""
         vertices = shape(self.vertices.copy())
         return replace(self, vertices=vertices, normals=smooth_normals(vertices, self.triangles))
 
     def flat(self, along: int, up: int) -> Solid:
-        """With texture coordinates (s, t, 0) in metres from the corner, for textures that are pictures.
+        """Return the solid with texture coordinates (s, t, 0) in meters from the corner, for pictures.
 
-        s runs along one coordinate axis of the vertices, t along another.
+        s and t run along the coordinate axes `along` and `up` of the vertices.
         """
         s = self.vertices[:, along] - self.vertices[:, along].min()
         t = self.vertices[:, up] - self.vertices[:, up].min()
@@ -51,7 +51,7 @@ class Solid:
 
 
 def axis_rotation(axis: str, angle: float) -> Float64:
-    """The (3, 3) rotation by `angle` rad about the axis x, y or z."""
+    """Return the (3, 3) rotation by `angle` rad about the axis x, y or z."""
     c, s = np.cos(angle), np.sin(angle)
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -61,12 +61,12 @@ def axis_rotation(axis: str, angle: float) -> Float64:
 
 
 def _turn(R: Float64, vectors: Float64) -> Float64:
-    """R applied to vectors (V, 3), without BLAS: its rounding may depend on the number of threads."""
+    """Rotate vectors (V, 3) without BLAS, whose rounding may depend on the number of threads."""
     return np.asarray(np.einsum("ck,vk->vc", R, vectors))
 
 
 def smooth_normals(vertices: Float64, triangles: Int32) -> Float64:
-    """Area-weighted (V, 3) vertex normals; vertices at the same place share one."""
+    """Return area-weighted (V, 3) vertex normals; vertices at the same position share one."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     faces = np.cross(b - a, c - a)
     _, point = np.unique(np.round(vertices / WELD).astype(np.int64), axis=0, return_inverse=True)
@@ -81,7 +81,7 @@ def smooth_normals(vertices: Float64, triangles: Int32) -> Float64:
 def rounded_box(
     x: float, y: float, z: float, radius: float = 0.004, segments: int = 1, spacing: float = SPACING
 ) -> Solid:
-    """A box of these side lengths (m) about the origin, with edges rounded by `radius`."""
+    """Return a box of these side lengths (m), with edges rounded by `radius` m."""
     half = np.array([x, y, z]) / 2
     radius = min(radius, float(half.min()) * 0.999)
     inner = half - radius
@@ -109,12 +109,12 @@ def rounded_box(
 
 
 def _grain_first(vertices: Float64, size: Float64) -> Float64:
-    """Texture coordinates with the longest side first: the grain of wood runs along a board."""
+    """Return texture coordinates with the longest side first: the grain of wood runs along a board."""
     return vertices[:, np.argsort(-size, kind="stable")]
 
 
 def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
-    """A pillow: thick in the middle, thin at the seam."""
+    """Return a pillow: thick in the middle, thin at the seam."""
     box = rounded_box(x, y, z, radius=0.45 * z, segments=4, spacing=min(x, y) / 9)
 
     def swell(p: Float64) -> Float64:
@@ -129,27 +129,27 @@ def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
 
 @dataclass(frozen=True)
 class Section:
-    """A horizontal cut of a loft: a superellipse |x/a|^n + |y/b|^n = 1 about (x, y) at height z."""
+    """A horizontal section of a loft: a superellipse |x/a|^n + |y/b|^n = 1 about (x, y) at height z."""
 
     z: float
     a: float  # m, half width along x
     b: float  # m, half width along y
     x: float = 0.0
     y: float = 0.0
-    n: float = 2.0  # 2 = ellipse, larger = nearer to a rectangle
+    n: float = 2.0  # 2 = ellipse, larger = closer to a rectangle
     front: float = 1.0  # stretches the half with positive y: egg shapes
 
 
 def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACING) -> Solid:
-    """The body through these cuts, from bottom to top, closed by flat ends."""
+    """Return the body through these sections, from bottom to top, closed by flat ends."""
     cuts = [sections[0]]
     for below, above in pairwise(sections):
         length = np.hypot(above.z - below.z, max(abs(above.a - below.a), abs(above.b - below.b)))
         steps = max(1, int(np.ceil(length / spacing)))
         for i in range(1, steps + 1):
             f = i / steps
-            fields = ("z", "a", "b", "x", "y", "n", "front")
-            cuts.append(Section(*((1 - f) * getattr(below, name) + f * getattr(above, name) for name in fields)))
+            pairs = zip(astuple(below), astuple(above), strict=True)
+            cuts.append(Section(*((1 - f) * low + f * high for low, high in pairs)))
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     c, s = np.cos(angle), np.sin(angle)
     rings = np.empty((len(cuts), segments + 1, 3))
@@ -168,45 +168,40 @@ def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACI
         cap = np.concatenate([center[None], inner, ring])
         k = np.arange(segments)
         fan = np.stack([np.zeros_like(k), 1 + k, 2 + k], axis=1)
-        first, second = 1 + k, 2 + segments + k
-        band = np.concatenate(
-            [np.stack([first, second, second + 1], axis=1), np.stack([first, second + 1, first + 1], axis=1)]
-        )
-        faces = np.concatenate([fan, band])
+        a, b = 1 + k, 2 + segments + k
+        faces = np.concatenate([fan, np.stack([a, b, b + 1], axis=1), np.stack([a, b + 1, a + 1], axis=1)])
         triangles.append((faces if up > 0 else faces[:, ::-1]) + count)
         vertices.append(cap)
         normals.append(np.tile([0.0, 0.0, up], (len(cap), 1)))
         count += len(cap)
     points = np.concatenate(vertices)
-    extent = np.ptp(points, axis=0)
-    return Solid(
-        points, np.concatenate(normals), np.concatenate(triangles).astype(np.int32), _grain_first(points, extent)
-    )
+    texture = _grain_first(points, np.ptp(points, axis=0))
+    return Solid(points, np.concatenate(normals), np.concatenate(triangles).astype(np.int32), texture)
 
 
 def lathe(profile: Sequence[tuple[float, float]], segments: int = 24, spacing: float = SPACING) -> Solid:
-    """The body of revolution about z through these (height, radius) pairs, m."""
+    """Return the body of revolution about z through these (height, radius) pairs, m."""
     return loft([Section(z, r, r) for z, r in profile], segments, spacing)
 
 
 def cylinder(radius: float, height: float, top_radius: float | None = None, segments: int = 20) -> Solid:
-    """A cylinder or cone frustum standing on z = 0."""
+    """Return a cylinder or cone frustum standing on z = 0."""
     top = radius if top_radius is None else top_radius
     return lathe([(0.0, radius), (height, top)], segments)
 
 
 def leg(thickness: float, height: float, taper: float = 0.7) -> Solid:
-    """A tapered square leg standing on z = 0, thicker at the top."""
+    """Return a tapered square leg standing on z = 0, thicker at the top."""
     a = thickness / 2
     return loft([Section(0.0, taper * a, taper * a, n=8), Section(height, a, a, n=8)], segments=16)
 
 
-def tube(points: Sequence[tuple[float, float, float]], radius: float, segments: int = 10) -> Solid:
-    """A round rod along a polyline, smoothed by a Catmull-Rom spline where it bends."""
+def tube(points: Sequence[tuple[float, float, float]] | Float64, radius: float, segments: int = 10) -> Solid:
+    """Return a round rod along a polyline (N, 3), smoothed by a Catmull-Rom spline where it bends."""
     path = _spline(np.asarray(points, np.float64))
     tangents = np.gradient(path, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    # one coordinate axis that is far from parallel to all tangents, so that the rod does not twist
+    # The coordinate axis that is the least parallel to all tangents: the rod does not twist.
     aside = np.cross(tangents, np.eye(3)[np.abs(tangents).max(axis=0).argmin()])
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     other = np.cross(tangents, aside)
@@ -226,16 +221,14 @@ def _spline(points: Float64) -> Float64:
     t = np.linspace(0, 1, 6, endpoint=False)[:, None]
     pieces = []
     for p0, p1, p2, p3 in zip(padded[:-3], padded[1:-2], padded[2:-1], padded[3:], strict=True):
-        pieces.append(
-            0.5 * (2 * p1 + (p2 - p0) * t + (2 * p0 - 5 * p1 + 4 * p2 - p3) * t**2 + (3 * p1 - p0 - 3 * p2 + p3) * t**3)
-        )
+        square, cubic = 2 * p0 - 5 * p1 + 4 * p2 - p3, 3 * p1 - p0 - 3 * p2 + p3
+        pieces.append(0.5 * (2 * p1 + (p2 - p0) * t + square * t**2 + cubic * t**3))
     return np.concatenate([*pieces, points[-1:]])
 
 
 def panel(width: float, height: float, spacing: float = 0.1) -> Solid:
-    """A flat rectangle in the plane y = 0 that faces +y; texture (s, t, 0) in metres from its lower left corner."""
-    s = np.linspace(0, width, max(2, int(np.ceil(width / spacing)) + 1))
-    t = np.linspace(0, height, max(2, int(np.ceil(height / spacing)) + 1))
+    """Return a flat rectangle in the plane y = 0 that faces +y; texture (s, t, 0) in meters from the lower left."""
+    s, t = (np.linspace(0, side, max(2, int(np.ceil(side / spacing)) + 1)) for side in (width, height))
     S, T = np.meshgrid(s, t, indexing="ij")
     zero = np.zeros_like(S)
     vertices = np.stack([width / 2 - S, zero, T], axis=-1).reshape(-1, 3)
@@ -245,7 +238,7 @@ def panel(width: float, height: float, spacing: float = 0.1) -> Solid:
 
 
 def grid_triangles(rows: int, columns: int, flip: bool) -> Int32:
-    """Two triangles for each cell of a (rows, columns) grid of vertices."""
+    """Return two triangles for each cell of a (rows, columns) grid of vertices."""
     index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     triangles = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)
