@@ -23,7 +23,7 @@ from framework.figures.figure_page import (
     say_inside,
     text_width,
 )
-from framework.figures.map_panels import Panel, PanelLine, Window
+from framework.figures.map_panels import Panel, PanelLine
 from framework.rendering.camera_path import ProjectedPath
 
 HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # above the columns, below a line, between panels
@@ -71,13 +71,16 @@ def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) 
         for axes, panel in zip(overall, line.panels.maps, strict=False):
             _draw(axes, panel, "not complete")
         _draw(overall[-1], line.panels.truth, "no true instances")
-        _draw_names(overall[-1], line.panels.truth, width)
-        if line.panels.window:
+        if line.panels.truth:
+            draw_names(overall[-1], line.panels.truth.objects, line.panels.truth.names, NOTE_PT, width)
+        if window := line.panels.window:
+            corner = window.left - 0.5, window.top - 0.5
             for left, axes, panel in zip(lefts, overall, line.panels.zoomed, strict=True):
                 larger = page.axes(left, foot, width, height)
                 _draw(larger, panel, "")
-                _draw_names(larger, panel, width)
-                _draw_window(axes, panel, line.panels.window)
+                if panel:
+                    draw_names(larger, panel.objects, panel.names, NOTE_PT, width)
+                    axes.add_patch(Rectangle(corner, window.width, window.height, fill=False, ec=INK, linewidth=0.5))
         top = foot - CAPTION_MM
     return page
 
@@ -105,14 +108,3 @@ def _draw_path(axes: Axes, path: ProjectedPath) -> None:
     axes.add_collection(LineCollection(segments, colors=shades[:-1], linewidths=widths, capstyle="round"))
     for k in (0, -1) if len(path.pixels) else ():
         axes.plot(*path.pixels[k], "o", color=shades[k], markersize=2.6, markeredgecolor="white", markeredgewidth=0.4)
-
-
-def _draw_window(axes: Axes, panel: Panel | None, window: Window) -> None:
-    if panel is not None:
-        corner = window.left - 0.5, window.top - 0.5
-        axes.add_patch(Rectangle(corner, window.width, window.height, fill=False, edgecolor=INK, linewidth=0.5))
-
-
-def _draw_names(axes: Axes, panel: Panel | None, width_mm: float) -> None:
-    if panel is not None:
-        draw_names(axes, panel.objects, panel.names, NOTE_PT, width_mm)

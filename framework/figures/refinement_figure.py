@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
-from framework.data import Array, Bool, Frame, Int32, UInt8
+from framework.data import Array, Frame, Int32, UInt8
 from framework.evaluation.refined_points import Refinement, point_counts
 from framework.figures.cluster_marks import DROPPED, ClusterMarks
 from framework.figures.figure_page import FAINT_INK, INCH_MM, INK, draw_names
@@ -86,7 +86,9 @@ def draw_image(axes: Axes, frame: Frame, marks: ClusterMarks, width_in: float) -
     axes.imshow(tinted(frame, marks), interpolation="antialiased", aspect="auto")
     axes.axis("off")
     for k in marks.by_size():
-        smooth = cv2.medianBlur(_filled(marks.mask(k), frame).astype(np.uint8), 5)
+        cluster = marks.mask(k).astype(np.uint8)
+        closed = cv2.morphologyEx(cluster, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        smooth = cv2.medianBlur(np.where(frame.depth == 0, closed, cluster), 5)  # without holes where depth is missing
         if smooth.any():
             outline = axes.contour(*_region(smooth), [0.5], colors=[0.62 * marks.colors[k] / 255], linewidths=1.2)
             outline.set(path_effects=[withStroke(linewidth=2.2, foreground="white")])
@@ -116,12 +118,6 @@ def tinted(frame: Frame, marks: ClusterMarks) -> UInt8:
         mask = marks.mask(k)
         image[mask] = (0.42 * gray[mask] + 0.30 * frame.color[mask]) * 0.72 + 0.5 * marks.colors[k]
     return np.asarray(np.clip(image, 0, 255), np.uint8)
-
-
-def _filled(mask: Bool, frame: Frame) -> Bool:
-    """Fill single pixels without depth, so that the outline is one line."""
-    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
-    return np.asarray(mask | (closed & (frame.depth == 0)))
 
 
 def _region(mask: Array) -> tuple[Array, Array, Array]:

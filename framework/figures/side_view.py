@@ -121,18 +121,15 @@ def _up(frame: Frame) -> Float64:
     z = depth.ravel()[triangles]
     connected = (z.min(axis=1) > 0) & (np.ptp(z, axis=1) < MAX_DEPTH_STEP * z[:, 0])
     surface = Surface(vertices, triangles[connected])
+    areas = np.linalg.norm(surface.face_normals, axis=1)
     candidates = []
     for pitch in PITCHES_RAD:
         T_camera_level = np.eye(4)
         T_camera_level[1:3, 1:3] = [[np.cos(pitch), -np.sin(pitch)], [np.sin(pitch), np.cos(pitch)]]
-        candidates.append(upward(T_camera_level[None], surface))
-    return max(candidates, key=lambda up: _level_area(surface, up))
-
-
-def _level_area(surface: Surface, up: Float64) -> float:
-    """Return the area of the surface that faces upwards, m^2."""
-    areas = np.linalg.norm(surface.face_normals, axis=1)
-    return float(areas[surface.face_normals @ up > np.cos(LEVEL_RAD) * areas].sum() / 2)
+        up = upward(T_camera_level[None], surface)
+        level_area = areas[surface.face_normals @ up > np.cos(LEVEL_RAD) * areas].sum()
+        candidates.append((level_area, up))
+    return max(candidates, key=lambda scored: scored[0])[1]
 
 
 def _turned(up: Float64, azimuth: float) -> Float64:

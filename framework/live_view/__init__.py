@@ -1,1 +1,1 @@
-"""What viewers share: a thread that draws while the loop goes on, and what there is to be drawn."""
+"""Live view of a run: a drawing thread, and drawing with rerun."""

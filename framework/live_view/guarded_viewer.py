@@ -1,4 +1,4 @@
-"""A viewer whose faults are its own."""
+"""A viewer whose errors do not end a run."""
 
 from __future__ import annotations
 
@@ -15,10 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class GuardedViewer(Viewer):
-    """Passes all on to another one until that raises something: a run goes on whatever becomes of its viewer.
-
-    What `begin` raises is passed on, too: nothing is lost yet. `end` is always called, as it may give something back.
-    """
+    """A wrapper that disables a viewer after its first error. Errors of `begin` are raised; `end` is always called."""
 
     def __init__(self, viewer: Viewer) -> None:
         self._viewer = viewer
@@ -30,20 +27,20 @@ class GuardedViewer(Viewer):
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
         if not self._failed:
-            with self._kept_apart():
+            with self._guard():
                 self._viewer.show(frame, detections, pose, stage_ms)
 
     def skip(self, reason: str) -> None:
         if not self._failed:
-            with self._kept_apart():
+            with self._guard():
                 self._viewer.skip(reason)
 
     def end(self) -> None:
-        with self._kept_apart():
+        with self._guard():
             self._viewer.end()
 
     @contextmanager
-    def _kept_apart(self) -> Iterator[None]:
+    def _guard(self) -> Iterator[None]:
         try:
             yield
         except Exception as error:

@@ -1,4 +1,4 @@
-"""A growing mesh in regions, of which only those are taken that have changed."""
+"""The changed regions of a growing mesh."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ import numpy as np
 from framework.data import Float32, Int32, Int64, UInt8
 
 Region = tuple[int, int, int]
-"""The corner of a cube of space, in cubes."""
+"""Index of a cube."""
 
 
 @dataclass(frozen=True)
 class MeshPart:
-    """The triangles whose first vertex lies in a region, with all of their vertices."""
+    """The triangles whose first vertex lies in a region, with all their vertices."""
 
     vertices: Float32  # (V, 3) m, world
-    triangles: Int32  # (F, 3), 0 of both where the region's surface is gone
+    triangles: Int32  # (F, 3); no vertices and triangles = removed
     colors: UInt8  # (V, 3) RGB
 
 
 class MeshRegions:
-    """Cubes of `side` m, and what each had in it when it was last taken."""
+    """Cubes of `side` m, with digests of their last content."""
 
     def __init__(self, side: float) -> None:
         self.side = side
         self._digests: dict[Region, bytes] = {}
 
     def changed(self, vertices: Float32, triangles: Int32, colors: UInt8) -> Iterator[tuple[Region, MeshPart]]:
-        """The parts of a mesh that are not what they were, those that are gone included."""
+        """Yield the parts of a mesh that have changed or disappeared since the last call."""
         gone = set(self._digests)
         for region, chosen in _by_region(vertices, triangles, self.side):
             gone.discard(region)
@@ -49,14 +49,14 @@ class MeshRegions:
 
 
 def _by_region(vertices: Float32, triangles: Int32, side: float) -> Iterator[tuple[Region, Int64]]:
-    """The triangles (M,) of each region that has any, in order."""
+    """Yield the triangles (M,) of each nonempty region, in order."""
     if not len(triangles):
         return
     cubes = np.floor(vertices[triangles[:, 0]] / np.float32(side)).astype(np.int64)
     low = cubes.min(axis=0)
     shape = tuple((cubes.max(axis=0) - low + 1).tolist())
     codes = np.ravel_multi_index(tuple((cubes - low).T), shape)
-    # 16-bit keys are sorted by radix, several times as fast
+    # NumPy uses the faster radix sort for 16-bit keys
     order = np.argsort(codes.astype(np.uint16) if np.prod(shape) <= 2**16 else codes, kind="stable")
     ordered = codes[order]
     starts = np.flatnonzero(np.diff(ordered, prepend=-1))

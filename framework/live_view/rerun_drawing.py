@@ -8,38 +8,34 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import open3d  # noqa: F401  # here and not in the middle of a run: boxes need it
+import open3d  # noqa: F401  # needed by boxes; imported before the run
 import simplejpeg
 from scipy.spatial.transform import Rotation
 
 from framework.data import Float32, Float64, Frame, InstanceMesh, Int32, Pose, UInt8
 from framework.live_view import rerun_layout as at
+from framework.live_view.drawing_thread import FrameNote, FrameUpdate, MapSnapshot
 from framework.live_view.instance_colors import InstanceColors, seen_instances
 from framework.live_view.mesh_regions import MeshRegions
-from framework.live_view.updates import FrameNote, FrameUpdate, MapSnapshot
 from framework.mapping.instances.instance_list import box_around, vertices_by_id
 
 if TYPE_CHECKING:
     import rerun as rr
 
-PATH_PIECE = 200  # poses that are drawn anew when one is added
+PATH_PIECE = 200  # poses that are redrawn when one is added
 MM = 1000  # units of depth images per m
-UNKNOWN = 65535  # number, in an image of masks, of what is under a mask and no instance of the map
+UNKNOWN = 65535  # label of masks without an instance of the map
 UNKNOWN_COLOR = np.array([235, 235, 235], np.uint8)
 MASK_OPACITY = 0.5
 PATH_COLOR, LOST_COLOR = (40, 160, 255), (230, 60, 50)
 NAME_RADIUS = 0.005  # m
 PATH_RADIUS = 0.004  # m
 FRUSTUM_M = 0.25  # m, from the camera to its picture
-LEAST_TURN = 0.01  # of a unit vector, that up must have changed by
+LEAST_TURN = 0.01  # minimum change of the up direction, of a unit vector
 
 
 class RerunDrawing:
-    """A `Drawing` that logs to a recording stream.
-
-    Pictures have every `stride`-th pixel of a frame in either direction, JPEG of `jpeg_quality`; the mesh lies in
-    regions of `region` m; instances below `min_confidence` are background, detections below it have no name.
-    """
+    """A `Drawing` that logs to a recording stream. The parameters are those of `RerunViewer`."""
 
     def __init__(
         self, recording: rr.RecordingStream, stride: int, jpeg_quality: int, region: float, min_confidence: float
@@ -53,10 +49,10 @@ class RerunDrawing:
         self._path: list[Float32] = []  # (3,) of the last piece
         self._pieces = 0
         self._up: Float64 | None = None  # (3,) as it is drawn
-        self._ahead: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) where the first camera looked
-        self._mesh: InstanceMesh | None = None  # as it was drawn last, its instances those that are shown
-        self._names: dict[int, str] = {}  # of these
-        self._named: dict[int, str] = {}  # of all so far, as they are in images of masks
+        self._forward: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) direction of the first camera
+        self._mesh: InstanceMesh | None = None  # as last drawn, with the shown instances
+        self._names: dict[int, str] = {}  # of the shown instances
+        self._named: dict[int, str] = {}  # of all instances so far
         recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         stages, colors = [*at.STAGE_COLORS], [*at.STAGE_COLORS.values()]
         recording.log(at.STAGE_MS, rerun.SeriesLines(names=stages, colors=colors), static=True)
@@ -107,17 +103,17 @@ class RerunDrawing:
         return timestamp - self._first_s
 
     def _turn(self, up: Float64) -> None:
-        """Turns the world so that `up` (3,) is the view's z."""
+        """Rotate the world so that `up` (3,) is the z axis of the view."""
         if self._up is None or not np.allclose(self._up, up, atol=LEAST_TURN):
             self._up = up
-            self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._ahead)))
+            self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._forward)))
 
     def _begin_world(self, T_world_camera: Float64) -> None:
-        """Turns the world as the first camera was held, until the map knows better, and looks over its shoulder."""
-        up, self._ahead = -T_world_camera[:3, 1], T_world_camera[:3, 2]
+        """Orient the world and the view by the first camera, until the map provides the up direction."""
+        up, self._forward = -T_world_camera[:3, 1], T_world_camera[:3, 2]
         self._turn(up)
         T_view_camera = T_world_camera.copy()
-        T_view_camera[:3] = turned(up, self._ahead) @ T_world_camera[:3]
+        T_view_camera[:3] = turned(up, self._forward) @ T_world_camera[:3]
         self._recording.send_blueprint(at.layout(T_view_camera))
         self._recording.log(at.LOG, self._rr.TextLog("mapping begins", level="INFO"))
 
@@ -169,7 +165,7 @@ class RerunDrawing:
         self._draw_found(picture)
 
     def _draw_found(self, picture: FrameUpdate) -> None:
-        """The masks in the colours of their instances, and their names."""
+        """Draw the masks and names of the detections in the colors of their instances."""
         found, stride = picture.detections, self._stride
         ids = np.zeros(len(found), np.int32)
         if self._mesh is not None and not picture.pose.lost:
@@ -177,16 +173,16 @@ class RerunDrawing:
         numbers = np.where((ids > 0) & (ids < UNKNOWN), ids, UNKNOWN).astype(np.uint16)
         image = np.zeros(found.masks[:, ::stride, ::stride].shape[1:], np.uint16)
         for mask, number in zip(found.masks[::-1, ::stride, ::stride], numbers[::-1], strict=True):
-            image[mask] = number  # the best is painted last
+            image[mask] = number  # best detection last
         self._recording.log(at.MASKS, self._rr.SegmentationImage(image, opacity=MASK_OPACITY))
         named = np.flatnonzero(found.scores >= self._min_confidence).tolist()
         classes = found.class_probabilities.argmax(axis=1)
         labels = [f"{found.classes[classes[k]]} {found.scores[k]:.2f}" for k in named]
-        colors = [self._colors.known().get(int(ids[k]), UNKNOWN_COLOR) for k in named]
-        boxes = (found.boxes[named] + 0.5) / stride  # rerun's pixels begin at whole numbers
+        colors = [self._colors.get(int(ids[k]), UNKNOWN_COLOR) for k in named]
+        boxes = (found.boxes[named] + 0.5) / stride  # in rerun, integer coordinates are corners of pixels
         form = self._rr.Box2DFormat.XYXY
         self._recording.log(at.FOUND, self._rr.Boxes2D(array=boxes, array_format=form, colors=colors))
-        middles = (boxes[:, :2] + boxes[:, 2:]) / 2  # below its box, a name may lie outside of the picture
+        middles = (boxes[:, :2] + boxes[:, 2:]) / 2  # the label of a box may lie outside of the picture
         names = self._rr.Points2D(middles, labels=labels, colors=_lighter(colors), radii=2.0, show_labels=True)
         self._recording.log(at.NAMES, names)
 
@@ -207,7 +203,7 @@ class RerunDrawing:
         )
 
     def _name_masks(self) -> None:
-        """Says what the numbers in images of masks mean."""
+        """Log the names of the labels in images of masks."""
         known = [(key, name, self._colors[key]) for key, name in self._named.items()]
         nothing, unknown = (0, "nothing", np.zeros(4, np.uint8)), (UNKNOWN, "not in the map", UNKNOWN_COLOR)
         self._recording.log(at.MASKS, self._rr.AnnotationContext([nothing, unknown, *known]), static=True)
@@ -215,14 +211,14 @@ class RerunDrawing:
     def _draw_mesh(self, mesh: InstanceMesh) -> None:
         colors = self._colors.painted(mesh)
         for (x, y, z), part in self._regions.changed(mesh.vertices, mesh.triangles, colors):
-            place = f"{at.MESH}/{x}_{y}_{z}"
+            entity = f"{at.MESH}/{x}_{y}_{z}"
             if len(part.triangles):
                 drawn = self._rr.Mesh3D(
                     vertex_positions=part.vertices, triangle_indices=part.triangles, vertex_colors=part.colors
                 )
-                self._recording.log(place, drawn)
+                self._recording.log(entity, drawn)
             else:
-                self._recording.log(place, self._rr.Clear(recursive=False))
+                self._recording.log(entity, self._rr.Clear(recursive=False))
 
     def _draw_boxes(
         self, members: Mapping[int, Int32], confidences: Mapping[int, float], snapshot: MapSnapshot
@@ -243,13 +239,13 @@ class RerunDrawing:
         self._recording.log(at.OBJECT_NAMES, names)
 
 
-def turned(up: Float64, ahead: Float64) -> Float64:
-    """R_view_world (3, 3): turns the unit vector `up` (3,) to z, and the level part of `ahead` (3,) to y."""
-    across = np.cross(ahead, up)
+def turned(up: Float64, forward: Float64) -> Float64:
+    """Return R_view_world (3, 3) that maps the unit vector `up` (3,) to z and the level part of `forward` (3,) to y."""
+    across = np.cross(forward, up)
     across = across / np.linalg.norm(across) if across.any() else np.linalg.svd(up[None])[2][1]
     return np.stack([across, np.cross(up, across), up])
 
 
 def _lighter(colors: Sequence[UInt8]) -> UInt8:
-    """Colours (N, 3) RGB for texts on a dark ground."""
+    """Return colors (N, 3) RGB for text on a dark background."""
     return (np.array(colors, np.uint16).reshape(-1, 3) // 2 + 115).astype(np.uint8)

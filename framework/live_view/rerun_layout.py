@@ -1,4 +1,4 @@
-"""Where rerun's viewer shows what, and where it lies in a recording."""
+"""Entity paths of a rerun recording, and the layout of its views."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from framework.data import Float64
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-WORLD = "world"  # the map's coordinates, turned so that up is up
+WORLD = "world"  # the map's coordinates, rotated upright
 MESH, PATH = f"{WORLD}/mesh", f"{WORLD}/path"
 OBJECTS, OBJECT_NAMES = f"{WORLD}/objects/boxes", f"{WORLD}/objects/names"
 CAMERA = f"{WORLD}/camera"
@@ -20,7 +20,7 @@ MASKS, FOUND, NAMES = f"{CAMERA}/masks", f"{CAMERA}/found", f"{CAMERA}/names"
 STAGE_MS = "milliseconds"
 LOG = "log"
 
-FRAME, SECONDS = "frame", "seconds"  # time lines: Frame.index, and s since the first frame
+FRAME, SECONDS = "frame", "seconds"  # timelines: Frame.index, and s since the first frame
 
 STAGE_COLORS = {
     "read": (120, 126, 134),
@@ -32,16 +32,15 @@ STAGE_COLORS = {
 }
 """RGB, as in the figure of stage times, by stage."""
 
-
-TIMES_SHOWN = 300  # frames, up to the chosen one
+TIMES_SHOWN = 300  # frames before the current one
 EYE_BACK, EYE_ABOVE = 1.2, 0.8  # m, from the first camera to the eye
-AIM_AHEAD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to what the eye looks at
+AIM_FORWARD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to the target of the eye
 
 
 def layout(T_view_camera: Float64 | None = None) -> rrb.Blueprint:
-    """The map and the stages' times at the left, the frame and its depth at the right.
+    """Return the layout: map and stage times on the left, frame and depth on the right.
 
-    The map is seen from behind the first camera, which is at `T_view_camera`, z up; None = it is not known yet.
+    The eye is behind the first camera at `T_view_camera`, z up; None = unknown.
     """
     import rerun.blueprint as rrb
 
@@ -85,7 +84,7 @@ def layout(T_view_camera: Float64 | None = None) -> rrb.Blueprint:
 def _eye(T_view_camera: Float64) -> rrb.EyeControls3D:
     import rerun.blueprint as rrb
 
-    position, ahead = T_view_camera[:3, 3], T_view_camera[:3, 2]
+    position, forward = T_view_camera[:3, 3], T_view_camera[:3, 2]
     up = np.array([0.0, 0.0, 1.0])
-    eye, aim = position - EYE_BACK * ahead + EYE_ABOVE * up, position + AIM_AHEAD * ahead - AIM_BELOW * up
+    eye, aim = position - EYE_BACK * forward + EYE_ABOVE * up, position + AIM_FORWARD * forward - AIM_BELOW * up
     return rrb.EyeControls3D(position=eye, look_target=aim, eye_up=up)

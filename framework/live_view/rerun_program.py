@@ -1,4 +1,4 @@
-"""rerun's own program (rerun-sdk 0.41), made to listen to this machine alone: by itself it listens to the network."""
+"""rerun's executable (rerun-sdk 0.41), bound to 127.0.0.1 instead of its default 0.0.0.0."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from contextlib import contextmanager
 from pathlib import Path
 
 HERE = "127.0.0.1"
-PATIENCE_S = 60.0  # until it listens, on a machine that has much else to do
-BETWEEN_S = 0.05  # looking whether it does
+TIMEOUT_S = 60.0  # until it listens, on a busy machine
+POLL_S = 0.05
 
 
 def program() -> str:
-    """The path of rerun's program. Raises OSError where it is not there.
+    """Return the path of rerun's executable. Raises OSError if it is missing.
 
-    The `rerun` that pip puts beside Python only starts this one, which would go on when the other is ended.
+    The `rerun` script in Python's bin folder is only a launcher, whose end does not end the executable.
     """
     found = importlib.util.find_spec("rerun_cli")
     places = [Path(place) for place in (found and found.submodule_search_locations) or ()]
     places += [place / "Rerun.app" / "Contents" / "MacOS" for place in places]
     path = shutil.which("rerun", path=os.pathsep.join(map(str, places)))
     if path is None:
-        raise OSError("rerun's program is not there: pip install --force-reinstall rerun-sdk")
+        raise OSError("rerun's program is missing: pip install --force-reinstall rerun-sdk")
     return path
 
 
 def open_window(port: int, memory_limit: str) -> None:
-    """Opens rerun's viewer, unless something listens on `port` already. It sends no statistics of its use.
+    """Open rerun's viewer without usage statistics, unless a program already listens on `port`.
 
-    Raises OSError or SubprocessError where it cannot.
+    Raises OSError or SubprocessError on failure.
     """
-    subprocess.run([program(), "analytics", "disable"], check=True, capture_output=True, timeout=PATIENCE_S)
+    subprocess.run([program(), "analytics", "disable"], check=True, capture_output=True, timeout=TIMEOUT_S)
     if listens(port):
         return
     limits = ["--memory-limit", memory_limit, "--hide-welcome-screen", "--expect-data-soon"]
@@ -46,16 +46,16 @@ def open_window(port: int, memory_limit: str) -> None:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         env=os.environ | {"RUST_LOG": "error"},
-        start_new_session=True,  # it stays when the run ends, by Ctrl-C too
+        start_new_session=True,  # it survives the run, also after Ctrl-C
     )
     _wait_for(viewer, port)
 
 
 @contextmanager
 def page_server() -> Iterator[str]:
-    """The address of rerun's server of its page. Raises OSError where there is none.
+    """Run rerun's web server and return its address. Raises OSError on failure.
 
-    It sends no statistics: it does from a user's second time on, and finds a new home each time.
+    Each call has a new home folder, because rerun sends usage statistics from the second start on.
     """
     port = free_port()
     ports = ["--port", str(free_port()), "--web-viewer-port", str(port)]
@@ -76,13 +76,13 @@ def page_server() -> Iterator[str]:
 
 
 def listens(port: int) -> bool:
-    """Whether anybody listens on a port of this machine."""
+    """Return whether a program listens on a port of this machine."""
     with socket.socket() as probe:
         return probe.connect_ex((HERE, port)) == 0
 
 
 def free_port() -> int:
-    """A port that nobody has."""
+    """Return an unused port."""
     with socket.socket() as probe:
         probe.bind((HERE, 0))
         port: int = probe.getsockname()[1]
@@ -90,10 +90,10 @@ def free_port() -> int:
 
 
 def _wait_for(process: subprocess.Popen[bytes], port: int) -> None:
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while not listens(port):
         if process.poll() is not None:
             raise OSError(f"it ended with status {process.returncode}")
         if time.monotonic() > deadline:
-            raise OSError(f"it does not answer within {PATIENCE_S:g} s")
-        time.sleep(BETWEEN_S)
+            raise OSError(f"it does not answer within {TIMEOUT_S:g} s")
+        time.sleep(POLL_S)

@@ -7,7 +7,6 @@ downloads the page's files once from that server, stops it, and serves them with
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 from urllib.parse import quote
@@ -20,45 +19,38 @@ SOURCES = "'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:"
 SOURCE_TIMEOUT_S = 30.0
 
 
-@dataclass(frozen=True)
-class PageFile:
-    """A file of the page, as it is served."""
-
-    content: bytes
-    content_type: str
-
-
 class SealedPage:
-    """Serves the page on `port` of this machine's own address, until it is closed. Raises OSError where it cannot.
+    """A server of the page on `port` of 127.0.0.1, until it is closed. The page may connect only to `data_port`.
 
-    `data_port` is where the data are; the page may have them, under either name of this machine.
+    Raises OSError if the port is in use or the page is not available.
     """
 
     def __init__(self, port: int, data_port: int) -> None:
         data = f"http://{HERE}:{data_port} http://localhost:{data_port}"
         policy = f"default-src {SOURCES}; connect-src 'self' blob: data: {data}"
-        files: dict[str, PageFile] = {}
+        files: dict[str, tuple[bytes, str]] = {}
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                file = files.get(self.path.partition("?")[0])
-                if file is None:
+                path = self.path.partition("?")[0]
+                if path not in files:
                     self.send_error(404)
                     return
+                content, content_type = files[path]
                 self.send_response(200)
-                self.send_header("Content-Type", file.content_type)
-                self.send_header("Content-Length", str(len(file.content)))
+                self.send_header("Content-Type", content_type)
+                self.send_header("Content-Length", str(len(content)))
                 self.send_header("Content-Security-Policy", policy)
                 self.end_headers()
                 try:
-                    self.wfile.write(file.content)
-                except ConnectionError:  # the browser has gone
+                    self.wfile.write(content)
+                except ConnectionError:  # the browser was closed
                     self.close_connection = True
 
             def log_message(self, format: str, *args: object) -> None:
-                """Nobody asked."""
+                """Requests are not logged."""
 
-        self._server = ThreadingHTTPServer((HERE, port), Handler)  # first, as the port may be another's
+        self._server = ThreadingHTTPServer((HERE, port), Handler)  # before the download, because the port may be in use
         try:
             files |= page_files()
         except BaseException:
@@ -72,12 +64,12 @@ class SealedPage:
         self._server.server_close()
 
 
-def page_files() -> dict[str, PageFile]:
-    """The page's files by path, from rerun's server. Raises OSError where it does not give them."""
-    opener = build_opener(ProxyHandler({}))  # this machine is reached without a proxy
-    found = {}
+def page_files() -> dict[str, tuple[bytes, str]]:
+    """Return content and type of the page's files, by path. Raises OSError if rerun's server fails."""
+    opener = build_opener(ProxyHandler({}))  # no proxy for 127.0.0.1
+    files = {}
     with page_server() as address:
         for path in FILES:
             with opener.open(address + path, timeout=SOURCE_TIMEOUT_S) as answer:
-                found[path] = PageFile(answer.read(), answer.headers["Content-Type"])
-    return found
+                files[path] = answer.read(), answer.headers["Content-Type"]
+    return files

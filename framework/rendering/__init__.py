@@ -1,1 +1,1 @@
-"""Pictures of surfaces: a rasterizer, light, and the overview of a map."""
+"""Rendering of surfaces: rasterizer, lighting, viewpoints, and the overview of a map."""

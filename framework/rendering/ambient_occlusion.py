@@ -1,7 +1,7 @@
-"""How much of the light from around reaches what a picture shows: corners and contacts are darker.
+"""Screen-space ambient occlusion.
 
-In screen space (Ritschel, Grosch and Seidel, "Approximating Dynamic Global Illumination in Image Space", I3D 2009): the
-rays that ask what is near to a point are followed in the picture, where its depth says what they would meet.
+Ritschel, Grosch and Seidel, "Approximating Dynamic Global Illumination in Image Space", I3D 2009: rays around a point
+are traced in the depth image.
 """
 
 from __future__ import annotations
@@ -10,37 +10,37 @@ import cv2
 import numpy as np
 
 from framework.data import Camera, Float32
-from framework.rendering.ambient_occlusion_kernels import RAYS, STEPS, TILE, block_light
+from framework.rendering.ambient_occlusion_kernels import RAYS, STEPS, TILE, trace_occlusion
 
-RANGE_M = 0.35  # what is nearer than this to a point takes light from it
-DEPTH = 0.75  # how dark a point gets that is closed in on all sides
+RANGE_M = 0.35  # maximum distance of occluders
+DEPTH = 0.75  # darkening of a fully occluded point
 
 
 def openness(camera: Camera, depth: Float32, normals_camera: Float32) -> Float32:
-    """(H, W) in (0, 1]: the share of the light that gets there.
+    """Return the fraction (H, W) of the ambient light, in (0, 1].
 
     Args:
-        depth: (H, W) m along z, 0 = nothing is seen.
-        normals_camera: (H, W, 3) unit length, in the camera's coordinates.
+        depth: (H, W) m along z, 0 = none.
+        normals_camera: (H, W, 3) unit vectors, camera frame.
     """
-    blocked = np.zeros(depth.shape, np.float32)
-    block_light(depth, normals_camera, camera.K.astype(np.float32), _directions(), _reaches(), blocked)
-    # the mean over a tile, of the pixels that see something
-    mean = cv2.blur(blocked, (TILE, TILE))
+    occluded = np.zeros(depth.shape, np.float32)
+    trace_occlusion(depth, normals_camera, camera.K.astype(np.float32), _directions(), _reaches(), occluded)
+    # mean of the valid pixels of a tile
+    mean = cv2.blur(occluded, (TILE, TILE))
     share = cv2.blur((depth > 0).astype(np.float32), (TILE, TILE))
     return np.asarray(1 - DEPTH * mean / np.maximum(share, 1e-6), np.float32)
 
 
 def _directions() -> Float32:
-    """(TILE^2, RAYS, 3) along two tangents and the normal: dense around the normal, as light counts."""
+    """Return cosine-weighted rays (TILE^2, RAYS, 3) in the frame of two tangents and the normal."""
     pixel, ray = np.arange(TILE**2)[:, None], np.arange(RAYS)
     angle = 2 * np.pi / RAYS * (ray + (pixel * 7 % TILE**2) / TILE**2)
-    sine = np.sqrt(((ray + pixel) % RAYS + 0.5) / RAYS)  # over the tile, each height in each direction
+    sine = np.sqrt(((ray + pixel) % RAYS + 0.5) / RAYS)  # a tile has each elevation in each direction
     return np.stack([sine * np.cos(angle), sine * np.sin(angle), np.sqrt(1 - sine**2)], axis=-1).astype(np.float32)
 
 
 def _reaches() -> Float32:
-    """(TILE^2, STEPS) m, how far along a ray is looked: at its end, and before at other places in each pixel."""
+    """Return the sampled distances along a ray (TILE^2, STEPS) m: its end, and jittered ones before it."""
     pixel = np.arange(TILE**2)
     shift = (pixel * 5 % TILE**2 + 0.5) / TILE**2
     share = (np.arange(STEPS) + shift[:, None]) / (STEPS - 1)

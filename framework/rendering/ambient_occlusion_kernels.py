@@ -7,19 +7,19 @@ from numba import njit
 
 from framework.data import Float32
 
-RAYS = 8  # per pixel; neighbours in tiles of 4x4 pixels look elsewhere, and the tile is averaged
-STEPS = 4  # along a ray, at which it is asked whether it lies behind what the picture shows
+RAYS = 8  # per pixel; they differ within a tile, and the tile is averaged
+STEPS = 4  # samples along a ray
 TILE = 4  # px
-SLACK_M = np.float32(2e-3)  # a ray that is not farther behind the surface than this has not met it
-THICKNESS_M = np.float32(0.15)  # what is seen is taken to reach this far back; a ray that is farther behind passes
-HALF = np.float32(0.5)  # px, from a pixel's border to its middle
+SLACK_M = np.float32(2e-3)  # minimum depth behind the surface for a hit
+THICKNESS_M = np.float32(0.15)  # of surfaces; a ray farther behind passes
+HALF = np.float32(0.5)  # px, from the border of a pixel to its center
 
 
 @njit(cache=True, nogil=True)
-def block_light(
-    depth: Float32, normals: Float32, K: Float32, directions: Float32, reaches: Float32, blocked: Float32
+def trace_occlusion(
+    depth: Float32, normals: Float32, K: Float32, directions: Float32, reaches: Float32, occluded: Float32
 ) -> None:
-    """Writes the share (H, W) of each pixel's rays that meet something."""
+    """Write the fraction (H, W) of occluded rays of each pixel."""
     height, width = depth.shape
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     for v in range(height):
@@ -30,15 +30,15 @@ def block_light(
             x, y = (np.float32(u) - cx) / fx * z, (np.float32(v) - cy) / fy * z
             n = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
             s, t = _tangents(n)
-            place = v % TILE * TILE + u % TILE
-            met = 0
+            offset = v % TILE * TILE + u % TILE
+            hits = 0
             for ray in range(RAYS):
-                a, b, c = directions[place, ray, 0], directions[place, ray, 1], directions[place, ray, 2]
+                a, b, c = directions[offset, ray, 0], directions[offset, ray, 1], directions[offset, ray, 2]
                 dx = a * s[0] + b * t[0] + c * n[0]
                 dy = a * s[1] + b * t[1] + c * n[1]
                 dz = a * s[2] + b * t[2] + c * n[2]
                 for step in range(STEPS):
-                    reach = reaches[place, step]
+                    reach = reaches[offset, step]
                     far = z + reach * dz
                     if far <= 0:
                         break
@@ -47,16 +47,16 @@ def block_light(
                     row = int(np.floor(fy * (y + reach * dy) * scale + cy + HALF))
                     if not (0 <= column < width and 0 <= row < height):
                         break
-                    there = depth[row, column]
-                    if there > 0 and SLACK_M < far - there < THICKNESS_M:
-                        met += 1
+                    surface = depth[row, column]
+                    if surface > 0 and SLACK_M < far - surface < THICKNESS_M:
+                        hits += 1
                         break
-            blocked[v, u] = met / RAYS
+            occluded[v, u] = hits / RAYS
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _tangents(n):
-    """Two unit vectors at right angles to the unit vector n and to each other (Duff et al., JCGT 6(1), 2017)."""
+    """Return two orthonormal tangents of the unit vector n (Duff et al., JCGT 6(1), 2017)."""
     sign = np.float32(1) if n[2] >= 0 else np.float32(-1)
     a = -1 / (sign + n[2])
     b = n[0] * n[1] * a

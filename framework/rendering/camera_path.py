@@ -1,4 +1,4 @@
-"""The way of the camera, as it is seen in the picture of a map."""
+"""The camera path in the picture of a map."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)
 
 @dataclass(frozen=True)
 class ProjectedPath:
-    """Where a moving camera was, in the pixels of another one that looks at the scene."""
+    """The positions of a camera, projected into the image of another camera."""
 
     pixels: Float64  # (F, 2) u v
-    hidden: Bool  # (F,) behind the surface
+    hidden: Bool  # (F,) occluded by the surface
 
     @classmethod
     def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> ProjectedPath:
-        """The positions of `poses` (F, 4, 4) that lie before `camera`, which sees the surface as `hits`."""
+        """Project the positions of `poses` (F, 4, 4) in front of `camera`, whose view of the surface is `hits`."""
         positions = poses[:, :3, 3]
         points = transform(inverse(T_world_camera), positions)
         points = points[points[:, 2] > 0.05]
@@ -36,17 +36,17 @@ class ProjectedPath:
         return cls(np.asarray(pixels, np.float64), (depth > 0) & (depth < points[:, 2]))
 
     def shades(self) -> UInt8:
-        """(F, 3) RGB: blue at the beginning, orange at the end."""
+        """Return RGB colors (F, 3) from blue to orange."""
         share = np.linspace(0, 1, max(2, len(self.pixels)))[: len(self.pixels), None]
         mixed = (1 - share) * np.array(PATH_START) + share * np.array(PATH_END)
         return np.asarray(np.rint(mixed), np.uint8)
 
     def draw(self, image: Image.Image) -> None:
-        """A line with dots at its ends; thin where something stands before it."""
+        """Draw a line with dots at its ends, thin where it is occluded."""
         canvas = ImageDraw.Draw(image)
         points = [tuple(pixel) for pixel in self.pixels.tolist()]
         shades = [tuple(shade) for shade in self.shades().tolist()]
-        for k in range(len(points) - 1):  # segments of a line, not pixels
+        for k in range(len(points) - 1):
             canvas.line((points[k], points[k + 1]), shades[k], width=1 if self.hidden[k] else 3)
         for (u, v), color in zip(points[:1] + points[-1:], (PATH_START, PATH_END), strict=False):
             canvas.ellipse((u - 6, v - 6, u + 6, v + 6), fill=color, outline=PAPER, width=2)

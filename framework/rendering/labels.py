@@ -1,9 +1,10 @@
-"""Names in a picture of objects: on those that have room for them, beside the others with a line to them."""
+"""Placement of object names in a picture: on large objects, next to small ones with a line."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -12,17 +13,17 @@ from PIL import Image, ImageDraw, ImageFont
 from framework.data import Bool, Int32
 from framework.rendering.palette import INK, PAPER
 
-MIN_PIXELS = 60  # an object that shows less gets no name in the picture
-ROOM = 0.75  # of a name's height, from the middle of an object's widest part to its border: less would cover the object
-NEAREST, FARTHEST, STEP = 24, 160, 8  # px, from an object's middle to that of a name beside it
+MIN_PIXELS = 60  # of an object with a name
+ROOM = 0.75  # minimum distance from the name to the border of its object, relative to the height of the name
+NEAREST, FARTHEST, STEP = 24, 160, 8  # px, distances of a name next to its object
 DIRECTIONS = 32
-ABOUT = 0.9  # of the largest distance from the border
-ON_OTHERS = 0.1  # of the box of a name that stands on its object, which other objects may have at most
-COVERING = 150.0  # px that a name goes rather than cover objects, its own one too, with all of its box
-CROSSING = 100.0  # px that it goes rather than have all of its line on other objects
-SAMPLES = 24  # points of a line that are looked at
+ABOUT = 0.9  # minimum distance from the border, relative to the largest one
+ON_OTHERS = 0.1  # maximum fraction of a name on its object that covers other objects
+COVERING = 150.0  # px, cost of covering objects with the whole box
+CROSSING = 100.0  # px, cost of a line that lies on other objects
+SAMPLES = 24  # points of a line
 DOT = 2.5  # px, the radius of a line's end on the object
-AROUND = 3  # px that stay free around a name
+AROUND = 3  # px, margin of a name
 HALO = 3  # px
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, px
@@ -30,19 +31,19 @@ Box = tuple[float, float, float, float]  # left, top, right, bottom, px
 
 @dataclass(frozen=True)
 class Label:
-    """A name, its place, and the point of the object that a line leads to."""
+    """A name with its position."""
 
     text: str
-    u: float  # px, the middle
+    u: float  # px, of the center
     v: float  # px
-    target: tuple[float, float] | None = None  # u, v, px; None = the name stands on the object
+    target: tuple[float, float] | None = None  # u, v, px, end of the line; None = the name is on the object
 
 
 def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tuple[float, float]]) -> list[Label]:
-    """Where the `names` by id go in a picture whose pixels show `ids` (H, W), 0 = none.
+    """Place the `names` by id in a picture of `ids` (H, W), 0 = none, starting with large objects.
 
-    The large objects come first. Names lie inside the picture, and none over another; one without a place is left out.
-    `size` tells a text's width and height, px.
+    Names do not overlap and are inside the picture; a name without space is omitted. `size` returns the width and
+    height of a text, px.
     """
     pixels = np.bincount(ids.ravel(), minlength=max([0, *names]) + 1)
     shown = sorted((key for key in names if pixels[key] >= MIN_PIXELS), key=lambda key: (-pixels[key], key))
@@ -69,7 +70,7 @@ def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tup
 
 
 def draw_labels(image: Image.Image, labels: Sequence[Label], font: ImageFont.FreeTypeFont) -> None:
-    """Draws the names and their lines."""
+    """Draw the names and their lines."""
     canvas = ImageDraw.Draw(image)
     for label in labels:
         if label.target is not None:
@@ -83,15 +84,15 @@ def draw_labels(image: Image.Image, labels: Sequence[Label], font: ImageFont.Fre
 
 
 def text_size(text: str, font: ImageFont.FreeTypeFont) -> tuple[float, float]:
-    """Width and height of a name, px."""
+    """Return the width and height of a name, px."""
     left, _, right, _ = font.getbbox(text, anchor="mm")
     return right - left, float(font.size)
 
 
 def _widest_part(mask: Bool) -> tuple[float, float, float]:
-    """The point (u, v) that is farthest from the border of mask (H, W), and how far that is, px.
+    """Return the point (u, v) with the largest distance from the border of a mask (H, W), and this distance, px.
 
-    Of those about as far, the nearest to the middle.
+    Of points with similar distances, it is the one nearest to the center.
     """
     u, v, width, height = cv2.boundingRect(mask.astype(np.uint8))
     framed = np.pad(mask[v : v + height, u : u + width], 1).astype(np.uint8)
@@ -104,11 +105,14 @@ def _widest_part(mask: Bool) -> tuple[float, float, float]:
 def _place_beside(
     u: float, v: float, size: tuple[float, float], boxes: Sequence[Box], objects: Bool, others: Bool
 ) -> tuple[float, float] | None:
-    """The best free place for a name of an object at (u, v): near, over few `objects` (H, W), its line over few
-    `others`.
+    """Return the best free position for the name of an object at (u, v).
+
+    Costs are the distance, the covered `objects` (H, W), and the `others` (H, W) below the line.
     """
     best, least = None, np.inf
-    for distance, a, b in _around(u, v, size):
+    angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    for distance, angle in product(range(NEAREST, FARTHEST, STEP), angles):
+        a, b = u + np.cos(angle) * (distance + size[0] / 2), v - np.sin(angle) * distance
         box = _box(a, b, *size)
         if distance >= least or not _is_free(box, boxes, others.shape):
             continue
@@ -120,14 +124,6 @@ def _place_beside(
         if cost < least:
             best, least = (a, b), cost
     return best
-
-
-def _around(u: float, v: float, size: tuple[float, float]) -> Iterator[tuple[float, float, float]]:
-    """Distances (px) from (u, v) and middles of names there, in rings that leave the point itself free."""
-    for distance in range(NEAREST, FARTHEST, STEP):
-        for k in range(DIRECTIONS):
-            angle = 2 * np.pi * k / DIRECTIONS
-            yield distance, u + np.cos(angle) * (distance + size[0] / 2), v - np.sin(angle) * distance
 
 
 def _box(u: float, v: float, width: float, height: float) -> Box:
@@ -146,5 +142,5 @@ def _is_free(box: Box, taken: Sequence[Box], shape: tuple[int, ...]) -> bool:
 
 
 def _nearest_point(box: Box, u: float, v: float) -> tuple[float, float]:
-    """The point of a box that is nearest to (u, v)."""
+    """Return the point of a box that is nearest to (u, v)."""
     return min(max(u, box[0]), box[2]), min(max(v, box[1]), box[3])

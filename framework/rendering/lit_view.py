@@ -1,4 +1,4 @@
-"""What a camera sees of a lit surface: its own colours, or those of its instances on a pale background."""
+"""Images of a lit surface: in its own colors, or in those of its instances on a pale background."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from framework.rendering.lit_view_kernels import light_up, paint
 from framework.rendering.surface import FrontSides, Surface
 
 SUPERSAMPLING = 2  # rays per pixel in either direction
-NOTHING = (229, 232, 236)  # where nothing was mapped: a shade off the paper, as mapped things may be white
+NOTHING = (229, 232, 236)  # RGB of empty pixels; not white, as surfaces may be white
 
 
 class LitView:
-    """The picture that `camera` at `T_world_camera` takes of a surface, before it is coloured."""
+    """The view of a surface by `camera` at `T_world_camera`, before coloring."""
 
     def __init__(self, surface: Surface, camera: Camera, T_world_camera: Float64) -> None:
         R_world_camera = T_world_camera[:3, :3]
@@ -32,14 +32,14 @@ class LitView:
         self._light *= cv2.resize(ambient, self._light.shape[::-1])
 
     def in_colors(self, colors: UInt8) -> UInt8:
-        """(H, W, 3) RGB, the vertices' own colours (V, 3)."""
+        """Return the image (H, W, 3) RGB in the colors (V, 3) of the vertices."""
         return self._developed(self._fine.interpolated(colors * np.float32(1.08)))
 
     def in_instances(self, colors: UInt8, ids: Int32, color_of: Mapping[int, UInt8]) -> UInt8:
-        """(H, W, 3) RGB, each instance in its one colour.
+        """Return the image (H, W, 3) RGB with one color per instance.
 
         Args:
-            colors: (V, 3) RGB of the vertices: their texture shows through.
+            colors: (V, 3) RGB of the vertices, whose brightness remains visible.
             ids: (V,) instances of the vertices, 0 = none.
             color_of: RGB (3,) of each id.
         """
@@ -52,7 +52,7 @@ class LitView:
         return self._developed(painted)
 
     def _developed(self, color: Float32) -> UInt8:
-        """The lit picture on paper, scaled down to the camera's size; `color` is used up."""
+        """Return the lit image in the camera's size. Modifies `color`."""
         np.clip(color * self._light[..., None], 0, 255, out=color)
         color[self._fine.depth <= 0] = NOTHING
         return np.asarray(cv2.resize(color, self.hits.depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)

@@ -7,14 +7,14 @@ from numba import njit
 
 from framework.data import Float32, Float64, Int32
 
-TO_LAMP = np.array([-0.45, -0.75, -0.6])  # in the camera's coordinates: over the viewer's left shoulder
+TO_LAMP = np.array([-0.45, -0.75, -0.6])  # camera frame: above and left of the viewer
 LAMP = TO_LAMP / np.linalg.norm(TO_LAMP)
-AMBIENT, DIFFUSE = 0.70, 0.34  # light from around and from the lamp, which is soft
+AMBIENT, DIFFUSE = 0.70, 0.34  # light from all directions and from the lamp
 
 
 @njit(cache=True, nogil=True)
 def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float32) -> None:
-    """Writes the brightness (H, W), and turns the normals (H, W, 3): to the camera, of unit length, in its axes."""
+    """Write the brightness (H, W), and turn the normals (H, W, 3) into unit vectors to the camera, in its frame."""
     R = R_world_camera
     for v in range(normals.shape[0]):
         y = (v - K[1, 2]) / K[1, 1]
@@ -31,7 +31,7 @@ def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float
 
 @njit(cache=True, nogil=True)
 def paint(ids: Int32, gray: Float32, palette: Float32, painted: Float32) -> None:
-    """Writes the colour (H, W, 3) of each pixel's instance, before it is lit; some texture shows through."""
+    """Write the unlit color (H, W, 3) of each pixel's instance, with some texture."""
     height, width = ids.shape
     for v in range(height):
         for u in range(width):
@@ -42,7 +42,7 @@ def paint(ids: Int32, gray: Float32, palette: Float32, painted: Float32) -> None
                 or (v > 0 and ids[v - 1, u] != instance)
                 or (v < height - 1 and ids[v + 1, u] != instance)
             )
-            dim = np.float32(0.45 if border else 1)  # where an instance meets another one or the background
+            dim = np.float32(0.45 if border else 1)
             background = np.float32(0.22) * gray[v, u] + np.float32(178)  # pale, so that the instances stand out
             texture = np.float32(0.84) + np.float32(0.16 / 140) * gray[v, u]
             for k in range(3):

@@ -1,4 +1,4 @@
-"""Which objects of a map are which of another one, so that the same object has the same colour in several pictures."""
+"""Matching of objects between maps, so that an object has the same color in several pictures."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from scipy.optimize import linear_sum_assignment
 from framework.data import Int32, SceneTruth, UInt8
 from framework.rendering.palette import DARK, instance_colors
 
-SAME_OBJECT_IOU = 0.25  # overlap, on what is mapped, from which two instances are one object
-UNKNOWN = (206, 184, 152)  # RGB of true instances whose class nobody knows: what is found there is not evaluated
+SAME_OBJECT_IOU = 0.25  # minimum IoU of matching instances
+UNKNOWN = (206, 184, 152)  # RGB of true instances of unknown class, which are not evaluated
 
 
 class ObjectColors:
-    """The objects of one scene in several maps of it, numbered from 1: the true ones, and what only a map has."""
+    """The objects of one scene in several maps, numbered from 1: true instances, and unmatched ones of the maps."""
 
     def __init__(self, truth: SceneTruth) -> None:
         ids = np.setdiff1d(truth.instance_ids, [0]).tolist()
@@ -28,9 +28,11 @@ class ObjectColors:
         self.color_of |= {self.true_objects[key]: color for key, color in zip(named, colors, strict=True)}
 
     def objects(self, ids: Int32, true_ids: Int32) -> dict[int, int]:
-        """The object that each of a map's instances is: a true one, or one of its own in a dark shade.
+        """Return the object of each instance of a map; unmatched instances get new objects in dark colors.
 
-        Both are labels (V,) of the same points, 0 = none.
+        Args:
+            ids: (V,) instances of points, 0 = none.
+            true_ids: (V,) true instances of the same points, 0 = none.
         """
         same = {key: self.true_objects[true] for key, true in same_objects(ids, true_ids).items()}
         others = np.setdiff1d(ids, [0, *same]).tolist()
@@ -40,13 +42,13 @@ class ObjectColors:
 
 
 def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
-    """The true instance that each instance is; both are labels (V,) of the same points, 0 = none.
+    """Match instances to true instances one-to-one with the largest sum of IoU; both (V,) of the same points, 0 = none.
 
-    One to one, with the largest sum of IoU. Instances that overlap none by SAME_OBJECT_IOU are not in it.
+    Pairs with an IoU below SAME_OBJECT_IOU are omitted.
     """
-    found, mine = np.unique(ids, return_inverse=True)
-    true, theirs = np.unique(true_ids, return_inverse=True)
-    common = np.bincount(mine * len(true) + theirs, minlength=len(found) * len(true)).reshape(len(found), len(true))
+    found, rows = np.unique(ids, return_inverse=True)
+    true, columns = np.unique(true_ids, return_inverse=True)
+    common = np.bincount(rows * len(true) + columns, minlength=len(found) * len(true)).reshape(len(found), len(true))
     iou = common / np.maximum(common.sum(axis=1)[:, None] + common.sum(axis=0)[None] - common, 1)
     iou[found == 0] = 0
     iou[:, true == 0] = 0
@@ -55,6 +57,6 @@ def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
 
 
 def relabeled(ids: Int32, object_of: Mapping[int, int]) -> Int32:
-    """`ids` (V,) as objects, 0 where none."""
+    """Return the objects of `ids` (V,), 0 = none."""
     values, inverse = np.unique(ids, return_inverse=True)
     return np.array([object_of.get(key, 0) for key in values.tolist()], np.int32)[inverse]

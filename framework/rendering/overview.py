@@ -1,4 +1,4 @@
-"""overview.png: the map in its colours and its instances, side by side, from one well-chosen point of view."""
+"""overview.png: the map in its colors and its instances, side by side, from one viewpoint."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ PANEL_WIDTH, PANEL_HEIGHT = 960, 760  # px
 TITLE_HEIGHT = 56  # px
 LEGEND_ROW = 30  # px
 LEGEND_COLUMNS, LEGEND_ROWS = 9, 4
-PNG_LEVEL = 3  # of zlib: 6, the default, takes 2.4 times as long for a file 3% smaller
+PNG_LEVEL = 3  # of zlib; the default, 6, is much slower for a file 3% smaller
 LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22
 
 
 def write_overview(
     path: Path, mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], poses: Float64, title: str
 ) -> None:
-    """Draws the map to a PNG.
+    """Write the overview as a PNG.
 
     Args:
-        instances: class name and confidence by instance id; ids that are not in it are drawn as background.
+        instances: class name and confidence by id; other ids are background.
         poses: (F, 4, 4) T_world_camera of the frames that were mapped.
-        title: the line above the pictures.
+        title: above the pictures.
     """
     image = overview(mesh, instances, poses, title)
     with written_whole(path) as temporary:
@@ -42,7 +42,7 @@ def write_overview(
 
 
 def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], poses: Float64, title: str) -> UInt8:
-    """The picture (H, W, 3) RGB."""
+    """Return the picture (H, W, 3) RGB."""
     ids = np.where(np.isin(mesh.instance_ids, list(instances)), mesh.instance_ids, 0).astype(np.int32)
     shown = [key for key in sorted(instances) if (ids == key).any()]
     centroids = np.array([mesh.vertices[ids == key].mean(axis=0) for key in shown], np.float64).reshape(-1, 3)
@@ -50,9 +50,9 @@ def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], pos
     if len(mesh.triangles) and len(poses):
         panels = _panels(mesh, ids, {key: instances[key][0] for key in shown}, colors, poses)
     else:
-        panels = _centered("nothing was mapped", 2 * PANEL_WIDTH, PANEL_HEIGHT)
+        panels = _text_panel("nothing was mapped", PANEL_HEIGHT, PANEL_WIDTH, FAINT_INK, "mm")
     legend = _legend([(colors[key], *instances[key]) for key in shown])
-    return np.concatenate([_title(title), panels, legend])
+    return np.concatenate([_text_panel(title, TITLE_HEIGHT, 24, INK, "lm"), panels, legend])
 
 
 def _panels(
@@ -71,15 +71,14 @@ def _panels(
     return np.concatenate([np.asarray(left), np.asarray(right)], axis=1)
 
 
-def _title(text: str) -> UInt8:
-    image = Image.new("RGB", (2 * PANEL_WIDTH, TITLE_HEIGHT), PAPER)
-    canvas, font = ImageDraw.Draw(image), _font(TITLE_PX)
-    canvas.text((24, TITLE_HEIGHT / 2), text, INK, font, anchor="lm")
+def _text_panel(text: str, height: int, x: int, ink: tuple[int, int, int], anchor: str) -> UInt8:
+    image = Image.new("RGB", (2 * PANEL_WIDTH, height), PAPER)
+    ImageDraw.Draw(image).text((x, height / 2), text, ink, _font(TITLE_PX), anchor=anchor)
     return np.asarray(image)
 
 
 def _legend(entries: Iterable[tuple[UInt8, str, float]]) -> UInt8:
-    """What the colours mean, the most confident first."""
+    """Draw the names and confidences of the colors, the most confident first."""
     ranked = sorted(entries, key=lambda entry: -entry[2])
     rows = min(LEGEND_ROWS, -(-len(ranked) // LEGEND_COLUMNS))
     image = Image.new("RGB", (2 * PANEL_WIDTH, LEGEND_ROW * rows + 20), PAPER)
@@ -91,18 +90,11 @@ def _legend(entries: Iterable[tuple[UInt8, str, float]]) -> UInt8:
         x, y = 24 + step * (k % LEGEND_COLUMNS), 10 + LEGEND_ROW * (k // LEGEND_COLUMNS) + LEGEND_ROW / 2
         canvas.rounded_rectangle((x, y - 8, x + 16, y + 8), 4, fill=tuple(color.tolist()))
         canvas.text((x + 24, y), name, INK, font, anchor="lm")
-        canvas.text(
-            (x + 24 + canvas.textlength(f"{name} ", font), y), f"{confidence:.2f}", FAINT_INK, font, anchor="lm"
-        )
+        right = x + 24 + canvas.textlength(f"{name} ", font)
+        canvas.text((right, y), f"{confidence:.2f}", FAINT_INK, font, anchor="lm")
     if len(shown) < len(ranked):
         x, y = 24 + step * (LEGEND_COLUMNS - 1), 10 + LEGEND_ROW * (LEGEND_ROWS - 0.5)
         canvas.text((x, y), f"and {len(ranked) - len(shown)} more", FAINT_INK, font, anchor="lm")
-    return np.asarray(image)
-
-
-def _centered(text: str, width: int, height: int) -> UInt8:
-    image = Image.new("RGB", (width, height), PAPER)
-    ImageDraw.Draw(image).text((width / 2, height / 2), text, FAINT_INK, _font(TITLE_PX), anchor="mm")
     return np.asarray(image)
 
 

@@ -1,4 +1,4 @@
-"""The colours of pictures; those of instances are far apart from each other where the objects are near."""
+"""Colors of pictures; nearby instances have dissimilar colors."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from framework.data import Float64, UInt8
 
 PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)
 
-NEAR_M = 0.8  # objects within about this distance are seen together, so their colours matter most to each other
-ALIKE = 22.0  # CIE76 colour difference within which two colours are taken for each other
+NEAR_M = 0.8  # distance scale within which colors should be dissimilar
+ALIKE = 22.0  # CIE76 difference of similar colors
 HUES = 18
-CLEAR = ((165, 245), (105, 250), (190, 200))  # saturation and value: three degrees of lightness
-DARK = ((130, 95), (60, 125))  # none of the clear colours is among these
+CLEAR = ((165, 245), (105, 250), (190, 200))  # saturation and value
+DARK = ((130, 95), (60, 125))  # disjoint from CLEAR
 
 
 def candidates(shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """(K, 3) RGB: all hues in each of the shades."""
+    """Return RGB colors (K, 3): all hues in each shade."""
     hues = np.arange(HUES) * (180 // HUES)
     hsv = np.array([(hue, *shade) for shade in shades for hue in hues], np.uint8)
     return np.asarray(cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0], np.uint8)
 
 
 def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """(N, 3) RGB for objects at centroids (N, 3) m: each takes the colour least like those near to it, in order."""
+    """Return RGB colors (N, 3) of objects at centroids (N, 3) m, chosen greedily to differ from those nearby."""
     rgb = candidates(shades)
     lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
     likeness = np.exp(-np.linalg.norm(lab[:, None] - lab[None], axis=2) / ALIKE)  # (K, K)
@@ -39,17 +39,17 @@ def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEA
 
 
 def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[int, UInt8]:
-    """RGB (3,) by id of objects at centroids (3,) m: those of overview.png, which has the likely ones, then others."""
+    """Return RGB (3,) by id of objects at centroids (3,) m: likely objects have the colors of overview.png."""
     ordered = sorted(centroids, key=lambda key: (key not in likely, key))
-    places = np.array([centroids[key] for key in ordered], np.float64).reshape(-1, 3)
-    return dict(zip(ordered, instance_colors(places), strict=True))
+    positions = np.array([centroids[key] for key in ordered], np.float64).reshape(-1, 3)
+    return dict(zip(ordered, instance_colors(positions), strict=True))
 
 
 def class_colors(objects: Sequence[tuple[str, float]]) -> dict[str, UInt8]:
-    """RGB (3,) by class of objects of a class and a confidence; those of the likeliest are least like each other."""
+    """Return RGB (3,) by class, given class and confidence of objects; likely classes differ most."""
     most: dict[str, float] = {}
     for name, confidence in objects:
         most[name] = max(confidence, most.get(name, 0.0))
     names = sorted(most, key=lambda name: (-most[name], name))
-    # all in one place: each is to differ from all others
+    # at one position, so that each differs from all others
     return dict(zip(names, instance_colors(np.zeros((len(names), 3))), strict=True))

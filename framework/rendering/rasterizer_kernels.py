@@ -9,15 +9,15 @@ from numba import njit
 from framework.data import Float32, Float64, Int32
 
 NO_TRIANGLE = -1
-CHUNK = 32  # triangles that are looked at together
-SLACK = 0.01  # px by which bounds are wider than what they hold, so that rounding loses no pixel
-CELLS = 1023  # along each axis, of the cube that is ordered
-NEAR = 1e-9  # m, where triangles that reach behind the camera are cut to find their bounds
+CHUNK = 32  # triangles that are culled together
+SLACK = 0.01  # px, margin of bounds against rounding
+CELLS = 1023  # along each axis of the bounding cube
+NEAR = 1e-9  # m, near plane for the bounds of triangles that reach behind the camera
 
 
 @njit(cache=True, nogil=True)
 def morton_codes(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
-    """The place (F,) of each triangle's middle on Morton's curve through the mesh's bounding cube, 10 bits an axis."""
+    """Return the Morton code (F,) of each triangle's center in the bounding cube of the mesh, 10 bits per axis."""
     middle = np.empty((len(triangles), 3), np.float32)
     for f in range(len(triangles)):
         for axis in range(3):
@@ -43,7 +43,7 @@ def morton_codes(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
 
 @njit(cache=True, nogil=True)
 def bounding_spheres(vertices: Float32, triangles: Int32) -> Float64:
-    """(ceil(F / CHUNK), 4) center (m, world) and radius (m) around each chunk of triangles."""
+    """Return the bounding spheres (ceil(F / CHUNK), 4) of chunks of triangles: center (m, world) and radius (m)."""
     spheres = np.zeros(((len(triangles) + CHUNK - 1) // CHUNK, 4))
     for chunk in range(len(spheres)):
         part = triangles[chunk * CHUNK : (chunk + 1) * CHUNK]
@@ -75,10 +75,10 @@ def draw_triangles(
     depth: Float32,
     uv: Float32,
 ) -> None:
-    """Writes the last three, (H, W) and (H, W, 2); x (W,) and y (H,) are the pixels' places on the plane z = 1."""
+    """Write the last three arguments, (H, W) and (H, W, 2); x (W,) and y (H,) are pixel coordinates at z = 1."""
     height, width = triangle.shape
     closeness = np.zeros((height, width))  # 1/m
-    triangle[:] = NO_TRIANGLE  # until the end, in the order of `triangles`
+    triangle[:] = NO_TRIANGLE  # indices into `triangles` until the second pass
     for chunk in range(len(spheres)):
         center = _in_camera(T_world_camera, spheres[chunk, 0], spheres[chunk, 1], spheres[chunk, 2])
         if _is_out_of_sight(center, spheres[chunk, 3], intrinsics, width, height):
@@ -90,7 +90,7 @@ def draw_triangles(
                 continue
             ea, eb, ec, volume = _edge_functions(a, b, c)
             if volume == 0:
-                continue  # the camera lies in its plane
+                continue  # edge-on
             scale = 1 / volume
             for v in range(np.uint64(v0), np.uint64(v1)):
                 row_a, row_b, row_c = ea[1] * y[v] + ea[2], eb[1] * y[v] + eb[2], ec[1] * y[v] + ec[2]
@@ -131,9 +131,23 @@ def nearest(triangle: Int32, uv: Float32, triangles: Int32, labels: Int32, image
                 image[v, u] = labels[triangles[f, 0 if a >= b and a >= c else (1 if b >= c else 2)]]
 
 
+@njit(cache=True, nogil=True)
+def interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32, image: Float32) -> None:
+    for v in range(triangle.shape[0]):
+        for u in range(triangle.shape[1]):
+            f = triangle[v, u]
+            if f == NO_TRIANGLE:
+                continue
+            a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+            wb, wc = uv[v, u, 0], uv[v, u, 1]
+            wa = np.float32(1) - wb - wc
+            for k in range(values.shape[1]):
+                image[v, u, k] = wa * values[a, k] + wb * values[b, k] + wc * values[c, k]
+
+
 @njit(cache=True, nogil=True, inline="always")
 def _corners(vertices, triangles, f, T_world_camera):
-    """The corners of triangle f in the camera's coordinates."""
+    """Return the corners of triangle f, camera frame."""
     i, j, k = np.uint64(triangles[f, 0]), np.uint64(triangles[f, 1]), np.uint64(triangles[f, 2])
     return (
         _in_camera(T_world_camera, vertices[i, 0], vertices[i, 1], vertices[i, 2]),
@@ -144,22 +158,21 @@ def _corners(vertices, triangles, f, T_world_camera):
 
 @njit(cache=True, nogil=True, inline="always")
 def _edge_functions(a, b, c):
-    """The three edge functions of a triangle, and its corners' triple product, which is 0 or positive.
+    """Return the three edge functions of a triangle, and the triple product of its corners, which is not negative.
 
-    A corner's barycentric weight, but for a factor that all three share, is the product of the pixel's ray and the
-    cross product of the other two corners. Neighbours compute that of their common edge alike but for the sign, so that
-    no pixel falls between them.
+    The barycentric weight of a corner is proportional to the product of the pixel's ray and the cross product of the
+    other two corners. For a common edge, neighbors compute the same value except for the sign, which leaves no gap.
     """
     ea, eb, ec = _cross(b, c), _cross(c, a), _cross(a, b)
     volume = a[0] * ea[0] + a[1] * ea[1] + a[2] * ea[2]
-    if volume < 0:  # its other side is seen
+    if volume < 0:  # back side
         return (-ea[0], -ea[1], -ea[2]), (-eb[0], -eb[1], -eb[2]), (-ec[0], -ec[1], -ec[2]), -volume
     return ea, eb, ec, volume
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _in_camera(T, x, y, z):
-    """A point of the world in the camera's coordinates."""
+    """Transform a world point into the camera frame."""
     x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
     return (
         T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
@@ -175,7 +188,7 @@ def _cross(p, q):
 
 @njit(cache=True, nogil=True)
 def _is_out_of_sight(center, radius, intrinsics, width, height):
-    """Whether a sphere lies behind the camera or beside one of the four planes around what it sees."""
+    """Return whether a sphere is outside of the view frustum."""
     fx, fy, cx, cy = intrinsics
     x, y, z = center
     for distance, slope in (
@@ -192,7 +205,7 @@ def _is_out_of_sight(center, radius, intrinsics, width, height):
 
 @njit(cache=True, nogil=True, inline="always")
 def _pixels_of(a, b, c, intrinsics, width, height):
-    """First and end of the columns, then of the rows, that a triangle's part in front of the camera can cover."""
+    """Return begin and end of the columns and of the rows that a triangle in front of the camera can cover."""
     fx, fy, cx, cy = intrinsics
     if min(a[2], b[2], c[2]) > NEAR:
         za, zb, zc = 1 / a[2], 1 / b[2], 1 / c[2]
@@ -210,7 +223,7 @@ def _pixels_of(a, b, c, intrinsics, width, height):
 
 @njit(cache=True, nogil=True)
 def _bounds_in_front(a, b, c):
-    """Left, right, top and bottom on the plane z = 1 of what of a triangle is in front of z = NEAR."""
+    """Return left, right, top and bottom at z = 1 of the part of a triangle in front of z = NEAR."""
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     for p, q in ((a, b), (b, c), (c, a)):
         x, y, z = p

@@ -1,4 +1,4 @@
-"""Pictures of a triangle surface by rasterization: no window system, no OpenGL."""
+"""Oriented triangle surfaces and their rasterized views, without OpenGL."""
 
 from __future__ import annotations
 
@@ -9,39 +9,37 @@ import numpy as np
 
 from framework.data import Bool, Camera, Float32, Float64, Int32
 from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
-from framework.rendering.rasterizer_kernels import NO_TRIANGLE
-from framework.rendering.surface_kernels import interpolate
+from framework.rendering.rasterizer_kernels import NO_TRIANGLE, interpolate
 
-VOTES = 20000  # triangles that are asked which of their sides was seen
-VOTERS = 50  # cameras that are asked
+VOTES, VOTERS = 20000, 50  # triangles and cameras that determine the front side
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What each pixel of a camera sees of a surface."""
+    """The visible surface point of each pixel of a camera."""
 
     camera: Camera
     buffer: VisibilityBuffer
     vertices: Float32  # (V, 3) m, world
-    triangles: Int32  # (F, 3), those that `buffer` counts
+    triangles: Int32  # (F, 3), indexed by `buffer`
 
     @property
     def depth(self) -> Float32:
-        """(H, W) m along z, 0 = nothing."""
+        """Depth (H, W) m along z, 0 = none."""
         return self.buffer.depth
 
     @property
     def seen(self) -> Bool:
-        """(H, W)."""
+        """Mask (H, W) of the pixels with a surface."""
         return np.asarray(self.buffer.triangle != NO_TRIANGLE)
 
     @property
     def points_world(self) -> Float32:
-        """(H, W, 3) m, 0 where nothing is seen."""
+        """Points (H, W, 3) m, 0 = none."""
         return self.interpolated(self.vertices)
 
     def subsampled(self, n: int) -> Hits:
-        """The picture of each n-th pixel."""
+        """Return every n-th pixel in both directions."""
         seen, c = self.buffer, self.camera
         triangle, depth = np.ascontiguousarray(seen.triangle[::n, ::n]), np.ascontiguousarray(seen.depth[::n, ::n])
         height, width = depth.shape
@@ -50,18 +48,18 @@ class Hits:
         return replace(self, camera=camera, buffer=buffer)
 
     def interpolated(self, values: Float32) -> Float32:
-        """(H, W, C) of values (V, C) at the vertices, 0 where nothing is seen."""
+        """Interpolate values (V, C) of the vertices, (H, W, C), 0 = none."""
         image = np.zeros((*self.camera.shape, values.shape[1]), np.float32)
         interpolate(self.buffer.triangle, self.buffer.uv, self.triangles, np.ascontiguousarray(values), image)
         return image
 
     def nearest(self, labels: Int32) -> Int32:
-        """(H, W) the label (V,) of the nearest corner, 0 where nothing is seen."""
+        """Return the label (V,) of the nearest corner, (H, W), 0 = none."""
         return self.buffer.nearest(self.triangles, labels)
 
 
 class Surface:
-    """Triangles whose winding says which side is the front: the side that was seen."""
+    """Triangles whose winding defines the front side."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
         self.vertices = np.ascontiguousarray(vertices, np.float32)  # (V, 3) m
@@ -69,9 +67,9 @@ class Surface:
 
     @classmethod
     def seen_from(cls, vertices: Float32, triangles: Int32, poses: Float64) -> Surface:
-        """The surface wound so that most of what lies before the cameras at `poses` (F, 4, 4) shows them its front.
+        """Orient the surface with its front towards the cameras at `poses` (F, 4, 4).
 
-        Mesh extractors do not agree on the winding.
+        The winding of meshes depends on their extractor.
         """
         some = cls(vertices, triangles[:: max(1, len(triangles) // VOTES)])
         centers = vertices[some.triangles].mean(axis=1)
@@ -86,13 +84,13 @@ class Surface:
 
     @cached_property
     def face_normals(self) -> Float32:
-        """(F, 3), length = twice the area, so that sums of them weigh by area."""
+        """Normals (F, 3) with twice the area as length."""
         a, b, c = self.vertices[self.triangles].transpose(1, 0, 2)
         return np.cross(b - a, c - a)
 
     @cached_property
     def vertex_normals(self) -> Float32:
-        """(V, 3) unit length, averaged over the triangles around each vertex by area."""
+        """Unit normals (V, 3), averaged over adjacent triangles by area."""
         corners, weights = self.triangles.ravel(), np.repeat(self.face_normals, 3, axis=0)
         x, y, z = (np.bincount(corners, weights[:, k], minlength=len(self.vertices)) for k in range(3))
         length = np.maximum(np.sqrt(x**2 + y**2 + z**2), 1e-12)
@@ -100,7 +98,7 @@ class Surface:
 
 
 class FrontSides:
-    """The triangles of a surface that face an eye: not the walls and ceilings between it and the room."""
+    """The triangles of a surface that face an eye, without the walls and ceilings in between."""
 
     def __init__(self, surface: Surface, eye_world: Float64) -> None:
         self._eye_world = eye_world  # (3,) m
@@ -111,7 +109,7 @@ class FrontSides:
         self._rasterizer = Rasterizer(self._vertices, self._triangles)
 
     def seen_by(self, camera: Camera, R_world_camera: Float64) -> Hits:
-        """What a camera at the eye sees along each pixel's ray."""
+        """Return the view of a camera at the eye."""
         T_world_camera = np.eye(4)
         T_world_camera[:3, :3], T_world_camera[:3, 3] = R_world_camera, self._eye_world
         return Hits(camera, self._rasterizer.draw(camera, T_world_camera), self._vertices, self._triangles)

@@ -1,4 +1,4 @@
-"""From where to look at a map: obliquely from above, into the room, with as many objects in sight as there can be."""
+"""Viewpoint selection for a map: obliquely from above, into the room, with many visible objects."""
 
 from __future__ import annotations
 
@@ -8,20 +8,17 @@ from framework.data import Camera, Float32, Float64, Int32
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint_kernels import draw_fronts, sum_level_normals
 
-FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, so that far objects are not much smaller than near ones
+FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, for a weak perspective
 ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])
 AZIMUTHS = 16  # candidates around the vertical
-MARGIN = 1.04  # of free space around what is shown
-TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, of the small pictures that candidates are judged by
-TRIAL_POINTS = 60000  # vertices in those pictures
-LEVEL_CONE_RAD = np.deg2rad(30)  # floors and tables are looked for this near to the cameras' mean upward direction
+MARGIN = 1.04  # size of the view relative to its content
+TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, of the images of candidates
+TRIAL_POINTS = 60000  # vertices in these images
+LEVEL_CONE_RAD = np.deg2rad(30)  # maximum angle of floor normals to the mean up direction of the cameras
 
 
 def upward(poses: Float64, surface: Surface) -> Float64:
-    """(3,) the direction up in the world: the mean of the cameras' -y axes, straightened by floors and table tops.
-
-    The world's axes say nothing: z-up, y-up and the first camera's frame all exist.
-    """
+    """Estimate the up direction (3,): the mean of the cameras' -y axes, refined by floors and table tops."""
     up = -poses[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
     cone = LEVEL_CONE_RAD
@@ -35,16 +32,16 @@ def upward(poses: Float64, surface: Surface) -> Float64:
 
 
 def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int, height: int) -> tuple[Camera, Float64]:
-    """The camera of width x height px and its T_world_camera that show most.
+    """Return the camera of width x height px and its T_world_camera with the best view.
 
     Args:
         instance_ids: (V,) of the surface's vertices, 0 = no instance.
-        poses: (F, 4, 4) of the cameras that saw the surface.
+        poses: (F, 4, 4) of the cameras that mapped the surface.
     """
     up = upward(poses, surface)
     forward = poses[:, :3, 2].mean(axis=0)
     forward -= (forward @ up) * up
-    if np.linalg.norm(forward) < 0.1:  # the cameras looked all around
+    if np.linalg.norm(forward) < 0.1:  # the cameras looked in all directions
         forward = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     forward /= np.linalg.norm(forward)
     side = np.cross(forward, up)
@@ -60,15 +57,15 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
             R_trial = looking(np.cos(elevation) * level - np.sin(elevation) * up, up)
             visible = _visible(points, normals, *_framed(R_trial, bulk, TRIAL_WIDTH, TRIAL_HEIGHT))
             score = _score(instance_ids[chosen][visible])
-            score *= 1 + 0.15 * np.cos(azimuth)  # between equals, the way that the cameras looked
+            score *= 1 + 0.15 * np.cos(azimuth)  # prefer the direction of the cameras
             if score > best_score:
                 best_score, R, shown = score, R_trial, points[visible]
-    # framed for what is seen: the ceiling and the near walls, which are looked through, need no room
+    # framed for the visible points, without the ceiling and the near walls
     return fitted(R, shown, width, height)
 
 
 def looking(forward: Float64, up: Float64) -> Float64:
-    """(3, 3) the rotation of a camera that looks along `forward` (3,) with `up` (3,) upwards in its picture."""
+    """Return the rotation (3, 3) of a camera that looks along `forward` (3,) with `up` (3,) upwards in the image."""
     z = forward / np.linalg.norm(forward)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
@@ -76,23 +73,23 @@ def looking(forward: Float64, up: Float64) -> Float64:
 
 
 def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """A camera with this rotation, as near as it can be with the points (P, 3) in its picture of width x height px."""
+    """Return the nearest camera with this rotation whose image of width x height px contains the points (P, 3)."""
     return _framed(R_world_camera, _without_strays(points_world), width, height)
 
 
 def _without_strays(points: Float32) -> Float32:
-    """Points (P, 3) less those at the border of a map that lie apart."""
+    """Remove outliers at the border of points (P, 3)."""
     low, high = np.percentile(points, [0.3, 99.7], axis=0)
     kept = points[((points >= low) & (points <= high)).all(axis=1)]
     return kept if len(kept) else points
 
 
 def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """`fitted`, with all the points in the picture."""
+    """Return the camera of `fitted`, for all points."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     x, y, z = R_world_camera.T @ points_world.T
-    # |x - x0| <= tan_x (z - z0) for all points; the extreme lines of either side meet where the camera must be
+    # |x - x0| <= tan_x (z - z0) for all points; the extreme lines of both sides intersect at the camera
     tan_x, tan_y = width / 2 / focal / MARGIN, height / 2 / focal / MARGIN
     right, left = (x - tan_x * z).max(), (x + tan_x * z).min()
     below, above = (y - tan_y * z).max(), (y + tan_y * z).min()
@@ -104,13 +101,13 @@ def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: 
 
 
 def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
-    """The points (P, 3) that a small picture shows: in each pixel the nearest of those that turn their front to it."""
+    """Return the nearest front-facing point of each pixel, as indices into the points (P, 3)."""
     nearest = np.full(camera.shape, -1, np.int32)
-    points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)  # one kernel for both layouts
+    points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)  # as the kernel is compiled
     draw_fronts(points, normals, T_world_camera, (camera.fx, camera.fy, camera.cx, camera.cy), nearest)
     return np.asarray(nearest[nearest >= 0])
 
 
 def _score(instance_ids: Int32) -> float:
-    """How much a picture shows, given its pixels' ids. Square roots: ten objects are worth more than a large one."""
+    """Rate an image by the ids of its pixels. Square roots rate ten small objects higher than one large object."""
     return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))

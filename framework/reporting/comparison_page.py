@@ -115,11 +115,11 @@ class Comparison:
             "sameWorld": len(sequences) == 1,
             "maps": [{"name": name, **scene.data()} for name, scene in shown],
         }
+        metrics = [run.record.metrics for run in self.runs]
+        choices = [", ".join(filter(None, (one.get("choice.detector"), one.get("choice.fuser")))) for one in metrics]
         context = {
             "heading": heading,
-            "runs": [
-                (name, link, _choices(run)) for name, link, run in zip(self.names, self.links, self.runs, strict=True)
-            ],
+            "runs": list(zip(self.names, self.links, choices, strict=True)),
             "run_colors": len(RUN_COLORS),
             "notices": self._notices(),
             "shown": [name for name, _ in shown],
@@ -226,9 +226,3 @@ def short_names(directories: Sequence[Path]) -> list[str]:
 def _target(node: Any) -> str:
     """Return the class name of a plugin."""
     return str(node.get("_target_")).rpartition(".")[2] if isinstance(node, dict) else ""
-
-
-def _choices(run: RunContents) -> str:
-    """The detector and the fuser of a run."""
-    names = [run.record.metrics.get(f"choice.{group}") for group in ("detector", "fuser")]
-    return ", ".join(str(name) for name in names if name)

@@ -28,8 +28,8 @@ def page(template: str, title: str, context: Mapping[str, Any], data: Mapping[st
         data: for the scripts, as JSON.
         maps: GLB, gzip, base64.
     """
-    style = asset(STYLE)
-    script = "\n".join(asset(name) for name in SCRIPTS)
+    style, *scripts = [(ASSETS / name).read_text(encoding="utf-8") for name in (STYLE, *SCRIPTS)]
+    script = "\n".join(scripts)
     if "</script" in script.lower() or "</style" in style.lower():
         raise DataError(f"{ASSETS}: expected no end tag in scripts and styles")
     environment = Environment(
@@ -43,11 +43,6 @@ def page(template: str, title: str, context: Mapping[str, Any], data: Mapping[st
     policy = POLICY.format(style=_hash(style), script=_hash(script))
     shared = {"title": title, "policy": policy, "style": style, "script": script, "data": data, "maps": maps}
     return environment.get_template(template).render(**context, **shared)
-
-
-def asset(name: str) -> str:
-    """Return the text of a file that comes with the project."""
-    return (ASSETS / name).read_text(encoding="utf-8")
 
 
 def _hash(text: str) -> str:

@@ -42,15 +42,6 @@ from framework.runs.stored_runs import is_number
 OVERVIEW_WIDTH = 1400  # px, of the picture for browsers without WebGL
 SMALL_PATH = 0.3  # of the width of the top view: a smaller path is also shown enlarged
 TOP_VIEW_KEY = (("mine", "estimated"), ("truth", "true"), ("start", "start"), ("end", "end"), ("lost", "tracking lost"))
-TABLE_HEADS = (
-    ("Object", "text"),
-    ("Confidence", "number"),
-    ("Size, cm", "number"),
-    ("Frames", "number"),
-    ("First seen", "number"),
-    ("Position, m", "text"),
-)
-TRUTH_HEADS = (("Truth", "text"), ("IoU", "number"))
 
 
 @dataclass(frozen=True)
@@ -102,7 +93,6 @@ class RunReport:
             "likely": LIKELY,
             "mapped": self.scene is not None,
             "still": overview_url(contents.record.directory / "overview.png") if self.scene is not None else "",
-            "heads": TABLE_HEADS + (TRUTH_HEADS if self.check else ()),
             "checked": self.check is not None,
             "objects": object_rows(contents, self.pictures, judgements),
             "truth": truth_section(self.check, self.why_unchecked, contents, self.pictures),

@@ -1,1 +1,1 @@
-"""Viewers: what is seen of a run while it goes on."""
+"""Viewers of a run in progress."""

@@ -1,4 +1,4 @@
-"""No viewer: a run is seen when it is over."""
+"""No viewer."""
 
 from __future__ import annotations
 

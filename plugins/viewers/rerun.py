@@ -1,4 +1,4 @@
-"""The run in rerun (https://rerun.io, Apache-2.0 and MIT): in its own window, in a browser, or in a file for later."""
+"""Live view in rerun (https://rerun.io, Apache-2.0 and MIT): in a window, in a browser, or recorded to a file."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from framework.config.validation import check_bounds, require
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, in_one_line
 from framework.interfaces import SceneMap, Viewer
-from framework.live_view.drawing_thread import Background
+from framework.live_view.drawing_thread import DrawingThread
 from framework.live_view.rerun_program import HERE, open_window
 from framework.live_view.sealed_page import SealedPage
 
 log = logging.getLogger(__name__)
 
 RECORDING = "recording.rrd"
-FLUSH_S = 0.2  # after which what was drawn is in the file: what a killed run loses
+FLUSH_S = 0.2  # maximum duration that a killed run loses
 
 
 class Mode(Enum):
-    """Where a run is shown."""
+    """Output of the viewer."""
 
     RECORD = "record"
     WINDOW = "window"
@@ -40,11 +40,9 @@ class Mode(Enum):
 
 @dataclass
 class RerunViewer(Viewer):
-    """Shows the camera, what it sees and the growing map, in rerun's viewer or in a file that it opens later.
+    """Viewer of the camera path, the newest frame with masks and depth, the mesh, object boxes, and stage times.
 
-    Drawn are the camera's path, the newest frame with its masks and depth, the parts of the mesh that have changed,
-    boxes around the objects, milliseconds by stage, and lost frames. Where drawing is slower than mapping, pictures are
-    left out, and never a pose, a time or a lost frame.
+    If drawing is slower than mapping, pictures are omitted, but no poses, times or lost frames.
     """
 
     mode: Mode = Mode.RECORD  # RECORD, WINDOW or BROWSER
@@ -75,7 +73,7 @@ class RerunViewer(Viewer):
         require(limit.isdecimal(), "RerunViewer.memory_limit", self.memory_limit, "like 2GB or 25%")
         self._page: SealedPage | None = None
         if importlib.util.find_spec("rerun") is None:
-            raise ConfigError("rerun, which draws the run, is not there: pip install instancemap[viewer]")
+            raise ConfigError("rerun, which draws the run, is missing: pip install instancemap[viewer]")
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
         import rerun as rr
@@ -88,21 +86,21 @@ class RerunViewer(Viewer):
         recording.set_sinks(*self._sinks(rr, directory), default_blueprint=layout())
         recording.send_recording_name(video)
         drawing = RerunDrawing(recording, self.stride, self.jpeg_quality, self.region_size, self.min_confidence)
-        self._background = Background(scene, drawing, self.frame_interval, self.mesh_interval)
+        self._thread = DrawingThread(scene, drawing, self.frame_interval, self.mesh_interval)
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
-        self._background.show(frame, detections, pose, stage_ms)
+        self._thread.show(frame, detections, pose, stage_ms)
 
     def skip(self, reason: str) -> None:
-        self._background.skip(reason)
+        self._thread.skip(reason)
 
     def end(self) -> None:
-        self._background.end()
+        self._thread.end()
         if self._page is not None:
             self._page.close()
 
     def _sinks(self, rr: Any, directory: Path) -> list[Any]:
-        """Where the drawing goes."""
+        """Return rerun's sinks for the chosen outputs."""
         sinks = []
         file = self.file or (RECORDING if self.mode is Mode.RECORD else "")
         if file:
@@ -120,14 +118,14 @@ class RerunViewer(Viewer):
 def _file_sink(rr: Any, path: Path) -> Any:
     with _faults(f"{path} cannot be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.open("wb").close()  # rerun itself would only say so on stderr
+        path.open("wb").close()  # rerun would report this only on stderr
         return rr.FileSink(path)
 
 
 def _server(rr: Any, port: int, memory_limit: str) -> Any:
-    """Serves the data, to this machine alone."""
+    """Serve the data on 127.0.0.1."""
     with _faults(f"port {port} cannot be had: set viewer.port"):
-        with socket.socket() as probe:  # rerun itself would only say so on stderr
+        with socket.socket() as probe:  # rerun would report this only on stderr
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((HERE, port))
         return rr.GrpcServerSink(bind_ip=HERE, port=port, server_memory_limit=memory_limit)

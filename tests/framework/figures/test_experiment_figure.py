@@ -192,7 +192,7 @@ def test_stage_times_are_averaged_over_the_sequences(tmp_path: Path, caplog: pyt
     assert {"track", "refine", "fuse", "30 ms", "not complete"} <= set(found)
     note = " ".join(found[0].split())
     assert note.startswith("Mean of 2 sequences (011, 206) ")
-    assert "Lines end where the shortest sequence does." in note
+    assert "Lines end with the shortest sequence." in note
 
 
 @pytest.mark.parametrize(

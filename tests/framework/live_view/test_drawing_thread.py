@@ -13,8 +13,7 @@ import pytest
 
 from framework.data import Pose
 from framework.live_view import drawing_thread
-from framework.live_view.drawing_thread import Background, Pace
-from framework.live_view.updates import FrameNote, FrameUpdate, MapSnapshot
+from framework.live_view.drawing_thread import DrawingThread, FrameNote, FrameUpdate, MapSnapshot, Pace
 from framework.pipeline import Pipeline
 from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector
 
@@ -62,7 +61,7 @@ def mapped(room: CornerRoom) -> GridMap:
 
 def test_all_is_told_and_the_last_map_is_whole(room: CornerRoom) -> None:
     scene, book = mapped(room), Notebook()
-    background = Background(scene, book, every=1, map_every=3600)
+    background = DrawingThread(scene, book, frame_interval=1, map_interval=3600)
     for frame in room:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera, frame.index == 3), {"fuse": 1.5})
         background.skip(f"after {frame.index}")
@@ -82,7 +81,7 @@ def test_all_is_told_and_the_last_map_is_whole(room: CornerRoom) -> None:
 def test_the_loop_does_not_wait_and_only_the_newest_picture_is_drawn(room: CornerRoom) -> None:
     going_on, book = threading.Event(), Notebook()
     book.waits_for = going_on
-    background = Background(mapped(room), book, every=1, map_every=3600)
+    background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
     while not book.threads:  # it has begun to draw, and is stuck
         time.sleep(0.001)
@@ -98,7 +97,7 @@ def test_the_loop_does_not_wait_and_only_the_newest_picture_is_drawn(room: Corne
 @pytest.mark.parametrize("every", [2, 4])
 def test_pictures_are_of_every_so_many_frames(room: CornerRoom, every: int) -> None:
     book = Notebook()
-    background = Background(mapped(room), book, every, map_every=3600)
+    background = DrawingThread(mapped(room), book, every, map_interval=3600)
     for frame in room:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
     background.end()
@@ -107,7 +106,7 @@ def test_pictures_are_of_every_so_many_frames(room: CornerRoom, every: int) -> N
 
 def test_a_drawing_that_fails_is_told_once_and_ends_nothing(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
     book = Notebook(fails=True)
-    background = Background(mapped(room), book, every=1, map_every=3600)
+    background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     for frame in room:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
         background.skip("a fault")
@@ -122,7 +121,9 @@ def test_a_drawing_that_fails_is_told_once_and_ends_nothing(room: CornerRoom, ca
 def test_a_drawing_that_cannot_be_closed_is_told_once(
     fails: bool, room: CornerRoom, caplog: pytest.LogCaptureFixture
 ) -> None:
-    background = Background(mapped(room), Notebook(fails=fails, fails_to_close=True), every=1, map_every=3600)
+    background = DrawingThread(
+        mapped(room), Notebook(fails=fails, fails_to_close=True), frame_interval=1, map_interval=3600
+    )
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
     background.end()
     [told] = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
@@ -135,7 +136,7 @@ def test_a_map_that_cannot_be_shown_ends_nothing(room: CornerRoom, caplog: pytes
             raise MemoryError("Unable to allocate 40 GiB")
 
     book = Notebook()
-    background = Background(Broken(vertices=[np.zeros((1, 3))]), book, every=1, map_every=3600)
+    background = DrawingThread(Broken(vertices=[np.zeros((1, 3))]), book, frame_interval=1, map_interval=3600)
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
     background.end()
     assert "viewer: it failed, and the run goes on without it: Unable to allocate 40 GiB" in caplog.text
@@ -145,7 +146,7 @@ def test_a_map_that_cannot_be_shown_ends_nothing(room: CornerRoom, caplog: pytes
 def test_what_came_last_is_drawn_although_no_frame_follows(room: CornerRoom) -> None:
     """A live video that stands still."""
     book = Notebook()
-    background = Background(mapped(room), book, every=1, map_every=3600)
+    background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     for frame in room:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
     deadline = time.monotonic() + 20

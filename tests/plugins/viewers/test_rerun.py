@@ -240,7 +240,7 @@ def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     find_spec = importlib.util.find_spec
     there = {"rerun": None}
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: there.get(name, find_spec(name, *rest)))
-    with pytest.raises(ConfigError, match=r"rerun, .* is not there: pip install instancemap\[viewer\]$"):
+    with pytest.raises(ConfigError, match=r"rerun, .* is missing: pip install instancemap\[viewer\]$"):
         build_viewer("rerun")
 
 
