@@ -13,27 +13,27 @@ from pathlib import Path
 import framework
 
 COMMANDS = {
-    "tables": "run records below a folder become tables: Markdown, LaTeX, CSV",
-    "figures": "run records below a folder become the paper's figures",
-    "report": "shows a run, or several side by side, as a page for the browser",
-    "import": "turns a recording of a phone or a sensor into a folder that can be mapped",
-    "check": "looks whether a recording will map, and says what to set where it will not",
-    "diff": "lists what appeared, vanished or moved between two visits of a place",
-    "export": "writes a run as GLB, USD, PLY, OBJ, floor plan, ROS map or scene graph",
-    "query": "ranks a stored run's objects by words: a red chair",
-    "evaluate": "evaluates stored runs anew, without running them again",
-    "detect": "writes a video's detections as a COCO result file",
-    "show-refinement": "draws one frame's masks before and after refinement",
-    "compile": "compiles the map's kernels, once for a machine: the first run then begins at once",
-    "doctor": "says what is there of what can be used, and what gets the rest: first of all in an issue",
-    "plugins": "lists what is registered for each stage, with its parameters",
-    "new-plugin": "writes a repository with a plugin of your own: package, option, tests, CI",
-    "synthesize": "writes a benchmark of furnished rooms in SceneNN's own format",
-    "train-detector": "trains Mask R-CNN on rendered rooms",
-    "convert-weights": "converts a Mask R-CNN of torchvision or detectron2",
-    "convert-oni": "converts SceneNN's raw video to the images that dataset=scenenn reads",
+    "tables": "write the tables of an experiment: Markdown, LaTeX, CSV",
+    "figures": "draw the figures of an experiment",
+    "report": "write an HTML report of a run, or a comparison of several",
+    "import": "convert a recording of a phone or sensor to a folder for dataset=rgbd_folder",
+    "check": "validate a recording and suggest parameter fixes",
+    "diff": "list objects that appeared, vanished or moved between two runs",
+    "export": "export a run as GLB, USD, PLY, OBJ, floor plan, ROS map or scene graph",
+    "query": 'rank the objects of a run by a text query: "a red chair"',
+    "evaluate": "re-evaluate stored runs without mapping them again",
+    "detect": "write the detections of a sequence as a COCO result file",
+    "show-refinement": "draw the masks of a frame before and after refinement",
+    "compile": "compile the kernels in advance, once per installation",
+    "doctor": "check the installation and print the fix for each problem",
+    "plugins": "list the plugins of each stage and their parameters",
+    "new-plugin": "create a repository with a plugin: package, option, tests, CI",
+    "synthesize": "render a benchmark of synthetic rooms in SceneNN's format",
+    "train-detector": "train Mask R-CNN on rendered rooms",
+    "convert-weights": "convert a Mask R-CNN of torchvision or detectron2",
+    "convert-oni": "convert an OpenNI recording to images for dataset=scenenn",
 }
-"""What each does."""
+"""Summary of each command."""
 
 FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
@@ -43,37 +43,25 @@ FOLDERS = {
 }
 """The folder of framework.commands that contains the module of each command."""
 
-PRINTING = (
-    "tables",
-    "figures",
-    "report",
-    "diff",
-    "export",
-    "query",
-    "evaluate",
-    "plugins",
-    "doctor",
-)  # what others may be reading: `| head` ends them without a word
+PRINTING = (*FOLDERS["results"], "plugins", "doctor")  # a closed pipe (`| head`) ends them silently
 
 HELP = """\
 {program} [COMMAND] ...    instance-oriented semantic 3D mapping from RGB-D video
 
-Without a command, KEY=VALUE ... make one run; with -m, or with an experiment, a sweep of runs:
+Without a command, KEY=VALUE ... start a run; with -m, or with an experiment, a sweep of runs:
   {program} dataset=rgbd_folder dataset.root=DIR
   {program} -m refiner=identity,kmeans,gmm_em seed=0,1,2
 
-Commands; each explains itself with --help:
+Commands (COMMAND --help lists the arguments):
 {commands}
 
-Exit status: 0 = done; 1 = a fault; 3 = a fault ended a run early, and what it had mapped is written; 128 + N = ended by
-signal N (130 = Ctrl-C, 143 = SIGTERM), and what a run had mapped is written.
+Exit status: 0 = success; 1 = error; 3 = an error ended a run early, and its partial outputs are written;
+128 + N = ended by signal N (130 = Ctrl-C, 143 = SIGTERM), and the partial outputs of a run are written.
 
-debug=true, for any of them, shows where an error comes from. The keys of a run: --cfg job; Hydra's own options:
---hydra-help.
+debug=true adds the traceback to errors of any command. --cfg job lists the keys of a run, --hydra-help Hydra's options.
 """
 
-
-RERUN = "--experimental-rerun"  # Hydra's: it reads a pickle, which may bring code
+RERUN = "--experimental-rerun"  # of Hydra: reads a pickle, which may contain code
 
 
 def module_of(command: str) -> str:
@@ -101,40 +89,37 @@ def leave_working_folder(arguments: list[str]) -> None:
 
 
 def open_standard_streams() -> None:
-    """Opens /dev/null for those that were closed (`2>&-`).
+    """Open /dev/null for closed streams (`2>&-`).
 
-    Else a file of the record gets the number of one, and what a library prints goes into that file.
+    Otherwise an output file of the run gets the number of one, and receives what libraries print.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
             mode = "r" if number == 0 else "w"
-            # the lowest free number is the one that was closed, as they are gone through in order
+            # opening takes the lowest free number, which is this one
             stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115  (open until the process ends)
             setattr(sys, name, stream)
             setattr(sys, f"__{name}__", stream)
 
 
 def main() -> None:
-    """The console script `instancemap`."""
+    """Run the console script `instancemap`."""
     open_standard_streams()
     leave_working_folder(sys.argv[1:])
     if any(word.startswith("--e") and RERUN.startswith(word.partition("=")[0]) for word in sys.argv[1:]):
         sys.exit(f"error: {RERUN} reads a pickle, which may bring code that runs; give the run's overrides instead")
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # names of files may be no text
+        if isinstance(stream, TextIOWrapper):  # file names may not be valid text
             stream.reconfigure(errors="backslashreplace")
     program = "python -m framework" if Path(sys.argv[0]).name == "__main__.py" else Path(sys.argv[0]).name
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     if word in ("--help", "-h", "help"):
         width = max(map(len, COMMANDS))
-        listed = "\n".join(f"  {name:<{width}}  {says}" for name, says in COMMANDS.items())
-        try:
-            print(HELP.format(program=program, commands=listed), end="", flush=True)
-        except OSError as error:
-            drop_output()
-            sys.exit(f"error: the help could not be written: {error.strerror}")
+        listed = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items())
+        print(HELP.format(program=program, commands=listed), end="")
+        flush_output()
         return
     if word == "--version":
         print(f"instancemap {framework.__version__}")
@@ -152,23 +137,19 @@ def main() -> None:
     try:
         import_module(module_of(word)).main()
     finally:
-        end_output()
+        flush_output()
 
 
-def end_output() -> None:
-    """Writes what is still to be written to stdout; where it cannot, and nothing else is told, that is told."""
-    told = sys.exc_info()[0] is not None
+def flush_output() -> None:
+    """Flush stdout; exit with an error if that fails and no other error is being reported."""
+    reported = sys.exc_info()[0] is not None
     try:
         sys.stdout.flush()
     except OSError as error:
-        drop_output()
-        if not told:
+        # redirect the rest of the buffer to nowhere: Python flushes it again at exit, and would report that
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not reported:
             sys.exit(f"error: {error}")
-
-
-def drop_output() -> None:
-    """Writes what stdout still holds to nowhere: Python would try once more when it ends, and tell of that."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

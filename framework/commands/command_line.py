@@ -1,8 +1,9 @@
-"""How the commands answer faults: one line on stderr and an exit status; the traceback only where it is asked for."""
+"""Error handling of commands: one line on stderr and an exit status; a traceback only with `debug=true`."""
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import logging
 import os
 import signal
@@ -20,6 +21,7 @@ from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from tqdm import tqdm
 
 from framework.config.composition import FileConfigSource, InstalledConfigs, add_config_dir, one_line
 from framework.config.hydra_api import replace_file_source
@@ -30,18 +32,14 @@ log = logging.getLogger(__name__)
 
 KNOWN_ERRORS = (InstanceMapError, HydraException, OmegaConfBaseException, OSError)
 EXIT_FAILED = 1
-EXIT_PARTIAL = 3  # a run ended early, and what it had mapped is written
-EXIT_SIGNAL = 128  # and the signal's number, as shells report it: 130 after Ctrl-C, 143 after SIGTERM
+EXIT_PARTIAL = 3  # a run ended early, and its partial outputs are written
+EXIT_SIGNAL = 128  # plus the signal's number, as in shells: 130 after Ctrl-C, 143 after SIGTERM
 
 
 def directory_name(overrides: str) -> str:
-    """Overrides as the name of one directory: no separators, and short enough for every file system."""
+    """Return overrides as the name of one directory: no separators, and short enough for every file system."""
     name = overrides.replace(os.sep, "_") or "defaults"
-    if len(name) <= 200:
-        return name
-    import hashlib
-
-    return f"{name[:180]}_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+    return name if len(name) <= 200 else f"{name[:180]}_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
 
 
 replace_file_source(FileConfigSource)
@@ -50,72 +48,67 @@ OmegaConf.register_new_resolver("directory_name", directory_name, replace=True)
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Ends the process with one line on stderr and a status when a known error, or Ctrl-C, comes out of the body."""
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises its errors in place of printing them
+    """Exit with one line on stderr and a status after a known error or Ctrl-C in the body."""
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises its errors instead of printing them
     try:
         yield
     except KeyboardInterrupt as error:
         print(str(error) or "interrupted", file=sys.stderr)
         sys.exit(EXIT_SIGNAL + (error.number if isinstance(error, Interrupted) else signal.SIGINT))
-    except (*KNOWN_ERRORS, ValueError) as error:  # Hydra answers some faults on its command line with ValueError
-        show_traceback(error)
-        print(f"error: {one_line(error)}", file=sys.stderr)
+    except (*KNOWN_ERRORS, ValueError) as error:  # Hydra raises ValueError for some wrong arguments
+        print_error(error)
         sys.exit(EXIT_FAILED)
 
 
-def show_traceback(error: BaseException) -> None:
-    """Where an error comes from, for whoever asks with `debug=true`; it precedes the line that says what is wrong."""
+def print_error(error: BaseException, prefix: str = "error: ") -> None:
+    """Print an error as one line to stderr, after its traceback with `debug=true`."""
     if "debug=true" in sys.argv:
         traceback.print_exception(error)
+    tqdm.write(f"{prefix}{one_line(error)}", file=sys.stderr)  # above a progress bar
 
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """What the command line asks for; `debug=true`, which all commands understand, is not for the parser.
-
-    They all take --config-dir, too: what is registered there counts as registered, as in a run.
-    """
+    """Parse the command line. All commands also take `debug=true` and --config-dir, which registers more options."""
     for word in sys.argv[1:]:
         if word.startswith("debug=") and word not in ("debug=true", "debug=false"):
             parser.error(f"debug must be true or false, found {word.partition('=')[2][:60]!r}")
-    parser.add_argument("--config-dir", metavar="FOLDER", type=Path, help="of options of your own, as in a run")
-    asked = parser.parse_intermixed_args([word for word in sys.argv[1:] if not word.startswith("debug=")])
-    if asked.config_dir is not None:
+    parser.add_argument("--config-dir", metavar="FOLDER", type=Path, help="folder with more options, as in a run")
+    parsed = parser.parse_intermixed_args([word for word in sys.argv[1:] if not word.startswith("debug=")])
+    if parsed.config_dir is not None:
         try:
-            add_config_dir(asked.config_dir)
+            add_config_dir(parsed.config_dir)
         except InstanceMapError as error:
             parser.error(str(error))
-    return asked
+    return parsed
 
 
-def print_for_directories(description: str, place: str, write: Callable[[Path], str]) -> None:
-    """A command whose arguments are DIR...: prints what `write` returns for each directory, which is a `place`.
+def print_for_directories(description: str, directory_help: str, write: Callable[[Path], str]) -> None:
+    """Run a command with arguments DIR...: print what `write` returns for each directory.
 
-    One that is refused does not stop the others.
+    An error in one directory does not stop the others.
     """
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("directory", metavar="DIR", nargs="+", type=Path, help=place)
-    asked = arguments(parser)
-    refused = 0
+    parser.add_argument("directory", metavar="DIR", nargs="+", type=Path, help=directory_help)
+    failed = False
     with one_line_errors():
-        for directory in asked.directory:
+        for directory in arguments(parser).directory:
             try:
                 print(write(directory))
             except KNOWN_ERRORS as error:
-                show_traceback(error)
-                print(f"error: {one_line(error)}", file=sys.stderr)
-                refused += 1
-    if refused:
+                print_error(error)
+                failed = True
+    if failed:
         sys.exit(EXIT_FAILED)
 
 
 @dataclass
 class Jobs:
-    """Reports each job's fault where it happens, so that the other jobs of a sweep still run, and keeps the status."""
+    """Reports the error of each job of a sweep, so that the others still run, and keeps the exit status."""
 
     status: int = 0
 
     def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
-        """`job`, with its faults in the log: one line for a known error, the traceback for others and with `debug`."""
+        """Return `job` with its errors logged: one line for a known error, else (or with `debug`) a traceback."""
 
         @wraps(job)
         def reported_job(config: DictConfig) -> None:
@@ -124,20 +117,20 @@ class Jobs:
                 job(config)
             except Exception as error:
                 partial = isinstance(error, PartialRunError)
-                fault = error.__cause__ or error if partial else error
-                known = isinstance(fault, KNOWN_ERRORS)
-                _log_error(one_line(error), fault if config.get("debug") is True or not known else None)
-                if _in_worker():  # Hydra carries the error, if it can be pickled, to where the sweep was started
+                cause = error.__cause__ or error if partial else error
+                known = isinstance(cause, KNOWN_ERRORS)
+                _log_error(one_line(error), cause if config.get("debug") is True or not known else None)
+                if _in_worker():  # Hydra pickles the error for the process of the sweep
                     raise InstanceMapError(f"a run failed: {one_line(error)}") from None
                 self.status = EXIT_PARTIAL if partial and not is_of_sweep(HydraConfig.get()) else EXIT_FAILED
 
         return reported_job
 
     def run(self, command: Callable[[], None]) -> None:
-        """Runs Hydra's command for a reported job, and ends the process with a status when one has failed."""
+        """Run Hydra's command for a reported job, and exit with a status if one has failed."""
         with one_line_errors():
-            for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra says where one is missing
-                add_config_dir(folder)  # for what is done when Hydra has ended, such as a sweep's figure
+            for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra reports a missing one
+                add_config_dir(folder)  # for what follows Hydra's part, such as a sweep's figure
             Plugins.instance().register(InstalledConfigs)
             command()
         if self.status:
@@ -145,19 +138,19 @@ class Jobs:
 
 
 def check_switches(config: DictConfig) -> None:
-    """Raise ConfigError for a switch that is neither true nor false, such as `skip_completed=flase`."""
+    """Raise ConfigError for a switch that is not a boolean, such as `skip_completed=flase`."""
     for name in ("skip_completed", "debug"):
         if not isinstance(config.get(name, False), bool):
             raise ConfigError(f"{name} must be true or false, found {config[name]!r}")
 
 
-def is_of_sweep(own: HydraConf) -> bool:
-    """Whether a job is one of a sweep's."""
-    return not OmegaConf.is_missing(own.job, "num")
+def is_of_sweep(hydra_config: HydraConf) -> bool:
+    """Return true for a job of a sweep."""
+    return not OmegaConf.is_missing(hydra_config.job, "num")
 
 
 def _config_dirs(words: list[str]) -> list[Path]:
-    """The folders that --config-dir names on Hydra's command line."""
+    """Return the folders of --config-dir on Hydra's command line."""
     folders = []
     for word, following in zip(words, [*words[1:], ""], strict=True):
         option, equals, value = word.partition("=")
@@ -167,13 +160,13 @@ def _config_dirs(words: list[str]) -> list[Path]:
 
 
 def _in_worker() -> bool:
-    """Whether a job runs in another process than the sweep: in one of a launcher that is not Hydra's own."""
-    own = HydraConfig.get()
-    return is_of_sweep(own) and not str(own.launcher._target_).endswith(".BasicLauncher")
+    """Return true in a job that another launcher than Hydra's own runs in a separate process."""
+    hydra_config = HydraConfig.get()
+    return is_of_sweep(hydra_config) and not str(hydra_config.launcher._target_).endswith(".BasicLauncher")
 
 
 def _log_error(message: str, error: BaseException | None) -> None:
-    """Through the log, which also keeps it beside the job's other files; to stderr where there is no log."""
+    """Log an error, which also writes it to the job's log file; print it if logging is not configured."""
     if logging.getLogger().handlers and not log.disabled:
         log.error("%s", message, exc_info=error)
         return

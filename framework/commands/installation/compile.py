@@ -1,4 +1,4 @@
-"""`python -m framework compile`: compiles the map's kernels, so that the first run does not have to."""
+"""`instancemap compile`: compile the kernels in advance, once per installation."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from framework.errors import ConfigError
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="Compiles the kernels that a run with the default stages calls; numba keeps them for all later runs"
-        " of this machine and this installation. What is compiled already is left as it is.",
+        description="Compiles the kernels of a run with the default stages, which numba stores for later runs of this "
+        "installation. Compiled kernels are skipped.",
     )
-    parser.add_argument("words", metavar="WORD", nargs="*", help="only kernels with one of these in their names")
-    parser.add_argument("--all", action="store_true", help="also those that only the other stages call")
-    asked = arguments(parser)
+    parser.add_argument("words", metavar="WORD", nargs="*", help="only kernels whose names contain one of these")
+    parser.add_argument("--all", action="store_true", help="also the kernels of other stages")
+    parsed = arguments(parser)
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     with one_line_errors():
-        print(compile_named(listed(DEFAULT, *([OTHERS] if asked.all or asked.words else [])), asked.words))
+        print(compile_named(listed(DEFAULT, *([OTHERS] if parsed.all or parsed.words else [])), parsed.words))
 
 
 def compile_named(kernels: list[Kernel], words: list[str]) -> str:
-    """Compiles what is missing of those kernels, or of those with a word in their names, and says what it did.
+    """Compile the missing kernels whose names contain one of the words (none = all), and return a summary.
 
-    Raises ConfigError where there is none, DataError where one cannot be compiled.
+    Raises ConfigError if there is no such kernel, DataError if one cannot be compiled.
     """
     if words:
         kernels = [kernel for kernel in kernels if any(word in f"{kernel.module}.{kernel.name}" for word in words)]

@@ -1,7 +1,6 @@
-"""`python -m framework convert-weights IN OUT`: a Mask R-CNN of torchvision or detectron2 for `detector=mask_rcnn`.
+"""`instancemap convert-weights IN OUT`: convert a Mask R-CNN of torchvision or detectron2 for `detector=mask_rcnn`.
 
-IN is a published network's name or a file (.pth, .pkl); OUT a .safetensors file, whose metadata say what network it is,
-so that it needs no more than `detector.weights=OUT`. No code that IN may contain is run.
+The metadata of OUT describe the network, so it needs only `detector.weights=OUT`. Code in IN is never executed.
 """
 
 from __future__ import annotations
@@ -17,23 +16,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description="Converts a Mask R-CNN of torchvision or detectron2 for detector=mask_rcnn.",
     )
-    parser.add_argument("source", metavar="IN", type=Path, help="a published network's name, or a .pth or .pkl file")
+    parser.add_argument("source", metavar="IN", type=Path, help="name of a published network, or a .pth or .pkl file")
     parser.add_argument("target", metavar="OUT", type=Path, help="the .safetensors file to write")
-    parser.add_argument("--kind", choices=["torchvision", "detectron2"], help="whose IN is; else its names tell")
-    parser.add_argument("--classes", help="comma-separated, in the network's order, where they are not COCO's")
-    parser.add_argument(
-        "--norm-eps", type=float, default=0.0, help="torchvision only: 0 for its COCO checkpoint (default)"
-    )
+    parser.add_argument("--kind", choices=["torchvision", "detectron2"], help="format of IN, default: detected")
+    parser.add_argument("--classes", help="comma-separated, in the network's order, if not COCO's")
+    epsilon = "of batch normalization, torchvision only; default: 0, as in its COCO checkpoint"
+    parser.add_argument("--norm-eps", type=float, default=0.0, help=epsilon)
     parser.add_argument("--half", action="store_true", help="store float16: half the size")
-    asked = arguments(parser)
+    parsed = arguments(parser)
     with one_line_errors():
-        convert(asked.source, asked.target, asked.kind, asked.classes, asked.norm_eps, asked.half)
+        convert(parsed.source, parsed.target, parsed.kind, parsed.classes, parsed.norm_eps, parsed.half)
 
 
 def convert(source: Path, target: Path, kind: str | None, classes: str | None, norm_eps: float, half: bool) -> None:
-    """Does what the command says, and prints what it did."""
     if target.suffix != ".safetensors":
-        raise ConfigError(f"{target}: the converted network is a .safetensors file; give it such a name")
+        raise ConfigError(f"{target}: expected a file name that ends in .safetensors")
     from framework.detection.mask_rcnn.checkpoint import CheckpointKind, read_network
     from framework.detection.mask_rcnn.network_file import save_network
     from framework.detection.mask_rcnn.published_weights import find_network

@@ -1,4 +1,4 @@
-"""`python -m framework train-detector`: trains Mask R-CNN on rendered rooms."""
+"""`instancemap train-detector`: train Mask R-CNN on rendered rooms."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ from framework.files.search_paths import CONF
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train_detector")
 def job(config: DictConfig) -> None:
-    from framework.training.train import (
-        train,  # here, so that a misspelt key is answered before the heavy libraries load
-    )
+    from framework.training.train import train  # slow: after Hydra has checked the keys
 
     train(config, Path(HydraConfig.get().runtime.output_dir))
 

@@ -1,6 +1,6 @@
-"""`python -m framework check dataset=D [out=FILE]`: whether a recording will map, and what to set where it will not.
+"""`instancemap check dataset=D [out=FILE]`: validate a recording and suggest parameter fixes.
 
-Exit status 1 = something is wrong.
+Exit status 1 = it will not map.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ jobs = Jobs()
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="check")
 @jobs.reported
 def job(config: DictConfig) -> None:
-    """Builds the dataset that the config names, looks at it, prints what it found and draws it."""
+    """Check the dataset of the config, print the findings and draw them."""
     out = checked_file("out", config.out, ".png")
 
     from framework.checking.recording_check import check
     from framework.figures.check_figure import write_check
-    from framework.registry import build  # here, so that such faults are answered before the heavy libraries load
+    from framework.registry import build
     from framework.runtime.process_settings import Settings
 
     Settings.of(config).apply()
@@ -39,7 +39,7 @@ def job(config: DictConfig) -> None:
     log.info("%s", out)
     if found.faults:
         settings = " ".join(dict.fromkeys(finding.setting for finding in found.faults if finding.setting))
-        raise DataError(f"it will not map as it is read{f'; try it with {settings}' if settings else ''}")
+        raise DataError(f"the recording will not map{f'; try {settings}' if settings else ''}")
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
-"""`python -m framework convert-oni FILE.oni OUT`: SceneNN's raw video as the images that `dataset=scenenn` reads.
+"""`instancemap convert-oni FILE.oni OUT`: convert SceneNN's raw recordings to the images that `dataset=scenenn` reads.
 
-OpenNI 2 plays the recording. OUT is the scene's folder, DIR/NNN, and gets image/, depth/ and timestamp.txt as from
-SceneNN's own play-back, with the same numbers.
+OpenNI 2 plays the recording. OUT is the scene's folder, DIR/NNN, and gets image/, depth/ and timestamp.txt with the
+file names of SceneNN's own converter.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from tqdm import tqdm
 from framework.commands.command_line import arguments, one_line_errors
 from framework.data import Array
 from framework.datasets.scenenn.oni import read_frames
-from framework.datasets.scenenn.oni_records import OniContents, Stream, read_contents
+from framework.datasets.scenenn.oni_records import Stream, read_contents
 from framework.datasets.scenenn.scene_files import MICROSECONDS, write_timestamps
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
 
-PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # what a better one saves takes longer than playing
+PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # a higher level takes longer than playing
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Converts an OpenNI recording to SceneNN's images. Needs OpenNI 2: apt-get install libopenni2-0.",
     )
-    parser.add_argument("source", metavar="FILE.oni", type=Path, help="the recording, SceneNN's oni/NNN.oni")
-    parser.add_argument("target", metavar="OUT", type=Path, help="the scene's folder, DIR/NNN; has no images yet")
-    asked = arguments(parser)
+    parser.add_argument("source", metavar="FILE.oni", type=Path, help="the recording, oni/NNN.oni")
+    parser.add_argument("target", metavar="OUT", type=Path, help="the scene's folder, DIR/NNN; without images")
+    parsed = arguments(parser)
     with one_line_errors():
-        convert(asked.source, asked.target)
+        convert(parsed.source, parsed.target)
 
 
 def convert(source: Path, target: Path) -> None:
-    """Does what the command says, and prints what it did; what was written before a fault is kept.
+    """Convert `source` and print a summary. Frames that were written before an error are kept.
 
-    Raises DataError when `source` cannot be converted, or not to its end, or `target` has images already.
+    Raises DataError if `source` cannot be converted to its end, or `target` has images.
     """
     contents = read_contents(source)
     image, depth, timestamp = target / "image", target / "depth", target / "timestamp.txt"
     for path in (image, depth, timestamp):
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-            raise DataError(f"{path} is there already; remove it, or choose another folder")
+            raise DataError(f"{path} exists; remove it, or choose another folder")
     image.mkdir(parents=True, exist_ok=True)
     depth.mkdir(exist_ok=True)
     color_times: dict[int, float] = {}
@@ -63,25 +63,21 @@ def convert(source: Path, target: Path) -> None:
         if depth_times:
             write_timestamps(timestamp, depth_times, color_times)
     if not number:
-        raise DataError(f"{source} has no image of color and of depth that are of the same moment")
+        raise DataError(f"{source} has no color and depth images of the same time")
     left_out = {stream: count - number for stream, count in counts.items()}
     print(
-        f"{target}: {number} frames; left out are {left_out[Stream.COLOR]} images of color and"
-        f" {left_out[Stream.DEPTH]} of depth that are damaged or have no partner"
+        f"{target}: {number} frames; skipped {left_out[Stream.COLOR]} color and {left_out[Stream.DEPTH]} depth images"
+        " that are damaged or have no partner"
     )
-    _check_whole(contents, number)
-
-
-def _check_whole(contents: OniContents, number: int) -> None:
     if contents.cut_off:
         raise DataError(
-            f"{contents.path} is cut off or damaged at byte {contents.end}: what was read is kept, up to"
+            f"{contents.path} is truncated or damaged at byte {contents.end}: kept the frames up to"
             f" image{number:05d}.png; download it again for the rest"
         )
 
 
 def _write_png(path: Path, image: Array) -> None:
-    """Writes (H, W) uint16 or (H, W, 3) uint8 BGR."""
+    """Write (H, W) uint16 or (H, W, 3) uint8 BGR."""
     _, data = cv2.imencode(".png", image, PNG)
     with written_whole(path) as temporary:
         temporary.write_bytes(data.tobytes())

@@ -1,4 +1,4 @@
-"""`python -m framework synthesize DIR`: a benchmark of furnished rooms in SceneNN's own format."""
+"""`instancemap synthesize DIR`: render a benchmark of synthetic rooms in SceneNN's format."""
 
 from __future__ import annotations
 
@@ -16,26 +16,27 @@ from framework.synthetic.scenenn_scene import BenchmarkSettings
 def main() -> None:
     default = BenchmarkSettings()
     parser = argparse.ArgumentParser(
-        description="Writes made-up rooms into DIR, in SceneNN's format: images, depth, trajectory, labelled mesh. "
-        "The same parameters give the same bytes. What is there already is kept.",
+        description="Writes synthetic rooms to DIR in SceneNN's format: images, depth, trajectory, labeled mesh. The "
+        "same parameters give the same bytes. Existing rooms are kept.",
     )
-    parser.add_argument("directory", metavar="DIR", type=Path, help="a new folder, or one that this command began")
-    parser.add_argument("--scenes", default=",".join(SCENES), help="which rooms, default: %(default)s")
-    parser.add_argument("--seed", type=int, default=default.seed, help="another seed gives other rooms")
-    parser.add_argument("--frames", type=int, default=default.frames, help="of each room, default: 120")
-    parser.add_argument("--rate", type=float, default=default.rate, help="of the frames, Hz, default: 10")
-    parser.add_argument("--width", type=int, default=default.width, help="of the images, px, default: 640")
-    parser.add_argument("--haste", type=float, default=default.haste, help="of the walk, default: 2; 1 = no hurry")
-    parser.add_argument("--jobs", type=int, default=available_cores(), help="processes, default: all cores")
-    asked = arguments(parser)
+    add = parser.add_argument
+    add("directory", metavar="DIR", type=Path, help="new folder, or one that this command began")
+    add("--scenes", default=",".join(SCENES), help="comma-separated rooms, default: %(default)s")
+    add("--seed", type=int, default=default.seed, help="another seed gives other rooms")
+    add("--frames", type=int, default=default.frames, help="number of frames per room, default: 120")
+    add("--rate", type=float, default=default.rate, help="frame rate, Hz, default: 10")
+    add("--width", type=int, default=default.width, help="image width, px, default: 640")
+    add("--haste", type=float, default=default.haste, help="speed of the camera, default: 2; 1 = slow")
+    add("--jobs", type=int, default=available_cores(), help="number of processes, default: all cores")
+    parsed = arguments(parser)
     with one_line_errors():
-        names = asked.scenes.split(",")
+        names = parsed.scenes.split(",")
         unknown = [name for name in names if name not in SCENES]
         if unknown:
             raise ConfigError(f"there is no scene {unknown[0]!r}; the scenes are: {', '.join(SCENES)}")
-        if asked.jobs < 1:
-            raise ConfigError(f"jobs must be at least 1, found {asked.jobs}")
-        recording = BenchmarkSettings(asked.seed, asked.frames, asked.rate, asked.width, asked.haste)
-        write_scenes(asked.directory, {name: SCENES[name] for name in names}, recording, asked.jobs)
-        root = asked.directory.resolve()
-        print(f"{root} is complete: python -m framework dataset=scenenn dataset.root={root} dataset.scene={names[0]}")
+        if parsed.jobs < 1:
+            raise ConfigError(f"jobs must be at least 1, found {parsed.jobs}")
+        recording = BenchmarkSettings(parsed.seed, parsed.frames, parsed.rate, parsed.width, parsed.haste)
+        write_scenes(parsed.directory, {name: SCENES[name] for name in names}, recording, parsed.jobs)
+        root = parsed.directory.resolve()
+        print(f"{root} is complete: instancemap dataset=scenenn dataset.root={root} dataset.scene={names[0]}")

@@ -1,4 +1,4 @@
-"""`python -m framework diff RUN RUN`: what has changed between two visits of a place."""
+"""`instancemap diff RUN RUN`: list the changes between two runs in the same world."""
 
 from __future__ import annotations
 
@@ -23,53 +23,46 @@ UNCHANGED = (Kind.STAYED, Kind.NOT_SEEN)
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="Lists the objects that appeared, vanished or moved from one run to another, with probabilities. "
-        "Both must lie in one world: run the second with localize_in=FIRST, or both with given poses.",
+        description="Lists the objects that appeared, vanished or moved between two runs, with probabilities. Both "
+        "need the same world frame: run the second with localize_in=FIRST, or both with given poses.",
     )
-    parser.add_argument("before", metavar="FIRST", type=Path, help="the directory of the first visit's run")
-    parser.add_argument("after", metavar="SECOND", type=Path, help="that of the second's")
-    parser.add_argument("--all", action="store_true", help="list what stayed, and what the second did not see, too")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="write all of it there, too, as JSON")
-    asked = arguments(parser)
+    parser.add_argument("before", metavar="FIRST", type=Path, help="run directory of the first visit")
+    parser.add_argument("after", metavar="SECOND", type=Path, help="run directory of the second visit")
+    parser.add_argument("--all", action="store_true", help="also list objects that stayed or were not seen")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="also write all changes to this JSON file")
+    parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
-        if not in_world(asked.after, asked.before):
-            log.warning(
-                "%s does not say that it lies in the world of %s: run it with localize_in=%s, or both with given poses",
-                asked.after,
-                asked.before,
-                asked.before,
-            )
-        found = changes(visit_of(asked.before), visit_of(asked.after))
-        if asked.out is not None:
-            write_json(asked.out, [entry(change) for change in found])
-        shown = [change for change in found if asked.all or change.kind not in UNCHANGED]
+        if not in_world(parsed.after, parsed.before):
+            message = "%s may not be in the world frame of %s: run it with localize_in=%s, or both with given poses"
+            log.warning(message, parsed.after, parsed.before, parsed.before)
+        found = changes(visit_of(parsed.before), visit_of(parsed.after))
+        if parsed.out is not None:
+            write_json(parsed.out, [entry(change) for change in found])
+        shown = [change for change in found if parsed.all or change.kind not in UNCHANGED]
         print("\n".join(map(line, shown)) or "nothing has changed")
         rest = {kind: sum(change.kind is kind for change in found) for kind in UNCHANGED}
-        print(f"{rest[Kind.STAYED]} stayed; of {rest[Kind.NOT_SEEN]} the other visit does not tell")
+        print(f"{rest[Kind.STAYED]} stayed, {rest[Kind.NOT_SEEN]} not seen by the other run")
 
 
 def visit_of(run: Path) -> Visit:
-    """What a stored run saw. Raises DataError for a directory that holds no run's map and trajectory."""
-    from framework.api import scene_of  # here: what is wrong with the arguments is said at once
+    """Read the map and trajectory of a stored run. Raises DataError."""
+    from framework.api import scene_of  # slow: after the arguments are checked
 
-    scene = scene_of("diff", run)
-    _, poses = read_tum(run / TRAJECTORY)
-    return Visit(scene, poses)
+    return Visit(scene_of("diff", run), read_tum(run / TRAJECTORY)[1])
 
 
 def in_world(run: Path, world: Path) -> bool:
-    """Whether a run lies in the world of another, as far as their records say."""
+    """Return true if the outputs of two runs show that they have the same world frame."""
     config = load_yaml(run / CONFIG) if is_there(run / CONFIG) else None
-    asked = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
-    if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in asked):
+    worlds = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
+    if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):
         return True
     records = [read_json(place / METRICS) if is_there(place / METRICS) else None for place in (run, world)]
     return all(isinstance(record, dict) and record.get("pose_source") == "ground_truth" for record in records)
 
 
 def line(change: Change) -> str:
-    """One change for people."""
     x, y, z = change.place
     where = f"at ({x:.2f}, {y:.2f}, {z:.2f}) m"
     if change.kind is Kind.MOVED:
@@ -79,7 +72,6 @@ def line(change: Change) -> str:
 
 
 def entry(change: Change) -> dict[str, object]:
-    """One change for programs."""
     return {
         "kind": change.kind.value,
         "class": change.name,

@@ -1,4 +1,4 @@
-"""`python -m framework export RUN [--to glb usd ...]`: what a run found, in the formats of other programs."""
+"""`instancemap export RUN [--to glb usd ...]`: export a run to the formats of other programs."""
 
 from __future__ import annotations
 
@@ -11,62 +11,42 @@ from framework.commands.command_line import arguments, one_line_errors
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="Writes a run's scene, its objects by themselves (upright, standing on the origin, metres), a "
-        "floor plan or a scene graph in the formats of other programs.",
+        description="Exports the scene of a run, its separate objects (upright, at the origin, in meters), a floor "
+        "plan or a scene graph to the formats of other programs.",
     )
-    parser.add_argument("run", metavar="RUN", type=Path, help="the directory of a run, also of one that ended early")
-    parser.add_argument(
-        "--to",
-        nargs="+",
-        default=["glb"],
-        choices=("glb", "ply", "usd", "obj", "floorplan", "graph"),
-        help="one or several, default: glb",
-    )
-    parser.add_argument("--out", metavar="DIR", type=Path, help="where the files go, default: RUN/export")
-    parser.add_argument(
-        "--object",
-        metavar="OBJECT",
-        action="append",
-        default=[],
-        help="an id, or a class for all of it: these objects only; may be given several times",
-    )
-    parser.add_argument(
-        "--min-confidence", metavar="P", type=float, default=0.3, help="of objects, default: 0.3; an id is not asked"
-    )
-    parser.add_argument("--up", metavar=("X", "Y", "Z"), nargs=3, type=float, help="where the run does not tell")
-    parser.add_argument("--floor", metavar="M", type=float, help="how high the floor is along up, likewise")
-    surfaces = parser.add_argument_group("surfaces")
-    surfaces.add_argument(
-        "--triangles", metavar="N", type=int, help="of the scene, and of each object's own file: fewer by decimation"
-    )
-    surfaces.add_argument(
-        "--colors", choices=("appearance", "instance", "class"), default="appearance", help="what colours tell"
-    )
-    surfaces.add_argument(
-        "--collision", choices=("hull", "box"), default="hull", help="what objects collide by, in USD; default: hull"
-    )
-    plans = parser.add_argument_group("floor plan and ROS map")
-    plans.add_argument("--resolution", metavar="M", type=float, default=0.05, help="side of a cell, default: 0.05")
-    plans.add_argument(
-        "--robot-height",
-        metavar="M",
-        type=float,
-        default=1.0,
-        help="free is where nothing is, and all was seen to be empty, up to this height above the floor, default: 1",
-    )
-    asked = arguments(parser)
+    add = parser.add_argument
+    formats = ("glb", "ply", "usd", "obj", "floorplan", "graph")
+    add("run", metavar="RUN", type=Path, help="directory of a run, also of a partial one")
+    add("--to", nargs="+", default=["glb"], choices=formats, help="one or several formats, default: glb")
+    add("--out", metavar="DIR", type=Path, help="output folder, default: RUN/export")
+    only = "only these objects: an id, or a class for all its objects; repeatable"
+    add("--object", metavar="OBJECT", action="append", default=[], help=only)
+    least = "minimum confidence of an object, default: 0.3; ignored for explicit ids"
+    add("--min-confidence", metavar="P", type=float, default=0.3, help=least)
+    add("--up", metavar=("X", "Y", "Z"), nargs=3, type=float, help="up direction, if the run has none")
+    add("--floor", metavar="M", type=float, help="height of the floor along the up direction, if the run has none")
+    add = parser.add_argument_group("surfaces").add_argument
+    add("--triangles", metavar="N", type=int, help="maximum number for the scene, and for each object's own file")
+    colors = ("appearance", "instance", "class")
+    add("--colors", choices=colors, default="appearance", help="vertex colors, default: appearance")
+    add("--collision", choices=("hull", "box"), default="hull", help="collision shape of objects in USD, default: hull")
+    add = parser.add_argument_group("floor plan and ROS map").add_argument
+    add("--resolution", metavar="M", type=float, default=0.05, help="cell size, default: 0.05")
+    height = "space is free if it was seen to be empty up to this height above the floor, default: 1"
+    add("--robot-height", metavar="M", type=float, default=1.0, help=height)
+    parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
-        from framework.exporting.exports import Chosen, ExportFormat, export  # here: wrong arguments are told at once
+        from framework.exporting.exports import Chosen, ExportFormat, export  # slow
 
         chosen = Chosen.named(
-            asked.object,
-            min_confidence=asked.min_confidence,
-            triangles=asked.triangles,
-            coloring=asked.colors,
-            collision=asked.collision,
-            resolution=asked.resolution,
-            robot_height=asked.robot_height,
+            parsed.object,
+            min_confidence=parsed.min_confidence,
+            triangles=parsed.triangles,
+            coloring=parsed.colors,
+            collision=parsed.collision,
+            resolution=parsed.resolution,
+            robot_height=parsed.robot_height,
         )
-        for path in export(asked.run, map(ExportFormat, asked.to), asked.out, chosen, asked.up, asked.floor):
+        for path in export(parsed.run, map(ExportFormat, parsed.to), parsed.out, chosen, parsed.up, parsed.floor):
             print(path)

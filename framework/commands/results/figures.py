@@ -1,4 +1,4 @@
-"""`python -m framework figures DIR...`: the pictures of experiments, also while a sweep still runs."""
+"""`instancemap figures DIR...`: draw the figures of an experiment, also during a sweep."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from framework.figures.experiment_figure import write_figure
 
 def main() -> None:
     print_for_directories(
-        "Writes figure.png and figure.pdf into DIR, from the records of the experiment's runs below it.",
-        "where an experiment's runs went",
+        "Writes figure.png and figure.pdf of the experiment in DIR.",
+        "folder of an experiment",
         lambda directory: "\n".join(map(str, write_figure(directory))),
     )

@@ -1,4 +1,4 @@
-"""`python -m framework query RUN "a red chair"`: which objects of a stored run are meant."""
+"""`instancemap query RUN "a red chair"`: rank the objects of a stored run by a text query."""
 
 from __future__ import annotations
 
@@ -13,47 +13,47 @@ from framework.queries.text_search import BY, WITH_EMBEDDINGS, Match, QueryResul
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="Ranks the objects of a stored run by how well words fit them: by the embeddings of their pictures "
-        f"where the run has any ({WITH_EMBEDDINGS}), else by class names and the colours of their surfaces.",
+        description="Ranks the objects of a stored run by a text query: by image embeddings if the run has any "
+        f"({WITH_EMBEDDINGS}), else by class names and surface colors.",
     )
-    parser.add_argument("run", metavar="RUN", type=Path, help="the directory of a run")
-    parser.add_argument("text", metavar="WORDS", help='what is looked for: "a red chair"')
-    parser.add_argument("--top", metavar="N", type=int, default=5, help="how many objects to list (default: 5)")
-    parser.add_argument("--by", choices=BY, help="by what (default: embeddings where there are)")
-    parser.add_argument("--model", help="that embeds the words (default: that of the run's detector)")
-    parser.add_argument("--json", action="store_true", help="print it for programs")
-    asked = arguments(parser)
-    if asked.top < 1:
-        parser.error(f"--top must be at least 1, found {asked.top}")
+    parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
+    parser.add_argument("text", metavar="WORDS", help='text query: "a red chair"')
+    parser.add_argument("--top", metavar="N", type=int, default=5, help="number of objects (default: 5)")
+    parser.add_argument("--by", choices=BY, help="ranking (default: embeddings if available)")
+    parser.add_argument("--model", help="model that embeds the query (default: that of the run's detector)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parsed = arguments(parser)
+    if parsed.top < 1:
+        parser.error(f"--top must be at least 1, found {parsed.top}")
     with one_line_errors():
-        from framework.api import query  # here: what is wrong with the arguments is said at once
+        from framework.api import query  # slow: after the arguments are checked
 
-        answer = query(asked.run, asked.text, asked.by, asked.model)
-        shown = answer.objects[: asked.top]
-        if asked.json:
+        answer = query(parsed.run, parsed.text, parsed.by, parsed.model)
+        shown = answer.objects[: parsed.top]
+        if parsed.json:
             entries = [entry(one) for one in shown]
             space = answer.space or None
-            print(json.dumps({"query": asked.text, "by": answer.by, "space": space, "objects": entries}, indent=1))
+            print(json.dumps({"query": parsed.text, "by": answer.by, "space": space, "objects": entries}, indent=1))
             return
-        print(heading(answer, asked.by))
+        print(heading(answer, parsed.by))
         if shown:
             print(table(shown, "similarity" if answer.by == "embeddings" else "match"))
         else:
-            print(f"nothing in this map is {asked.text!r}")
+            print(f"nothing in this map is {parsed.text!r}")
 
 
 def heading(answer: QueryResult, wanted: str | None) -> str:
-    """By what it was answered, and why by names where nobody asked for them."""
+    """Describe the ranking, and the reason for names if they were not requested."""
     if answer.by == "embeddings":
         return f"by embeddings of {answer.space}"
-    unasked = wanted is None and not answer.space
-    why = f", for this run has no embeddings: run with {WITH_EMBEDDINGS}" if unasked else ""
-    return f"by class names and colours{why}"
+    unavailable = wanted is None and not answer.space
+    reason = f", because this run has no embeddings: run with {WITH_EMBEDDINGS}" if unavailable else ""
+    return f"by class names and colors{reason}"
 
 
 def table(found: Sequence[Match], measure: str) -> str:
-    """For people: lengths in metres."""
-    rows = [("id", "class", measure, "confidence", "colour", "position", "size")]
+    """Format a table with lengths in meters."""
+    rows = [("id", "class", measure, "confidence", "color", "position", "size")]
     for one in found:
         x, y, z = one.centroid
         size = " x ".join(f"{side:.2f}" for side in one.instance.obb.extent)
@@ -68,7 +68,7 @@ def table(found: Sequence[Match], measure: str) -> str:
 
 
 def entry(found: Match) -> dict[str, object]:
-    """For programs: lengths in metres."""
+    """Return a JSON entry with lengths in meters."""
     return {
         "id": found.instance.id,
         "class": found.name,

@@ -1,4 +1,4 @@
-"""`python -m framework report RUN...`: a run, or several side by side, as a page for the browser."""
+"""`instancemap report RUN...`: write an HTML report of a run, or a comparison of several."""
 
 from __future__ import annotations
 
@@ -20,28 +20,22 @@ COMPARISON = "comparison.html"
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="Writes a page that shows a run: its map to turn, its objects, trajectory and times, and where the "
-        "true instances are known what is right, wrong and missed. Of several runs it writes one each, and one that "
-        "sets them side by side. A page is one file that loads nothing from elsewhere.",
+        description="Writes an interactive HTML report of a run: map, objects, trajectory, times, and errors if ground "
+        "truth is known. For several runs, it writes a report of each and a comparison. A report is a single file.",
     )
-    parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="a run's directory")
-    parser.add_argument(
-        "--out",
-        metavar="FILE",
-        type=Path,
-        help=f"where the page goes, that of the comparison where there are several runs; else {REPORT} in the run's "
-        f"directory, or {COMPARISON} in the folder that all of them are in",
-    )
-    asked = arguments(parser)
+    parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory")
+    default = f"default: {REPORT} in the run directory, or {COMPARISON} in the common folder of the runs"
+    parser.add_argument("--out", metavar="FILE", type=Path, help=f"file of the report or comparison; {default}")
+    parsed = arguments(parser)
     with one_line_errors():
-        for path in write_reports(asked.run, asked.out):
+        for path in write_reports(parsed.run, parsed.out):
             print(path.resolve().as_uri())
 
 
 def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[Path]:
-    """Writes the pages and returns where they are, the one that was asked for last.
+    """Write the reports and return their paths; the last one is the comparison, or the only report.
 
-    Raises DataError when a record cannot be read, before any page is written.
+    Raises DataError before any file is written if a run cannot be read.
     """
     from framework.reporting.comparison_page import Comparison
     from framework.reporting.run_contents import RunContents
@@ -49,9 +43,12 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
 
     places = [directory.resolve() for directory in directories]
     if again := [place for k, place in enumerate(places) if place in places[:k]]:
-        raise DataError(f"{again[0]}: each run is to be named once")
+        raise DataError(f"{again[0]}: expected each run once")
     if out is not None:
-        _check_place(out)  # before the maps are looked at, which takes a while
+        if not out.parent.is_dir():
+            raise DataError(f"{out} could not be written: its folder does not exist")
+        if out.exists():
+            check_regular(out)
     runs = [RunContents.read(directory) for directory in directories]
     if len(runs) == 1:
         path = out or directories[0] / REPORT
@@ -66,13 +63,6 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
     return [*pages, path]
 
 
-def _check_place(path: Path) -> None:
-    if not path.parent.is_dir():
-        raise DataError(f"{path} could not be written: its folder does not exist")
-    if path.exists():
-        check_regular(path)
-
-
 def _write(path: Path, page: str) -> None:
     with written_whole(path) as temporary:
-        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may be no text
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may not be valid text

@@ -1,4 +1,4 @@
-"""`python -m framework tables DIR...`: the tables of the runs below a directory, also while a sweep still runs."""
+"""`instancemap tables DIR...`: write the tables of the runs below a directory, also during a sweep."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from framework.tables.experiment_tables import write_tables
 
 def main() -> None:
     print_for_directories(
-        "Writes table.md, table.tex and table.csv into DIR, from the records of the runs below it.",
-        "where a sweep or several runs went",
+        "Writes table.md, table.tex and table.csv of the runs below DIR.",
+        "folder of a sweep or of several runs",
         write_tables,
     )

@@ -1,29 +1,67 @@
-"""What a command line sweeps over: looked at before the first run of it begins."""
+"""Choices of the command line: swept keys and an experiment's rows, checked before the first run.
+
+Hydra's sweeper varies one key at a time. An experiment therefore sweeps over the key `row`, and a job adds the
+overrides that `rows` lists for its row.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
 from math import prod
 
+from hydra import compose
+from hydra.conf import HydraConf
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from framework.config.composition import config_loader
+from framework.config.validation import checked_rows
 from framework.errors import ConfigError
 
-MANY = 1_000_000  # where glob() asks the disk
+MANY = 1_000_000  # number of values of a glob(), which depends on the file system
 COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)
+
+Choices = Mapping[str, str | None]
+
+OmegaConf.register_new_resolver("all_of", lambda by_name: ",".join(map(str, by_name)), replace=True)
+"""`${all_of:${rows}}`: the names of all rows, as a choice for Hydra's sweeper."""
+
+
+def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, Choices]:
+    """Return a job's config and its choices by group, with the overrides of the job's row.
+
+    Raises ConfigError for an unknown row, and for an invalid `table` or `figure`.
+    """
+    choices: Choices = dict(hydra_config.runtime.choices)
+    rows = checked_rows(config.get("rows"))
+    if not rows:
+        return config, choices
+    from framework.figures.figure_choice import FigureChoice
+    from framework.tables.comparison import TableChoice
+
+    TableChoice.of(config.table)
+    if config.get("figure") is not None:
+        FigureChoice.of(config.figure)
+    row = str(config.row)
+    check_row([row], rows)
+    overrides = [*hydra_config.overrides.task, *rows[row]]
+    composed = compose(hydra_config.job.config_name, overrides, return_hydra_config=True)
+    choices = dict(composed.hydra.runtime.choices)
+    with open_dict(composed):
+        del composed["hydra"]
+    return composed, choices
 
 
 def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
-    """How many runs a sweep has at most, as far as its command line tells.
+    """Return an upper bound on the number of runs of a sweep.
 
-    Raises ConfigError for a sweep without a single run, and for a row that is none of an experiment's `rows`.
+    Raises ConfigError for an empty sweep, and for a row that is not in `rows` of the experiment.
     """
-    runs: dict[str, int] = {}  # by key, of which the last one counts
-    for override in OverridesParser.create().parse_overrides([*overrides]):
+    runs: dict[str, int] = {}  # by key; the last override counts
+    for override in _parsed(overrides):
         values = _values(override)
         runs[override.get_key_element()] = len(values) or MANY
         if not values and override.value_type in COUNTED:
@@ -34,25 +72,25 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
 
 
 def swept_keys(overrides: Sequence[str]) -> set[str]:
-    """The keys and groups that get several values, one after the other; the last override of a key counts."""
-    last = {override.key_or_group: override for override in OverridesParser.create().parse_overrides([*overrides])}
+    """Return the keys and groups with several values; the last override of a key counts."""
+    last = {override.key_or_group: override for override in _parsed(overrides)}
     return {key for key, override in last.items() if override.is_sweep_override()}
 
 
-def check_row(asked: Sequence[str], rows: Collection[str]) -> None:
-    """Raises ConfigError for the first of the rows asked for that an experiment does not have."""
-    for row in asked:
+def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
+    """Raise ConfigError for the first chosen row that the experiment does not have."""
+    for row in chosen:
         if row not in rows:
             close = get_close_matches(row, rows, n=1)
             hint = f"; did you mean {close[0]}?" if close else "."
             raise ConfigError(f"there is no row={row}{hint} The experiment has {', '.join(rows)}")
 
 
-def fault_of_first_run(words: Sequence[str]) -> HydraException | None:
-    """What is wrong with the first run of a sweep that an experiment makes; None = nothing.
+def error_of_first_run(words: Sequence[str]) -> HydraException | None:
+    """Return what is wrong with the first run of a sweep that an experiment starts; None = nothing.
 
-    Hydra asks a config whether it is a sweep's, and where that cannot be composed it takes it for a run's, and finds
-    fault with its choices, whatever else is wrong. `words` are those of the command line.
+    If the experiment's config cannot be composed, Hydra takes the command line for a single run and reports its
+    choices as errors. `words` is the command line.
     """
     overrides = [word for word in words if word.startswith("~") or ("=" in word and not word.startswith("-"))]
     try:
@@ -64,17 +102,21 @@ def fault_of_first_run(words: Sequence[str]) -> HydraException | None:
 
 
 def single_run(overrides: Sequence[str]) -> list[str]:
-    """The overrides of the first run of the sweep that they make."""
+    """Return the overrides of the first run of a sweep."""
     chosen = []
-    for override in OverridesParser.create().parse_overrides([*overrides]):
+    for override in _parsed(overrides):
         values = _values(override)
         swept = override.value_type in COUNTED and values
         chosen.append(f"{override.get_key_element()}={values[0]}" if swept else str(override.input_line))
     return chosen
 
 
+def _parsed(overrides: Sequence[str]) -> list[Override]:
+    return list(OverridesParser.create().parse_overrides([*overrides]))
+
+
 def _values(override: Override) -> list[str]:
-    """What an override gives its key, one after the other, as far as that can be told from the command line."""
+    """Return the values of an override in order; none if they depend on the file system."""
     try:
         return [*override.sweep_string_iterator()] if override.is_sweep_override() else [str(override.value())]
     except HydraException:

@@ -1,4 +1,4 @@
-"""One run from its config, or with -m or an experiment a sweep of runs: what there is without a command."""
+"""A run from its config, or with -m or an experiment a sweep of runs: `instancemap` without a command."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig
 
 from framework.commands.command_line import Jobs, is_of_sweep
-from framework.commands.running.choices import fault_of_first_run
-from framework.commands.running.experiment import with_row
+from framework.commands.running.choices import error_of_first_run, with_row
 from framework.commands.running.sweep import by_joblib, ending
 from framework.errors import PartialRunError
 from framework.files.directory_lock import locked
@@ -32,35 +31,35 @@ jobs = Jobs()
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 @jobs.reported
 def job(config: DictConfig) -> None:
-    """One run: builds the stages that the config names, maps the sequence, leaves the record in Hydra's directory."""
+    """Build the stages of the config, map the sequence and write the outputs to Hydra's directory."""
     hydra_config = HydraConfig.get()
     if is_of_sweep(hydra_config) and by_joblib(hydra_config) and parent_process() is not None:
         heard_from_sweep().check()
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
-    # where a sweep was killed and not its workers, they go on; a run by itself has its place since it was started
+    # workers of a killed sweep may still run; a single run has locked its directory since its start
     with locked(directory, wait=True) if is_of_sweep(hydra_config) else nullcontext():
         if config.skip_completed and is_recorded(directory, config):
             return
         interruption = run(config, directory, choices)
-    if is_of_sweep(hydra_config):  # which has not ended with this run
+    if is_of_sweep(hydra_config):  # it continues after this run
         interruption.check()
 
 
 def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) -> Interruption:
-    """Maps the config's video with its stages and leaves the run's record in `directory`.
+    """Map the config's video with its stages and write the outputs to `directory`.
 
-    `choices` are the options that were chosen, by config group. This is where it is decided how a run ends:
+    `choices` are the chosen options by config group. A run ends in one of three ways:
 
-    - completed: the record is whole. A signal that came while it was written is in the Interruption that this returns,
-      as is the one that ended a live video.
-    - partial: there is a map, and a signal, a stage or the disk has ended the run. What was mapped is written as far as
-      it goes, marked as partial; then Interrupted is raised, or PartialRunError from what ended it.
-    - nothing to keep: raises what ended the run before anything was mapped.
+    - completed: the outputs are complete. The returned Interruption contains a signal that arrived while they were
+      written, or that ended a live video.
+    - partial: a signal, a stage or the disk ended the run after something was mapped. The outputs are written as far
+      as possible, and marked as partial. Raises Interrupted, or PartialRunError from the cause.
+    - nothing was mapped: raises the cause.
 
-    The first signal ends it after the frame, or the record, that is in work, the second one at once.
+    The first signal takes effect after the current frame or output, the second one immediately.
     """
-    from framework.api import begin  # here: a misspelt name is answered before these load
+    from framework.api import begin  # after Hydra has checked the names
     from framework.compilation.catalog import compile_for_run
     from framework.datasets.frames.sequence_reader import Recording
     from framework.detection.stored.cache import cache_metrics
@@ -73,14 +72,14 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     settings.apply()
     pipeline = begin(config)
     settings.apply()  # to torch, if a stage has loaded it
-    gc.collect()  # of itself, it would stop one of the first hundreds of frames for longer than they take
-    video = build(RGBDVideo, config.get("dataset"))  # after the stages: making up a room takes longest
-    compile_for_run()  # what renders it
+    gc.collect()  # otherwise it delays one of the first hundreds of frames
+    video = build(RGBDVideo, config.get("dataset"))  # after the stages: a synthetic scene takes longest
+    compile_for_run()  # its renderer
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     length = f"{len(video)} frames" if isinstance(video, RGBDSequence) else "live until Ctrl-C"
     log.info("mapping %s: %s, %s", video.name, length, chosen)
-    if isinstance(video, Recording):  # files of anybody's
+    if isinstance(video, Recording):  # may be the user's own
         from framework.checking.recording_check import warn_of_poses
 
         warn_of_poses(video)
@@ -106,5 +105,5 @@ def job_or_sweep() -> None:
         try:
             job()
         except ConfigCompositionException as error:
-            fault = fault_of_first_run(sys.argv[1:]) or error
-            raise fault from fault.__cause__
+            first = error_of_first_run(sys.argv[1:]) or error
+            raise first from first.__cause__

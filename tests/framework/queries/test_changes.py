@@ -171,7 +171,7 @@ def test_the_command_lists_changes(
     assert printed.err == ""
     [first, last] = printed.out.splitlines()
     assert first.startswith("vanished  chair            0.")
-    assert "stayed; of" in last
+    assert "stayed, " in last
     written = json.loads(out.read_text())
     assert written[0]["kind"] == "vanished"
     assert written[0]["after"] is None

@@ -119,8 +119,8 @@ def test_the_command_says_by_what_it_answers(
     status, out, _ = asked(monkeypatch, capsys, str(run_without), "chair")
     assert status == 0
     lines = out.splitlines()
-    assert lines[0].startswith("by class names and colours, for this run has no embeddings: run with detector=")
-    assert lines[1].split() == ["id", "class", "match", "confidence", "colour", "position", "size"]
+    assert lines[0].startswith("by class names and colors, because this run has no embeddings: run with detector=")
+    assert lines[1].split() == ["id", "class", "match", "confidence", "color", "position", "size"]
     assert lines[2].split()[:2] == ["1", "chair"]
     _, out, _ = asked(monkeypatch, capsys, str(run_without), "chair", "--by", "names", "--json", "--top", "1")
     answer = json.loads(out)
@@ -154,7 +154,7 @@ def test_embeddings_need_the_model_that_they_are_of(
     assert (status, len(err.splitlines())) == (1, 1)
     assert "does not say of which model the embeddings are: name it by --model" in err
     _, out, _ = asked(monkeypatch, capsys, str(run), "a bed", "--by", "names")
-    assert out.splitlines()[0] == "by class names and colours"
+    assert out.splitlines()[0] == "by class names and colors"
     status, _, err = asked(monkeypatch, capsys, "nowhere", "a bed")
     assert status == 1
     assert "expected the directory of a run" in err

@@ -48,7 +48,7 @@ def test_own_classes_and_normalization_of_torchvision(tmp_path, monkeypatch):
     [
         ("absent.pkl", "out.safetensors", "there is no network"),
         ("broken.pkl", "out.safetensors", "broken.pkl is no pickle of numpy arrays"),
-        ("broken.pkl", "out.pth", "out.pth: the converted network is a .safetensors file"),
+        ("broken.pkl", "out.pth", "out.pth: expected a file name that ends in .safetensors"),
     ],
 )
 def test_faults_are_one_line(tmp_path, monkeypatch, capsys, source, target, fault):

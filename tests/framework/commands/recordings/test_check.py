@@ -36,7 +36,7 @@ def test_what_it_names_mends_the_recording(inverted: Path, tmp_path: Path) -> No
     assert done.returncode == 1
     assert "WRONG  poses: they are T_camera_world" in done.stdout
     assert "; set dataset.pose_kind=T_CAMERA_WORLD" in done.stdout
-    assert "ERROR   it will not map as it is read; try it with dataset.pose_kind=T_CAMERA_WORLD" in done.stderr
+    assert "ERROR   the recording will not map; try dataset.pose_kind=T_CAMERA_WORLD" in done.stderr
     assert "Traceback" not in done.stderr
     picture = cv2.imread(str(tmp_path / "check.png"))
     assert picture is not None

@@ -67,7 +67,7 @@ def test_a_recording_becomes_the_images_of_a_scene(tmp_path, monkeypatch, capsys
     assert names(tmp_path / "011") == written(4)
     check_images(tmp_path / "011", 4)
     assert (tmp_path / "011/timestamp.txt").read_text().splitlines()[0] == "1 33338 33333"
-    assert f"{tmp_path / '011'}: 4 frames; left out are 0 images" in capsys.readouterr().out
+    assert f"{tmp_path / '011'}: 4 frames; skipped 0 color" in capsys.readouterr().out
 
 
 def test_colour_and_depth_have_times_of_their_own(tmp_path, monkeypatch, source):
@@ -80,7 +80,7 @@ def test_colour_and_depth_have_times_of_their_own(tmp_path, monkeypatch, source)
 def test_images_that_are_left_out_are_counted(tmp_path, monkeypatch, capsys, source):
     deliver(monkeypatch, 3)
     convert_oni.convert(source, tmp_path / "011")
-    assert "3 frames; left out are 1 images of color and 1 of depth" in capsys.readouterr().out
+    assert "3 frames; skipped 1 color and 1 depth" in capsys.readouterr().out
 
 
 def test_the_folder_may_hold_the_other_files_of_a_scene(tmp_path, monkeypatch, source):
@@ -97,7 +97,7 @@ def test_nothing_is_written_over(tmp_path, monkeypatch, source, file):
     (tmp_path / "011" / file).parent.mkdir(parents=True)
     (tmp_path / "011" / file).write_bytes(b"mine")
     deliver(monkeypatch, 4)
-    with pytest.raises(DataError, match="is there already; remove it, or choose another folder"):
+    with pytest.raises(DataError, match="exists; remove it, or choose another folder"):
         convert_oni.convert(source, tmp_path / "011")
     assert names(tmp_path / "011") == [file]
 
@@ -127,13 +127,13 @@ def test_of_a_recording_that_was_cut_off_the_last_good_image_is_named(tmp_path, 
         command(monkeypatch, source, tmp_path / "011")
     assert names(tmp_path / "011") == written(3)
     fault = capsys.readouterr().err.splitlines()[-1]
-    assert fault.startswith(f"error: {source} is cut off or damaged at byte ")
+    assert fault.startswith(f"error: {source} is truncated or damaged at byte ")
     assert "up to image00003.png; download it again" in fault
 
 
 def test_a_recording_without_a_frame_is_an_error(tmp_path, monkeypatch, source):
     deliver(monkeypatch, 0)
-    with pytest.raises(DataError, match="no image of color and of depth that are of the same moment"):
+    with pytest.raises(DataError, match="no color and depth images of the same time"):
         convert_oni.convert(source, tmp_path / "011")
     assert names(tmp_path / "011") == []
 

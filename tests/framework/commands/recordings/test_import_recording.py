@@ -34,9 +34,9 @@ def test_it_says_what_it_wrote_and_how_to_go_on(
     out, err = capsys.readouterr()
     assert out.splitlines() == [
         f"{tmp_path}/out: from Stray Scanner, 2 frames",
-        "up is not up in these images, and detectors find little in them; --turn 180 turns them upright",
-        f"check it: python -m framework check dataset=rgbd_folder dataset.root={tmp_path}/out",
-        f"map it: python -m framework dataset=rgbd_folder dataset.root={tmp_path}/out",
+        "the images are not upright, and detectors find little in them; rotate them with --turn 180",
+        f"check it: instancemap check dataset=rgbd_folder dataset.root={tmp_path}/out",
+        f"map it: instancemap dataset=rgbd_folder dataset.root={tmp_path}/out",
     ]
     assert err == ""
     assert RgbdFolder(tmp_path / "out").camera.width == 160

@@ -216,7 +216,7 @@ def test_the_address_is_one_that_a_browser_takes(stored: Path, command) -> None:
 
 def test_what_is_no_run_is_refused(stored: Path, command, tmp_path: Path) -> None:
     assert "holds no run" in command(tmp_path)[2]
-    assert "each run is to be named once" in command(stored, stored.parent / "." / "first")[2]
+    assert "expected each run once" in command(stored, stored.parent / "." / "first")[2]
 
 
 def test_several_runs_are_set_side_by_side(mapped: Path, stored: Path, command) -> None:

@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from framework.commands.running.experiment import with_row
+from framework.commands.running.choices import with_row
 from framework.errors import ConfigError
 from framework.files.search_paths import CONF
 from framework.interfaces import ClusterRefiner, MapFuser
