@@ -1,7 +1,7 @@
-"""A small room whose every pixel is known exactly: what the contracts run on.
+"""A synthetic scene with exactly known pixels, for the contract tests.
 
-The corner of a room (two walls and a floor, textured) with a chair and a couch, both spheres. World: x right, y down,
-z forward, like the first camera.
+The textured corner of a room (two walls and a floor) with a chair and a couch, both spheres. World: x right, y down,
+z forward, as the first camera.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ CLASSES = ("chair", "couch")
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
 RATE = 30  # Hz
 PLANES = (((-1.0, 0.0, 0.0), 1.5), ((0.0, -1.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 3.0))  # n . p + d = 0, n into the room
-SPHERES = (((-0.5, 0.7, 2.2), 0.35), ((0.5, 0.6, 2.5), 0.45))  # centre, radius: instances 1 and 2
+SPHERES = (((-0.5, 0.7, 2.2), 0.35), ((0.5, 0.6, 2.5), 0.45))  # center, radius: instances 1 and 2
 
 
 def look(camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float64, UInt8, Int32]:
-    """Depth (H, W), normals (H, W, 3), colour (H, W, 3) and instance ids (H, W), all exact."""
+    """Return exact depth (H, W), normals (H, W, 3), color (H, W, 3) and instance ids (H, W)."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
     d = rays @ T_world_camera[:3, :3].T
@@ -68,12 +68,12 @@ def look(camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float64, UIn
 
 
 def pose_at(k: int) -> Float64:
-    """T_world_camera of frame k: about a centimetre and a third of a degree further than the one before."""
+    """Return T_world_camera of frame k, about 1 cm and 0.3 degrees from the previous frame."""
     return exp_se3(np.array([0.010, -0.003, 0.006, 0.002, -0.005, 0.001]) * k)
 
 
 def frame_at(k: int, truth: bool = True) -> Frame:
-    """Frame k of a camera that moves through the room, with its true pose and instances, or without either."""
+    """Return frame k of a moving camera, with or without its true pose and instances."""
     depth, _, color, ids = look(CAMERA, pose_at(k))
     if not truth:
         return Frame(k, k / RATE, color, depth, CAMERA)
@@ -81,7 +81,7 @@ def frame_at(k: int, truth: bool = True) -> Frame:
 
 
 def spheres_in(frame: Frame) -> Detections:
-    """Both spheres, where they really are. Raises DataError for a frame without true instances."""
+    """Return the true masks of both spheres. Raises DataError for a frame without true instances."""
     if frame.truth is None:
         raise DataError(f"frame {frame.index} has no true instances: choose a detector that needs none")
     masks = frame.truth.instance_ids == np.array([1, 2], np.int32)[:, None, None]
@@ -93,12 +93,12 @@ def spheres_in(frame: Frame) -> Detections:
 
 
 def exact_clusters(frame: Frame) -> PointClusters:
-    """Both spheres, lifted from their true masks and the true pose."""
+    """Lift both spheres from their true masks and pose."""
     return lift(spheres_in(frame), frame, Pose(pose_at(frame.index)))
 
 
 def bleeding_clusters(frame: Frame) -> PointClusters:
-    """Both spheres, with masks that take in some of the wall behind."""
+    """Lift both spheres with masks that include some of the wall."""
     exact = spheres_in(frame)
     masks = exact.masks | np.roll(exact.masks, 3, axis=2)
     return lift(replace(exact, masks=masks), frame, Pose(pose_at(frame.index)))
@@ -106,7 +106,7 @@ def bleeding_clusters(frame: Frame) -> PointClusters:
 
 @dataclass(frozen=True)
 class RoomMap(SceneMap):
-    """The room itself as a map, which nobody can write: every view of it is perfect."""
+    """The room as a read-only map with exact views."""
 
     classes: tuple[str, ...] = CLASSES
 

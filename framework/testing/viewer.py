@@ -1,4 +1,4 @@
-"""The contract of a viewer."""
+"""Contract tests of a viewer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 from framework.data import Box, Camera, Detections, Float64, Frame, Instance, InstanceMesh, Pose, View
 from framework.interfaces import Viewer
-from framework.testing.assertions import same
+from framework.testing.contracts import same
 from framework.testing.corner_room import CAMERA, RoomMap, frame_at, pose_at, spheres_in
 
 FRAMES, LOST, SKIPPED, NOTHING_FOUND, BLIND = 8, 2, 3, 4, 5
@@ -23,7 +23,7 @@ STAGE_MS = {"read": 1.0, "detect": 20.0, "track": 5.0, "lift": 0.5, "refine": 3.
 
 @dataclass(frozen=True)
 class WatchedMap(RoomMap):
-    """A map of one chair, a triangle, that notes what is asked of it while nobody may."""
+    """A map of one chair (a triangle) that records reads outside of a viewer's calls."""
 
     within_a_call: threading.Event = field(default_factory=threading.Event)
     asked_outside: list[str] = field(default_factory=list)
@@ -51,7 +51,7 @@ class WatchedMap(RoomMap):
 
     @contextmanager
     def call(self) -> Iterator[None]:
-        """Around a call of a viewer: meanwhile the map may be read."""
+        """Allow reads of the map in the body."""
         self.within_a_call.set()
         yield
         self.within_a_call.clear()
@@ -62,16 +62,14 @@ class WatchedMap(RoomMap):
 
 
 class ViewerContract:
-    """What every viewer keeps."""
+    """Tests of a viewer."""
 
     stage = "viewer"
 
     def plugin(self) -> Viewer:
         raise NotImplementedError("the viewer that is tested")
 
-    def test_viewer_takes_all_that_happens_to_frames_and_changes_nothing(
-        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
-    ) -> None:
+    def test_viewer_accepts_all_frames_and_keeps_them(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         scene, frames = WatchedMap(), [frame_with_found(k) for k in range(FRAMES)]
         show_run(self.plugin(), scene, frames, tmp_path)
         for k, (frame, found) in enumerate(frames):
@@ -79,12 +77,12 @@ class ViewerContract:
             assert same(found, frame_with_found(k)[1])
         assert not warnings(caplog)
 
-    def test_viewer_reads_the_map_within_a_call_only(self, tmp_path: Path) -> None:
+    def test_viewer_reads_map_only_in_calls(self, tmp_path: Path) -> None:
         scene = WatchedMap()
         show_run(self.plugin(), scene, [frame_with_found(k) for k in range(FRAMES)], tmp_path)
         assert not scene.asked_outside, "the fuser may be writing it then"
 
-    def test_viewer_takes_an_end_without_a_frame(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def test_viewer_accepts_run_without_frames(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         scene, viewer = WatchedMap(), self.plugin()
         with scene.call():
             viewer.begin(scene, "a room", tmp_path)
@@ -92,16 +90,14 @@ class ViewerContract:
             viewer.end()
         assert not warnings(caplog)
 
-    def test_viewer_shows_one_video_after_another(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def test_viewer_accepts_several_runs(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         viewer = self.plugin()
         for name in ("one", "other"):
             (tmp_path / name).mkdir()
             show_run(viewer, WatchedMap(), [frame_with_found(0)], tmp_path / name)
         assert not warnings(caplog)
 
-    def test_viewer_leaves_its_files_in_the_runs_directory(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_viewer_writes_only_to_run_directory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "here").mkdir()
         (tmp_path / "run").mkdir()
         monkeypatch.chdir(tmp_path / "here")
@@ -110,7 +106,7 @@ class ViewerContract:
 
 
 def frame_with_found(k: int) -> tuple[Frame, Detections]:
-    """Frame k and its detections: one is without any, one is dark and without depth."""
+    """Return frame k and its detections; one frame has none, one is black and without depth."""
     frame = frame_at(k)
     found = spheres_in(frame)
     if k == NOTHING_FOUND:
@@ -122,7 +118,7 @@ def frame_with_found(k: int) -> tuple[Frame, Detections]:
 
 
 def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detections]], directory: Path) -> None:
-    """A run of these frames, as the loop tells of it. One of them is lost, one is skipped."""
+    """Show these frames as a run does. One of them is lost, one is skipped."""
     with scene.call():
         viewer.begin(scene, "a room", directory)
     for k, (frame, found) in enumerate(frames):
@@ -139,5 +135,5 @@ def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detect
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """What a viewer that fails in a thread of its own says."""
+    """Return logged warnings, such as those of a viewer that fails in its own thread."""
     return [record.message for record in caplog.records if record.levelno >= logging.WARNING]

@@ -75,4 +75,4 @@ def test_a_contract_is_inherited() -> None:
     names: dict[str, Any] = {"__name__": "my_package"}
     exec(CONTRACT, names)
     inherited = {name for name in dir(names["TestMyRefiner"]) if name.startswith("test_")}
-    assert {"test_option_is_listed_with_every_parameter_and_a_comment", "test_refiner_is_repeatable"} <= inherited
+    assert {"test_option_lists_every_parameter_with_comment", "test_refiner_is_repeatable"} <= inherited

@@ -16,11 +16,13 @@ import pytest
 
 from framework.data import Frame
 from framework.interfaces import LiveVideo, RGBDSequence
-from framework.testing.dataset import SequenceContract
-from framework.testing.detector import DetectorContract
-from framework.testing.fuser import FuserContract
-from framework.testing.refiner import RefinerContract
-from framework.testing.tracker import TrackerContract
+from framework.testing.contracts import (
+    DetectorContract,
+    FuserContract,
+    RefinerContract,
+    SequenceContract,
+    TrackerContract,
+)
 from framework.testing.viewer import ViewerContract
 from tests.support import option_files, registered
 from tests.support.cores import all_cores

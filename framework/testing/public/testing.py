@@ -12,6 +12,14 @@ import pytest
 
 pytest.register_assert_rewrite("framework.testing")  # failed assertions show their values
 
+from framework.testing.contracts import (
+    DetectorContract,
+    FuserContract,
+    OptionContract,
+    RefinerContract,
+    SequenceContract,
+    TrackerContract,
+)
 from framework.testing.corner_room import (
     CAMERA,
     CLASSES,
@@ -22,12 +30,6 @@ from framework.testing.corner_room import (
     pose_at,
     spheres_in,
 )
-from framework.testing.dataset import SequenceContract
-from framework.testing.detector import DetectorContract
-from framework.testing.fuser import FuserContract
-from framework.testing.option import OptionContract
-from framework.testing.refiner import RefinerContract
-from framework.testing.tracker import TrackerContract
 from framework.testing.viewer import (
     FRAMES,
     LOST,

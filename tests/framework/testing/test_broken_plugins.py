@@ -16,12 +16,14 @@ import pytest
 from framework.config import composition
 from framework.data import Detections, Frame, PointClusters, Pose
 from framework.interfaces import ClusterRefiner, PoseTracker, SceneMap, Viewer
-from framework.testing.dataset import SequenceContract
-from framework.testing.detector import DetectorContract
-from framework.testing.fuser import FuserContract
-from framework.testing.option import OptionContract
-from framework.testing.refiner import RefinerContract
-from framework.testing.tracker import TrackerContract
+from framework.testing.contracts import (
+    DetectorContract,
+    FuserContract,
+    OptionContract,
+    RefinerContract,
+    SequenceContract,
+    TrackerContract,
+)
 from framework.testing.viewer import ViewerContract
 from tests.support.scenes.corner_room import CornerRoom, GridFuser, SphereDetector
 
@@ -96,13 +98,13 @@ class Backwards(CornerRoom):
 @pytest.mark.parametrize(
     ("contract", "plugin", "test"),
     [
-        (DetectorContract, Forgetful(), "test_detector_gives_the_same_for_the_same_frame_in_any_order"),
-        (DetectorContract, Sharing(), "test_detector_gives_the_same_in_another_thread_and_in_several_where_it_says_so"),
+        (DetectorContract, Forgetful(), "test_detector_does_not_depend_on_frame_order"),
+        (DetectorContract, Sharing(), "test_detector_does_not_depend_on_thread"),
         (RefinerContract, Shifting(), "test_refiner_invents_no_points"),
         (RefinerContract, Dropping(), "test_refiner_invents_no_points"),
-        (TrackerContract, Writing(writes=True), "test_tracker_returns_a_pose_and_leaves_the_map_alone"),
-        (TrackerContract, Writing(), "test_trackers_world_is_the_first_frames_true_pose"),
-        (FuserContract, Careless(), "test_fusers_map_is_seen_by_cameras_from_poses_only"),
+        (TrackerContract, Writing(writes=True), "test_tracker_returns_pose_and_keeps_map"),
+        (TrackerContract, Writing(), "test_tracker_starts_at_first_true_pose"),
+        (FuserContract, Careless(), "test_fuser_map_rejects_invalid_poses"),
         (SequenceContract, Backwards(), "test_dataset_is_in_order"),
     ],
 )
@@ -137,9 +139,9 @@ class Painting(Viewer):
 @pytest.mark.parametrize(
     ("viewer", "test"),
     [
-        (Painting(), ViewerContract.test_viewer_takes_all_that_happens_to_frames_and_changes_nothing),
-        (Late(), ViewerContract.test_viewer_reads_the_map_within_a_call_only),
-        (Late(), ViewerContract.test_viewer_leaves_its_files_in_the_runs_directory),
+        (Painting(), ViewerContract.test_viewer_accepts_all_frames_and_keeps_them),
+        (Late(), ViewerContract.test_viewer_reads_map_only_in_calls),
+        (Late(), ViewerContract.test_viewer_writes_only_to_run_directory),
     ],
 )
 def test_a_broken_viewer_is_found(
@@ -186,8 +188,8 @@ def test_a_yaml_that_differs_from_its_class_is_found(
     monkeypatch.setattr(composition, "_added", [tmp_path])
     tests = option(tmp_path, text)
     for test, holds in (
-        (tests.test_option_is_listed_with_every_parameter_and_a_comment, listed),
-        (tests.test_values_in_the_yaml_are_the_defaults_of_the_class, defaults),
+        (tests.test_option_lists_every_parameter_with_comment, listed),
+        (tests.test_option_values_are_class_defaults, defaults),
     ):
         if holds:
             test()

@@ -8,7 +8,7 @@ import pytest
 from framework.data import Camera, Frame
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.errors import ConfigError, DataError
-from framework.testing.detector import DetectorContract
+from framework.testing.contracts import DetectorContract
 from plugins.detectors.onnx_segmentation import OnnxSegmentation
 from tests.support.networks.tiny_networks import constant_network
 from tests.support.recordings.rewritten_exports import LAYOUTS, rewritten

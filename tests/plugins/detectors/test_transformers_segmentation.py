@@ -14,7 +14,7 @@ from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError
 
 # a detector that any config registers keeps these; here they run on the networks below
-from framework.testing.detector import DetectorContract
+from framework.testing.contracts import DetectorContract
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID
 from plugins.detectors.transformers_segmentation import (
     FAMILIES,

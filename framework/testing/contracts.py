@@ -1,0 +1,385 @@
+"""Contract tests of each stage's plugins and of their options. Viewers are in viewer.py."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import is_dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from framework.commands.installation.plugins import registered
+from framework.config.composition import composed
+from framework.data import Detections, Float64, Frame, FrameTruth, PointClusters, Pose
+from framework.errors import DataError
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from framework.refinement.lifting import lift
+from framework.registry import GROUPS, build, find_class, parameters
+from framework.testing.corner_room import (
+    CAMERA,
+    CLASSES,
+    RoomMap,
+    bleeding_clusters,
+    exact_clusters,
+    frame_at,
+    pose_at,
+    spheres_in,
+)
+
+
+class OptionContract:
+    """Builds the plugin from its option, as a run does. The first base of a test class."""
+
+    stage: str  # of the stage's contract
+    option: str
+    overrides: tuple[str, ...] = ()  # values that only users know: ("detector.weights=FILE",)
+
+    def plugin(self) -> Any:
+        return build(GROUPS[self.stage], self.node())
+
+    def node(self) -> DictConfig:
+        others = [f"~{stage}" for stage in GROUPS if stage != self.stage]
+        node: DictConfig = composed(f"{self.stage}={self.option}", *others, *self.overrides)[self.stage]
+        return node
+
+    def test_option_lists_every_parameter_with_comment(self) -> None:
+        [listed] = registered(self.stage, only=self.option)
+        assert listed.documentation, "the class has no docstring"
+        assert not listed.documentation.startswith("cannot be used"), listed.documentation
+        named = {parameter.name for parameter in listed.parameters}
+        assert named == set(map(str, self.node())) - {"_target_"}, "the YAML needs every parameter"
+        bare = [parameter.name for parameter in listed.parameters if not parameter.comment]
+        assert not bare, f"the YAML needs comments of {bare}"
+
+    def test_option_values_are_class_defaults(self) -> None:
+        node = self.node()
+        plugin_class = find_class(GROUPS[self.stage], str(node["_target_"]))
+        of_the_user = [override.partition("=")[0].partition(".")[2] for override in self.overrides]
+        bare = OmegaConf.masked_copy(node, ["_target_", *of_the_user])
+        given, default = (parameters(self.option, plugin_class, of) for of in (node, bare))
+        assert given == default
+
+
+class SequenceContract:
+    """Tests of a recording with poses."""
+
+    stage = "dataset"
+
+    def plugin(self) -> RGBDSequence:
+        raise NotImplementedError("the recording that is tested")
+
+    def test_dataset_returns_frames_of_its_camera(self) -> None:
+        sequence = self.plugin()
+        assert sequence.name
+        assert len(sequence) > 0
+        frame = sequence[0]
+        assert frame.T_world_camera is not None, "the tests' recordings have poses"
+        assert frame.camera == sequence.camera
+        assert (frame.depth > 0).any()
+        assert same(frame, sequence[0])
+
+    def test_dataset_is_in_order(self) -> None:
+        sequence = self.plugin()
+        first, last = sequence[0], sequence[len(sequence) - 1]
+        assert len(sequence) == 1 or (last.index > first.index and last.timestamp > first.timestamp)
+
+
+class DetectorContract:
+    """Tests of a detector."""
+
+    stage = "detector"
+
+    def plugin(self) -> Detector:
+        raise NotImplementedError("the detector that is tested")
+
+    def test_detector_returns_valid_detections(self) -> None:
+        detector = self.plugin()
+        frame = frame_at(0)
+        assert_valid(detector.detect(frame), detector, frame)
+
+    def test_detector_does_not_depend_on_frame_order(self) -> None:
+        detector = self.plugin()
+        forwards = [detector.detect(frame_at(k)) for k in (0, 1)]
+        backwards = [detector.detect(frame_at(k)) for k in (1, 0)]
+        assert same(forwards[0], backwards[1])
+        assert same(forwards[1], backwards[0])
+
+    def test_detector_does_not_depend_on_thread(self) -> None:
+        detector = self.plugin()
+        frames = [frame_at(k) for k in (0, 1, 0, 1)]
+        with ThreadPoolExecutor(3 if detector.concurrent else 1) as threads:
+            found = list(threads.map(detector.detect, frames))
+        for k in (0, 1):
+            expected = detector.detect(frames[k])
+            assert same(found[k], expected)
+            assert same(found[k + 2], expected)
+
+    def test_detector_accepts_blank_image(self) -> None:
+        detector = self.plugin()
+        color, depth = np.zeros((*CAMERA.shape, 3), np.uint8), np.zeros(CAMERA.shape, np.float32)
+        blank = Frame(0, 0.0, color, depth, CAMERA, truth=FrameTruth(np.zeros(CAMERA.shape, np.int32), {}))
+        assert_valid(detector.detect(blank), detector, blank)
+
+    def test_detector_without_truth_works_or_raises(self) -> None:
+        detector = self.plugin()
+        frame = frame_at(0, truth=False)
+        try:
+            assert_valid(detector.detect(frame), detector, frame)
+        except DataError as error:
+            assert "\n" not in str(error)
+
+
+def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
+    assert found.classes == detector.classes
+    assert found.masks.shape == (len(found), *frame.camera.shape)
+    assert found.class_probabilities.shape == (len(found), len(detector.classes))
+    np.testing.assert_allclose(found.class_probabilities.sum(axis=1), 1, atol=1e-4)
+    assert (np.diff(found.scores) <= 0).all(), "best first"
+    for mask, (x1, y1, x2, y2) in zip(found.masks, found.boxes, strict=True):
+        assert -1 <= x1 <= x2 <= frame.camera.width + 1
+        assert -1 <= y1 <= y2 <= frame.camera.height + 1
+        v, u = np.nonzero(mask)
+        if len(u):
+            slack = 2  # px: boxes are regressed, masks are resampled
+            assert u.min() >= x1 - slack
+            assert u.max() <= x2 + slack
+            assert v.min() >= y1 - slack
+            assert v.max() <= y2 + slack
+
+
+class TrackerContract:
+    """Tests of a tracker. The map is frozen, so writing to it raises."""
+
+    stage = "tracker"
+
+    def plugin(self) -> PoseTracker:
+        raise NotImplementedError("the tracker that is tested")
+
+    def test_tracker_returns_pose_and_keeps_map(self) -> None:
+        tracker = self.plugin()
+        scene = RoomMap()
+        for k in range(6):
+            pose = tracker.track(frame_at(k), scene)
+            assert isinstance(pose, Pose)  # rigid, as every Pose
+            assert not pose.lost or pose.reason
+
+    def test_tracker_starts_at_first_true_pose(self) -> None:
+        pose = self.plugin().track(frame_at(4), RoomMap())
+        np.testing.assert_allclose(pose.T_world_camera, pose_at(4), atol=1e-12)
+
+    def test_tracker_without_truth_starts_at_identity_or_raises(self) -> None:
+        tracker = self.plugin()
+        try:
+            pose = tracker.track(frame_at(0, truth=False), RoomMap())
+        except DataError as error:
+            assert "\n" not in str(error)
+        else:
+            np.testing.assert_allclose(pose.T_world_camera, np.eye(4), atol=1e-12)
+
+    def test_tracker_accepts_frame_without_depth(self) -> None:
+        tracker = self.plugin()
+        scene = RoomMap()
+        tracker.track(frame_at(0), scene)
+        blind = replace(frame_at(1), depth=np.zeros(CAMERA.shape, np.float32))
+        assert isinstance(tracker.track(blind, scene), Pose)
+        assert isinstance(tracker.track(frame_at(2), scene), Pose)
+
+
+class RefinerContract:
+    """Tests of a refiner."""
+
+    stage = "refiner"
+
+    def plugin(self) -> ClusterRefiner:
+        raise NotImplementedError("the refiner that is tested")
+
+    def test_refiner_invents_no_points(self) -> None:
+        frame = frame_at(1)
+        clusters = bleeding_clusters(frame)
+        before = {name: np.array(value) for name, value in vars(clusters).items()}
+        refined = self.plugin().refine(clusters, frame)
+        u, v = refined.pixels.T
+        np.testing.assert_allclose(refined.points_world, readings(frame)[v, u], atol=1e-4)
+        of_one = np.c_[refined.pixels, refined.cluster]
+        assert len(np.unique(of_one, axis=0)) == len(of_one), "a pixel twice in one cluster"
+        assert refined.classes == clusters.classes
+        assert all(np.array_equal(before[name], value) for name, value in vars(clusters).items()), "input was changed"
+        assert (refined.cluster >= 0).any(), "nothing is left of two whole spheres"
+
+    def test_refiner_is_repeatable(self) -> None:
+        refiner = self.plugin()
+        one, other = frame_at(1), frame_at(2)
+        first = refiner.refine(bleeding_clusters(one), one)
+        refiner.refine(bleeding_clusters(other), other)
+        assert same(first, refiner.refine(bleeding_clusters(one), one))
+
+    def test_refiner_does_not_depend_on_thread_count(self) -> None:
+        refiner = self.plugin()
+        frame = frame_at(1)
+        clusters = bleeding_clusters(frame)
+        usual = numba.get_num_threads()
+        made = []
+        try:
+            for threads in (1, numba.config.NUMBA_NUM_THREADS):
+                numba.set_num_threads(threads)
+                made.append(refiner.refine(clusters, frame))
+        finally:
+            numba.set_num_threads(usual)
+        assert same(*made)
+
+    def test_refiner_accepts_no_clusters(self) -> None:
+        frame = frame_at(0)
+        nothing = lift(Detections.none(CAMERA.shape, CLASSES), frame, Pose(pose_at(0)))
+        refined = self.plugin().refine(nothing, frame)
+        assert (len(refined), len(refined.points_world), refined.classes) == (0, 0, CLASSES)
+
+    def test_refiner_accepts_empty_and_tiny_clusters(self) -> None:
+        frame = frame_at(0)
+        exact = spheres_in(frame)
+        masks = np.zeros_like(exact.masks)
+        masks[1, 40, 40] = True
+        refined = self.plugin().refine(lift(replace(exact, masks=masks), frame, Pose(pose_at(0))), frame)
+        assert len(refined.points_world) <= 1
+
+
+def readings(frame: Frame) -> Float64:
+    """Return (H, W, 3) each pixel's point in the world, NaN without depth."""
+    whole = replace(spheres_in(frame), masks=np.ones((2, *CAMERA.shape), np.bool_))
+    lifted = lift(whole, frame, Pose(pose_at(frame.index)))
+    points = np.full((*CAMERA.shape, 3), np.nan)
+    points[lifted.pixels[:, 1], lifted.pixels[:, 0]] = lifted.points_world
+    return points
+
+
+class FuserContract:
+    """Tests of a fuser and its map."""
+
+    stage = "fuser"
+
+    def plugin(self) -> MapFuser:
+        raise NotImplementedError("the fuser that is tested")
+
+    def test_fuser_starts_with_an_empty_map(self) -> None:
+        scene = self.plugin().scene
+        view = scene.render(CAMERA, np.eye(4))
+        assert not view.depth.any()
+        assert not view.instance_ids.any()
+        assert (view.class_ids == -1).all()
+        assert len(scene.mesh().vertices) == 0
+        assert not scene.instances()
+        assert not scene.instance_ids()
+
+    def test_fuser_map_matches_depth(self) -> None:
+        scene = fused(self.plugin()).scene
+        assert scene.statistics.voxels > 0
+        assert scene.statistics.bytes > 0
+        truth = frame_at(2)
+        view = scene.render(CAMERA, pose_at(2))
+        both = (view.depth > 0) & (truth.depth > 0)
+        assert both.mean() > 0.5
+        assert np.median(np.abs(view.depth - truth.depth)[both]) < 0.02
+        length = np.linalg.norm(view.normals_world[view.depth > 0], axis=1)
+        np.testing.assert_allclose(length, 1, atol=1e-3)
+        assert not view.normals_world[view.depth == 0].any()
+
+    def test_fuser_instances_match_mesh(self) -> None:
+        scene = fused(self.plugin()).scene
+        mesh, instances = scene.mesh(), scene.instances()
+        assert scene.instance_ids() == set(instances)
+        assert mesh.triangles.max(initial=-1) < len(mesh.vertices)
+        assert instances, "two spheres, each seen whole in five frames"
+        for key, instance in instances.items():
+            assert key == instance.id > 0
+            assert (mesh.instance_ids[instance.vertices] == key).all()
+            assert 0 <= instance.confidence <= 1
+            assert instance.class_probabilities.shape == (len(scene.classes),)
+            np.testing.assert_allclose(instance.class_probabilities.sum(), 1, atol=1e-3)
+            points = mesh.vertices[instance.vertices]
+            low, high = (instance.aabb.center + sign * instance.aabb.extent / 2 for sign in (-1, 1))
+            assert ((points >= low - 1e-4) & (points <= high + 1e-4)).all()
+            inside = np.abs((points - instance.obb.center) @ instance.obb.rotation)
+            assert (inside <= instance.obb.extent / 2 + 1e-3).all()
+
+    def test_fuser_accepts_frame_without_detections_or_depth(self) -> None:
+        fuser = self.plugin()
+        frame, pose = frame_at(0), Pose(pose_at(0))
+        fuser.fuse(frame, pose, nothing_in(frame, pose))
+        blind = replace(frame_at(1), depth=np.zeros(CAMERA.shape, np.float32))
+        fuser.fuse(blind, pose, nothing_in(blind, pose))
+        assert not fuser.scene.instances()
+
+    def test_fuser_maps_its_depth_range(self) -> None:
+        fuser = self.plugin()
+        nearest, farthest = fuser.scene.depth_range
+        frame, pose = frame_at(0), Pose(pose_at(0))
+        nothing = nothing_in(frame, pose)
+        for depth in [0.99 * nearest] + [1.01 * farthest] * bool(np.isfinite(farthest)):
+            fuser.fuse(replace(frame, depth=np.full(CAMERA.shape, depth, np.float32)), pose, nothing)
+        assert not len(fuser.scene.mesh().vertices)
+        fuser.fuse(replace(frame, depth=np.full(CAMERA.shape, nearest + 0.1, np.float32)), pose, nothing)
+        assert len(fuser.scene.mesh().vertices)
+
+    def test_fuser_map_rejects_invalid_poses(self) -> None:
+        scene, pose, depth = self.plugin().scene, pose_at(0), np.ones(CAMERA.shape, np.float32)
+        no_poses: list[Any] = [2 * pose, pose[:3], pose.tolist(), np.full((4, 4), np.nan), None]
+        for no_pose in no_poses:
+            assert_data_error(partial(scene.render, CAMERA, no_pose), "T_world_camera")
+            assert_data_error(partial(scene.render_near, CAMERA, no_pose, depth), "T_world_camera")
+        no_camera: Any = CAMERA.K
+        assert_data_error(partial(scene.render, no_camera, pose), "camera must be a Camera, found ndarray")
+
+    def test_fuser_map_survives_saving(self, tmp_path: Path) -> None:
+        scene = fused(self.plugin(), frames=3).scene
+        path = tmp_path / "map.npz"
+        scene.save(path)
+        assert [file.name for file in tmp_path.iterdir()] == ["map.npz"]
+        loaded = type(scene).load(path)
+        assert loaded.classes == scene.classes
+        assert loaded.statistics == scene.statistics
+        before, after = scene.render(CAMERA, pose_at(1)), loaded.render(CAMERA, pose_at(1))
+        for name in ("depth", "color", "instance_ids", "class_ids"):
+            np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
+        assert set(loaded.instances()) == set(scene.instances())
+
+    def test_fuser_map_rejects_damaged_file(self, tmp_path: Path) -> None:
+        fuser = self.plugin()
+        path = tmp_path / "map.npz"
+        fused(fuser, frames=1).scene.save(path)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        assert_data_error(lambda: type(fuser.scene).load(path), "map.npz")
+
+
+def fused(fuser: MapFuser, frames: int = 5) -> MapFuser:
+    """The fuser, once it has seen so many frames of the room."""
+    for k in range(frames):
+        frame = frame_at(k)
+        fuser.fuse(frame, Pose(pose_at(k)), exact_clusters(frame))
+    return fuser
+
+
+def nothing_in(frame: Frame, pose: Pose) -> PointClusters:
+    return lift(Detections.none(CAMERA.shape, CLASSES), frame, pose)
+
+
+def same(a: object, b: object) -> bool:
+    """Return true if two of the pipeline's data contain the same arrays."""
+    return all(
+        same(x, y) if is_dataclass(x) else np.array_equal(x, y)
+        for x, y in zip(vars(a).values(), vars(b).values(), strict=True)
+    )
+
+
+def assert_data_error(call: Callable[[], object], words: str) -> None:
+    """Assert that the call raises a DataError of one line with these words."""
+    try:
+        call()
+    except DataError as error:
+        assert words in str(error), f"{str(error)!r} does not say {words!r}"
+        assert "\n" not in str(error)
+    else:
+        raise AssertionError(f"nothing was raised; expected a DataError with {words!r}")
