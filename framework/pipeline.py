@@ -30,8 +30,7 @@ from framework.live_view.guarded_viewer import GuardedViewer
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 from framework.runtime.cpu_budget import CoreSharing, parallel_kernels_are_thread_safe
-from framework.runtime.frame_stream import FrameStream, stream_of
-from framework.runtime.prefetch import Turns, map_ahead
+from framework.runtime.frame_stream import FrameStream, Turns, map_ahead, stream_of
 from framework.runtime.run_log import Journal, RunResult, StageTime
 from framework.runtime.signals import Interruption, signals_deferred
 

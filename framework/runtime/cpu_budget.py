@@ -1,14 +1,8 @@
-"""Who gets how many cores: the threads that read and detect ahead, and the one that maps what was detected.
+"""CPU budget: numba threads for reading and detection ahead, and for mapping.
 
-A parallel loop waits for its slowest thread, and a thread whose core is taken is late by milliseconds. So loops of two
-threads that share all cores wait for each other: on two cores, beside a network that takes one, tracking and fusion
-have taken up to ten times as long with two threads as with one. Each gets cores of its own instead, in proportion to
-its work. No result depends on it, as no kernel's result depends on its number of threads.
-
-This is about numba's kernels. The threads of a network are its own: they are neither limited here nor counted. So
-detectors that take several frames at once may have more threads than their share has cores: on two cores, the second
-one uses what is left of the mapping's core while that waits for the first. What no frame waits for stands back where
-cores are scarce.
+A parallel loop waits for its slowest thread, so two loops that share all cores slow each other down. Each side gets its
+own cores instead, in proportion to its recent work. Kernel results do not depend on the number of threads. Threads of
+networks are neither limited nor counted. Work that no frame waits for has low priority.
 """
 
 from __future__ import annotations
@@ -24,14 +18,14 @@ from statistics import median
 
 import numba
 
-STANDING_BACK = 10  # of nice(2): a tenth of the time of others who want the same core
-RECENT = 15  # frames; their median is a frame's work
+LOW_PRIORITY = 10  # of nice(2): a tenth of the CPU time of normal threads on a busy core
+RECENT = 15  # number of frames whose median is the work of a frame
 
 
-def stand_back() -> None:
-    """Has the calling thread leave cores to others that want them. Only Linux knows that of a single thread."""
+def lower_priority() -> None:
+    """Lower the priority of the calling thread. Only Linux supports this for single threads."""
     if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), STANDING_BACK)
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), LOW_PRIORITY)
 
 
 def parallel_kernels_are_thread_safe() -> bool:
@@ -73,43 +67,40 @@ def limited_threads(threads: int) -> Iterator[None]:
 
 
 class CoreSharing:
-    """How many threads the kernels of either side have, by what the latest frames have cost it."""
+    """Divides the kernel threads between both sides, by their work on recent frames."""
 
     def __init__(self, with_a_thread_ahead: bool = True) -> None:
         self.cores = int(numba.get_num_threads())
         self._alone = not with_a_thread_ahead
-        self._ahead: deque[float] = deque(maxlen=RECENT)  # s of CPU time a frame, of its thread itself
-        self._mapping: deque[float] = deque(maxlen=RECENT)  # likewise, times its threads: it is one loop after another
+        self._ahead: deque[float] = deque(maxlen=RECENT)  # CPU time per frame of the thread itself, s
+        self._mapping: deque[float] = deque(maxlen=RECENT)  # CPU time per frame times threads, s: mostly parallel loops
         self._lock = threading.Lock()
 
     @contextmanager
     def ahead(self, workers: int = 1) -> Iterator[None]:
-        """Around what one of so many workers does ahead with one frame."""
+        """Run the work on one frame ahead, by one of `workers` threads."""
         with kernel_threads(self.cores if self._alone else max(self.cores_ahead() // workers, 1)):
             began = time.thread_time()
             yield
-            self._note(self._ahead, time.thread_time() - began)
+            self._record(self._ahead, time.thread_time() - began)
 
     @contextmanager
     def mapping(self) -> Iterator[None]:
-        """Around the mapping of one frame."""
+        """Run the mapping of one frame."""
         threads = self.cores if self._alone else max(self.cores - self.cores_ahead(), 1)
         with kernel_threads(threads):
             began = time.thread_time()
             yield
-            self._note(self._mapping, threads * (time.thread_time() - began))
+            self._record(self._mapping, threads * (time.thread_time() - began))
 
     def cores_ahead(self) -> int:
-        """The share of what is done ahead, rounded.
-
-        0: its work is so little that the mapping has all cores, and is disturbed. All of them: the other way round.
-        """
+        """Return the number of cores for work ahead, rounded: 0 or all cores if one side has almost no work."""
         with self._lock:
             if not (self._ahead and self._mapping):
                 return self.cores // 2
             ahead, mapping = median(self._ahead), median(self._mapping)
         return round(self.cores * ahead / max(ahead + mapping, 1e-9))
 
-    def _note(self, spent: deque[float], seconds: float) -> None:
+    def _record(self, spent: deque[float], seconds: float) -> None:
         with self._lock:
             spent.append(seconds)

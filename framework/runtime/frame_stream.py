@@ -1,32 +1,40 @@
-"""The frames of a video one after the other: all of a recording, of a live video the newest."""
+"""Frames of a video in order (all of a recording, the newest of a live video), processed ahead by other threads."""
 
 from __future__ import annotations
 
 import threading
 from abc import abstractmethod
-from collections.abc import Callable
-from contextlib import AbstractContextManager, closing
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, closing, contextmanager
 from functools import partial
+from typing import TypeVar
+
+import numba
 
 from framework.errors import DataError
 from framework.interfaces import FrameReader, LiveVideo, RGBDSequence, RGBDVideo
 
-PATIENCE_S = 0.1  # how long a wait for a frame goes on before it asks whether it shall end
+POLL_INTERVAL_S = 0.1  # between checks for the end while waiting for a frame
+
+Item = TypeVar("Item")
+Outcome = TypeVar("Outcome")
 
 
 class FrameStream(AbstractContextManager["FrameStream"]):
-    """Readers of a video's frames in their order. Another thread than that of the `with` around it may take them."""
+    """Readers of a video's frames in order. Any thread may take them."""
 
-    most_ahead: int | None = None  # frames that may be taken before they are needed; None = any number
-    dropped: int = 0  # frames so far that were not taken
+    most_ahead: int | None = None  # maximum number of prefetched frames; None = no limit
+    dropped: int = 0  # number of frames that were not taken
 
     @abstractmethod
     def take(self) -> FrameReader | None:
-        """The next frame; None at the end."""
+        """Return the next frame; None at the end."""
 
 
 def stream_of(video: RGBDVideo, ended: Callable[[], bool]) -> FrameStream:
-    """The frames of a video; a live one also ends when somebody has `ended` it."""
+    """Return the stream of a video; a live one also ends when `ended` returns true."""
     if isinstance(video, LiveVideo):
         return LiveFrames(video, ended)
     if isinstance(video, RGBDSequence):
@@ -48,10 +56,9 @@ class RecordedFrames(FrameStream):
 
 
 class LiveFrames(FrameStream):
-    """The newest frame of a live video whenever one is asked for, taken once.
+    """The newest frame of a live video at each call of `take`; older ones are dropped.
 
-    A thread listens to the video, so that nothing waits in it, and keeps the last frame that came: whatever is slow, no
-    frame gets older than the steps before it take, and no memory fills up. So only one is taken ahead.
+    A thread receives the frames, so that no queue builds up in the video. Only one frame is prefetched.
     """
 
     most_ahead = 1
@@ -59,8 +66,8 @@ class LiveFrames(FrameStream):
     def __init__(self, video: LiveVideo, ended: Callable[[], bool]) -> None:
         self._video, self._ended = video, ended
         self._newest: FrameReader | None = None
-        self._fault: Exception | None = None
-        self._over = False  # nothing more comes, or is wanted
+        self._error: Exception | None = None
+        self._over = False  # no more frames arrive or are needed
         self._changed = threading.Condition()
         self._listener = threading.Thread(target=self._listen, name="live-frames", daemon=True)
 
@@ -73,15 +80,15 @@ class LiveFrames(FrameStream):
         self._listener.join()
 
     def take(self) -> FrameReader | None:
-        """Waits for a frame. Raises what the video raises, once the last frame before that is taken."""
+        """Wait for a frame. Raises the video's error once the last frame before it is taken."""
         with self._changed:
             while self._newest is None and not self._over and not self._ended():
-                self._changed.wait(PATIENCE_S)
+                self._changed.wait(POLL_INTERVAL_S)
             if self._ended():
                 return None
             reader, self._newest = self._newest, None
-        if reader is None and self._fault is not None:
-            raise self._fault
+        if reader is None and self._error is not None:
+            raise self._error
         return reader
 
     def _listen(self) -> None:
@@ -92,8 +99,8 @@ class LiveFrames(FrameStream):
                         break
                     if reader is not None:
                         self._keep(reader)
-        except Exception as fault:
-            self._end(fault)
+        except Exception as error:
+            self._end(error)
         else:
             self._end(None)
 
@@ -103,8 +110,52 @@ class LiveFrames(FrameStream):
             self._newest = reader
             self._changed.notify_all()
 
-    def _end(self, fault: Exception | None) -> None:
+    def _end(self, error: Exception | None) -> None:
         with self._changed:
-            self._fault = self._fault or fault
+            self._error = self._error or error
             self._over = True
             self._changed.notify_all()
+
+
+def map_ahead(
+    function: Callable[[Item], Outcome], items: Iterable[Item], ahead: int, workers: int = 1
+) -> Generator[Outcome]:
+    """Yield `map(function, items)`, computed in order by `workers` threads, at most `ahead` outcomes in advance.
+
+    Errors are raised in place of their outcome. Closing the generator ends the workers after their current items.
+    """
+    if ahead == 0:
+        yield from map(function, items)
+        return
+    # numba's thread count is per thread: the workers get the consumer's
+    pool = ThreadPoolExecutor(workers, "detect-ahead", numba.set_num_threads, (numba.get_num_threads(),))
+    pending: deque[Future[Outcome]] = deque()
+    try:
+        for item in items:
+            pending.append(pool.submit(function, item))
+            if len(pending) > ahead:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+class Turns:
+    """Serializes a part of the work of several threads, in the order of their numbers from 0."""
+
+    def __init__(self) -> None:
+        self._next = 0
+        self._changed = threading.Condition()
+
+    @contextmanager
+    def turn(self, number: int) -> Iterator[None]:
+        """Wait until all smaller numbers are done."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._next == number)
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._next += 1
+                self._changed.notify_all()

@@ -1,11 +1,8 @@
-"""Memory that is only reserved is given page by page when it is first written, and a huge page is worth a wait.
+"""Populates memory in advance and keeps freed memory.
 
-Measured for 2 MiB: 0.1 ms, and 5 ms in a virtual machine whose host has to find them first. So a thread of its own has
-the system give the next pages of a map's growing arrays, while the map is at work on those that it has.
-
-What a frame needs for itself is megabytes, too. The C library gives such memory back to the system when it is freed, if
-not always, and the frame that gets it again waits for its pages: one in a hundred for 1300 of 4 KiB, 3 to 7 ms. So what
-is freed is kept.
+Reserved memory gets its pages when it is first written. A huge page (2 MiB) takes 0.1 ms, in a virtual machine up to
+5 ms. A thread therefore populates the next pages of the map's growing arrays. The C library returns large freed blocks
+to the system, and their pages have to be populated again: they are kept instead.
 """
 
 from __future__ import annotations
@@ -21,37 +18,37 @@ from typing import Any
 
 import numpy.typing as npt
 
-from framework.runtime.cpu_budget import stand_back
+from framework.runtime.cpu_budget import lower_priority
 
 PAGE = 2**21  # bytes, of a huge page
-SMALL = PAGE // 2  # bytes: what has no more in use, as the many maps of single objects, is given no page ahead
-POPULATE_WRITE = 23  # of madvise(2), Linux 5.14 and later: gives pages as if they were written, and writes nothing
+SMALL = PAGE // 2  # bytes in use, up to which an array gets no pages in advance
+POPULATE_WRITE = 23  # MADV_POPULATE_WRITE of madvise(2), Linux 5.14 and later
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-MOST_KEPT = 2**28  # bytes at the end of a heap that are free and stay
-MOST_SHARED = 2**25  # bytes of an array that is made of what was freed, and not of new pages; glibc takes no more
+MOST_KEPT = 2**28  # free bytes at the end of the heap
+MOST_SHARED = 2**25  # bytes of an array that reuses freed memory; the maximum of glibc
 
 
 @cache
 def keep_freed_memory() -> None:
-    """Has the process keep what it frees, about MOST_KEPT bytes, where glibc is its C library.
+    """Keep about MOST_KEPT freed bytes in the process, if its C library is glibc.
 
-    Who has set that by the environment is left alone.
+    Settings of the environment take precedence.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    said = {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES"} & os.environ.keys()
-    if mallopt is not None and not said:
+    configured = {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES"} & os.environ.keys()
+    if mallopt is not None and not configured:
         mallopt(TRIM_THRESHOLD, MOST_KEPT)
         mallopt(MMAP_THRESHOLD, MOST_SHARED)
 
 
 class PagesAhead:
-    """Has growing arrays come to their new pages before they need them, on Linux; elsewhere this does nothing."""
+    """Populates the next pages of growing arrays, on Linux only."""
 
     def __init__(self) -> None:
-        self._given: dict[int, int] = {}  # by the address of an array: the one up to which it has memory
+        self._given: dict[int, int] = {}  # end of the populated memory by the address of an array
 
     def ask(self, arrays: Iterable[npt.NDArray[Any]], count: int) -> None:
-        """Asks for the next page of each array that comes to it within a page; the first `count` rows are in use."""
+        """Request the next page of each array that is within a page of it; the first `count` rows are in use."""
         if sys.platform != "linux":
             return
         for array in arrays:
@@ -66,15 +63,15 @@ class PagesAhead:
 
 @cache
 def _asked() -> queue.SimpleQueue[tuple[npt.NDArray[Any], int]]:
-    """Where pages are asked for, by an array, which lives until it has the page, and an address in it."""
+    """Return the queue of requests: an array, which is kept alive, and an address in it."""
     asked: queue.SimpleQueue[tuple[npt.NDArray[Any], int]] = queue.SimpleQueue()
     threading.Thread(target=_give, args=(asked,), name="pages", daemon=True).start()
     return asked
 
 
 def _give(asked: queue.SimpleQueue[tuple[npt.NDArray[Any], int]]) -> None:
-    """What the thread does. A system that cannot give pages ahead gives them when they are written."""
-    stand_back()
+    """Populate the requested pages. On failure, they are populated when they are written."""
+    lower_priority()
     madvise = ctypes.CDLL(None).madvise
     while True:
         array, address = asked.get()

@@ -99,18 +99,18 @@ def configure_process(threads: int = 0, seed: int | None = None) -> None:
 
 
 def available_cores() -> int:
-    """The cores that this process may use. macOS and Windows do not tell a process's affinity: there, all."""
+    """Return the number of cores that this process may use; all cores on macOS and Windows."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the top of the config says to all stages."""
+    """The settings of the config that all stages share."""
 
     seed: int  # 0 or more
     device: str  # one of DEVICES; the stages that run networks read it
     threads: int  # 0 = all cores
-    prefetch: int = 0  # frames that wait to be mapped; each with its masks takes some 10 MB
+    prefetch: int = 0  # number of prefetched frames, about 10 MB each with masks
 
     def __post_init__(self) -> None:
         for name, most in MOST.items():

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, else a line in the log now and then."""
+"""Progress of long operations: a bar in a terminal, else a log line from time to time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SIGN_OF_LIFE, LONGEST = 3.0, 60.0  # s, the least and the most from one line to 
 
 
 class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
-    """tqdm's bar of `total` things (None = nobody knows), and when it is time for a line where no bar is shown."""
+    """tqdm's bar of `total` things (None = unknown), and when it is time for a line where no bar is shown."""
 
     def __init__(self, total: int | None, unit: str, **options: Any) -> None:
         # tqdm itself does not look where `disable` is given; a program without a console has no stderr

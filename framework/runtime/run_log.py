@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import takewhile
-from types import TracebackType
 
 import numpy as np
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -35,10 +34,10 @@ class StageTime:
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """Where the camera was believed to be, and where it was."""
+    """The estimated and the true pose of a frame."""
 
     index: int  # Frame.index
-    position: int  # among the frames taken from the sequence, skipped ones included
+    position: int  # in the sequence, including skipped frames
     timestamp: float  # s
     pose: Pose
     T_world_camera_truth: Float64 | None  # (4, 4)
@@ -46,61 +45,61 @@ class TrackedFrame:
 
 @dataclass(frozen=True)
 class LiveFigures:
-    """What only a live video has."""
+    """Statistics of a live video."""
 
-    frames_dropped: int  # came while another was in work, and a newer one followed
-    latencies: tuple[float, ...]  # s, from when a frame was there to when it was in the map, of each fused frame
+    frames_dropped: int  # replaced by a newer one before they were mapped
+    latencies: tuple[float, ...]  # of each fused frame, from capture to map, s
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run over a video leaves in memory."""
+    """The result of a run in memory."""
 
     scene: SceneMap
-    frames: int  # taken from the video: mapped, lost and skipped ones
-    frames_skipped: int  # could not be used: unreadable, inconsistent, or without a pose where poses are given
-    tracked: tuple[TrackedFrame, ...]  # in order, lost frames included
+    frames: int  # mapped, lost and skipped
+    frames_skipped: int  # unreadable, inconsistent, or without a required pose
+    tracked: tuple[TrackedFrame, ...]  # including lost frames
     timings: tuple[StageTime, ...]
     seconds: float  # wall clock of the whole loop
-    stopped_by: BaseException | None = None  # what ended it early; None = the video was mapped to its end
-    intervals: tuple[float, ...] = ()  # s, wall clock from each frame to the next
+    stopped_by: BaseException | None = None  # reason for an early end; None = completed
+    intervals: tuple[float, ...] = ()  # wall clock between frames, s
     pose_source: str = PoseTracker.pose_source
-    live: LiveFigures | None = None  # None = of a recording, which is mapped whole
-    keyframes: Mapping[str, Array] = field(default_factory=dict)  # that the tracker remembers
+    live: LiveFigures | None = None  # None = a recording
+    keyframes: Mapping[str, Array] = field(default_factory=dict)  # of the tracker
 
     @property
     def frames_lost(self) -> int:
-        """Frames that were not fused because the tracker could not tell their pose."""
+        """Return the number of frames without an estimated pose, which are not fused."""
         return sum(frame.pose.lost for frame in self.tracked)
 
     @property
     def fps(self) -> float:
-        """Frames per second of wall clock, reading and detection included."""
+        """Return frames per second of wall clock, including reading and detection."""
         return self.frames / self.seconds
 
     @property
     def fps_median(self) -> float:
-        """The same by the median frame, without what only some frames cost: compiling the kernels, filling caches."""
+        """Return frames per second by the median frame, without outliers such as kernel compilation."""
         return 1 / float(np.median(self.intervals)) if self.intervals else self.fps
 
 
 @dataclass
 class Journal:
-    """Keeps the record of a run while it goes on, and shows its progress."""
+    """Records a run and shows its progress."""
 
     scene: SceneMap
-    frames_expected: int | None  # None = of a live video, which goes on as long as it likes
+    frames_expected: int | None  # None = a live video
     pose_source: str
     frames: int = 0
     frames_skipped: int = 0
-    without_pose: int = 0  # of the skipped frames: no pose is given for them
-    first_without_pose: str = ""  # which that was, and why
+    without_pose: int = 0  # skipped frames without a pose
+    first_without_pose: str = ""  # message of the first one
     tracked: list[TrackedFrame] = field(default_factory=list)
     timings: list[StageTime] = field(default_factory=list)
-    frames_in_map: int = 0  # of which at least a part may be in the map
+    frames_in_map: int = 0  # at least partly fused
     stopped_by: BaseException | None = None
-    frames_began: list[float] = field(default_factory=list)  # s, when each frame was taken
-    lost_for: int = 0  # frames up to the last one
+    frames_began: list[float] = field(default_factory=list)  # start of each frame, s
+    lost_for: int = 0  # number of consecutive lost frames
     frames_dropped: int = 0
     latencies: list[float] = field(default_factory=list)  # s
 
@@ -112,33 +111,31 @@ class Journal:
         self._counted_at = self._started = time.perf_counter()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.seconds = time.perf_counter() - self._started
         self._screen.close()
         if 0 < self.without_pose < self.frames:
-            told = (self.without_pose, self.frames, self.first_without_pose)
-            log.warning("%d of %d frames skipped, as no pose is given for them; the first: %s", *told)
-        if self._faults > SKIPS_LOGGED:
+            counts = (self.without_pose, self.frames, self.first_without_pose)
+            log.warning("%d of %d frames skipped, as no pose is given for them; the first: %s", *counts)
+        if self._errors > SKIPS_LOGGED:
             log.warning("%d frames skipped in all", self.frames_skipped)
         if self.frames_dropped:
             log.warning("%d frames dropped: they came while others were mapped", self.frames_dropped)
 
     @contextmanager
     def timed(self, frame: int, stage: str) -> Iterator[None]:
-        """Notes how long the body takes, if it succeeds."""
+        """Record the time of the body, if it succeeds."""
         started = time.perf_counter()
         yield
         self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
 
     def stage_ms(self, frame: int) -> dict[str, float]:
-        """What each stage took for the last frame, ms; `frame` is its index."""
+        """Return the time of each stage, ms, of the last frame, whose index is `frame`."""
         of_last = takewhile(lambda time: time.frame == frame, reversed(self.timings))
         return {time.stage: time.milliseconds for time in of_last}
 
     def frame_begins(self) -> None:
-        """Counts a frame that was taken from the sequence, whatever becomes of it."""
+        """Count a frame of the sequence."""
         self.frames += 1
         self._bar.update()
         now = time.perf_counter()
@@ -154,24 +151,24 @@ class Journal:
             log.info("frame %d%s, %d instances", self.frames, of_all, len(self.scene.instance_ids()))
 
     def frame_skipped(self, error: FrameError) -> None:
-        """Counts a frame that cannot be used."""
+        """Count an unusable frame."""
         self.frames_skipped += 1
         if isinstance(error, NoPoseError):
             self.without_pose += 1
             self.first_without_pose = self.first_without_pose or str(error)
             return
-        if self._faults <= SKIPS_LOGGED:
+        if self._errors <= SKIPS_LOGGED:
             log.warning("frame skipped: %s", error)
-        if self._faults == SKIPS_LOGGED:
+        if self._errors == SKIPS_LOGGED:
             log.warning("further skipped frames are only counted")
 
     @property
-    def _faults(self) -> int:
-        """Skipped frames of which each is worth a word."""
+    def _errors(self) -> int:
+        """Return the number of skipped frames that have a pose."""
         return self.frames_skipped - self.without_pose
 
     def frame_tracked(self, frame: Frame, pose: Pose) -> None:
-        """Keeps the pose; says when tracking gets lost and when it is found again."""
+        """Record a pose; log when tracking is lost and recovered."""
         self.tracked.append(TrackedFrame(frame.index, self.frames - 1, frame.timestamp, pose, frame.T_world_camera))
         if pose.lost:
             if not self.lost_for:
@@ -182,12 +179,12 @@ class Journal:
             self.lost_for = 0
 
     def frame_fused(self, frame: Frame) -> None:
-        """Keeps how old a frame of a live video is when the map has it."""
+        """Record the latency of a frame of a live video."""
         if self.frames_expected is None:
             self.latencies.append(time.time() - frame.timestamp)
 
     def result(self) -> RunResult:
-        """The run as it stands once the loop has ended."""
+        """Return the result after the loop."""
         return RunResult(
             scene=self.scene,
             frames=self.frames,

@@ -1,4 +1,4 @@
-"""Signals that ask a run to end: the first one is heard when the step in work is done, the second one at once."""
+"""Signals that end a run: the first one after the current step, the second one immediately."""
 
 from __future__ import annotations
 
@@ -13,22 +13,20 @@ from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from types import FrameType
 
-ENDING = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-)  # Ctrl-C; what `kill`, SLURM and containers send; a terminal that is closed, which Windows does not know
+# Ctrl-C; `kill`, SLURM and containers; a closed terminal (not on Windows)
+ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal ended the run. Whatever treats Ctrl-C well treats the others alike."""
+    """A signal ended the run. Code that handles Ctrl-C also handles the other signals."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
         self.number = number
 
     def __str__(self) -> str:
-        return (
-            "interrupted by Ctrl-C" if self.number == signal.SIGINT else f"ended by {signal.Signals(self.number).name}"
-        )
+        by_ctrl_c = self.number == signal.SIGINT
+        return "interrupted by Ctrl-C" if by_ctrl_c else f"ended by {signal.Signals(self.number).name}"
 
 
 def _raise_interrupted(number: int, _frame: FrameType | None) -> None:
@@ -36,11 +34,11 @@ def _raise_interrupted(number: int, _frame: FrameType | None) -> None:
 
 
 OURS_TO_HANDLE = (signal.SIG_DFL, signal.default_int_handler, _raise_interrupted)
-"""Who ignores a signal, as scripts do for what they start in the background, or handles it, goes on to do so."""
+"""Handlers that may be replaced; a signal that is ignored or handled otherwise is left alone."""
 
 
 def raise_on_signals() -> None:
-    """Has every signal of ENDING raise Interrupted in this process, from now on."""
+    """Make every signal of ENDING raise Interrupted in this process."""
     for number in ENDING:
         if signal.getsignal(number) in OURS_TO_HANDLE:
             signal.signal(number, _raise_interrupted)
@@ -48,23 +46,23 @@ def raise_on_signals() -> None:
 
 @dataclass
 class Interruption:
-    """What signals have asked for while they were deferred."""
+    """The signals that were received while they were deferred."""
 
     asked: Interrupted | None = None
-    quiet: bool = False  # where another process says what happens
-    _when: str = "after this frame"  # when the step that is in work is done, in words
-    _at_once: bool = False  # whether a further signal raises
+    quiet: bool = False  # true if another process prints messages
+    _when: str = "after this frame"  # end of the current step, for the message
+    _at_once: bool = False  # true if the second signal raises
 
     def check(self) -> None:
-        """Raises Interrupted where a signal has been heard."""
+        """Raise Interrupted if a signal was received."""
         if self.asked is not None:
             raise self.asked
 
     @contextmanager
     def second_ends_at_once(self, when: str) -> Iterator[None]:
-        """While the body runs, the second signal raises in the middle of it; the first one is told that it ends `when`.
+        """Let the second signal raise in the body; the message of the first one announces the end `when`.
 
-        Between such bodies no signal raises, so that what one of them has made reaches the next.
+        Between such bodies no signal raises, so that the result of one reaches the next.
         """
         self._when, self._at_once = when, True
         try:
@@ -72,33 +70,32 @@ class Interruption:
         finally:
             self._at_once = False
 
-    def hear(self, number: int, _frame: FrameType | None) -> None:
+    def receive(self, number: int, _frame: FrameType | None) -> None:
         if self.asked is None:
             self.asked = Interrupted(number)
             if not self.quiet:
-                _say(f"{self.asked}: ending {self._when}; a second time ends at once\n")
+                _print(f"{self.asked}: ending {self._when}; a second time ends at once\n")
         elif self._at_once:
             raise Interrupted(number)
 
 
-def _say(text: str) -> None:
-    """To stderr, past its buffer and the log, which the signal may have come in the middle of."""
+def _print(text: str) -> None:
+    """Write to stderr without its buffer and the log, which the signal may have interrupted."""
     if sys.__stderr__ is not None:
         with suppress(OSError, ValueError):
             os.write(sys.__stderr__.fileno(), text.encode())
 
 
 _deferring: Interruption | None = None
-_in_worker = ExitStack()  # which nobody leaves
+_in_worker = ExitStack()  # never closed
 
 
 @contextmanager
 def signals_deferred(*numbers: int) -> Iterator[Interruption]:
-    """While the body runs, the first of these signals is noted in what this yields, in place of raising.
+    """Record the first of these signals in the yielded Interruption instead of raising in the body.
 
-    An exception in the middle of a frame would leave it half integrated. Inside of another such body, that one goes on.
-    Outside the main thread, where Python does not let signals be handled, and for signals that others handle or ignore,
-    nothing changes.
+    An exception within a frame would leave it partly integrated. A nested call yields the outer Interruption. Nothing
+    changes outside the main thread, and for signals that are ignored or handled otherwise.
     """
     global _deferring
     if threading.current_thread() is not threading.main_thread():
@@ -106,8 +103,8 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
         return
     if _deferring is not None:
         for number in numbers:
-            if signal.getsignal(number) == _deferring.hear:
-                signal.signal(number, _deferring.hear)  # libraries set their own past Python, such as glog in pycolmap
+            if signal.getsignal(number) == _deferring.receive:
+                signal.signal(number, _deferring.receive)  # restores it: libraries such as glog replace it
         yield _deferring
         return
     interruption = _deferring = Interruption()
@@ -115,7 +112,7 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
     taken = {number: handler for number, handler in before.items() if handler in OURS_TO_HANDLE}
     try:
         for number in taken:
-            signal.signal(number, interruption.hear)
+            signal.signal(number, interruption.receive)
         yield interruption
     finally:
         for number, handler in taken.items():
@@ -123,10 +120,10 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
         _deferring = None
 
 
-def heard_from_sweep() -> Interruption:
-    """In a worker process of a sweep: what the sweep has asked for by SIGTERM, since the worker's first job.
+def received_from_sweep() -> Interruption:
+    """Return the Interruption of a sweep's worker process: a SIGTERM of the sweep since the worker's first job.
 
-    Of the other signals, which a terminal sends to all of its processes, the sweep decides what they mean.
+    Other signals, which a terminal sends to all its processes, are left to the sweep.
     """
     for number in set(ENDING) - {signal.SIGTERM}:
         signal.signal(number, signal.SIG_IGN)
@@ -138,23 +135,23 @@ def heard_from_sweep() -> Interruption:
 
 @contextmanager
 def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterator[None]:
-    """While the body runs, the first signal is passed on to the worker processes of this one, and raises in the end.
+    """Forward the first signal in the body to the worker processes `at_work`, and raise once none is busy.
 
-    It is passed on to those `at_work`, and that is when none is at work any more. An idle one may not have begun to
-    listen: it would die, and joblib kills all workers when one has. The second signal raises at once.
+    Idle workers get no signal: they may have no handler yet, and joblib kills all workers when one ends. The second
+    signal raises immediately.
     """
 
     def end_workers(number: int, _frame: FrameType | None) -> None:
         asked = Interrupted(number)
         for each in taken:
             signal.signal(each, _raise_interrupted)
-        _say(f"{asked}: ending once the runs in work have left their records; a second time ends at once\n")
-        told: set[int | None] = set()
+        _print(f"{asked}: ending once the runs in work have left their records; a second time ends at once\n")
+        signaled: set[int | None] = set()
         while busy := at_work():
             for worker in busy:
-                if worker.pid not in told:
+                if worker.pid not in signaled:
                     worker.terminate()
-                    told.add(worker.pid)
+                    signaled.add(worker.pid)
             time.sleep(0.1)
         raise asked
 

@@ -21,7 +21,7 @@ from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import is_there
 from framework.geometry import back_project, transform
 from framework.mapping.storage.map_file import faults_of, read_arrays, write_map
-from framework.runtime.cpu_budget import stand_back
+from framework.runtime.cpu_budget import lower_priority
 from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
 from framework.tracking.features import DESCRIPTOR_LENGTH, FeatureExtractor, Features, match
 
@@ -137,7 +137,7 @@ class Keyframes:
             return  # too near to that frame, whether it becomes a keyframe or has too few features
         if not self.is_new(T_world_camera) or self._is_retry(self._barren, T_world_camera):
             return
-        worker = ThreadPoolExecutor(1, "keyframe", stand_back)
+        worker = ThreadPoolExecutor(1, "keyframe", lower_priority)
         self._offered = T_world_camera.copy(), worker.submit(self._extracted, frame, T_world_camera.copy())
         worker.shutdown(wait=False)  # it ends with this frame
 

@@ -22,7 +22,7 @@ from framework.errors import PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.runs.stored_runs import is_recorded
-from framework.runtime.signals import ENDING, Interruption, heard_from_sweep, raise_on_signals, signals_deferred
+from framework.runtime.signals import ENDING, Interruption, raise_on_signals, received_from_sweep, signals_deferred
 
 log = logging.getLogger(__name__)
 jobs = Jobs()
@@ -34,7 +34,7 @@ def job(config: DictConfig) -> None:
     """Build the stages of the config, map the sequence and write the outputs to Hydra's directory."""
     hydra_config = HydraConfig.get()
     if is_of_sweep(hydra_config) and by_joblib(hydra_config) and parent_process() is not None:
-        heard_from_sweep().check()
+        received_from_sweep().check()
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
     # workers of a killed sweep may still run; a single run has locked its directory since its start

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from framework.runtime.prefetch import Turns, map_ahead
+from framework.runtime.frame_stream import Turns, map_ahead
 
 
 def test_map_ahead_is_bounded_and_ordered() -> None:
