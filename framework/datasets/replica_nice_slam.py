@@ -16,7 +16,7 @@ from framework.datasets.calibration.camera_json import camera_of, read_json_obje
 from framework.datasets.frames.numbered_images import numbered_images, paired_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording
 from framework.errors import DataError
-from framework.files.matrix_file import read_matrix_lines
+from framework.files.number_lines import read_matrix_lines
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 

@@ -32,9 +32,8 @@ from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Reco
 from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import is_there
-from framework.files.gravity_file import read_gravity
 from framework.files.image_files import read_uint16
-from framework.files.number_lines import SHOWN
+from framework.files.number_lines import SHOWN, read_gravity
 from framework.files.tum_trajectory import TumLine, read_tum_lines
 from framework.vocabulary.label_spaces import COCO
 

@@ -20,7 +20,7 @@ from framework.data import Camera, Float64, UInt16
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording, StoredImages
 from framework.datasets.seven_scenes_kernels import register_depth
 from framework.errors import DataError
-from framework.files.matrix_file import read_matrix
+from framework.files.number_lines import read_matrix
 
 DEPTH_SCALE = 1000.0  # units per meter
 DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)  # as published

@@ -1,4 +1,4 @@
-"""A directory that one process writes at a time, and one that nobody has written yet."""
+"""Locks on directories, and new directories."""
 
 from __future__ import annotations
 
@@ -14,22 +14,19 @@ from filelock import FileLock, Timeout
 from framework.errors import DataError
 from framework.files.atomic_write import read_text, written_whole
 
-LOCK, HOLDER = ".lock", ".lock_holder"  # what is locked, and who has it: on Windows a locked file cannot be read
+LOCK, HOLDER = ".lock", ".lock_holder"  # the locked file, and its owner: on Windows, locked files cannot be read
 
 log = logging.getLogger(__name__)
 
 
 def new_directory(wanted: str) -> str:
-    """Makes a directory that was not there: `wanted`, or where others were faster `wanted`_2, _3 ...
-
-    Raises DataError when the disk does not take it.
-    """
+    """Create a directory with the first unused name of `wanted`, `wanted`_2, ... Raises DataError."""
     path, number = Path(wanted), 1
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         while True:
             try:
-                path.mkdir()  # of several processes that try, one succeeds
+                path.mkdir()  # atomic: succeeds in one process
                 return str(path)
             except FileExistsError:
                 number += 1
@@ -40,15 +37,21 @@ def new_directory(wanted: str) -> str:
 
 @contextmanager
 def locked(directory: Path, wait: bool = False) -> Iterator[None]:
-    """Keeps out who else asks for `directory` while the body runs. The lock ends with the process, even by `kill -9`.
+    """Lock `directory` while the body runs. The lock ends with the process, even after `kill -9`.
 
-    While another process has it, waits for that, or raises DataError; both name it. On a file system without locks
-    there is a warning, and nobody is kept out.
+    If another process has the lock, waits or raises DataError. Warns on a file system without locks.
     """
     directory.mkdir(parents=True, exist_ok=True)
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
     try:
-        _acquire(lock, directory, wait)
+        try:
+            lock.acquire(blocking=False)
+        except Timeout as error:
+            owner = holder(directory) or "another process"
+            if not wait:
+                raise DataError(f"{directory} is in use by {owner}; wait until it has ended, or end it") from error
+            log.warning("waiting for %s, which is at work in %s", owner, directory)
+            lock.acquire()
     except OSError as error:
         log.warning("%s cannot be locked (%s): start nothing else there meanwhile", directory, error.strerror)
     try:
@@ -60,7 +63,7 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
 
 
 def is_locked(directory: Path) -> bool:
-    """Whether a process has `directory` to itself at this moment."""
+    """Return true if a process has locked `directory`."""
     if not (directory / LOCK).exists():
         return False
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
@@ -75,7 +78,7 @@ def is_locked(directory: Path) -> bool:
 
 
 def holder(directory: Path) -> str:
-    """Who has `directory` to itself, or had it last, in words; "" = that is not known."""
+    """Return the current or last owner of the lock; "" = unknown."""
     try:
         return read_text(directory / HOLDER).strip()
     except DataError:
@@ -83,17 +86,5 @@ def holder(directory: Path) -> str:
 
 
 def holder_name(process: int | None) -> str:
-    """A process of this machine as `holder` names it."""
+    """Return the name of a process as in `holder`."""
     return f"process {process} on {socket.gethostname()}"
-
-
-def _acquire(lock: FileLock, directory: Path, wait: bool) -> None:
-    try:
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        who = holder(directory) or "another process"
-        if not wait:
-            message = f"{directory} is in use by {who}; wait until it has ended, or end it"
-            raise DataError(message) from error
-        log.warning("waiting for %s, which is at work in %s", who, directory)
-        lock.acquire()

@@ -12,21 +12,18 @@ from framework.files.atomic_write import check_regular
 
 
 def add_values(digest: hashlib._Hash, array: Array) -> None:
-    """Updates `digest` by the bytes of an array, row by row, whatever its order in memory."""
+    """Update `digest` with the bytes of an array in C order."""
     digest.update(np.ascontiguousarray(array).data)
 
 
 def add_array(digest: hashlib._Hash, array: Array) -> None:
-    """Likewise, and by what tells the same bytes of another array apart: its type and shape."""
+    """Update `digest` with the type, shape and bytes of an array."""
     digest.update(f"{array.dtype.str}{array.shape};".encode())
     add_values(digest, array)
 
 
 def path_hash(path: Path) -> str:
-    """SHA-256 (hex) of a file's bytes, or of the names and the bytes of all files below a folder.
-
-    Raises DataError for what is neither.
-    """
+    """Return the SHA-256 (hex) of a file, or of the names and contents of all files in a folder. Raises DataError."""
     if path.is_dir():
         digest = hashlib.sha256()
         for below in sorted(below for below in path.rglob("*") if below.is_file()):

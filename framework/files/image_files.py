@@ -1,8 +1,7 @@
-"""Images read strictly: a damaged file is an error, never a half-grey picture.
+"""Images, read strictly: a damaged file is an error.
 
-Pillow reads the headers and a PNG's checksums, but accepts files without their end: it is looked for here. JPEGs have
-no checksums. libjpeg fills up what it cannot decode and calls that a warning, on which OpenCV is silent; simplejpeg
-makes an error of it, and gives the same pixels.
+Pillow checks headers and the checksums of PNG, but accepts truncated files, so the end marker is checked here. libjpeg
+fills in what it cannot decode with a warning that OpenCV does not report; simplejpeg raises an error.
 """
 
 from __future__ import annotations
@@ -23,20 +22,23 @@ from framework.files.atomic_write import read_bytes
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-JPEG_PADDING = b"\0\r\n"  # some cameras fill their files up with zeros, and some programs add a line end
-LARGEST_FILE = 2**28  # bytes; MOST_PIXELS of four channels of 16 bits, unpacked
+JPEG_PADDING = b"\0\r\n"  # some cameras append zeros, and some programs a line end
+LARGEST_FILE = 2**28  # bytes; MOST_PIXELS of four 16-bit channels
 
 
 def read_color(path: Path) -> UInt8:
-    """The (H, W, 3) uint8 RGB of a JPEG or PNG file. Raises FrameError when it is damaged or not 8-bit."""
+    """Return (H, W, 3) uint8 RGB of a JPEG or PNG file. Raises FrameError if it is damaged or not 8-bit."""
     return decode_color(path, _read(path))
 
 
 def decode_color(name: Path | str, data: bytes) -> UInt8:
-    """Likewise, of what such a file holds; `name` is for messages."""
+    """Decode the content of such a file; `name` is for errors."""
     check_image(name, data)
     if data.startswith(JPEG_START):
-        return _decode_jpeg(name, data)
+        try:
+            return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB", strict=True), np.uint8)
+        except ValueError as error:
+            raise FrameError(f"{name} is damaged: {in_one_line(error)}") from error
     image = _decode_png(name, data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image.dtype != np.uint8:
         raise FrameError(f"{name}: colour must be 8 bits a channel, found {image.dtype}")
@@ -44,17 +46,17 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
 
 
 def read_uint16(path: Path) -> UInt16:
-    """The (H, W) uint16 values of a PNG file. Raises FrameError when it is damaged or of another type."""
+    """Return the (H, W) uint16 values of a PNG file. Raises FrameError if it is damaged or of another type."""
     return decode_uint16(path, _read(path))
 
 
 def decode_uint16(name: Path | str, data: bytes) -> UInt16:
-    """Likewise, of what such a file holds; `name` is for messages."""
+    """Decode the content of such a file; `name` is for errors."""
     return np.asarray(_decode_channel(name, data, np.uint16), np.uint16)
 
 
 def read_uint8(path: Path) -> UInt8:
-    """The (H, W) uint8 values of a PNG file. Raises FrameError when it is damaged or of another type."""
+    """Return the (H, W) uint8 values of a PNG file. Raises FrameError if it is damaged or of another type."""
     return np.asarray(_decode_channel(path, _read(path), np.uint8), np.uint8)
 
 
@@ -76,13 +78,6 @@ def _read(path: Path) -> bytes:
         raise FrameError(str(error)) from error
 
 
-def _decode_jpeg(name: Path | str, data: bytes) -> UInt8:
-    try:
-        return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB", strict=True), np.uint8)
-    except ValueError as error:
-        raise FrameError(f"{name} is damaged: {in_one_line(error)}") from error
-
-
 def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -94,9 +89,9 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
 
 
 def check_image(name: Path | str, data: bytes) -> None:
-    """Raises FrameError unless `data` is a whole PNG or JPEG file with a picture of a usual size.
+    """Raise FrameError unless `data` is a complete PNG or JPEG file with an image of at most MOST_PIXELS.
 
-    Decoders allocate whatever a header claims: a damaged one can claim 10^10 px.
+    Decoders allocate what the header declares, which may be 10^10 px in a damaged file.
     """
     if not data:
         raise FrameError(f"{name} is empty")
@@ -110,11 +105,11 @@ def check_image(name: Path | str, data: bytes) -> None:
     if not ended:
         raise FrameError(f"{name} is truncated: it ends after {len(data)} bytes without its end marker")
     try:
-        image = kind(io.BytesIO(data))  # not Image.open, which warns of large pictures and has its own limit
+        image = kind(io.BytesIO(data))  # Image.open warns of large images and has its own limit
         width, height = image.size
         pictures = getattr(image, "n_frames", 1)
         image.verify()
-    except Exception as error:  # Pillow has no base of its own
+    except Exception as error:  # Pillow has no base exception
         raise FrameError(f"{name} is damaged: {in_one_line(error)}") from error
     if pictures > 1:
         raise FrameError(f"{name} is an animation of {pictures} pictures; a frame is one")

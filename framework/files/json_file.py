@@ -1,4 +1,4 @@
-"""JSON files: read strictly, up to a size and a depth that none of ours comes near."""
+"""JSON files, read strictly up to a size and depth."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from typing import Any
 from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
 
-DEEPEST = 50  # objects and lists in each other
+DEEPEST = 50  # nested objects and lists
 TOO_DEEP = f"it is not valid JSON for us: lists and objects more than {DEEPEST} deep"
-MOST_BITS = 63  # of a whole number: times in ns have 61, and libraries cannot take more
+MOST_BITS = 63  # of an integer: times in ns have 61, and libraries support no more
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Writes `content`, whole or not at all; floats with as many digits as it takes to read them back exactly."""
+    """Write `content` atomically, with all digits of floats."""
     with written_whole(path) as temporary:
         temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path, most: int = MOST_TEXT) -> Any:
-    """What a JSON file of at most so many bytes holds. Raises DataError, naming the file, when it cannot be read."""
+    """Read a JSON file of at most `most` bytes. Raises DataError."""
     return parse_json(path, read_bytes(path, most))
 
 
 def parse_json(where: object, content: bytes | str) -> Any:
-    """What JSON text says, with or without a byte order mark. `where` it is from begins a DataError's line."""
+    """Parse JSON with or without a byte order mark. Raises DataError, which begins with `where`."""
     try:
         found = json.loads(content, parse_int=_whole, object_pairs_hook=_once)
     except RecursionError as error:
@@ -47,7 +47,7 @@ def _whole(digits: str) -> int:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object: JSON lets a key be there twice, and readers take the last value or the first."""
+    """Reject duplicate keys, which JSON permits without defining their meaning."""
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for k, (key, _) in enumerate(pairs) if key in {before for before, _ in pairs[:k]})
@@ -56,23 +56,18 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _is_shallow(content: Any) -> bool:
-    """Whether what was read is at most DEEPEST deep: what handles it may call itself for each level."""
-    level = [content]
+    """Return true if content is at most DEEPEST deep, without recursion."""
+    level = [content] if isinstance(content, list | dict) else []
     for _ in range(DEEPEST):
-        level = [
-            below
-            for node in level
-            if isinstance(node, list | dict)
-            for below in (node.values() if isinstance(node, dict) else node)
-            if isinstance(below, list | dict)
-        ]
+        nodes = [node.values() if isinstance(node, dict) else node for node in level]
+        level = [below for node in nodes for below in node if isinstance(below, list | dict)]
         if not level:
             return True
     return False
 
 
 def _finite(content: Any) -> Any:
-    """NaN is not JSON: a figure that is not defined, such as the AP of a class that is not there, is null."""
+    """Replace NaN, which is not JSON, by null: an undefined metric, such as the AP of an absent class."""
     if isinstance(content, Mapping):
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list):

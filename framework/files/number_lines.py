@@ -1,6 +1,6 @@
-"""Text files with some numbers in each line, as datasets publish times and poses.
+"""Text files with numbers on each line: gravity directions, 4x4 matrices, and helpers for other formats.
 
-Hand-written, for np.loadtxt does not know Microsoft's NaN, and counts rows where a person looks for a line.
+np.loadtxt does not read the NaN of Microsoft's C library, and does not report line numbers.
 """
 
 from __future__ import annotations
@@ -8,36 +8,38 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from framework.errors import DataError
-from framework.files.atomic_write import read_text
+import numpy as np
 
-SHOWN = 60  # characters of what a file holds that an error repeats
+from framework.data import Camera, Float64
+from framework.errors import DataError, errors_of
+from framework.files.atomic_write import read_text, written_whole
+from framework.geometry import nearest_rigid
+
+SHOWN = 60  # characters of a file that an error repeats
+COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is NaN of Microsoft's C library
+GRAVITY_COLUMNS = "x y z"
+SHORTEST, LONGEST = 1e-6, 1e6  # of a direction, in any unit
 
 _NO_NUMBER = re.compile(r"[+-]?(1\.#\w+|nan\(\w+\))", re.ASCII | re.IGNORECASE)
 
 
 def read_lines(path: Path, missing: str = "does not exist") -> list[str]:
-    """The lines of a text file. Raises DataError, naming it; `missing` is what is said of one that is not there."""
+    """Return the lines of a text file. Raises DataError; `missing` is the message for a file that does not exist."""
     if not path.exists():
         raise DataError(f"{path} {missing}")
     return read_text(path).splitlines()
 
 
 def number(word: str) -> float:
-    """The number that a word is; NaN for all that Microsoft's C library prints where there is none: -1.#IND, 1.#INF.
-
-    Raises ValueError when it is none.
-    """
+    """Parse a number; NaN for -1.#IND, 1.#INF and the like of Microsoft's C library. Raises ValueError."""
     return math.nan if _NO_NUMBER.fullmatch(word) else float(word)
 
 
 def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> list[float]:
-    """The words of a line as so many numbers, NaN among them. Raises DataError, naming the place, when they are not.
-
-    `names` are what the numbers are called.
-    """
+    """Parse the words of a line as `count` numbers, which may be NaN. Raises DataError with `where` and `names`."""
     expected = f"{where}: expected {count} numbers{f' ({names})' if names else ''}"
     if len(words) != count:
         raise DataError(f"{expected}, found {len(words)}")
@@ -48,3 +50,69 @@ def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> li
         except ValueError as error:
             raise DataError(f"{expected}, found {word[:SHOWN]!r}") from error
     return values
+
+
+def read_gravity(path: Path) -> list[Float64 | None]:
+    """Read the up direction in the camera frame of each frame: `x y z` per line, `nan nan nan` = unknown.
+
+    Returns unit vectors (3,); None = unknown. Skips empty lines and comments after `#`. Raises DataError.
+    """
+    words = [COMMENT.sub("", line).split() for line in read_lines(path)]
+    return [_direction(f"{path}, line {n}", found) for n, found in enumerate(words, start=1) if found]
+
+
+def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
+    """Write the up direction (3,) of each frame, None = unknown, in the format of `read_gravity`."""
+    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        for up in ups:
+            file.write("nan nan nan\n" if up is None else " ".join(f"{value:.9f}" for value in up) + "\n")
+
+
+def _direction(where: str, words: Sequence[str]) -> Float64 | None:
+    values = numbers(where, words, 3, GRAVITY_COLUMNS)
+    if all(map(math.isnan, values)):
+        return None
+    length = math.hypot(*values)
+    if not SHORTEST <= length <= LONGEST:
+        raise DataError(f"{where}: expected a direction, or nan nan nan where none is known, found {' '.join(words)!r}")
+    return np.array(values) / length
+
+
+@dataclass(frozen=True)
+class PrintedMatrix:
+    """A matrix of a file, which is checked when it is used as a pose or camera."""
+
+    where: str  # file, and line if it contains several
+    values: Float64  # (4, 4), may be NaN
+
+    def pose(self) -> Float64:
+        """Return the rigid (4, 4) transform. Raises DataError if it is not rigid."""
+        with errors_of(self.where):
+            return nearest_rigid(self.values)
+
+    def camera(self, width: int, height: int) -> Camera:
+        """Return the pinhole camera with this intrinsic matrix for images of this size. Raises DataError."""
+        (fx, _, cx, _), (_, fy, cy, _) = self.values[:2].tolist()
+        if not np.allclose(self.values, [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]]):
+            raise DataError(f"{self.where}: expected intrinsics, fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0 / 0 0 0 1")
+        with errors_of(self.where):
+            return Camera(width, height, fx, fy, cx, cy)
+
+
+def read_matrix(path: Path) -> PrintedMatrix:
+    """Read a file with one matrix: four lines of four numbers. Raises DataError."""
+    lines = _numbered_lines(path)
+    if len(lines) != 4:
+        raise DataError(f"{path}: expected 4 lines of 4 numbers, found {len(lines)} lines")
+    return PrintedMatrix(str(path), np.array([numbers(where, words, 4) for where, words in lines]))
+
+
+def read_matrix_lines(path: Path) -> list[PrintedMatrix]:
+    """Read a file with a matrix of 16 numbers on each line. Raises DataError."""
+    lines = _numbered_lines(path)
+    return [PrintedMatrix(where, np.array(numbers(where, words, 16)).reshape(4, 4)) for where, words in lines]
+
+
+def _numbered_lines(path: Path) -> list[tuple[str, list[str]]]:
+    """Return the place and words of each line that is not empty."""
+    return [(f"{path}, line {n}", line.split()) for n, line in enumerate(read_lines(path), start=1) if line.strip()]

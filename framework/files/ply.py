@@ -1,6 +1,6 @@
-"""Triangle meshes as PLY files: any of the format's three encodings is read, little-endian binary is written.
+"""Triangle meshes as PLY files: reads all three encodings, writes little-endian binary.
 
-Hand-written, for Open3D crashes the process on some malformed files, and plyfile is GPL.
+Open3D crashes the process on some malformed files, and plyfile is GPL.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from framework.files.ply_elements import TYPES, Element, read_elements
 
 LARGEST_FILE = 2**32  # bytes; the mesh of a room has some 2^26
 AXES = ("x", "y", "z")
-INDICES = ("vertex_indices", "vertex_index")  # what writers call a face's list
+INDICES = ("vertex_indices", "vertex_index")  # names of a face's list
 TYPE_NAMES = {code: name for name, code in reversed(TYPES.items())}  # the classic names: float, not float32
 
 
 @dataclass(frozen=True)
 class PlyMesh:
-    """What a PLY file holds of a mesh."""
+    """The mesh in a PLY file."""
 
     vertices: Float32  # (V, 3) m
     triangles: Int32  # (F, 3)
@@ -35,10 +35,9 @@ class PlyMesh:
 
 
 def read_ply(path: Path) -> PlyMesh:
-    """The mesh in a PLY file; polygons become fans of triangles, other elements and lists of a vertex are left out.
+    """Read a mesh; polygons become triangle fans, other elements and lists of a vertex are ignored.
 
-    Raises DataError, naming line or byte, for a file that is damaged, does not hold what its header announces, or has
-    vertices that are not finite or triangles of vertices that it does not have.
+    Raises DataError with line or byte for a damaged file, vertices that are not finite, or invalid vertex indices.
     """
     header, elements = read_elements(path, read_bytes(path, LARGEST_FILE))
     if "vertex" not in elements:
@@ -52,9 +51,9 @@ def read_ply(path: Path) -> PlyMesh:
 def write_ply(
     path: Path, vertices: Float32, triangles: Int32, properties: Mapping[str, Array], comments: Sequence[str] = ()
 ) -> None:
-    """Writes vertices (V, 3) m, triangles (F, 3) and each vertex's properties (V,), whole or not at all.
+    """Write vertices (V, 3) m, triangles (F, 3) and properties (V,) of the vertices.
 
-    Raises DataError when these do not make a mesh that `read_ply` would read, or the disk does not take the file.
+    Raises DataError for a mesh that `read_ply` rejects, or a failed write.
     """
     _check_mesh(path, vertices, triangles)
     row = _vertex_dtype(path, len(vertices), properties)
@@ -116,7 +115,7 @@ def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
 
 
 def _fans(corners: Int32, lengths: Int64) -> Int32:
-    """Polygons with so many corners each as triangles (F, 3): corners 0 1 2, 0 2 3, ..."""
+    """Split polygons with `lengths` corners into triangles (F, 3): corners 0 1 2, 0 2 3, ..."""
     if (lengths == 3).all():
         return corners.reshape(-1, 3)
     triangles = lengths - 2  # of each polygon

@@ -1,17 +1,17 @@
-"""Where a file that a parameter names is looked for, and where the configs are."""
+"""Search paths of the files that parameters name, and the config folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-PROJECT_ROOT = _PACKAGE.parent  # in a checkout, what holds conf/
+PROJECT_ROOT = _PACKAGE.parent  # in a checkout, the parent of conf/
 CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else PROJECT_ROOT / "conf"
-"""The configs: inside the package where it was installed from a wheel, beside it in a checkout."""
+"""The config folder: in the package if installed from a wheel, next to it in a checkout."""
 
 
 def candidates(path: Path) -> tuple[Path, ...]:
-    """The path, `~` resolved; of a relative one, where it would be in the working, then in the project folder."""
+    """Return the path with `~` expanded; a relative one in the working folder, then in the project folder."""
     path = expanded(path)
     if path.is_absolute():
         return (path,)
@@ -20,12 +20,12 @@ def candidates(path: Path) -> tuple[Path, ...]:
 
 
 def folder_of(path: Path) -> Path:
-    """The first of these places that is a folder; the path itself where none is."""
+    """Return the first candidate that is a folder, else the path itself."""
     return next((place for place in candidates(path) if place.is_dir()), expanded(path))
 
 
 def expanded(path: Path) -> Path:
-    """The path with its `~` resolved; as it is where nobody has that name."""
+    """Return the path with `~` expanded; unchanged for an unknown user."""
     try:
         return path.expanduser()
     except RuntimeError:

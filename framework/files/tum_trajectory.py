@@ -1,12 +1,11 @@
-"""Trajectories in the TUM format: a line a pose, `timestamp tx ty tz qx qy qz qw`, T_world_camera, metres, seconds.
+"""Trajectories in the TUM format: a line per pose, `timestamp tx ty tz qx qy qz qw`, T_world_camera, meters, seconds.
 
-Hand-written, for evo, which reads them too, is GPL.
+evo, which also reads them, is GPL.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,16 +17,15 @@ from scipy.spatial.transform import Rotation
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
-from framework.files.number_lines import numbers, read_lines
+from framework.files.number_lines import COMMENT, numbers, read_lines
 
-COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is what Microsoft's C library prints for NaN
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
-QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | that is rounding of printed digits and not another kind of number
+QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | due to rounding
 
 
 @dataclass(frozen=True)
 class TumLine:
-    """One line of a TUM file; whether its numbers are a pose is only told when that is asked for."""
+    """One line of a TUM file, which is checked when it is used as a pose."""
 
     path: Path
     number: int  # of the line in the file, from 1
@@ -36,7 +34,7 @@ class TumLine:
     quat_xyzw: tuple[float, ...]  # (4,), may be NaN
 
     def pose(self) -> Float64:
-        """T_world_camera (4, 4), rigid. Raises DataError, naming file and line, when the numbers are none."""
+        """Return T_world_camera (4, 4), rigid. Raises DataError for an invalid pose."""
         norm = math.hypot(*self.quat_xyzw)
         if not all(map(math.isfinite, (*self.position, norm))):
             raise self.fault("the pose is not finite")
@@ -52,10 +50,9 @@ class TumLine:
 
 
 def read_tum(path: Path) -> tuple[Float64, Float64]:
-    """Timestamps (F,) s and poses T_world_camera (F, 4, 4) of a TUM file, in the file's order.
+    """Return timestamps (F,) s and poses T_world_camera (F, 4, 4) of a TUM file.
 
-    Raises DataError, naming file and line, when a line does not hold eight finite numbers with a unit quaternion, or
-    when timestamps do not grow.
+    Raises DataError for a line without eight finite numbers and a unit quaternion, or timestamps that do not increase.
     """
     lines = read_tum_lines(path)
     for before, line in pairwise(lines):
@@ -66,19 +63,16 @@ def read_tum(path: Path) -> tuple[Float64, Float64]:
 
 
 def read_tum_lines(path: Path) -> list[TumLine]:
-    """The lines of a TUM file; empty ones and what follows a `#` are skipped.
-
-    Raises DataError, naming file and line, when one does not hold eight numbers, the first of them finite.
-    """
+    """Return the lines of a TUM file without comments. Raises DataError for a line without eight numbers."""
     lines = read_lines(path, missing="does not exist: expected a trajectory in TUM format")
     words = [COMMENT.sub("", line).split() for line in lines]
     return [_line(path, number, found) for number, found in enumerate(words, start=1) if found]
 
 
 def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence[Float64] | Float64) -> None:
-    """Writes T_world_camera (4, 4) of each timestamp, whole or not at all; `read_tum` gives them back to 1e-9.
+    """Write timestamps and poses T_world_camera (4, 4), which `read_tum` reads with an error of at most 1e-9.
 
-    Raises DataError when there are not equally many, a pose is not rigid, or the disk does not take the file.
+    Raises DataError for different lengths, a pose that is not rigid, or a failed write.
     """
     if len(timestamps) != len(poses):
         raise DataError(f"{path}: {len(timestamps)} timestamps for {len(poses)} poses; there must be equally many")

@@ -1,4 +1,4 @@
-"""YAML files: checked before they are loaded, for a few lines of aliases can stand for gigabytes."""
+"""YAML files, checked before they are loaded: a few lines of aliases can expand to gigabytes."""
 
 from __future__ import annotations
 
@@ -15,17 +15,15 @@ from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import read_text
 
 LARGEST_FILE = 2**22  # bytes; the config of a run has 3 KB, that of a sweep 20
-DEEPEST = 50  # mappings and lists in each other
+DEEPEST = 50  # nested mappings and lists
 TOO_DEEP = f"its mappings and lists are more than {DEEPEST} deep"
-MOST_VALUES = 200_000  # keys and values, those that aliases repeat counted as often as they stand for
+MOST_VALUES = 200_000  # keys and values after the expansion of aliases
 
-_EventLoader = getattr(
-    yaml, "CSafeLoader", yaml.SafeLoader
-)  # the compiled one is ten times as fast, and not everywhere
+_EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled one is ten times as fast
 
 
 def load_yaml(path: Path) -> Any:
-    """The DictConfig or ListConfig of a YAML file. Raises DataError, naming the file, when it cannot be read."""
+    """Return the DictConfig or ListConfig of a YAML file. Raises DataError."""
     text = read_text(path, LARGEST_FILE)
     with yaml_faults(path):
         check_yaml(path, text)
@@ -34,7 +32,7 @@ def load_yaml(path: Path) -> Any:
 
 @contextmanager
 def yaml_faults(path: Path) -> Iterator[None]:
-    """Turns what goes wrong while a file is loaded into a DataError that names it."""
+    """Convert errors of loading a file to a DataError that names it."""
     try:
         yield
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, OverflowError) as error:
@@ -42,7 +40,7 @@ def yaml_faults(path: Path) -> Iterator[None]:
 
 
 def _events(where: object, text: str) -> Iterator[Any]:
-    """Raises DataError at the library's own bound, which from PyYAML 6.0.4 on comes before it tells of any level."""
+    """Yield events. Raises DataError at the nesting limit of PyYAML 6.0.4 and later."""
     try:
         yield from yaml.parse(text, _EventLoader)
     except yaml.YAMLError as error:
@@ -52,8 +50,8 @@ def _events(where: object, text: str) -> Iterator[Any]:
 
 
 def check_yaml(where: object, text: str) -> None:
-    """Raises DataError for YAML that is too deep or stands for too much, and YAMLError for what is none."""
-    counts = [0]  # of the values in each of the mappings and lists that are open, outermost first
+    """Raise DataError for YAML that is too deep or too large, and YAMLError for invalid YAML."""
+    counts = [0]  # number of values of each open mapping and list, outermost first
     open_anchors: list[Hashable] = []
     anchors: dict[Hashable, int] = {}
     for event in _events(where, text):

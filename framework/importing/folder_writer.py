@@ -17,8 +17,8 @@ from framework.datasets.calibration.camera_json import DISTORTION
 from framework.datasets.calibration.color_registration import ColorRegistration
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
-from framework.files.gravity_file import write_gravity
 from framework.files.json_file import write_json
+from framework.files.number_lines import write_gravity
 from framework.files.tum_trajectory import write_tum
 from framework.importing.depth_resampling import upsampled
 from framework.importing.phones.image_rotation import QUARTER, Turn

@@ -37,7 +37,7 @@ from framework.datasets.scannet.sens_file import open_sens
 from framework.errors import DataError, errors_of
 from framework.files.atomic_write import is_there
 from framework.files.image_files import read_color, read_uint16
-from framework.files.matrix_file import PrintedMatrix, read_matrix
+from framework.files.number_lines import PrintedMatrix, read_matrix
 from framework.geometry import inverse, rotation_angle
 
 MESH_FILES = ("_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")  # behind the scene's name

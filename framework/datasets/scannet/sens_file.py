@@ -30,7 +30,7 @@ from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import check_regular
 from framework.files.image_files import decode_color
-from framework.files.matrix_file import PrintedMatrix
+from framework.files.number_lines import PrintedMatrix
 
 VERSION = 4
 RAW, PNG, JPEG = 0, 1, 2  # compression of color

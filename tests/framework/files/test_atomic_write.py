@@ -24,7 +24,7 @@ from framework.files.atomic_write import read_bytes, read_text, written_whole
 from framework.files.hashing import path_hash
 from framework.files.image_files import read_color, read_uint16
 from framework.files.json_file import read_json
-from framework.files.matrix_file import read_matrix_lines
+from framework.files.number_lines import read_matrix_lines
 from framework.files.ply import read_ply
 from framework.files.tum_trajectory import read_tum
 from framework.runs.stored_runs import read_yaml

@@ -11,7 +11,7 @@ from hypothesis import settings as examples
 
 from framework.data import UNIT_TOLERANCE
 from framework.errors import DataError
-from framework.files.gravity_file import read_gravity, write_gravity
+from framework.files.number_lines import read_gravity, write_gravity
 from tests.support.recordings.damaged_files import EXAMPLES, damaged
 
 UPS = [np.array([0.0, -1.0, 0.0]), None, np.array([0.6, 0.0, -0.8])]

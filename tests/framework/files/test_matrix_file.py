@@ -9,7 +9,7 @@ import pytest
 
 from framework.data import Camera
 from framework.errors import DataError
-from framework.files.matrix_file import PrintedMatrix, read_matrix, read_matrix_lines
+from framework.files.number_lines import PrintedMatrix, read_matrix, read_matrix_lines
 
 QUARTER_TURN = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 ROWS = "0 -1 0 1\n1 0 0 2\n0 0 1 3\n0 0 0 1\n"
