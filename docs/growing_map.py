@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from framework.api import pipeline_of
+from framework.api import begin
 from framework.config.composition import composed
 from framework.data import Int32
 from framework.interfaces import RGBDSequence
@@ -40,7 +40,7 @@ def main() -> None:
         sys.exit(__doc__)
     out, config = Path(sys.argv[1]), composed(*sys.argv[2:])
     Settings.of(config).apply()
-    sequence, pipeline = build(RGBDSequence, config.dataset), pipeline_of(config)
+    sequence, pipeline = build(RGBDSequence, config.dataset), begin(config)
     scene, journal = pipeline.fuser.scene, Journal(pipeline.fuser.scene, len(sequence), pipeline.tracker.pose_source)
     poses, maps = [], []
     for k in tqdm(range(len(sequence)), unit="frame"):

@@ -1,4 +1,4 @@
-"""Mapping from Python: the same stages, names and defaults as on the command line."""
+"""The Python API: the same stages, names and defaults as on the command line."""
 
 from __future__ import annotations
 
@@ -90,50 +90,31 @@ __all__ = [
 ]
 
 
-def pipeline_of(config: DictConfig) -> Pipeline:
-    """The stages that a config names, the detector behind the cache that it asks for."""
+def begin(config: DictConfig) -> Pipeline:
+    """Build the stages of a config, resume or localize in the map that it names, and compile the kernels.
+
+    With `resume_from`, the tracker reports lost poses until it relocalizes in the stored map. Raises ConfigError if the
+    stages do not fit that map, DataError if it cannot be read.
+    """
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
     viewer = build(Viewer, config.get("viewer"))
-    detector = with_cache(build(Detector, config.get("detector")), config)  # last, as loading a network takes its time
+    detector = with_cache(build(Detector, config.get("detector")), config)  # last: loading a network takes long
+    chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
+    if len(chosen) > 1:
+        raise ConfigError("resume_from and localize_in: expected at most one of them, got both")
+    for key, value in chosen.items():
+        run = checked_path(key, value)
+        scene = scene_of(key, run)
+        if key == "resume_from":
+            fuser.resume(scene)
+        tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene)
+    compile_for_run()
     return Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer)
 
 
-def resume_map(pipeline: Pipeline, run: Path) -> None:
-    """Has a pipeline that has mapped nothing go on with the map of a stored run.
-
-    The tracker says that it is lost until it finds itself in that map. Raises DataError where the run has left no map
-    that can be read, ConfigError where the stages cannot go on with it.
-    """
-    scene = scene_of("resume_from", run)
-    pipeline.fuser.resume(scene)
-    pipeline.tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene)
-
-
-def begin_in(pipeline: Pipeline, run: Path) -> None:
-    """Has a pipeline make a map of its own in the world of a stored run, in whose map the tracker first finds itself.
-
-    Raises likewise.
-    """
-    pipeline.tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene_of("localize_in", run))
-
-
-def begin(config: DictConfig) -> Pipeline:
-    """The stages that a config names, with the map or the world that it asks for and their kernels compiled."""
-    pipeline = pipeline_of(config)
-    map_, world = config.get("resume_from"), config.get("localize_in")
-    if map_ is not None and world is not None:
-        raise ConfigError("resume_from and localize_in: expected at most one of them, got both")
-    if map_ is not None:
-        resume_map(pipeline, checked_path("resume_from", map_))
-    if world is not None:
-        begin_in(pipeline, checked_path("localize_in", world))
-    compile_for_run()
-    return pipeline
-
-
 def scene_of(key: str, run: Path) -> SceneMap:
-    """The map of a stored run. Raises DataError, which begins with `key`, where there is none that can be read."""
+    """Read the map of a stored run. Raises DataError, which begins with `key`."""
     if not (run / MAP).is_file():
         raise DataError(f"{key}: there is no {run / MAP}: expected the directory of a run")
     return load_scene(run / MAP)
@@ -141,23 +122,24 @@ def scene_of(key: str, run: Path) -> SceneMap:
 
 @dataclass(frozen=True)
 class FrameResult(Pose):
-    """What became of a frame: the camera's pose, or that it is lost, and which objects there are since."""
+    """The pose of a frame, or that it is lost, and the changes of the objects."""
 
-    new: tuple[int, ...] = ()  # ids of objects that count from this frame on
-    removed: tuple[int, ...] = ()  # ids that no longer count: merged with another object, or outvoted
+    new: tuple[int, ...] = ()  # ids of objects since this frame
+    removed: tuple[int, ...] = ()  # ids of merged or outvoted objects
 
 
 class Mapper(Map):
-    """Maps frames as they come: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`.
+    """Maps frames one by one: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`.
 
-    The arguments are those of a run on the command line, as words or by name, with its defaults for what is recorded;
-    `dataset` is left out, since the frames are yours, and `prefetch` and `skip_completed` mean nothing here.
-    `resume_from=DIR` goes on with the map of the run in DIR, `viewer="rerun"` shows it, in `recording.rrd` in the
-    working directory or as `viewer.mode` says, until the mapper is gone. Raises ConfigError for a name or a value that
-    there is not.
+    Takes the overrides of a run on the command line, as text or by name, with its defaults for recordings. `dataset` is
+    not allowed; `prefetch` and `skip_completed` have no effect. `resume_from=DIR` resumes the map of a run.
+    `viewer="rerun"` shows the map until the mapper is deleted.
 
-    Several threads may share one: they wait for each other. Whoever reads `scene` itself while another thread may be in
-    `add` holds `lock` meanwhile, `with mapper.lock: mesh = mapper.scene.mesh()`: half a frame may be in it.
+    All methods are thread-safe. To read `scene` itself while another thread may call `add`, hold the lock:
+    `with mapper.lock: mesh = mapper.scene.mesh()`.
+
+    Raises:
+        ConfigError: An unknown name or an invalid value.
     """
 
     def __init__(self, *overrides: str, **named: object) -> None:
@@ -166,7 +148,7 @@ class Mapper(Map):
             if not isinstance(override, str):
                 raise ConfigError(f"Mapper takes words such as 'fuser.voxel_size=0.02', found {override!r}")
             if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
-                raise ConfigError(f"Mapper: {override} is of a run on the command line; here the frames are yours")
+                raise ConfigError(f"Mapper: {override} is only for the command line")
         config = composed("~dataset", *words)
         self._threads = Settings.of(config).threads
         self.pipeline = begin(config)
@@ -175,10 +157,10 @@ class Mapper(Map):
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)
         viewer = self.pipeline.viewer
         viewer.begin(self.scene, "frames from Python", Path())
-        finalize(self, viewer.end)  # with this mapper, or with the program
+        finalize(self, viewer.end)  # when the mapper is deleted, or at exit
         self._camera: Camera | None = None  # of the last frame
-        self._T_world_camera: Float64 | None = None  # of the last frame that was not lost
-        self._frames = 0  # that `add` was given
+        self._T_world_camera: Float64 | None = None  # of the last frame with a pose
+        self._frames = 0  # number of calls of `add`
 
     def add(
         self,
@@ -189,22 +171,37 @@ class Mapper(Map):
         timestamp: float | None = None,
         up: Float64 | None = None,
     ) -> FrameResult:
-        """Detects, tracks, refines and fuses one frame; the frames of a video in their order.
+        """Detect, track, refine and fuse the next frame of a video. A lost frame is not fused.
 
-        `color` (H, W, 3) is uint8 RGB, `depth` (H, W) float32 m along z, 0 = no reading, `pose` (4, 4) T_world_camera
-        where it is known, `camera` that of the last frame where none is given, `timestamp` s, 30 frames a second where
-        none is given, `up` (3,) the unit vector against gravity in the camera where a sensor tells it; or `color` is a
-        Frame, with all of that.
+        Args:
+            color: (H, W, 3) uint8 RGB, or a Frame instead of all arguments.
+            depth: (H, W) float32, m along z; 0 = no reading.
+            pose: (4, 4) T_world_camera; None = unknown.
+            camera: None = that of the last frame.
+            timestamp: s; None = 30 frames per second.
+            up: (3,) unit vector against gravity in the camera frame; None = unknown.
 
-        A frame that is lost was not fused, and the next ones may be found again. Raises FrameError when the frame
-        cannot be used, as one without a pose where poses are given, which leaves the map as it was, DataError for
-        arrays that are no frame, and MapFullError at the end of `fuser.max_blocks`.
+        Raises:
+            FrameError: The frame is unusable, such as one without a required pose; the map is unchanged.
+            DataError: The arrays do not form a frame.
+            MapFullError: The map has reached `fuser.max_blocks`.
         """
         with self.lock, limited_threads(self._threads):
-            frame = color if isinstance(color, Frame) else self._frame(color, depth, pose, camera, timestamp, up)
+            if isinstance(color, Frame):
+                frame = color
+            else:
+                camera = camera or self._camera
+                if depth is None:
+                    raise DataError(
+                        f"Mapper.add takes a Frame, or colour and depth, found {type(color).__name__} alone"
+                    )
+                if camera is None:
+                    raise DataError("Mapper.add needs the camera once: camera=Camera(width, height, fx, fy, cx, cy)")
+                time = self._frames / FRAME_RATE if timestamp is None else timestamp
+                frame = Frame(self._frames, time, color, depth, camera, pose, up=up)
             self._camera = frame.camera
             self._frames += 1
-            self._journal.timings.clear()  # nobody asks for them, or for the poses, and a camera may run for days
+            self._journal.timings.clear()  # unused, and a camera may run for days
             self._journal.tracked.clear()
             before = self.scene.instance_ids()
             found = self._map(frame)
@@ -215,7 +212,7 @@ class Mapper(Map):
         return FrameResult(found.T_world_camera, new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)))
 
     def _map(self, frame: Frame) -> Pose:
-        """Detects and maps a frame, and has the viewer show it."""
+        """Detect and map a frame, and show it in the viewer."""
         pipeline, journal = self.pipeline, self._journal
         try:
             with journal.timed(frame.index, "detect"):
@@ -227,39 +224,21 @@ class Mapper(Map):
         pipeline.viewer.show(frame, detections, pose, journal.stage_ms(frame.index))
         return pose
 
-    def _frame(
-        self,
-        color: UInt8,
-        depth: Float32 | None,
-        pose: Float64 | None,
-        camera: Camera | None,
-        timestamp: float | None,
-        up: Float64 | None,
-    ) -> Frame:
-        camera = camera or self._camera
-        if depth is None:
-            raise DataError(f"Mapper.add takes a Frame, or colour and depth, found {type(color).__name__} alone")
-        if camera is None:
-            raise DataError("Mapper.add needs the camera once: camera=Camera(width, height, fx, fy, cx, cy)")
-        when = self._frames / FRAME_RATE if timestamp is None else timestamp
-        return Frame(self._frames, when, color, depth, camera, pose, up=up)
-
     def at_pixel(
         self, u: int, v: int, camera: Camera | None = None, T_world_camera: Float64 | None = None
     ) -> Instance | None:
-        """The object at pixel (u, v) of the last frame that was not lost, or of what `camera` would see from elsewhere.
+        """Return the object at pixel (u, v) of the last frame with a pose, or of another view; None = no object.
 
-        None where there is none. Raises DataError for a pixel outside the image, or before there is any frame.
+        Raises DataError for a pixel outside of the image, or before the first frame.
         """
         camera = camera or self._camera
         T_world_camera = self._T_world_camera if T_world_camera is None else T_world_camera
         if camera is None or T_world_camera is None:
-            raise DataError("nothing is mapped yet, so that there is no last frame")
+            raise DataError("nothing is mapped yet, so there is no last frame")
         return super().at_pixel(u, v, camera, T_world_camera)
 
 
 def _override(name: str, value: object) -> str:
-    """A keyword as a word of the command line."""
     if value is None or isinstance(value, bool | int | float):
         return f"{name}={'null' if value is None else value}"
     if isinstance(value, str | Path):
@@ -268,20 +247,17 @@ def _override(name: str, value: object) -> str:
 
 
 def open_dataset(name: str, **parameters: object) -> RGBDSequence:
-    """A recording, to be gone through frame by frame: `open_dataset("rgbd_folder", root="DIR", stride=2)`.
+    """Open a recording: `open_dataset("rgbd_folder", root="DIR", stride=2)`.
 
-    The name and the parameters are those of `dataset=` on the command line. Raises ConfigError for what there is not,
-    DataError for a recording that cannot be read.
+    Takes the options and parameters of `dataset=` on the command line. Raises ConfigError for unknown ones, DataError
+    for an unreadable recording.
     """
     words = [_override("dataset", name), *(_override(f"dataset.{key}", value) for key, value in parameters.items())]
     return build(RGBDSequence, composed(*words).dataset)
 
 
 def load_map(path: Path | str) -> Map:
-    """The map that a run left behind as map.npz, or that `save` wrote, of whatever fuser.
-
-    Raises DataError when the file is none or was damaged.
-    """
+    """Read map.npz of a run, or a map that `save` wrote, of any fuser. Raises DataError."""
     return Map(load_scene(path))
 
 
@@ -294,13 +270,24 @@ def export(
     floor: float | None = None,
     **choices: object,
 ) -> list[Path]:
-    """Writes what a run found as "glb", "ply", "usd", "obj", "floorplan" or "graph", and returns the files.
+    """Export a run, as in `export("outputs/demo", "glb", objects=["chair", 7])`.
 
-    `export("outputs/demo", "glb", objects=["chair", 7])`: `objects` are classes or ids, () = all and the room around
-    them; `out` is a folder, None = `export` in the run's. `choices` are min_confidence, triangles, coloring, collision,
-    resolution and robot_height, as `instancemap export --help` says of them. `up` (3,) and `floor`, m along up, say
-    what the run does not tell. Raises ConfigError for a word that there is not, DataError for a run that cannot be
-    exported.
+    Args:
+        run: The run directory.
+        formats: "glb", "ply", "usd", "obj", "floorplan" or "graph".
+        out: The output folder; None = `export` in the run directory.
+        objects: Classes or ids; () = the whole room.
+        up: (3,) the up direction, if the run has none.
+        floor: The floor height along `up`, m, if the run has none.
+        choices: min_confidence, triangles, coloring, collision, resolution, robot_height; see
+            `instancemap export --help`.
+
+    Returns:
+        The files.
+
+    Raises:
+        ConfigError: An unknown name or value.
+        DataError: The run cannot be exported.
     """
     from framework.exporting import exports
 
@@ -310,14 +297,17 @@ def export(
 
 
 def query(run: Map | Path | str, words: str, by: str | None = None, model: Path | str | None = None) -> QueryResult:
-    """The objects of a run, or of a map, that words mean, best first: `query("outputs/demo", "a red chair").objects`.
+    """Rank the objects of a run or map by a text query: `query("outputs/demo", "a red chair").objects`.
 
-    `by` "embeddings" compares the words with the objects' pictures, through `model`, a folder, a file or an id on
-    huggingface.co, None = that of the run's detector; "names" with class names and measured colours; None is
-    embeddings where there are any, else names. Of a map that is no run's, `model` is to be named.
+    Args:
+        run: The run directory, or a map.
+        words: The text query.
+        by: "embeddings" of images, "names" of classes and colors, or None = embeddings if available.
+        model: Folder, file or id on huggingface.co of the embedding model; None = that of the run's detector.
 
-    Raises ConfigError for a question that is none, DataError for a run without a map, for words that nothing in it is
-    called, and for embeddings that are not there or of another model.
+    Raises:
+        ConfigError: An invalid query.
+        DataError: A run without a map, unknown words, or missing embeddings.
     """
     question = TextQuery(words, by, None if model is None else str(model))
     if isinstance(run, Map):
@@ -326,7 +316,7 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
 
 
 def load_scene(path: Path | str) -> SceneMap:
-    """The same as `load_map`, for who goes on with the map itself."""
+    """Read a map like `load_map`, without the query interface."""
     from framework.baselines import object_map, open3d_map, semantic_map
     from framework.mapping import instance_map
     from framework.mapping.storage.map_file import read_format

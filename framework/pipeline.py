@@ -45,13 +45,13 @@ WITHOUT_THREADS = (
 
 @dataclass
 class Pipeline:
-    """The four stages and the loop over them: `Pipeline(detector, tracker, refiner, fuser).run(video)`."""
+    """The stages and the loop: `Pipeline(detector, tracker, refiner, fuser).run(video)`."""
 
     detector: Detector
     tracker: PoseTracker
     refiner: ClusterRefiner
     fuser: MapFuser
-    prefetch: int = 2  # frames that other threads read and detect meanwhile, 1 of a live video; 0 = no such thread
+    prefetch: int = 2  # frames that other threads read and detect ahead (live video: at most 1); 0 = none
     viewer: Viewer = field(default_factory=Viewer)
 
     def __post_init__(self) -> None:
@@ -60,14 +60,13 @@ class Pipeline:
         self.viewer = GuardedViewer(self.viewer)
 
     def run(self, video: RGBDVideo) -> RunResult:
-        """Maps `video` frame by frame.
+        """Map `video` frame by frame.
 
-        A frame that raises FrameError, as one without a pose where poses are given (NoPoseError), is skipped, a frame
-        whose pose is lost is not fused; both are counted. Ctrl-C (once the frame in work is done) and a full map end
-        the loop early: the result holds what has been mapped so far, and `stopped_by` says why. A live video ends by
-        Ctrl-C, which is then no fault; its frames that nobody has time for are dropped and counted.
+        Frames that raise FrameError are skipped, and lost frames are not fused; both are counted. Ctrl-C (after the
+        current frame) and a full map end the loop early, with the reason in `stopped_by`. Ctrl-C is the normal end of a
+        live video, whose frames are dropped and counted when mapping falls behind.
 
-        Raises DataError when nothing could be mapped, and whatever else a stage raises.
+        Raises DataError if nothing was mapped, and other errors of stages.
         """
         result = self.run_to_any_end(video)
         if result.stopped_by is None or isinstance(result.stopped_by, KeyboardInterrupt | MapFullError):
@@ -75,9 +74,9 @@ class Pipeline:
         raise result.stopped_by
 
     def run_to_any_end(self, video: RGBDVideo, directory: Path = Path()) -> RunResult:
-        """Maps `video` likewise; a stage's fault, too, is in `stopped_by` once a part of a frame is in the map.
+        """Map `video`, and return errors of stages in `stopped_by` once something is mapped.
 
-        `directory` is where a viewer leaves its files.
+        `directory` is the folder of a viewer's files.
         """
         frames_expected = len(video) if isinstance(video, RGBDSequence) else None
         if frames_expected == 0:
@@ -102,21 +101,21 @@ class Pipeline:
             if journal.frames_in_map == 0:
                 raise journal.stopped_by
             if isinstance(video, LiveVideo) and journal.stopped_by is interruption.asked:
-                journal.stopped_by = None  # that is how it ends; a second signal is another Interrupted
+                journal.stopped_by = None  # normal end; a second signal is another Interrupted
         elif journal.frames_in_map == 0 or self.fuser.scene.statistics.voxels == 0:
-            raise DataError(f"{video.name}: {self.why_nothing(journal)}")
+            raise DataError(f"{video.name}: {self.empty_map_reason(journal)}")
         return replace(journal.result(), keyframes=keyframes)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
-        """What the tracker remembers; a fault of the last frame's place, which is told only now, ends the run, too."""
+        """Return the tracker's keyframes. An error of the last frame, which is raised only now, ends the run."""
         try:
             return self.tracker.keyframes()
-        except Exception as fault:
-            journal.stopped_by = journal.stopped_by or fault
+        except Exception as error:
+            journal.stopped_by = journal.stopped_by or error
             return self.tracker.keyframes()
 
-    def why_nothing(self, journal: Journal) -> str:
-        """What became of the frames of a run whose map is empty."""
+    def empty_map_reason(self, journal: Journal) -> str:
+        """Return why the map of a run is empty."""
         result = journal.result()
         if result.frames == 0:
             return "no frame came"
@@ -138,7 +137,7 @@ class Pipeline:
         )
 
     def map_all(self, video: RGBDVideo, journal: Journal, interruption: Interruption) -> None:
-        """The loop. Raises Interrupted between two frames when a signal has asked for it."""
+        """Run the loop. Raises Interrupted between two frames after a signal."""
         prefetch = self.prefetch
         if prefetch > 0 and not parallel_kernels_are_thread_safe():
             log.info(WITHOUT_THREADS)
@@ -151,7 +150,7 @@ class Pipeline:
                 interruption.check()
 
     def map_and_show(self, frame: Frame, detections: Detections, journal: Journal) -> None:
-        """What happens to one frame, and that the viewer hears of it."""
+        """Map one frame and show it in the viewer."""
         try:
             pose = self.map_frame(frame, detections, journal)
         except FrameError as error:
@@ -160,18 +159,16 @@ class Pipeline:
             self.viewer.show(frame, detections, pose, journal.stage_ms(frame.index))
 
     def skip(self, error: FrameError, journal: Journal) -> None:
-        """A frame cannot be used."""
         journal.frame_skipped(error)
         self.viewer.skip(str(error))
 
     def detect_ahead(
         self, video: RGBDVideo, journal: Journal, interruption: Interruption, sharing: CoreSharing, prefetch: int
     ) -> Generator[tuple[Frame, Detections]]:
-        """The frames with their detections, in order and without those that cannot be used.
+        """Yield the usable frames with their detections, in order.
 
-        Frame k + 1 is read and detected while frame k is tracked and fused, and those after it, too, up to `prefetch`
-        frames at once by a detector that can; the results of a recording do not depend on it. What comes of a live
-        video meanwhile is dropped, but for the newest frame.
+        Up to `prefetch` frames are read and detected while another one is mapped, in parallel if the detector supports
+        it; the results of a recording do not depend on it.
         """
         stream = stream_of(video, lambda: interruption.asked is not None)
         prefetch = prefetch if stream.most_ahead is None else min(prefetch, stream.most_ahead)
@@ -182,10 +179,10 @@ class Pipeline:
             with sharing.ahead(workers):
                 return self.read_and_detect(stream, turns.turn(number))
 
-        # the stream ends first: a worker may be waiting for its next frame
+        # close the stream first: a worker may be waiting for a frame
         with closing(map_ahead(work, count(), prefetch, workers)) as outcomes, stream:
             for outcome in outcomes:
-                interruption.check()  # waiting for a frame may have taken long
+                interruption.check()  # after a possibly long wait
                 journal.frames_dropped = stream.dropped
                 if outcome is None:
                     return
@@ -200,10 +197,7 @@ class Pipeline:
     def read_and_detect(
         self, stream: FrameStream, turn: AbstractContextManager[None]
     ) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
-        """The next frame, read when it is its `turn`, its detections and what they took; or why it cannot be used.
-
-        None at the end.
-        """
+        """Read the next frame in its `turn` and detect. Returns its stage times, too, or its error; None at the end."""
         try:
             with turn:
                 read_frame = stream.take()
@@ -217,14 +211,11 @@ class Pipeline:
             detect_ms = 1e3 * (time.perf_counter() - began)
         except FrameError as error:
             return error
-        return (
-            frame,
-            detections,
-            [StageTime(frame.index, "read", read_ms), StageTime(frame.index, "detect", detect_ms)],
-        )
+        times = [StageTime(frame.index, "read", read_ms), StageTime(frame.index, "detect", detect_ms)]
+        return frame, detections, times
 
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
-        """Track, lift, refine, fuse: what happens to one frame. Raises FrameError when it cannot be used."""
+        """Track, lift, refine and fuse one frame. Raises FrameError if it is unusable."""
         with journal.timed(frame.index, "track"):
             pose = self.tracker.track(frame, self.fuser.scene)
         if not isinstance(cast(object, pose), Pose):
@@ -245,7 +236,7 @@ class Pipeline:
 
 @contextmanager
 def watched(viewer: Viewer, scene: SceneMap, video: str, directory: Path) -> Iterator[None]:
-    """Has the viewer begin, and end whatever comes."""
+    """Begin the viewer, and end it after the body or an error."""
     viewer.begin(scene, video, directory)
     try:
         yield

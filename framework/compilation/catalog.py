@@ -1,7 +1,7 @@
-"""The map's kernels, compiled ahead of the runs that need them: which there are, what is missing, and by how many.
+"""Compiles kernels before the runs that need them, in parallel processes and with a progress bar.
 
-numba compiles a kernel when it is first called, for the types that it is called with, and keeps it in its cache.
-kernels.txt lists those calls, so that they can be compiled before a run, side by side and with a progress bar.
+numba compiles a kernel at its first call with new argument types, and stores it in its cache. kernels.txt lists these
+calls.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
+from inspect import getsource
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
@@ -36,21 +37,21 @@ log = logging.getLogger(__name__)
 LIST = Path(__file__).with_name("kernels.txt")
 CHECKOUT = Path(__file__).resolve().parents[2]
 DEFAULT, OTHERS = "# a run with the default stages", "# what other stages add"
-MOST_WORKERS = 4  # each compiles anew what kernels share, and takes 0.5 GB
-SECONDS_EACH = 0.65  # of a core, an AMD EPYC (Zen 5) with 2 cores: for a guess of how long it takes
+MOST_WORKERS = 4  # each takes 0.5 GB and compiles shared functions again
+SECONDS_EACH = 0.65  # of a core (AMD EPYC, Zen 5), for an estimate of the time
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel with the types of one call: `framework.refinement.lifting._count_readings(boolean[:, :, ::1], ...)`."""
+    """A kernel with the argument types of one call."""
 
     module: str
     name: str
-    types: str  # as kernels.txt has them
+    types: str  # as in kernels.txt
 
     @property
     def dispatcher(self) -> Any:
-        """Raises DataError where the list is older than the code."""
+        """Raises DataError if the list is older than the code."""
         found = getattr(import_module(self.module), self.name, None)
         if not isinstance(found, Dispatcher):
             raise DataError(
@@ -63,27 +64,29 @@ class Kernel:
         return tuple(map(_type_of, ast.parse(f"f({self.types})", mode="eval").body.args))  # type: ignore[attr-defined]
 
     def is_compiled(self) -> bool:
-        """Whether numba's cache has it, and has it since all kernels that it calls were last changed."""
+        """Return true if numba's cache contains it, newer than all kernels that it calls."""
         cache = self.dispatcher._cache
-        if not cache._enabled:
-            return False
-        index = Path(cache._cache_file._index_path)
-        if not index.exists():
+        index = Path(cache._cache_file._index_path) if cache._enabled else None
+        if index is None or not index.exists():
             return False
         written = index.stat().st_mtime
         files = {kernel.py_func.__code__.co_filename for kernel in called_by(self.dispatcher)}
         if any(Path(path).stat().st_mtime > written for path in files):
-            cache.flush()  # numba looks at the kernel's own file alone
+            cache.flush()  # numba checks only the kernel's own file
             return False
-        codegen = self.dispatcher.targetctx.codegen()
-        return cache._index_key(self.signature, codegen) in cache._cache_file._load_index()
+        try:
+            compiled = cache._cache_file._load_index()
+        except (AttributeError, ImportError):  # a class in the pickled argument types was renamed or moved
+            index.unlink(missing_ok=True)
+            return False
+        return cache._index_key(self.signature, self.dispatcher.targetctx.codegen()) in compiled
 
     def compile(self) -> None:
         self.dispatcher.compile(self.signature)
 
 
 def listed(*sections: str) -> list[Kernel]:
-    """The kernels in those sections of kernels.txt: DEFAULT, OTHERS."""
+    """Return the kernels in these sections of kernels.txt: DEFAULT, OTHERS."""
     found, section = [], ""
     for line in LIST.read_text(encoding="utf-8").splitlines():
         if line.startswith("#"):
@@ -96,23 +99,22 @@ def listed(*sections: str) -> list[Kernel]:
 
 
 def line_of(dispatcher: Any, signature: Iterable[Any]) -> str:
-    """A kernel with the types of a call as kernels.txt has it."""
+    """Return the line of kernels.txt for a call of a kernel."""
     function = dispatcher.py_func
     return f"{function.__module__}.{function.__name__}({', '.join(map(_text_of, signature))})"
 
 
 def compile_for_run() -> None:
-    """Compiles what the modules that are loaded need, and says so.
+    """Compile the listed kernels of all imported modules. Logs a warning for those that fail.
 
-    A run calls it when its stages are built, and when its video is. What cannot be compiled ahead is left to numba, and
-    told.
+    A run calls it after it has built its stages, and after its video.
     """
     loaded = [kernel for kernel in listed(DEFAULT, OTHERS) if kernel.module in sys.modules]
     missing = [kernel for kernel in loaded if not kernel.is_compiled()]
     if not missing:
         return
     with _one_process_at_a_time(missing):
-        missing = [kernel for kernel in missing if not kernel.is_compiled()]  # another process may have been at it
+        missing = [kernel for kernel in missing if not kernel.is_compiled()]  # another process may have compiled them
         if not missing:
             return
         seconds = SECONDS_EACH * len(missing) / _workers(missing)
@@ -124,85 +126,77 @@ def compile_for_run() -> None:
 
 
 def compile_all(kernels: list[Kernel]) -> None:
-    """Compiles kernels in processes of their own, side by side, with a progress bar.
+    """Compile kernels in parallel processes, with a progress bar.
 
-    Those of one module go to one process, for they share what they call. Raises DataError for the first that cannot be
-    compiled, when the others are done.
+    One process compiles all kernels of a module, which share functions. Raises DataError for the first error, after
+    the other kernels are done.
     """
     in_order = sorted(kernels, key=attrgetter("module"))
     by_module = {module: list(group) for module, group in groupby(in_order, attrgetter("module"))}
-    # longest first, so that no process is left alone with a long one; its text tells how long a module takes
+    # modules with the longest source first, because they take longest
     waiting: queue.SimpleQueue[list[Kernel]] = queue.SimpleQueue()
-    for module in sorted(by_module, key=_length, reverse=True):
+    for module in sorted(by_module, key=lambda name: len(getsource(import_module(name))), reverse=True):
         waiting.put(by_module[module])
-    told: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
+    events: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
     processes = [_worker() for _ in range(_workers(kernels))]
-    threads = [threading.Thread(target=_feed, args=(process, waiting, told), daemon=True) for process in processes]
-    faults: list[str] = []
+    threads = [threading.Thread(target=_feed, args=(process, waiting, events), daemon=True) for process in processes]
     try:
         for thread in threads:
             thread.start()
-        _watch(len(kernels), threads, told, faults)
+        errors = _watch(len(kernels), threads, events)
     finally:
         for process in processes:
             process.kill()
             process.wait()
-    if faults:
-        raise DataError(faults[0])
+    if errors:
+        raise DataError(errors[0])
 
 
 def _workers(kernels: list[Kernel]) -> int:
     return min(MOST_WORKERS, available_cores(), len({kernel.module for kernel in kernels}))
 
 
-def _length(module: str) -> int:
-    return Path(str(import_module(module).__file__)).stat().st_size
-
-
 def _worker() -> subprocess.Popen[str]:
-    """A process that compiles the kernels whose lines it is given, and answers each."""
+    """Start a process that compiles kernels, one per input line, and prints a line for each."""
     path = os.pathsep.join(filter(None, [str(CHECKOUT), os.environ.get("PYTHONPATH")]))
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", "framework.compilation.worker"],  # -P: nothing of the working folder
+        [sys.executable, "-P", "-m", "framework.compilation.worker"],  # -P: import nothing from the working folder
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
         env=os.environ | {"PYTHONPATH": path},
-        start_new_session=os.name == "posix",  # Ctrl-C is for who has started it
+        start_new_session=os.name == "posix",  # Ctrl-C goes only to the parent
     )
 
 
 def _feed(
-    process: subprocess.Popen[str], waiting: queue.SimpleQueue[list[Kernel]], told: queue.SimpleQueue[tuple[str, str]]
+    process: subprocess.Popen[str], waiting: queue.SimpleQueue[list[Kernel]], events: queue.SimpleQueue[tuple[str, str]]
 ) -> None:
-    """Gives a worker one module's kernels after the other; tells which is begun, and which is done with what fault."""
+    """Send a worker the kernels of one module after the other; report `begun` and `done` with an error or ""."""
     assert process.stdin is not None
     assert process.stdout is not None
-    while True:
-        try:
-            kernels = waiting.get_nowait()
-        except queue.Empty:
-            return
-        for kernel in kernels:
-            told.put(("begun", f"{kernel.module.removeprefix('framework.')}.{kernel.name}"))
-            try:
-                process.stdin.write(f"{kernel.module}\t{kernel.name}\t{kernel.types}\n")
-                process.stdin.flush()
-                answer = process.stdout.readline()
-            except OSError:
-                answer = ""
-            told.put(("done", answer.strip() if answer else f"{kernel.module}.{kernel.name}: its process has ended"))
+    with suppress(queue.Empty):
+        while True:
+            for kernel in waiting.get_nowait():
+                events.put(("begun", f"{kernel.module.removeprefix('framework.')}.{kernel.name}"))
+                try:
+                    process.stdin.write(f"{kernel.module}\t{kernel.name}\t{kernel.types}\n")
+                    process.stdin.flush()
+                    answer = process.stdout.readline()
+                except OSError:
+                    answer = ""
+                error = answer.strip() if answer else f"{kernel.module}.{kernel.name}: its process has ended"
+                events.put(("done", error))
 
 
-def _watch(
-    count: int, threads: list[threading.Thread], told: queue.SimpleQueue[tuple[str, str]], faults: list[str]
-) -> None:
-    """Shows how many kernels are left until all are done: a bar, or a line every few seconds where there is none."""
+def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueue[tuple[str, str]]) -> list[str]:
+    """Show the number of remaining kernels until all are done, as a bar or as log lines, and return the errors."""
     left = count
+    errors: list[str] = []
     with Progress(count, " kernels") as bar:
         while left:
             try:
-                event, text = told.get(timeout=1.0)
+                event, text = events.get(timeout=1.0)
             except queue.Empty:
                 event, text = "", ""
                 if not any(thread.is_alive() for thread in threads):
@@ -210,17 +204,18 @@ def _watch(
             if event == "done":
                 left -= 1
                 bar.update()
-                faults += filter(None, [text])
+                errors += filter(None, [text])
             elif event == "begun":
                 bar.set_description_str(f"{left} left, {text}", refresh=False)
             bar.refresh()
             if bar.line_is_due():
                 log.info("%d of %d kernels are left", left, count)
+    return errors
 
 
 @contextmanager
 def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
-    """The jobs of a sweep start together: one compiles, and the others wait for what it has made."""
+    """Let one process compile and the others wait: the jobs of a sweep start at the same time."""
     folder = Path(kernels[0].dispatcher._cache.cache_path)
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / "compiling.lock")
@@ -230,7 +225,7 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
         except Timeout:
             log.info("another process compiles kernels: waiting for it")
             lock.acquire()
-    except OSError as error:  # a file system without locks: several may do the same work
+    except OSError as error:  # no locks: several processes may compile the same kernels
         log.warning("%s cannot be locked (%s)", folder, error.strerror)
     try:
         yield
@@ -239,15 +234,14 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
 
 
 def called_by(dispatcher: Any) -> set[Any]:
-    """A kernel and all kernels that it calls, directly or not."""
+    """Return a kernel and all kernels that it calls, directly or not."""
     found: set[Any] = set()
     waiting = [dispatcher]
     while waiting:
         kernel = waiting.pop()
         if kernel not in found:
             found.add(kernel)
-            scope = kernel.py_func.__globals__
-            called = (scope.get(name) for name in set(_names(kernel.py_func.__code__)))
+            called = map(kernel.py_func.__globals__.get, set(_names(kernel.py_func.__code__)))
             waiting += [value for value in called if isinstance(value, Dispatcher)]
     return found
 
@@ -260,7 +254,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _text_of(kind: Any) -> str:
-    """A type of numba's as Python would write it; _type_of() reads it."""
+    """Return a numba type as a Python expression, which _type_of() parses."""
     if isinstance(kind, types.Array):
         axes = [":"] * kind.ndim
         if kind.layout == "C":
@@ -278,12 +272,12 @@ def _text_of(kind: Any) -> str:
         return f"omitted({kind.value!r})"
     text = "boolean" if kind == types.boolean else str(kind)
     if getattr(types, text, None) != kind:
-        raise TypeError(f"no way is known to write down the type {kind}")
+        raise TypeError(f"cannot write the type {kind}")
     return text
 
 
 def _type_of(node: ast.expr) -> Any:
-    """The type of numba's that _text_of() has written."""
+    """Return the numba type of an expression of _text_of()."""
     if isinstance(node, ast.Name):
         return getattr(types, node.id)
     if isinstance(node, ast.Tuple):

@@ -1,4 +1,4 @@
-"""What a run reads beside its config: weights, other files and the recording, as one hash."""
+"""A hash of the files that a run reads: weights, recording and others."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from framework.files.search_paths import folder_of
 from framework.runs.provenance import leaves, relevant
 
 INPUTS = "inputs_sha256"  # the key of metrics.json
-MOST_FILES = 200_000  # of a recording, 3 s; the longest of the datasets read here have 20,000
-OUTPUTS = {"outputs", "multirun"}  # Hydra's folders: what runs leave behind where they were begun is no recording
+MOST_FILES = 200_000  # of a recording (3 s); the longest sequences of known datasets have 20,000
+OUTPUTS = {"outputs", "multirun"}  # Hydra's output folders
 
 
 def inputs_sha256(config: Mapping[str, Any]) -> str:
-    """SHA-256 (hex) of what the paths in a resolved config lead to.
+    """Return the SHA-256 (hex) of the files that a resolved config names.
 
-    Files and folders count by their bytes. A recording would take as long to read as to map: it counts by the names,
-    sizes and times of change of the files in dataset.root and of all below dataset.scene.
+    Files and folders are hashed by content; a recording by names, sizes and modification times of the files in
+    dataset.root and below dataset.scene, which is faster.
     """
     digest = hashlib.sha256()
     for key, value in leaves(relevant(config)):
@@ -38,7 +38,7 @@ def inputs_sha256(config: Mapping[str, Any]) -> str:
 
 
 def _content(value: str) -> str:
-    """Of a file or folder; "" for a word that names none."""
+    """Hash a file or folder; "" if there is none."""
     try:
         return content_hash(Path(value))
     except (ConfigError, DataError, OSError, ValueError):
@@ -46,17 +46,17 @@ def _content(value: str) -> str:
 
 
 def _listed(root: Path, scene: str) -> Iterator[tuple[str, str, int, int]]:
-    above = (root / scene).resolve().parents[:2]  # where ScanNet's label tables are
+    above = (root / scene).resolve().parents[:2]  # folders of ScanNet's label tables
     walks: list[Iterable[tuple[str, list[str], list[str]]]]
     walks = [[(str(folder), [], [LABEL_TABLE, FIRST_LABEL_TABLE]) for folder in above]]
     if scene:
-        walks.append(islice(os.walk(root), 1))  # what all scenes share, such as Replica's cam_params.json
-    walks.append(os.walk(root / scene, followlinks=True))  # MOST_FILES ends a circle
+        walks.append(islice(os.walk(root), 1))  # files that scenes share, such as Replica's cam_params.json
+    walks.append(os.walk(root / scene, followlinks=True))  # MOST_FILES ends cyclic links
     for folder, folders, files in chain.from_iterable(walks):
         folders[:] = sorted(set(folders) - OUTPUTS)
         for name in sorted(files):
             try:
                 found = Path(folder, name).stat()
-            except OSError:  # a link that leads nowhere, a table that is not there
+            except OSError:  # broken link or missing table
                 continue
             yield os.path.relpath(folder, root), name, found.st_size, found.st_mtime_ns

@@ -1,4 +1,4 @@
-"""The map's objects as a JSON list, and read back."""
+"""instances.json: the objects of a map."""
 
 from __future__ import annotations
 
@@ -9,44 +9,41 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Box, Float32, Float64, Instance, InstanceMesh
+from framework.data import Box, Float64, Instance, InstanceMesh
 from framework.errors import DataError
 from framework.files.json_file import read_json, write_json
 from framework.runs.metrics import class_name
 
 LARGEST_ID = 2**31 - 1
-FARTHEST = 1e6  # m, of places and sizes; mesh.ply has no finer steps than 6 cm there
-NO_CLASS = "object"  # what an object of a map without classes is called
+FARTHEST = 1e6  # m, limit of coordinates and sizes; float32 resolves 6 cm there
+NO_CLASS = "object"  # class name in a map without classes
 
 
 @dataclass(frozen=True)
 class StoredInstance:
-    """One object, as instances.json tells it; lengths in m, in the world."""
+    """One object of instances.json; lengths in m, in the world."""
 
     id: int  # 1 to LARGEST_ID
-    class_name: str  # NO_CLASS where the map knows no classes
+    class_name: str  # NO_CLASS in a map without classes
     confidence: float  # in [0, 1]
     class_probabilities: Mapping[str, float]  # each in [0, 1]
-    observations: int  # frames in which it was detected
-    first_frame: int  # whatever number its source gave it
+    observations: int  # number of frames with a detection
+    first_frame: int  # Frame.index
     last_frame: int
-    vertices: int  # of the mesh
-    centroid: Float64 | None  # (3,) of its vertices; None = it has none
+    vertices: int  # number of mesh vertices
+    centroid: Float64 | None  # (3,) of its vertices; None = no vertices
     obb: Box
 
     @property
     def probability(self) -> float | None:
-        """Of its class; None = the file does not tell."""
+        """Return the probability of its class; None = unknown."""
         return self.class_probabilities.get(self.class_name)
 
 
 def write_instances(
     path: Path, mesh: InstanceMesh, instances: Mapping[int, Instance], classes: tuple[str, ...]
 ) -> None:
-    """Writes the objects as a list, by id. `vertices` is how many of the mesh's vertices carry the id; lengths in m.
-
-    Confidences and probabilities have all their digits: rounded ones could tie, and then rank or name objects anew.
-    """
+    """Write the objects by id; lengths in m. Confidences and probabilities are not rounded, which could create ties."""
     write_json(
         path,
         [
@@ -54,7 +51,10 @@ def write_instances(
                 "id": instance.id,
                 "class": class_name(instance, classes),
                 "confidence": float(instance.confidence),
-                "class_probabilities": dict(zip(classes, _shortest(instance.class_probabilities), strict=True)),
+                # the shortest digits that give each float32 back: 0.9, not 0.8999999761581421
+                "class_probabilities": {
+                    name: float(str(value)) for name, value in zip(classes, instance.class_probabilities, strict=True)
+                },
                 "observations": int(instance.observations),
                 "first_frame": int(instance.first_frame),
                 "last_frame": int(instance.last_frame),
@@ -63,7 +63,7 @@ def write_instances(
                     "min": (instance.aabb.center - instance.aabb.extent / 2).tolist(),
                     "max": (instance.aabb.center + instance.aabb.extent / 2).tolist(),
                 },
-                "obb": _box(instance.obb),
+                "obb": {name: getattr(instance.obb, name).tolist() for name in ("center", "extent", "rotation")},
                 "vertices": len(instance.vertices),
             }
             for _, instance in sorted(instances.items())
@@ -72,7 +72,7 @@ def write_instances(
 
 
 def read_instances(path: Path) -> list[StoredInstance]:
-    """The objects that `write_instances` wrote. Raises DataError, naming the file and the entry, for anything else."""
+    """Read the objects that `write_instances` wrote. Raises DataError."""
     entries = read_json(path)
     if not isinstance(entries, list):
         raise DataError(f"{path} must hold a list of instances, found {type(entries).__name__}")
@@ -97,8 +97,8 @@ def _stored(where: str, entry: Any) -> StoredInstance:
             name: _fraction(f"{where}, class_probabilities", probabilities, name) for name in probabilities
         },
         observations=_integer(where, entry, "observations", 0),
-        first_frame=_whole(where, entry, "first_frame"),
-        last_frame=_whole(where, entry, "last_frame"),
+        first_frame=_integer(where, entry, "first_frame"),
+        last_frame=_integer(where, entry, "last_frame"),
         vertices=_integer(where, entry, "vertices", 0),
         centroid=None if entry.get("centroid") is None else _array(where, entry, "centroid", (3,)),
         obb=Box(
@@ -109,18 +109,13 @@ def _stored(where: str, entry: Any) -> StoredInstance:
     )
 
 
-def _integer(where: str, entry: Mapping[str, Any], key: str, lowest: int) -> int:
+def _integer(where: str, entry: Mapping[str, Any], key: str, lowest: int | None = None) -> int:
+    """Return an integer of any size, or from `lowest` to LARGEST_ID."""
     value = entry.get(key)
-    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= LARGEST_ID:
-        raise DataError(f"{where}: {key} must be a whole number from {lowest} to {LARGEST_ID}, found {value!r:.40}")
-    return value
-
-
-def _whole(where: str, entry: Mapping[str, Any], key: str) -> int:
-    value = entry.get(key)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise DataError(f"{where}: {key} must be a whole number, found {value!r:.40}")
-    return value
+    if isinstance(value, int) and not isinstance(value, bool) and (lowest is None or lowest <= value <= LARGEST_ID):
+        return value
+    limits = "" if lowest is None else f" from {lowest} to {LARGEST_ID}"
+    raise DataError(f"{where}: {key} must be a whole number{limits}, found {value!r:.40}")
 
 
 def _class(where: str, entry: Mapping[str, Any]) -> str:
@@ -147,12 +142,3 @@ def _array(where: str, entry: Mapping[str, Any], key: str, shape: tuple[int, ...
             f"{where}: {key} must hold numbers of shape {shape}, up to {FARTHEST:g}, found {entry.get(key)!r:.60}"
         )
     return values
-
-
-def _shortest(values: Float32) -> list[float]:
-    """With the fewest digits that give each float32 back: 0.9, not 0.8999999761581421."""
-    return [float(str(value)) for value in values]
-
-
-def _box(box: Box) -> dict[str, list[float] | list[list[float]]]:
-    return {"center": box.center.tolist(), "extent": box.extent.tolist(), "rotation": box.rotation.tolist()}

@@ -1,4 +1,4 @@
-"""The map's surface as a binary PLY file, written and read back."""
+"""mesh.ply: the surface of a map."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from framework.files.ply import read_ply, write_ply
 
 CHANNELS = ("red", "green", "blue")
 TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.int32}
-"""The properties of a vertex beside its place."""
+"""Properties of a vertex in addition to its position."""
 
-CLASSES = "classes "  # begins the comment that names the classes
+CLASSES = "classes "  # prefix of the comment that names the classes
 
 
 def write_mesh(path: Path, mesh: InstanceMesh) -> None:
-    """Writes `mesh` as a binary little-endian PLY: vertex x y z [m], red green blue, instance (0 = none), class.
+    """Write a binary little-endian PLY file: vertex x y z [m], red green blue, instance (0 = none), class.
 
-    `class` is an index into the comment line `classes`, -1 = none.
+    `class` is an index into the comment line `classes`; -1 = none.
     """
     properties: dict[str, Array] = {
         **{channel: mesh.colors[:, k] for k, channel in enumerate(CHANNELS)},
@@ -35,7 +35,7 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
 
 
 def read_mesh(path: Path) -> InstanceMesh:
-    """The mesh that `write_mesh` wrote, exactly. Raises DataError, naming the file, for anything else."""
+    """Read the mesh that `write_mesh` wrote. Raises DataError."""
     ply = read_ply(path)
     for name, kind in TYPES.items():
         if name not in ply.properties or ply.properties[name].dtype != kind:

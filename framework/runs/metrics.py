@@ -1,4 +1,4 @@
-"""The figures of one run: the flat dictionary that becomes metrics.json."""
+"""The metrics of one run: the flat dictionary of metrics.json."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from framework.runtime.run_log import RunResult
 
 Metrics = dict[str, float | int | str | bool | None]
 
-MAIN_FIGURES = ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou")  # of `instances.`, given for both transfers
-TRUTH = "truth_sha256"  # the key that says which true instances the run was compared with
+MAIN_FIGURES = ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou")  # of `instances.`, for both label transfers
+TRUTH = "truth_sha256"  # key of the hash of the ground truth
 STAGES_TIMED = ("read", "detect", "track", "lift", "refine", "fuse")
 
 
 def run_metrics(result: RunResult) -> Metrics:
-    """Counts, speed, time by stage and the size of the map; of a live video also what it dropped, and its latency."""
+    """Return counts, speed, stage times and map size; for a live video also dropped frames and latency."""
     metrics: Metrics = {
         "frames": result.frames,
         "frames_lost": result.frames_lost,
@@ -47,8 +47,8 @@ def run_metrics(result: RunResult) -> Metrics:
 
 
 def trajectory_metrics(result: RunResult) -> Metrics:
-    """The error of the poses that were not lost; nothing where no true pose is known."""
-    reference: list[Float64 | None] = [None] * result.frames  # a step over a skipped frame is no step of one frame
+    """Return the error of the poses that are not lost; empty without true poses."""
+    reference: list[Float64 | None] = [None] * result.frames  # keeps skipped frames, which interrupt relative poses
     estimated = [Pose(np.eye(4), lost=True)] * result.frames
     for frame in result.tracked:
         reference[frame.position], estimated[frame.position] = frame.T_world_camera_truth, frame.pose
@@ -56,7 +56,7 @@ def trajectory_metrics(result: RunResult) -> Metrics:
 
 
 def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
-    """Which way is up in the world, what tells it, and how high the floor is; nothing where the map does not tell."""
+    """Return the up direction, its source and the floor height; empty if the up direction is unknown."""
     gravity = scene.gravity()
     up = gravity.up
     if up is None:
@@ -69,7 +69,7 @@ def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
 def instance_metrics(
     video: RGBDVideo, mesh: InstanceMesh, found: Mapping[int, Instance], classes: tuple[str, ...]
 ) -> Metrics:
-    """How many instances were found and, where the true ones are known, how well."""
+    """Return the number of instances and, with ground truth, their metrics."""
     count: Metrics = {"instances.count": len(found)}
     truth = video.scene_truth()
     if truth is None:
@@ -78,9 +78,9 @@ def instance_metrics(
 
 
 def evaluation_metrics(predictions: PredictedInstances, truth: SceneTruth, annotation: str) -> Metrics:
-    """The figures of `InstanceEvaluation.metrics`, and the main ones of the other transfer as `instances.to_map.`...
+    """Return `InstanceEvaluation.metrics`, and the main ones of the other label transfer as `instances.to_map.`...
 
-    `annotation_release` names the release of the truth, None = there is but one; `truth_sha256` tells it from others.
+    `annotation_release` is the release of the ground truth, None = only one exists; `truth_sha256` its hash.
     """
     figures = instances.evaluate(predictions, truth).metrics()
     to_map = instances.evaluate(predictions, truth, transfer=Transfer.TO_MAP).metrics()
@@ -89,7 +89,7 @@ def evaluation_metrics(predictions: PredictedInstances, truth: SceneTruth, annot
 
 
 def truth_sha256(truth: SceneTruth) -> str:
-    """Of all that predictions are compared with."""
+    """Hash the ground truth of an evaluation."""
     digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
     for array in (truth.points_world, truth.instance_ids):
         add_values(digest, array)
@@ -97,10 +97,10 @@ def truth_sha256(truth: SceneTruth) -> str:
 
 
 def is_evaluation(key: str) -> bool:
-    """Whether a key of metrics.json is one that `evaluation_metrics` writes."""
+    """Return true for a key of `evaluation_metrics`."""
     return key in ("annotation_release", TRUTH) or (key.startswith("instances.") and key != "instances.count")
 
 
 def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:
-    """The most probable class of an instance; None where the map knows no classes."""
+    """Return the most probable class of an instance; None in a map without classes."""
     return classes[int(np.argmax(instance.class_probabilities))] if classes else None

@@ -1,4 +1,4 @@
-"""Where results come from: the config, the code and the machine."""
+"""Provenance of results: config, code and machine."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ PACKAGES = ("torch", "numpy", "numba", "open3d")
 UNKNOWN = "unknown"
 WITHOUT_EFFECT = (
     *("hydra", "debug", "skip_completed", "prefetch", "detection_cache", "detection_cache_dir", "viewer"),
-    "threads",  # but for networks' last digits: a sweep goes on with another number of jobs at once
-    *("row", "rows", "sequences", "table", "figure"),  # of an experiment: what its runs are compared for
+    "threads",  # changes only the last digits of networks
+    *("row", "rows", "sequences", "table", "figure"),  # settings of an experiment
 )
-"""Keys of the config that change no result."""
+"""Config keys that do not change results."""
 
-OF_SPEED = ("threads", "prefetch", "detection_cache")  # of these, what times depend on ...
-OF_MACHINE = ("environment.processor", "environment.cpus")  # ... like on these, of metrics.json
+OF_SPEED = ("threads", "prefetch", "detection_cache")  # config keys that change times
+OF_MACHINE = ("environment.processor", "environment.cpus")  # keys of metrics.json that change times
 
 
 def config_hash(resolved: Mapping[str, Any]) -> str:
-    """SHA-256 of what a config says about results, whatever the order of its keys and wherever the run is written."""
+    """Return the SHA-256 of the keys that change results, independent of their order."""
     return hashlib.sha256(json.dumps(relevant(resolved), sort_keys=True, default=str).encode()).hexdigest()
 
 
 def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The keys that results depend on."""
+    """Return the keys that results depend on."""
     return {key: value for key, value in config.items() if key not in WITHOUT_EFFECT}
 
 
 def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The values of a config by dotted key; a list is one value."""
+    """Yield the values of a config by dotted key; a list is one value."""
     for key, value in node.items():
         if isinstance(value, Mapping) and value:
             yield from leaves(value, f"{prefix}{key}.")
@@ -47,17 +47,17 @@ def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def shows_speed(config: Mapping[str, Any]) -> bool:
-    """Whether a config is of an experiment whose table has a column of frames a second."""
+    """Return true if the table of a config's experiment has the column `fps`."""
     return "fps" in (config.get("table") or {}).get("columns", ())
 
 
 def speed_settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """What the times of a run depend on and its results do not."""
+    """Return the settings that change the times of a run but not its results."""
     return {key: config.get(key) for key in OF_SPEED} | {key: metrics.get(key) for key in OF_MACHINE}
 
 
 def code_version() -> dict[str, str | bool]:
-    """The commit of the checkout that runs, and whether files differ from it; "unknown" outside a checkout."""
+    """Return the commit of the checkout, and true if files differ from it; "unknown" outside of a checkout."""
     checkout = Path(framework.__file__).resolve().parent.parent
     top = _git(checkout, "rev-parse", "--show-toplevel")
     if top is None or Path(top).resolve() != checkout:  # installed from a wheel, perhaps inside another repository
@@ -69,7 +69,7 @@ def code_version() -> dict[str, str | bool]:
 
 
 def environment() -> dict[str, str | int]:
-    """What times and last digits depend on: the machine and the libraries."""
+    """Return the machine and library versions, which change times and last digits."""
     return {
         "environment.python": platform.python_version(),
         "environment.platform": platform.platform(),

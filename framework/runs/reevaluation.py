@@ -1,4 +1,4 @@
-"""Stored runs evaluated anew, by the code of today, from the mesh and the instances that they left behind."""
+"""Re-evaluates stored runs with the current code, from their meshes and instances."""
 
 from __future__ import annotations
 
@@ -24,17 +24,14 @@ from framework.runs.stored_runs import EVALUATION, METRICS, Record
 
 @dataclass(frozen=True)
 class Truth:
-    """What a run's dataset knows about its scene."""
+    """The ground truth of a run's dataset."""
 
-    scene: SceneTruth | None  # None = nobody labelled it
+    scene: SceneTruth | None  # None = not labeled
     annotation: str  # RGBDVideo.annotation
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Truth:
-        """From a run's config, in which nothing is left to be resolved: a record does not ask for the environment.
-
-        Raises InstanceMapError when the dataset cannot be built or read.
-        """
+        """Read the ground truth of a run's resolved config. Raises InstanceMapError."""
         node = OmegaConf.create(dict(config)).get("dataset")
         for key, value in leaves({"dataset": config.get("dataset")}):
             if "${" in str(value):
@@ -45,18 +42,17 @@ class Truth:
 
 @dataclass(frozen=True)
 class Reevaluation:
-    """A run's figures as they are stored and as they are now."""
+    """The stored and the new metrics of a run."""
 
     record: Record
-    metrics: Mapping[str, Any]  # the whole new metrics.json
+    metrics: Mapping[str, Any]  # the new metrics.json
 
     @classmethod
     def of(cls, record: Record, truth: Truth, other_truth: bool = False) -> Reevaluation:
-        """Keeps all that is not the evaluation of the instances: speed, counts, and the errors of the trajectory.
+        """Evaluate the instances again, and keep all other metrics.
 
-        Those need the true pose of every frame, so every frame read again. Raises DataError when the files do not
-        belong together, when there is no truth any more for figures that are stored, or when it is not the one that
-        the run was compared with, unless `other_truth` allows that.
+        Raises DataError if the files are inconsistent, the ground truth is missing, or it has changed since the run
+        (unless `other_truth`).
         """
         if truth.scene is None:
             if any(map(is_evaluation, record.metrics)):
@@ -79,7 +75,7 @@ class Reevaluation:
 
     @property
     def changed(self) -> dict[str, tuple[Any, Any]]:
-        """The stored figures that are not what they were, old and new; None = not known."""
+        """Return the changed metrics, old and new; None = unknown."""
         old, new = self.record.metrics, self.metrics
         return {
             key: (value, new.get(key)) for key, value in old.items() if is_evaluation(key) and new.get(key) != value
@@ -87,16 +83,16 @@ class Reevaluation:
 
     @property
     def added(self) -> list[str]:
-        """The figures that were not stored."""
+        """Return the metrics that were not stored."""
         return [key for key in self.metrics if is_evaluation(key) and key not in self.record.metrics]
 
     def write(self) -> None:
-        """Replaces the record's metrics.json; its time stays, by which tables tell the latest of several runs.
+        """Replace metrics.json but keep its time, by which tables choose the latest of several runs.
 
-        Raises DataError when the run has begun again meanwhile.
+        Raises DataError if the run has started again meanwhile.
         """
         path = self.record.directory / METRICS
-        with locked(self.record.directory):  # a run that begins now waits, or it would end up with these figures
+        with locked(self.record.directory):  # a new run waits
             try:
                 before = path.stat()
             except OSError:
@@ -108,10 +104,7 @@ class Reevaluation:
 
 
 def read_predictions(record: Record) -> PredictedInstances:
-    """What the run's map claims, exactly as it was evaluated when it ended.
-
-    Raises DataError when mesh.ply and instances.json are not of this run.
-    """
+    """Return the predictions of a run as they were evaluated at its end. Raises DataError."""
     mesh, instances = read_objects(record)
     return PredictedInstances.on_mesh(
         mesh,
@@ -122,5 +115,5 @@ def read_predictions(record: Record) -> PredictedInstances:
 
 
 def dataset_of(record: Record) -> str:
-    """The same text for runs on the same truth."""
+    """Return a key that is equal for runs with the same ground truth."""
     return str(record.config.get("dataset"))

@@ -1,4 +1,4 @@
-"""The directory that a run leaves behind: every file whole or not at all, the small ones first, metrics.json last."""
+"""Writes the run directory: every file atomically, small ones first, metrics.json last."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from framework.config.composition import one_line
-from framework.data import Instance, InstanceMesh
+from framework.data import Instance
 from framework.errors import InstanceMapError
 from framework.files.atomic_write import remove_left_over, written_whole
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import write_tum
-from framework.interfaces import RGBDVideo, SceneMap
+from framework.interfaces import RGBDVideo
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 from framework.runs.inputs import INPUTS, inputs_sha256
@@ -53,8 +53,7 @@ from framework.tracking.keyframes import write_keyframes
 
 log = logging.getLogger(__name__)
 
-LIKELY = 0.3  # confidence from which on an instance is in the picture and in what a run says; files have them all
-
+LIKELY = 0.3  # minimum confidence of instances in figures and log messages; files contain all
 
 Arguments = ParamSpec("Arguments")
 Made = TypeVar("Made")
@@ -66,13 +65,13 @@ class RunRecord:
 
     directory: Path
     config: Mapping[str, Any]  # resolved
-    choices: Mapping[str, str | None]  # the option chosen of each config group
+    choices: Mapping[str, str | None]  # chosen option of each config group
     inputs: str  # inputs_sha256
-    provenance: Metrics  # the code and the machine, as they were when the run began
+    provenance: Metrics  # code and machine at the start of the run
 
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
-        """Takes `directory` over: an earlier run's metrics and report are removed: they could pass for this one's."""
+        """Start a run in `directory`: remove the metrics and report of an earlier run."""
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
         asked = {str(key): value for key, value in resolved.items()}
@@ -89,31 +88,37 @@ class RunRecord:
     def write(
         self, video: RGBDVideo, result: RunResult, counts: Mapping[str, int] | None = None
     ) -> BaseException | None:
-        """Writes everything that the run found, and says the main figures in the log.
+        """Write all outputs and log the main metrics.
 
-        Returns why the record is partial: `result.stopped_by`, or the first fault of the writing, which does not keep
-        the other files from being written; None = it is whole. `counts` are further figures for metrics.json, by key.
+        The map is written before it is evaluated, in case the ground truth is unusable. Until the end,
+        metrics.partial.json marks the run as partial, in case the process is killed.
 
-        What was mapped is written before it is judged: where the truth turns out to be unusable, it stays. While that
-        goes on, metrics.partial.json tells what there is: who is killed in the middle of it leaves a partial record.
+        Args:
+            video: The mapped video.
+            result: The result of the pipeline.
+            counts: Additional metrics.
+
+        Returns:
+            Why the run is partial: `result.stopped_by`, or the first error of writing, which does not stop the other
+            files; None = the run is complete.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         scene, attempt = result.scene, _Attempts(result.stopped_by)
-        for name in (*MAPPED, KEYFRAMES):  # of an earlier run into the same directory
+        for name in (*MAPPED, KEYFRAMES):  # of an earlier run
             attempt((self.directory / name).unlink, missing_ok=True)
-        if not (self.directory / CONFIG).exists():  # the directory was removed meanwhile
+        if not (self.directory / CONFIG).exists():  # the directory was removed
             attempt(_write_config, self.directory / CONFIG, self.config)
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
         attempt(write_tum, self.directory / TRAJECTORY, np.array([frame.timestamp for frame in trusted]), poses)
         attempt(write_timings, self.directory / "timings.csv", result)
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
-        found = attempt(_found, scene)
+        found = attempt(lambda: (scene.mesh(), scene.instances()))
         if found is not None:
             attempt(write_instances, self.directory / INSTANCES, *found, scene.classes)
             figures |= attempt(room_metrics, scene, found[0]) or {}
             figures["instances.count"] = len(found[1])
-        attempt(self._write_partial, video, figures, attempt.fault)
+        attempt(self._write_partial, video, figures, attempt.error)
         if found is not None:
             attempt(write_mesh, self.directory / MESH, found[0])
         attempt(scene.save, self.directory / MAP)
@@ -126,14 +131,14 @@ class RunRecord:
         if found is not None:
             labels = _labels(found[1], scene.classes)
             attempt(write_overview, self.directory / "overview.png", found[0], labels, poses, title)
-        if attempt.fault is None:
+        if attempt.error is None:
             attempt(write_json, self.directory / METRICS, self._metrics(video, figures))
-        if attempt.fault is None:
+        if attempt.error is None:
             (self.directory / PARTIAL_METRICS).unlink(missing_ok=True)
         else:
-            attempt(self._write_partial, video, figures, attempt.fault)
-        self._announce(title, labels if found is not None else {}, figures, attempt.fault)
-        return attempt.fault
+            attempt(self._write_partial, video, figures, attempt.error)
+        self._announce(title, labels if found is not None else {}, figures, attempt.error)
+        return attempt.error
 
     def _metrics(self, video: RGBDVideo, figures: Metrics) -> Metrics:
         return {
@@ -147,13 +152,13 @@ class RunRecord:
             **self.provenance,
         }
 
-    def _write_partial(self, video: RGBDVideo, figures: Metrics, fault: BaseException | None) -> None:
-        """Says what there is of a record that is not whole, and why; no fault = it is being written."""
-        why = "its record was not finished" if fault is None else reason(fault)
+    def _write_partial(self, video: RGBDVideo, figures: Metrics, error: BaseException | None) -> None:
+        """Write the metrics of a partial run with the reason; no error = it is still being written."""
+        why = "its record was not finished" if error is None else reason(error)
         write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
 
     def _announce(
-        self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, fault: BaseException | None
+        self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, error: BaseException | None
     ) -> None:
         log.info("%s", title)
         likely = Counter(name for name, _ in labels.values())
@@ -165,25 +170,25 @@ class RunRecord:
         if written:  # one line: a job of a sweep has a long name
             beside = f", and beside it {', '.join(written[1:])}" if written[1:] else ""
             log.info("%s%s", _from_here(self.directory / written[0]), beside)
-        if fault is not None:
-            log.warning("partial run, %s: its figures are in %s", reason(fault), PARTIAL_METRICS)
+        if error is not None:
+            log.warning("partial run, %s: its figures are in %s", reason(error), PARTIAL_METRICS)
 
 
 @dataclass
 class _Attempts:
-    """Calls one function after the other; one that fails says so in the log, and does not keep the others from it."""
+    """Calls functions; logs the error of one that fails, so that the others still run."""
 
-    fault: BaseException | None  # the first
+    error: BaseException | None  # the first
 
     def __call__(
         self, function: Callable[Arguments, Made], *arguments: Arguments.args, **named: Arguments.kwargs
     ) -> Made | None:
-        """What the function returns; None where it failed."""
+        """Return the result of the function; None if it fails."""
         try:
             return function(*arguments, **named)
         except Exception as error:
             log.warning("%s", reason(error))
-            self.fault = self.fault or error
+            self.error = self.error or error
             return None
 
 
@@ -193,17 +198,13 @@ def _write_config(path: Path, config: Mapping[str, Any]) -> None:
 
 
 def _from_here(path: Path) -> Path:
-    """The path as one would give it in the working folder."""
+    """Return the path relative to the working folder, if it is in it."""
     here, place = Path.cwd(), path.absolute()
     return place.relative_to(here) if place.is_relative_to(here) else place
 
 
-def _found(scene: SceneMap) -> tuple[InstanceMesh, Mapping[int, Instance]]:
-    return scene.mesh(), scene.instances()
-
-
 def _labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict[int, tuple[str, float]]:
-    """Class name and confidence of the instances that are likely, by id."""
+    """Return class name and confidence of the likely instances by id."""
     return {
         key: (class_name(instance, classes) or "object", instance.confidence)
         for key, instance in instances.items()
@@ -211,16 +212,16 @@ def _labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict
     }
 
 
-_FAULTS = {"frames_lost": "lost", "frames_skipped": "skipped", "frames_dropped": "dropped"}
+_DROPPED = {"frames_lost": "lost", "frames_skipped": "skipped", "frames_dropped": "dropped"}
 _QUALITY = {"instances.ap50": "AP50", "instances.ap25": "AP25"}
 
 
 def headline(metrics: Mapping[str, Any]) -> str:
-    """The main figures of a run in one line, as far as there are any."""
+    """Return the available main metrics of a run in one line."""
     parts = [str(metrics["sequence"])]
     if "frames" in metrics:
         parts += [f"{metrics['frames']} frames at {metrics['fps']:.1f}/s"]
-    parts += [f"{metrics[key]} {word}" for key, word in _FAULTS.items() if metrics.get(key)]
+    parts += [f"{metrics[key]} {word}" for key, word in _DROPPED.items() if metrics.get(key)]
     if metrics.get("latency_ms") is not None:
         parts.append(f"latency {metrics['latency_ms']:.0f} ms")
     if metrics.get("pose_source") == "ground_truth":
@@ -233,15 +234,15 @@ def headline(metrics: Mapping[str, Any]) -> str:
     return " | ".join(parts)
 
 
-def reason(fault: BaseException) -> str:
-    """Why a run is partial, in words."""
-    if isinstance(fault, KeyboardInterrupt):
-        return str(fault) or "interrupted by Ctrl-C"
-    return one_line(fault) if isinstance(fault, InstanceMapError) else f"{type(fault).__name__}: {one_line(fault)}"
+def reason(error: BaseException) -> str:
+    """Return the reason of a partial run as text."""
+    if isinstance(error, KeyboardInterrupt):
+        return str(error) or "interrupted by Ctrl-C"
+    return one_line(error) if isinstance(error, InstanceMapError) else f"{type(error).__name__}: {one_line(error)}"
 
 
 def write_timings(path: Path, result: RunResult) -> None:
-    """Writes how long each stage took for each frame, in the order in which it happened."""
+    """Write the time of each stage for each frame, in chronological order."""
     with written_whole(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("frame", "stage", "milliseconds"))
@@ -249,7 +250,7 @@ def write_timings(path: Path, result: RunResult) -> None:
 
 
 def peak_memory() -> int | None:
-    """The largest resident size of this process so far, bytes: since the run began, where the kernel can say so.
+    """Return the peak resident memory of this process, bytes; on Linux since the start of the run.
 
     None on Windows, which has no `resource`.
     """
@@ -262,6 +263,6 @@ def peak_memory() -> int | None:
 
 
 def _reset_peak_memory() -> None:
-    """Forgets the peak of what this process did before: an earlier job of a sweep may have needed more."""
+    """Reset the peak memory of earlier jobs of a sweep."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")

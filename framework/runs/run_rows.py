@@ -1,4 +1,4 @@
-"""Rows of runs side by side: means with their spread, and differences paired run by run."""
+"""Rows of a comparison: means of runs with their spread, and paired differences."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 from framework.runs.provenance import leaves, relevant
 from framework.runs.stored_runs import Record, is_number
 
-CHOICE = "choice."  # starts the keys of metrics.json that say which option was chosen of a config group
-DATA = "dataset.root"  # the key of the config that says where recorded data are
+CHOICE = "choice."  # prefix of the chosen options in metrics.json
+DATA = "dataset.root"  # config key of the recording's folder
 CONFIDENCE = 0.95
 
-Run = tuple[str, ...]  # what a run has under the keys that are averaged over: ("3",) is seed 3
+Run = tuple[str, ...]  # values of the keys that are averaged over: ("3",) is seed 3
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over runs. NaN where nothing is known: the mean of no run, the deviation of one."""
+    """A mean over runs; NaN = undefined: the mean of no run, the deviation of one."""
 
     value: float
     deviation: float  # sample standard deviation, with n - 1
@@ -36,14 +36,14 @@ class Mean:
 
     @property
     def error(self) -> float:
-        """The standard error of the mean."""
+        """Return the standard error of the mean."""
         return self.deviation / math.sqrt(self.count) if self.count > 1 else math.nan
 
     @property
     def is_not_zero(self) -> bool:
-        """Whether 0 lies outside of the mean's interval of confidence, by Student's t.
+        """Return true if 0 is outside of the confidence interval of the mean, by Student's t.
 
-        Values that are all the same have no interval: they are counts, and say nothing about the next one.
+        Equal values, such as counts, have no confidence interval.
         """
         if self.count < 2 or self.deviation <= 1e-9 * abs(self.value):
             return False
@@ -54,12 +54,12 @@ class Mean:
 
 @dataclass(frozen=True)
 class RunRow:
-    """Runs that differ in nothing but the keys that are averaged over."""
+    """Runs that differ only in the keys that are averaged over."""
 
     name: str
     records: Mapping[Run, Record]
-    system: str = ""  # what an experiment calls it; "" outside of experiments
-    variant: tuple[str, ...] = ()  # in what it differs from others beside that: ("tracker=icp_only",)
+    system: str = ""  # name in an experiment; "" = no experiment
+    variant: tuple[str, ...] = ()  # other differences between rows: ("tracker=icp_only",)
 
     @property
     def pose_source(self) -> str:
@@ -67,20 +67,20 @@ class RunRow:
 
     @property
     def poses(self) -> str:
-        """The pose source in words, and the tracker where there was one."""
+        """Return the pose source as text, with the tracker if there is one."""
         tracked = {"tracked": f"tracked ({self._distinct(f'{CHOICE}tracker')})"}
         return tracked.get(self.pose_source, self.pose_source.replace("_", " "))
 
     @property
     def annotation(self) -> str:
-        """The release of the true instances; "" = the dataset does not say."""
+        """Return the release of the ground truth; "" = unknown."""
         return "/".join(sorted({record.annotation for record in self.records.values()}))
 
     def _distinct(self, key: str) -> str:
         return "/".join(sorted({str(record.metrics.get(key)) for record in self.records.values()}))
 
     def values(self, column: str) -> dict[Run, float]:
-        """The runs' figures, without those that are not defined."""
+        """Return the metric of each run, without undefined ones."""
         found = {run: record.metrics.get(column) for run, record in self.records.items()}
         return {run: float(value) for run, value in found.items() if is_number(value)}
 
@@ -88,9 +88,9 @@ class RunRow:
         return Mean.of(self.values(column).values())
 
     def differences(self, base: RunRow, column: str) -> dict[Run, float]:
-        """This row's figure less the base's, for the runs that both rows have.
+        """Return the metric minus that of the baseline, for the runs in both rows.
 
-        Runs of one seed have the same room and the same detections: most of what varies between seeds cancels.
+        Runs with the same seed have the same scene and detections, so most of the variation cancels.
         """
         own, others = self.values(column), base.values(column)
         return {run: own[run] - others[run] for run in own if run in others}
@@ -99,13 +99,12 @@ class RunRow:
 def rows_of(
     records: Sequence[Record], over: Sequence[str], overrides: Mapping[str, Sequence[str]] | None = None
 ) -> list[RunRow]:
-    """The rows that `records` make: those named in `overrides` first, the others by name.
+    """Group `records` into rows: those named in `overrides` first, then the others by name.
 
-    A row is what an experiment calls `row`, else what was chosen: the stages' options and the parameters in which the
-    records differ, other than the keys `over` and what follows them, as dataset.seed follows seed. A row of an
-    experiment is split by what differs inside of it, by what differs between rows although no row's overrides change
-    it (one row tracked, another with given poses; one with more frames), and always by where the data are and which
-    annotation they have. Of two records of the same run, the later one counts.
+    A row is a `row` of an experiment, else the options and parameters in which the records differ, except for the keys
+    `over` and those that follow them, as dataset.seed follows seed. A row of an experiment is split by differences
+    within it, by differences between rows that no override of a row causes (tracked or given poses, number of frames),
+    and by data folder and annotation. Of two records of the same run, the later one counts.
     """
     overrides = overrides or {}
     variants = [_Variant.of(record, over) for record in sorted(records, key=lambda record: record.written)]
@@ -126,7 +125,7 @@ def rows_of(
         variant += [f"{key}={one.parameters[key]}" for key in parameters if key in one.parameters and key not in own]
         rows.setdefault((one.row, tuple(variant)), {})[one.run] = one.record
     place = {name: k for k, name in enumerate(overrides)}
-    # what a row of an experiment is split into stands where it does
+    # the parts of a split row replace it
     order = sorted(rows, key=lambda key: (place.get(key[0], len(place)), key))
     return [_row(system, variant, rows[system, variant]) for system, variant in order]
 
@@ -137,13 +136,13 @@ def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record]) -
 
 
 def _changed(override: str) -> str:
-    """The key that an override changes: refiner for refiner=chain, refiner.links.x for refiner@refiner.links.x=y."""
+    """Return the key that an override changes: refiner.links.x for refiner@refiner.links.x=y."""
     group, _, package = override.lstrip("+~").partition("=")[0].partition("@")
     return package or group.replace("/", ".")
 
 
 def _kept(one: _Variant, changed: Collection[str]) -> Iterator[tuple[Any, Mapping[str, Any]]]:
-    """The parameters that no row says it changes, under their stage and its option: runs of two rows share them."""
+    """Yield the parameters that no row changes, by stage and option."""
     for key, value in one.parameters.items():
         if not _is_below(key, changed):
             stage = key.partition(".")[0]
@@ -151,14 +150,14 @@ def _kept(one: _Variant, changed: Collection[str]) -> Iterator[tuple[Any, Mappin
 
 
 def _is_below(key: str, others: Collection[str]) -> bool:
-    """Whether a dotted key is one of `others` or below one."""
+    """Return true if a dotted key is in `others` or below one of them."""
     parts = key.split(".")
     return any(".".join(parts[:k]) in others for k in range(1, len(parts) + 1))
 
 
 @dataclass(frozen=True)
 class _Variant:
-    """What a record says about the row and the run that it belongs to."""
+    """The row and run of a record."""
 
     record: Record
     row: str
@@ -177,7 +176,7 @@ class _Variant:
 
 
 def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
-    """The keys that had the value of one of `over` in every record, although none of its name: maybe by chance."""
+    """Return the keys with the value of one of `over` in every record but another name, perhaps by chance."""
     variants = [_Variant.of(record, over) for record in records]
     names = {key.rpartition(".")[2] for key in over}
     differing = set(_differing([("", one.parameters) for one in variants]))
@@ -185,7 +184,7 @@ def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
 
 
 def _following(variants: Sequence[_Variant], over: Sequence[str]) -> set[str]:
-    """The keys `over`, and those whose value is that of one of them in every record."""
+    """Return the keys `over`, and those with the value of one of them in every record."""
     found = set(over)
     for key in {key for one in variants for key in one.parameters}:
         for k in range(len(over)):
@@ -195,7 +194,7 @@ def _following(variants: Sequence[_Variant], over: Sequence[str]) -> set[str]:
 
 
 def _differing(groups: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
-    """The keys that have several values in one group, in their order; `groups` are groups with keys and values."""
+    """Return the keys with several values in the same group, in order; `groups` are pairs of group and values."""
     seen: dict[Any, dict[str, set[str]]] = {}
     for group, values in groups:
         for key, value in values.items():
@@ -205,5 +204,5 @@ def _differing(groups: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
 
 
 def natural(run: Run) -> tuple[tuple[float, str], ...]:
-    """Seeds in their order as numbers, other words after them."""
+    """Return a sort key: seeds as numbers, then other words."""
     return tuple((float(word) if word.isdecimal() else math.inf, word) for word in run)

@@ -1,4 +1,4 @@
-"""The map that a run left behind, as far as pictures show it."""
+"""The mesh and objects of a stored run."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class StoredMap:
     """A map of F frames with V vertices."""
 
     mesh: InstanceMesh
-    ids: Int32  # (V,) 0 = of no instance that the run counted
+    ids: Int32  # (V,) 0 = no counted instance
     class_names: Mapping[int, str]  # by instance
-    poses: Float64  # (F, 4, 4) T_world_camera of the frames that were mapped
+    poses: Float64  # (F, 4, 4) T_world_camera of the mapped frames
     record: Record
 
     @classmethod
     def of(cls, record: Record) -> StoredMap:
-        """Raises DataError, naming the file, when one cannot be read or is of another run, or nothing was mapped."""
+        """Read the map of a run. Raises DataError for invalid or inconsistent files, and for an empty map."""
         mesh, instances = read_objects(record)
         _, poses = read_tum(record.directory / TRAJECTORY)
         if not len(mesh.triangles) or not len(poses):
@@ -39,12 +39,12 @@ class StoredMap:
         return cls(mesh, ids, names, poses, record)
 
     def true_ids(self, truth: SceneTruth) -> Int32:
-        """(V,) the true instance nearest to each vertex, 0 = none, or none as near as the evaluation asks."""
+        """Return (V,) the nearest true instance of each vertex, 0 = none within the distance of the evaluation."""
         return transfer_labels(truth.points_world, truth.instance_ids, self.mesh.vertices, MAX_DISTANCE)
 
 
 def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
-    """mesh.ply and instances.json. Raises DataError when they are not of this run."""
+    """Read mesh.ply and instances.json of a completed run. Raises DataError if they are inconsistent."""
     mesh, instances = read_labeled_mesh(record.directory)
     if len(instances) != record.metrics.get("instances.count"):
         raise DataError(
@@ -55,7 +55,7 @@ def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
 
 
 def read_labeled_mesh(directory: Path) -> tuple[InstanceMesh, list[StoredInstance]]:
-    """The same of a run that may have ended early. Raises DataError when the two files are not of one run."""
+    """Read mesh.ply and instances.json of a completed or partial run. Raises DataError if they are inconsistent."""
     mesh_path, instances_path = directory / MESH, directory / INSTANCES
     instances, mesh = read_instances(instances_path), read_mesh(mesh_path)
     ids, counts = np.unique(mesh.instance_ids, return_counts=True)

@@ -1,4 +1,4 @@
-"""The records that runs have left behind, read back: which are complete, and what became of the others."""
+"""Stored runs: the completed ones, and the reasons why others are incomplete."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from framework.runs.inputs import INPUTS, inputs_sha256
 from framework.runs.provenance import code_version, config_hash, environment, shows_speed, speed_settings
 
 CONFIG = "config.yaml"
-METRICS = "metrics.json"  # there exactly when the run completed
-PARTIAL_METRICS = "metrics.partial.json"  # in its place when the run ended early, with the reason under `partial`
+METRICS = "metrics.json"  # exists only for completed runs
+PARTIAL_METRICS = "metrics.partial.json"  # of partial runs, with the reason under `partial`
 LOG = "instancemap.log"
 MAP = "map.npz"
 MESH = "mesh.ply"
 INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
-REPORT = "report.html"  # what `report` writes: made of a record, and no part of it
-KEYFRAMES = "keyframes.npz"  # what the tracker remembers, for who goes on with the map; some remember nothing
+REPORT = "report.html"  # written by `instancemap report`
+KEYFRAMES = "keyframes.npz"  # of the tracker, to resume the map; optional
 MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
-"""What is written of a map, in this order: on a disk that is full the small ones still find a place."""
+"""Files of a map in the order of writing, small ones first in case the disk is full."""
 
-EVALUATION = "evaluation."  # before the keys that name the code that evaluated anew; absent where it is that of the run
+EVALUATION = "evaluation."  # prefix of the code version of a re-evaluation
 
-FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # begin the keys of numbers in METRICS
+FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # prefixes of numeric metrics
 
 _LOG_LINE = re.compile(r"\S+ (?P<level>DEBUG|INFO|WARNING|ERROR|CRITICAL) +(?P<message>.*)")
 
@@ -48,9 +48,9 @@ class Record:
     """A completed run."""
 
     directory: Path
-    metrics: Mapping[str, Any]  # flat; None = not defined
+    metrics: Mapping[str, Any]  # flat; None = undefined
     config: Mapping[str, Any]  # resolved
-    written: float  # s, when, as the file system tells
+    written: float  # modification time, s
 
     @property
     def commit(self) -> str:
@@ -58,65 +58,60 @@ class Record:
 
     @property
     def code(self) -> str:
-        """What ran, and what evaluated it where that is other code."""
-        anew = {
-            key.removeprefix(EVALUATION): value for key, value in self.metrics.items() if key.startswith(EVALUATION)
-        }
-        evaluator = commit_of(anew) if anew else self.commit
+        """Return the commit of the run, and of its re-evaluation if that differs."""
+        prefix = len(EVALUATION)
+        later = {key[prefix:]: value for key, value in self.metrics.items() if key.startswith(EVALUATION)}
+        evaluator = commit_of(later) if later else self.commit
         return self.commit if evaluator == self.commit else f"{self.commit}, evaluated by {evaluator}"
 
     @property
     def annotation(self) -> str:
-        """Which release of the true instances the run was compared with; "" = the dataset does not say."""
+        """Return the release of the ground truth; "" = unknown."""
         return str(self.metrics.get("annotation_release") or "")
 
 
 @dataclass(frozen=True)
 class Incomplete:
-    """A run without a record that can be used, and why."""
+    """A run without usable outputs, and the reason."""
 
     directory: Path
     reason: str
 
 
-WITH_CHANGES = " with changes"  # ends the name of code that is no commit
+WITH_CHANGES = " with changes"  # suffix of a modified commit
 
 
 def commit_of(metrics: Mapping[str, Any]) -> str:
-    """The code that ran, short: "7dcc5d0", "7dcc5d0 with changes" or "unknown"."""
+    """Return the short commit of a run: "7dcc5d0", "7dcc5d0 with changes" or "unknown"."""
     changes = WITH_CHANGES if metrics.get("git_dirty") is True else ""
     return f"{str(metrics.get('git_commit'))[:7]}{changes}"
 
 
 def read_record(directory: Path) -> Record:
-    """The record of the completed run in `directory`.
-
-    Raises DataError, naming the file, when one cannot be read or the two are not of the same run.
-    """
-    metrics, config = _read_flat(directory / METRICS), read_yaml(directory / CONFIG)
-    if metrics.get("config_hash") != config_hash(config):
-        raise DataError(f"{directory / METRICS} is not of the config beside it: config_hash differs; run it again")
-    try:
-        written = (directory / METRICS).stat().st_mtime
-    except OSError as error:  # the run has just begun again
-        raise DataError(f"{directory / METRICS} cannot be read: {error.strerror}") from error
-    return Record(directory, metrics, config, written)
+    """Read the completed run in `directory`. Raises DataError for invalid or inconsistent files."""
+    return _read(directory, METRICS)
 
 
 def read_partial(directory: Path) -> tuple[Record, str]:
-    """What there is of a run that ended early, and why it did.
+    """Read the partial run in `directory`, and why it ended early. Raises DataError."""
+    record = _read(directory, PARTIAL_METRICS)
+    return record, str(record.metrics.get("partial"))
 
-    Raises DataError, naming the file, when one cannot be read or the two are not of the same run.
-    """
-    path = directory / PARTIAL_METRICS
+
+def _read(directory: Path, name: str) -> Record:
+    path = directory / name
     metrics, config = _read_flat(path), read_yaml(directory / CONFIG)
     if metrics.get("config_hash") != config_hash(config):
         raise DataError(f"{path} is not of the config beside it: config_hash differs; run it again")
-    return Record(directory, metrics, config, path.stat().st_mtime), str(metrics.get("partial"))
+    try:
+        written = path.stat().st_mtime
+    except OSError as error:  # the run has started again
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    return Record(directory, metrics, config, written)
 
 
 def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
-    """All runs at and below `root`, by path: those that completed, and the others."""
+    """Return the completed and the other runs at and below `root`, by path."""
     records: list[Record] = []
     others: list[Incomplete] = []
     for directory in _run_directories(root):
@@ -131,10 +126,10 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
 
 
 def is_recorded(directory: Path, config: DictConfig) -> bool:
-    """Whether `directory` holds the complete record of a run of this very config and inputs, and says so in the log.
+    """Return true if `directory` contains a completed run of this config and inputs, and log the reason.
 
-    Where the experiment shows frames a second, its threads and the like must agree, too. The record may be of another
-    commit: most commits change no result, and the tables name those of all their runs.
+    If the experiment's table shows the speed, settings that change times must match, too. The commit may differ: most
+    commits do not change results, and tables list the commits of their runs.
     """
     if not (directory / METRICS).exists():
         return False
@@ -149,18 +144,18 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     if record.metrics["config_hash"] != config_hash(asked):
         log.info("run again: the record in %s is of another config", directory)
         return False
-    if record.metrics.get(INPUTS) not in (None, inputs_sha256(asked)):  # None: older records do not tell
+    if record.metrics.get(INPUTS) not in (None, inputs_sha256(asked)):  # None: an older run
         log.info("run again: weights or data have changed since the record in %s", directory)
         return False
     settings = speed_settings(record.config, record.metrics)
     if shows_speed(asked) and settings != speed_settings(asked, environment()):
-        said = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in settings.items())
-        log.info("run again: the times in %s are of other settings or another machine: %s", directory, said)
+        shown = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in settings.items())
+        log.info("run again: the times in %s are of other settings or another machine: %s", directory, shown)
         return False
     if lost := [name for name in MAPPED if not (directory / name).exists()]:
         log.warning("%s has lost %s; skip_completed=false would make it again", directory, ", ".join(lost))
     now = commit_of(code_version())
-    if record.commit == now and not now.endswith(WITH_CHANGES):  # two trees with changes may differ
+    if record.commit == now and not now.endswith(WITH_CHANGES):  # modified trees may differ
         log.info("kept: the complete record in %s", directory)
     else:
         message = (
@@ -171,7 +166,7 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file with keys and values, interpolations unresolved. Raises DataError, naming the file."""
+    """Read a YAML mapping without resolving interpolations. Raises DataError."""
     if not path.exists():
         raise DataError(f"{path} is missing")
     try:
@@ -184,14 +179,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _with_text_keys(node: Any) -> Any:
-    """With text for every key, as in JSON: YAML takes 1 and true for something else, and such keys have no order."""
+    """Convert keys to text as in JSON: YAML keys such as 1 and true cannot be sorted."""
     if isinstance(node, dict):
         return {str(key): _with_text_keys(value) for key, value in node.items()}
     return [_with_text_keys(one) for one in node] if isinstance(node, list) else node
 
 
 def read_figures(directory: Path) -> dict[str, Any]:
-    """metrics.json, or metrics.partial.json of a run that ended early. Raises DataError where there is neither."""
+    """Read metrics.json, or metrics.partial.json of a partial run. Raises DataError."""
     for name in (METRICS, PARTIAL_METRICS):
         if is_there(directory / name):
             return _read_flat(directory / name)
@@ -211,7 +206,7 @@ def _read_flat(path: Path) -> dict[str, Any]:
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Whether it is a finite number, and none of Python's truth values."""
+    """Return true for a finite number that is not a boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -223,7 +218,7 @@ def _run_directories(root: Path) -> Iterator[Path]:
 
 
 def _why_incomplete(directory: Path) -> str:
-    """In words. A job's fault is the last line of its log, but for a traceback."""
+    """Return the reason. The error of a job is the last message of its log."""
     if (directory / PARTIAL_METRICS).exists():
         try:
             return f"partial: {_read_flat(directory / PARTIAL_METRICS).get('partial')}"

@@ -1,10 +1,11 @@
-"""Hydra's record of a sweep: which runs it was last asked for."""
+"""multirun.yaml: the runs of the last sweep in a folder."""
 
 from __future__ import annotations
 
 import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -15,71 +16,61 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.validation import checked_rows
 
-_OF_ITSELF = re.compile(r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}")  # what our experiments write
+_OF_ITSELF = re.compile(r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}")  # references to its own keys, as in our experiments
 
-SWEEP = "multirun.yaml"  # Hydra's sweeper leaves the experiment's config under this name
-MOST_VALUES = 1000  # of a key; a range may claim any number
-MOST_RUNS = 100_000  # of all keys together
+SWEEP = "multirun.yaml"  # written by Hydra's sweeper
+MOST_VALUES = 1000  # of a key; a range may have any number
+MOST_RUNS = 100_000  # of all keys
 
 
 def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:
-    """The values of `keys` in each job that the sweep was asked for, without a job begun yet; `sweep` is its config.
-
-    Empty where the config does not say so in plain words, such as a value for each of them.
-    """
+    """Return the values of `keys` in each job of a sweep with this config; empty if they are not plain values."""
     asked = {override.key_or_group: override for override in _overrides(sweep)}
     if not all(key in asked for key in keys):
         return []
     try:
         values = [_values(asked[key]) for key in keys]
-    except HydraException:  # glob(*), which means nothing without the config groups
+    except HydraException:  # glob(*), which depends on the config groups
         return []
     plain = not any("${" in value for column in values for value in column)
     return list(itertools.islice(itertools.product(*values), MOST_RUNS)) if plain else []
 
 
 def sweep_rows(sweep: Mapping[str, Any]) -> dict[str, list[str]]:
-    """The overrides of each of the experiment's rows, by name, as they were when it ran: without ${...}.
-
-    Raises ConfigError when `rows` is something else.
-    """
+    """Return the overrides of each of the experiment's rows by name, resolved. Raises ConfigError."""
     rows = checked_rows(sweep.get("rows"))
     try:
         resolved = OmegaConf.to_container(_without_hydra(sweep).rows, resolve=True) if rows else {}
-    except OmegaConfBaseException:  # ${hydra:...}, or what is not there
+    except OmegaConfBaseException:  # ${hydra:...}, or a missing key
         return rows
     return checked_rows(resolved)
 
 
 def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
-    """Those of the experiment's config first: the ones of the command line win."""
+    """Return the overrides of the experiment's config, then those of the command line, which take precedence."""
     found = []
     for text in [*_params(sweep), *_below(sweep, "overrides", "task", list)]:
-        try:
+        with suppress(HydraException):  # ${all_of:${rows}}, which is not a value
             found.append(OverridesParser.create().parse_override(str(text)))
-        except HydraException:  # ${all_of:${rows}}, which is no text of the command line
-            continue
     return found
 
 
 def _params(sweep: Mapping[str, Any]) -> Iterator[str]:
-    """What the experiment's config itself asks for, as overrides: ${sequences.all} is what stands there."""
+    """Yield the sweeper's parameters as overrides; ${sequences.all} is resolved."""
     params = _below(sweep, "sweeper", "params", dict)
     node = OmegaConf.merge(_without_hydra(sweep), {"params": _of_itself(params)}).params
     for key in params:
-        try:
+        with suppress(OmegaConfBaseException):  # ${hydra:...}, or a missing key
             yield f"{key}={node[key]}"
-        except OmegaConfBaseException:  # ${hydra:...}, or what is not there
-            continue
 
 
 def _without_hydra(sweep: Mapping[str, Any]) -> DictConfig:
-    """The sweep's own config, in which ${...} may stand for its other keys and for nothing else."""
+    """Return the sweep's config without Hydra's part; ${...} may refer only to its own keys."""
     return OmegaConf.create({key: _of_itself(value) for key, value in sweep.items() if key != "hydra"})
 
 
 def _of_itself(node: Any) -> Any:
-    """With "???", which cannot be resolved, for what asks for more: ${oc.env:...} would tell of this machine."""
+    """Replace other references, such as ${oc.env:...}, which depends on this machine, by "???"."""
     if isinstance(node, Mapping):
         return {key: _of_itself(value) for key, value in node.items()}
     if isinstance(node, list):
@@ -88,7 +79,7 @@ def _of_itself(node: Any) -> Any:
 
 
 def _below(sweep: Mapping[str, Any], part: str, name: str, kind: type) -> Any:
-    """`hydra.PART.NAME`, which a file that others have written may hold in another form."""
+    """Return `hydra.PART.NAME`; empty if it is missing or of another type."""
     node: Any = sweep
     for key in ("hydra", part, name):
         node = node.get(key) if isinstance(node, Mapping) else None
@@ -96,7 +87,7 @@ def _below(sweep: Mapping[str, Any], part: str, name: str, kind: type) -> Any:
 
 
 def _values(override: Override) -> list[str]:
-    """What the key becomes, as `str` writes it."""
+    """Return the values of an override as text."""
     if not override.is_sweep_override():
         return [str(override.value())]
     parser = OverridesParser.create()

@@ -1,4 +1,4 @@
-"""timings.csv read back: how long each stage took for each frame."""
+"""timings.csv: the time of each stage for each frame."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from framework.errors import DataError
 from framework.files.atomic_write import read_text
 
 HEADER = ["frame", "stage", "milliseconds"]
-LARGEST = 2**53  # numbers of frames are smaller: every program has these exactly
+LARGEST = 2**53  # limit of frame numbers, which are exact in float64
 
 
 @dataclass(frozen=True)
 class StageTimes:
-    """The times of one run."""
+    """The stage times of a run."""
 
-    frames: Int64  # (F,) numbers of the video's frames, ascending
-    milliseconds: Mapping[str, Float64]  # by stage: (F,), NaN where it did not run, as after a lost pose
+    frames: Int64  # (F,) frame numbers, ascending
+    milliseconds: Mapping[str, Float64]  # by stage: (F,), NaN = not run, as after a lost pose
 
 
 def read_timings(path: Path) -> StageTimes:
-    """The times that a run wrote. Raises DataError, naming file and line, for anything else."""
+    """Read the stage times of a run. Raises DataError."""
     try:
         lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
     except csv.Error as error:

@@ -69,6 +69,13 @@ def small(x):
 def faulty(x):
     return x.nothing
 """
+PAIRS = """
+from numba import njit
+
+@njit(cache=True)
+def first(pair):
+    return pair[0]
+"""
 CALLEE = """
 from numba import njit
 
@@ -99,6 +106,23 @@ def test_a_kernel_is_compiled_once_and_again_when_one_that_it_calls_has_changed(
     assert not Kernel("kernel_caller", "small", "float64").is_compiled()
     os.utime(small, (time.time() + 5, time.time() + 5))
     assert not kernel.is_compiled()
+
+
+def test_index_with_renamed_class_is_deleted(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "kernel_types.py").write_text("from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    x: int\n")
+    (tmp_path / "kernel_caller.py").write_text(PAIRS)
+    monkeypatch.delitem(sys.modules, "kernel_types", raising=False)
+    kernel = Kernel("kernel_caller", "first", "kernel_types.Pair(int64)")
+    compile_all([kernel])
+    assert kernel.is_compiled()
+    index = Path(kernel.dispatcher._cache._cache_file._index_path)
+    monkeypatch.delattr("kernel_types.Pair")
+    other = Kernel("kernel_caller", "first", "(int64,)")
+    assert index.exists()
+    assert not other.is_compiled()
+    assert not index.exists()
+    compile_all([other])
+    assert other.is_compiled()
 
 
 def test_a_kernel_that_cannot_be_compiled_is_named(small: Path) -> None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from framework.api import pipeline_of
+from framework.api import begin
 from framework.commands.recordings.convert_oni import convert
 from framework.config.composition import composed
 from framework.data import Camera
@@ -64,7 +64,7 @@ def run(*overrides: str) -> tuple[RGBDSequence, RunResult]:
     """The command's own stages, without detection."""
     config = composed("detector=none", "fuser.voxel_size=0.02", *overrides)
     sequence = build(RGBDSequence, config.dataset)
-    return sequence, pipeline_of(config).run(sequence)
+    return sequence, begin(config).run(sequence)
 
 
 def check_map_shows_its_frames(sequence: RGBDSequence, result: RunResult) -> None:

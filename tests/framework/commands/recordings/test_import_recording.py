@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.api import pipeline_of
+from framework.api import begin
 from framework.checking.recording_check import check
 from framework.commands.recordings import import_recording
 from framework.config.composition import composed
@@ -83,7 +83,7 @@ def test_a_phones_recording_gives_a_map(shared_data: Path, tmp_path: Path, monke
     sequence = build(RGBDSequence, config.dataset)
     found = check(sequence, 5.0)
     assert not found.faults, found.faults
-    result = pipeline_of(config).run(sequence)
+    result = begin(config).run(sequence)
     assert not any(tracked.pose.lost for tracked in result.tracked)
     assert len(result.tracked) == 60
     seen = result.scene.render(kitchen.camera, result.tracked[30].pose.T_world_camera).depth
