@@ -1,4 +1,4 @@
-"""A room cut into its objects and the rest of it; each object stands upright on the origin of its own frame."""
+"""Splits a room into objects, each upright at the origin of its own frame, and the rest of the room."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.geometry import inverse, transform
 from framework.runtime.progress import Progress
 
-REST = "room"  # the name of what is of no object
+REST = "room"  # name of the rest of the room
 
 
 @dataclass(frozen=True)
@@ -31,25 +31,27 @@ class Part:
 
     @property
     def alone(self) -> Part:
-        """By itself: it stands on the origin."""
+        """Return the part at the origin."""
         return replace(self, T_room_part=np.eye(4))
 
 
 def parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
-    """The rest of the room, then its objects; together with about so many triangles, None = as many as there are."""
-    return _with_fewer([rest(room), *(object_part(room, one) for one in room.objects)], triangles)
+    """Return the rest of the room and its objects, with about `triangles` in total; None = all."""
+    found = [rest(room), *(object_part(room, one) for one in room.objects)]
+    total = sum(len(part.mesh.triangles) for part in found)
+    if triangles is None or total <= triangles:
+        return found
+    return _decimated(found, [round(triangles / total * len(part.mesh.triangles)) for part in found])
 
 
 def object_parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
-    """Each object, with at most about so many triangles."""
+    """Return each object with at most about `triangles`; None = all."""
     found = [object_part(room, one) for one in room.objects]
-    if triangles is None:
-        return found
-    return _decimated(found, [triangles] * len(found))
+    return found if triangles is None else _decimated(found, [triangles] * len(found))
 
 
 def object_part(room: UprightRoom, one: RoomObject) -> Part:
-    """An object's mesh in its own frame: upright, along the sides of its box, whose base has its middle at 0."""
+    """Return an object in its own frame: upright, along the sides of its box, with the center of its base at 0."""
     T_room_part = np.eye(4)
     T_room_part[:3, :3] = one.box.rotation
     T_room_part[:3, 3] = one.box.center - (0.0, 0.0, one.box.extent[2] / 2)
@@ -59,7 +61,7 @@ def object_part(room: UprightRoom, one: RoomObject) -> Part:
 
 
 def rest(room: UprightRoom) -> Part:
-    """What is of none of the room's objects, with the triangles between them, so that there is no gap."""
+    """Return the rest of the room, with the triangles between objects, so that there is no gap."""
     owner = _marked(room.mesh, room.objects)
     corners = owner[room.mesh.triangles]
     outside = (corners[:, 0] == 0) | (corners != corners[:, :1]).any(axis=1)
@@ -67,23 +69,15 @@ def rest(room: UprightRoom) -> Part:
 
 
 def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
-    """(V,) the number of the object that each vertex is of, from 1; 0 = none."""
+    """Return (V,) the number of each vertex's object from 1; 0 = none."""
     owner = np.zeros(len(mesh.vertices), np.int32)
     for number, one in enumerate(objects, start=1):
         owner[one.vertices] = number
     return owner
 
 
-def _with_fewer(found: list[Part], triangles: int | None) -> list[Part]:
-    total = sum(len(part.mesh.triangles) for part in found)
-    if triangles is None or total <= triangles:
-        return found
-    share = triangles / total
-    return _decimated(found, [round(share * len(part.mesh.triangles)) for part in found])
-
-
 def _decimated(found: Sequence[Part], most: Sequence[int]) -> list[Part]:
-    """The parts with at most so many triangles each. A million takes ten seconds, so it is shown how many are done."""
+    """Decimate parts to at most `most` triangles each, with a progress bar: a million takes ten seconds."""
     fewer = []
     total = sum(len(part.mesh.triangles) for part in found)
     with Progress(total, " triangles", unit_scale=True, leave=False) as bar:
@@ -94,19 +88,19 @@ def _decimated(found: Sequence[Part], most: Sequence[int]) -> list[Part]:
     return fewer
 
 
-GREY = (176, 176, 172)  # of what is no object, where colours tell objects or classes
+GREY = (176, 176, 172)  # of the rest of the room
 
 
 class Coloring(Enum):
-    """What vertices are coloured by."""
+    """The colors of vertices."""
 
-    APPEARANCE = "appearance"  # as the camera saw them
+    APPEARANCE = "appearance"  # of the camera images
     INSTANCE = "instance"
     CLASS = "class"
 
 
 def part_colors(parts: Sequence[Part], coloring: Coloring) -> list[UInt8]:
-    """For each part the colours (V, 3) of its vertices, sRGB."""
+    """Return the vertex colors (V, 3) of each part, sRGB."""
     if coloring is Coloring.APPEARANCE:
         return [part.mesh.colors for part in parts]
     grey = np.array(GREY, np.uint8)
@@ -119,13 +113,7 @@ def part_colors(parts: Sequence[Part], coloring: Coloring) -> list[UInt8]:
 
 
 def linear(colors: UInt8) -> Float32:
-    """Colours in [0, 1] in proportion to light, of sRGB ones (IEC 61966-2-1): what glTF and USD mean by a colour."""
-    return _LINEAR[colors]
-
-
-def _decoded() -> Float32:
+    """Convert sRGB (IEC 61966-2-1) to linear colors in [0, 1], as in glTF and USD."""
     encoded = np.arange(256) / 255
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-_LINEAR = _decoded()  # (256,)
+    table = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.asarray(table[colors])

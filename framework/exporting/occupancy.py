@@ -1,17 +1,15 @@
-"""Where a robot may drive, by what a run saw: free, occupied, or unknown.
+"""Occupancy of the floor for robots: free, occupied or unknown.
 
-A map keeps the air only near to surfaces: blocks of voxels are allocated along the truncation band of what was
-measured, and no others, so that `map.npz` does not tell of most of the room whether it is empty. What does tell are the
-cameras: what stands before the surface that one of them saw, it has looked through. So the surface is drawn from poses
-spread over the whole trajectory, and a place is free where all of this holds:
+A map stores only voxels near surfaces, so it does not contain most of the free space. The surface is therefore rendered
+from poses along the whole trajectory. A cell is free if
 
 - the floor was seen there,
-- nothing of the surface is between `CLEARANCE` and the robot's height above it,
-- all of the air between these was looked through, from one of the poses.
+- no surface is between `CLEARANCE` and the robot's height,
+- the cameras looked through all space between these heights.
 
-Occupied is where something of the surface is between these heights, all else is unknown. The camera's own field of
-view is not in a run's record: that of `object_changes.EYE`, a Kinect, stands for it. What no depth camera sees, such as
-glass and mirrors, is not in the map, and the place may then be called free; what moves was mapped where it was.
+A cell with a surface between these heights is occupied, all others are unknown. A run does not contain the camera's
+field of view; a Kinect's is used (`queries.changes.EYE`). Glass and mirrors are invisible to depth cameras and may be
+called free.
 """
 
 from __future__ import annotations
@@ -24,18 +22,17 @@ from PIL import Image
 
 from framework.data import Bool, Float64, Int32, Int64, UInt8
 from framework.errors import DataError
-from framework.exporting.surface_points import SurfacePoints, surface_points
-from framework.exporting.upright_room import UprightRoom
+from framework.exporting.upright_room import SurfacePoints, UprightRoom, surface_points
 from framework.files.atomic_write import written_whole
 from framework.geometry import inverse, project, transform
 from framework.queries.changes import EYE, LOOKS
 from framework.rendering.rasterizer import Rasterizer
 
-CLEARANCE = 0.08  # m above the floor, below which nothing counts: floors are noisy by some cm
-LEVEL_STEP = 0.1  # m, of the heights at which the air is asked
-SLACK = 0.03  # m, that a surface must lie behind a place to be seen through it
-FARTHEST = 5.0  # m, that a camera measures: the default of fuser.max_depth
-WALL_SPAN = 1.0  # m of height, of an upright surface of no object: so much of it is a wall
+CLEARANCE = 0.08  # ignored height above the floor, m: floors are noisy
+LEVEL_STEP = 0.1  # vertical sampling of free space, m
+SLACK = 0.03  # minimum distance of a surface behind free space, m
+FARTHEST = 5.0  # range of the camera, m: the default of fuser.max_depth
+WALL_SPAN = 1.0  # minimum height of a wall, m
 MOST_CELLS = 2**24  # of a plan
 
 
@@ -49,30 +46,27 @@ class Plan:
     free: Bool  # (H, W)
     floor: Bool  # (H, W) where the floor was seen
     wall: Bool  # (H, W)
-    highest: Int32  # (H, W) the id of the object whose surface is the highest there, 0 = none
+    highest: Int32  # (H, W) id of the object with the highest surface, 0 = none
 
     @property
     def shape(self) -> tuple[int, int]:
         return self.free.shape[0], self.free.shape[1]
 
     def cells(self, xy: Float64) -> Int64:
-        """(P, 2) row and column of points (P, 2) m; those outside get the nearest cell."""
+        """Return (P, 2) row and column of points (P, 2) m; the nearest cell for points outside."""
         columns, rows = np.floor((xy - self.origin) / self.resolution).astype(np.int64).T
         return np.stack([np.clip(rows, 0, self.shape[0] - 1), np.clip(columns, 0, self.shape[1] - 1)], axis=1)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """m: lowest and highest x, lowest and highest y."""
+        """Return lowest and highest x, lowest and highest y, m."""
         rows, columns = self.shape
         x, y = self.origin.tolist()
         return x, x + columns * self.resolution, y, y + rows * self.resolution
 
 
 def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
-    """The floor of a room, whose height is known, with cells of `resolution` m, for a robot of `robot_height` m.
-
-    Raises DataError where nothing was mapped, or there are too many cells.
-    """
+    """Return the plan of a room with a known floor height; cell size and robot height in m. Raises DataError."""
     found = surface_points(room, resolution / 2)
     if not len(found.points):
         raise DataError("nothing was mapped: there is no floor to plan")
@@ -81,7 +75,8 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
     columns, rows = (np.floor((high - origin) / resolution) + 2).astype(np.int64).tolist()
     if rows * columns > MOST_CELLS:
         raise DataError(f"a plan of {columns} x {rows} cells is too large: raise the resolution of {resolution:g} m")
-    number = _cell_numbers(found, origin, resolution, columns)
+    column, row = np.floor((found.points[:, :2] - origin) / resolution).astype(np.int64).T
+    number = row * columns + column  # (P,) cell of each point
     heights = found.points[:, 2]
 
     def any_of(chosen: Bool) -> Bool:
@@ -96,7 +91,7 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
 
 
 def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
-    """(H, W), see the module."""
+    """Return (H, W), see the module."""
     free = drawn.floor & ~drawn.occupied
     rows, columns = np.nonzero(free)
     levels = np.arange(CLEARANCE, robot_height, LEVEL_STEP) + LEVEL_STEP / 2
@@ -108,7 +103,7 @@ def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
 
 
 def looked_through(room: UprightRoom, places: Float64) -> Bool:
-    """(P,) whether a camera of the run saw a surface behind a place (P, 3) m of the room, and none before it."""
+    """Return (P,) true if a camera of the run looked through a place (P, 3) m of the room."""
     through = np.zeros(len(places), np.bool_)
     rasterizer = Rasterizer(room.mesh.vertices, room.mesh.triangles)
     for k in np.unique(np.linspace(0, len(room.poses) - 1, LOOKS).round().astype(int)) if len(room.poses) else []:
@@ -126,14 +121,8 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
     return through
 
 
-def _cell_numbers(found: SurfacePoints, origin: Float64, resolution: float, columns: int) -> Int64:
-    """(P,) the number of the cell that each point is over."""
-    column, row = np.floor((found.points[:, :2] - origin) / resolution).astype(np.int64).T
-    return np.asarray(row * columns + column)
-
-
 def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
-    """(cells,) where upright surface of no object is at so many heights that they are WALL_SPAN together."""
+    """Return (cells,) true for at least WALL_SPAN of upright surface outside of objects."""
     chosen = found.upright & (found.owner == 0)
     step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)
     lowest, highest = step.min(initial=0), step.max(initial=0)
@@ -142,22 +131,20 @@ def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
 
 
 def _highest(found: SurfacePoints, number: Int64, cells: int) -> Int32:
-    """(cells,) see Plan."""
+    """Return (cells,), see Plan."""
     chosen = np.flatnonzero(found.owner > 0)
     rising = chosen[np.argsort(found.points[chosen, 2], kind="stable")]
     ids = np.zeros(cells, np.int32)
-    ids[number[rising]] = found.owner[rising]  # of several writes, the last one stays
+    ids[number[rising]] = found.owner[rising]  # the last of several writes counts
     return ids
 
 
-OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # levels of grey, as map_saver writes them
-OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # of (255 - level) / 255: 205 is just above the second one
+OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # gray levels of map_saver
+OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # of (255 - level) / 255: UNKNOWN is just above FREE_THRESHOLD
 
 
 def write_ros_map(directory: Path, found: Plan) -> list[Path]:
-    """Write map.pgm and map.yaml for ROS's map_server (wiki.ros.org/map_server, nav2_map_server).
-
-    The map's frame is the room's: z up, the floor at 0, the same x and y as in all exports."""
+    """Write map.pgm and map.yaml for map_server and nav2_map_server of ROS, in the room frame."""
     image, yaml = directory / "map.pgm", directory / "map.yaml"
     with written_whole(image) as temporary:
         Image.fromarray(levels(found)).save(temporary)
@@ -177,6 +164,6 @@ def write_ros_map(directory: Path, found: Plan) -> list[Path]:
 
 
 def levels(found: Plan) -> UInt8:
-    """(H, W) the picture: its first row has the highest y."""
+    """Return the image (H, W); its first row has the highest y."""
     grey = np.where(found.occupied, OCCUPIED, np.where(found.free, FREE, UNKNOWN)).astype(np.uint8)
     return np.ascontiguousarray(grey[::-1])

@@ -1,7 +1,7 @@
-"""How objects stand to each other: on, in, next to, attached to a wall. By geometry alone, whatever they are.
+"""Spatial relations between objects, by geometry alone: on, in, next to, attached to a wall.
 
-Where things touch, nobody sees their surfaces: the table under a cup is not in the map. So a thing is on another one
-where that has a level surface around its foot, at the height of it, or where its top is there and below it.
+Contact surfaces are hidden: the table under a cup is not in the map. An object is therefore on another one that has a
+level surface around its foot at the height of its base, or whose top is there.
 """
 
 from __future__ import annotations
@@ -17,30 +17,29 @@ from scipy.spatial import KDTree
 
 from framework.data import Bool, Float32, Float64, Int64
 from framework.exporting.occupancy import Plan
-from framework.exporting.surface_points import surface_points
-from framework.exporting.upright_room import RoomObject, UprightRoom
+from framework.exporting.upright_room import RoomObject, UprightRoom, surface_points
 
-SPACING = 0.02  # m, of the points that stand for a surface
-CELL = 0.03  # m, of footprints
-TOUCHING = 0.05  # m, between a base and what it stands on: depth is noisy, and its edge mixes with what is beneath
-ON_FLOOR = 0.10  # m, above which nothing that is seen stands on the floor; legs are thin, and end early
-FOOT = 0.10  # m, of a thing above its base, that stands on something
-AROUND = 2  # cells about a foot, in which what it stands on is seen
-COVERED = 0.35  # of these, that have a level surface at its base; what lies beside it has less
-STACKED = 0.5  # of a foot's cells, that are over the other thing
-WITHIN = 0.9  # of a thing's surface in the box of another one, that holds it
-SECTORS = 36  # of directions around it; the legs of a table fill a few
-ALL_ROUND, UNDER_ROOF = 30, 16  # of these with the other one's surface at its height: in a bowl; on a cupboard's shelf
-BESIDE = 0.3  # m, between surfaces, up to which things are next to each other
-ON_WALL = 0.10  # m from a wall, within which is all of what hangs on it
-HANGING = 0.7  # of its cells
-STRAY = 2.0  # % of a surface at its lower and at its upper end that may be noise
-MOST_POINTS = 3000  # of an object, that distances are measured from
+SPACING = 0.02  # of surface points, m
+CELL = 0.03  # cell size of footprints, m
+TOUCHING = 0.05  # maximum distance of a base from its support, m: depth is noisy at edges
+ON_FLOOR = 0.10  # maximum height of the seen part of an object on the floor, m; thin legs are incomplete
+FOOT = 0.10  # height of the foot above the base, m
+AROUND = 2  # width of the ring around a foot, cells
+COVERED = 0.35  # minimum fraction of the ring with a level surface at the base
+STACKED = 0.5  # minimum fraction of the foot above the support
+WITHIN = 0.9  # minimum fraction of a surface in the box of its container
+SECTORS = 36  # number of directions around an object; the legs of a table fill few
+ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in a bowl, and on a covered shelf
+BESIDE = 0.3  # maximum distance of neighbors, m
+ON_WALL = 0.10  # maximum distance from a wall, m
+HANGING = 0.7  # minimum fraction of points near a wall
+STRAY = 2.0  # % of a surface at its lower and upper end that may be noise
+MOST_POINTS = 3000  # of an object for distances
 
 
 @dataclass(frozen=True)
 class Relation:
-    """`source` is `name` `target`; these are objects' ids, or "floor" and "walls"."""
+    """`source` is `name` `target`: ids of objects, or "floor" and "walls"."""
 
     source: int
     name: str  # "on", "in", "next_to", "attached_to"
@@ -49,9 +48,15 @@ class Relation:
 
 
 def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:
-    """All relations of a room's objects, by their ids. Without a plan nothing is said of floor and walls."""
+    """Return all relations of a room's objects; without a plan, none to floor and walls."""
     found = surface_points(room, SPACING)
-    things = [_thing(room, one, found.points, found.owner == one.id, found.level) for one in room.objects]
+    things = []
+    for one in room.objects:
+        own = found.owner == one.id
+        points, level = found.points[own], found.level[own]
+        if not len(points):  # too few vertices for a triangle
+            points, level = room.mesh.vertices[one.vertices], np.zeros(len(one.vertices), np.bool_)
+        things.append(_Thing(one.id, one, points, level))
     standing = [relation for thing in things if (relation := _standing(thing, things, plan)) is not None]
     joined = {frozenset((relation.source, relation.target)) for relation in standing}
     beside = [
@@ -64,7 +69,7 @@ def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:
 
 @dataclass(frozen=True)
 class _Thing:
-    """An object as its relations are found."""
+    """An object with cached geometry."""
 
     id: int
     box: RoomObject
@@ -97,15 +102,8 @@ class _Thing:
         return {(i + di, j + dj) for i, j in self.foot for di in steps for dj in steps} - self.foot
 
 
-def _thing(room: UprightRoom, one: RoomObject, points: Float32, own: Bool, level: Bool) -> _Thing:
-    if own.any():
-        return _Thing(one.id, one, points[own], level[own])
-    vertices = room.mesh.vertices[one.vertices]  # of too few for a triangle
-    return _Thing(one.id, one, vertices, np.zeros(len(vertices), np.bool_))
-
-
 def _standing(thing: _Thing, things: list[_Thing], plan: Plan | None) -> Relation | None:
-    """What a thing stands on, is in or hangs on; None where that cannot be told."""
+    """Return the support, container or wall of an object; None = unknown."""
     others = [other for other in things if other.id != thing.id]
     holder = next((other for other in others if _is_in(thing, other)), None)
     if holder is not None:
@@ -125,7 +123,7 @@ def _standing(thing: _Thing, things: list[_Thing], plan: Plan | None) -> Relatio
 
 
 def _carries(below: _Thing, above: _Thing) -> float:
-    """How well one thing carries another one, in [0, 1]; 0 = it does not."""
+    """Return how well one object supports another, in [0, 1]; 0 = not at all."""
     if below.base >= above.base or below.tree.n < 1:
         return 0.0
     near = below.level & (np.abs(below.points[:, 2] - above.base) <= TOUCHING)
@@ -139,7 +137,7 @@ def _carries(below: _Thing, above: _Thing) -> float:
 
 
 def _is_in(inner: _Thing, outer: _Thing) -> bool:
-    """Whether a thing is in another one: within its box, with that one's surface around it or over and around it."""
+    """Return true if an object is in the box of another one whose surface surrounds or covers it."""
     box = outer.box.box
     local = np.abs((inner.points - box.center) @ box.rotation)
     if float(np.mean((local <= box.extent / 2 + SPACING).all(axis=1))) < WITHIN:
@@ -157,7 +155,7 @@ def _is_in(inner: _Thing, outer: _Thing) -> bool:
 
 
 def _gap(a: _Thing, b: _Thing) -> float:
-    """m between two surfaces whose heights overlap; infinite where they do not, or are far from each other."""
+    """Return the distance of two surfaces, m; infinite if their heights do not overlap or they are far apart."""
     if min(a.top, b.top) < max(a.base, b.base):
         return float("inf")
     fewer, more = sorted((a, b), key=lambda thing: thing.tree.n)
@@ -174,6 +172,6 @@ def _hangs(thing: _Thing, plan: Plan) -> bool:
 
 
 def _cells(xy: Float32 | Float64) -> set[tuple[int, int]]:
-    """The cells of a footprint that points (P, 2) m are over."""
+    """Return the footprint cells of points (P, 2) m."""
     numbers: Int64 = np.unique(np.floor(xy / CELL).astype(np.int64), axis=0)
     return set(map(tuple, numbers.tolist()))

@@ -1,8 +1,7 @@
-"""Rooms: the known floor of a plan, cut where walls leave no more than a door between them.
+"""Rooms: the known floor of a plan, separated by walls with openings of at most a door.
 
-What lies farther than half a door from every wall is the inside of rooms; its connected pieces grow back towards each
-other and meet in the doors. Only walls cut: furniture and places that nobody saw do not. So where walls were hardly
-seen there is one room.
+The parts that are farther than half a door from every wall are the interiors of rooms; they grow until they meet in the
+doors. Only walls separate rooms, not furniture or unseen places: without visible walls there is one room.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from framework.data import Bool, Float64, Int32
 from framework.exporting.occupancy import Plan
 
 DOOR = 1.0  # m, the widest opening that separates rooms; most doors have 0.7 to 0.95
-GAP = 0.3  # m, of what was not seen between known places, that is taken for known
-LEAST_INSIDE = 0.5  # m^2 of a room's inside, farther than DOOR / 2 from its walls
+GAP = 0.3  # maximum width of unseen gaps that are filled, m
+LEAST_INSIDE = 0.5  # minimum interior of a room, m^2
 
 
 @dataclass(frozen=True)
 class Door:
-    """Where two rooms meet."""
+    """The opening between two rooms."""
 
     rooms: tuple[int, int]
     place: Float64  # (2,) m
@@ -32,9 +31,9 @@ class Door:
 
 @dataclass(frozen=True)
 class Rooms:
-    """The rooms of a plan, numbered from 1 by falling area."""
+    """The rooms of a plan, numbered from 1 by decreasing area."""
 
-    labels: Int32  # (H, W) 0 = of none
+    labels: Int32  # (H, W) 0 = none
     doors: tuple[Door, ...]
     plan: Plan
 
@@ -43,15 +42,15 @@ class Rooms:
         return int(self.labels.max(initial=0))
 
     def area(self, room: int) -> float:
-        """m^2"""
+        """Return the area of a room, m^2."""
         return float(np.count_nonzero(self.labels == room)) * self.plan.resolution**2
 
     def center(self, room: int) -> Float64:
-        """(2,) m"""
+        """Return the center of a room, (2,) m."""
         return _place(self.plan, self.labels == room)
 
     def of(self, xy: Float64) -> int:
-        """The room that most of some points (P, 2) m, P > 0, are in or next to; 0 where there is none."""
+        """Return the room nearest to most of the points (P, 2) m, P > 0; 0 = no rooms."""
         if not self.count:
             return 0
         nearest = ndimage.distance_transform_edt(self.labels == 0, return_distances=False, return_indices=True)
@@ -61,7 +60,7 @@ class Rooms:
 
 
 def rooms(plan: Plan) -> Rooms:
-    """The rooms of a plan; none where nothing is known."""
+    """Return the rooms of a plan."""
     known = plan.floor | plan.free | plan.occupied
     margin = int(np.ceil(GAP / plan.resolution))
     round_ = _disk(GAP / plan.resolution)
@@ -82,7 +81,7 @@ def rooms(plan: Plan) -> Rooms:
 
 
 def _grown(labels: Int32, domain: Bool) -> Int32:
-    """Labels (H, W) that spread over the domain (H, W) cell by cell, until they meet."""
+    """Spread labels (H, W) over the domain (H, W) cell by cell until they meet."""
     cross = ndimage.generate_binary_structure(2, 1)
     while True:
         spread = np.where((labels == 0) & domain, ndimage.maximum_filter(labels, footprint=cross), labels)
@@ -92,7 +91,7 @@ def _grown(labels: Int32, domain: Bool) -> Int32:
 
 
 def _doors(labels: Int32, plan: Plan) -> tuple[Door, ...]:
-    """A door for each connected line along which two rooms meet."""
+    """Return a door for each connected border between two rooms."""
     doors = []
     every = np.ones((3, 3), np.bool_)
     for a, b in combinations(range(1, int(labels.max()) + 1), 2):
@@ -106,7 +105,7 @@ def _doors(labels: Int32, plan: Plan) -> tuple[Door, ...]:
 
 
 def _place(plan: Plan, cells: Bool) -> Float64:
-    """(2,) m, the middle of cells (H, W)."""
+    """Return (2,) m, the center of cells (H, W)."""
     rows, columns = np.nonzero(cells)
     return np.asarray((np.array([columns.mean(), rows.mean()]) + 0.5) * plan.resolution + plan.origin)
 

@@ -1,4 +1,4 @@
-"""scene_graph.json: objects, surfaces and rooms, and how they stand to each other; scene_graph.schema.json says how."""
+"""scene_graph.json: objects, surfaces and rooms with their relations; see scene_graph.schema.json."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from framework.exporting.rooms import Rooms, rooms
 from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.files.json_file import write_json
 
-DIGITS = 4  # behind the point, of metres
+DIGITS = 4  # decimal places of meters
 
 
 def write_scene_graph(path: Path, room: UprightRoom, plan: Plan | None) -> None:
-    """Writes the graph of a room; without a plan, as where the floor is not known, without floor, walls and rooms."""
+    """Write the graph of a room; without a plan (unknown floor), it omits floor, walls and rooms."""
     write_json(path, scene_graph(room, plan))
 
 
 def scene_graph(room: UprightRoom, plan: Plan | None) -> dict[str, Any]:
-    """The graph as JSON has it."""
     divided = rooms(plan) if plan is not None else None
     nodes = [_object_node(one) for one in room.objects]
     edges = _edges(room, relations(room, plan))
@@ -74,7 +73,7 @@ def _edges(room: UprightRoom, found: list[Relation]) -> list[dict[str, Any]]:
 
 
 def _room_edges(room: UprightRoom, divided: Rooms) -> list[dict[str, Any]]:
-    """Which room each object is in, and which rooms have a door between them."""
+    """Return the room of each object, and the doors between rooms."""
     inside = [(one, divided.of(room.mesh.vertices[one.vertices, :2].astype(np.float64))) for one in room.objects]
     placed = [{"source": one.name, "relation": "in", "target": f"room_{k}"} for one, k in inside if k]
     doors = [

@@ -1,7 +1,7 @@
-"""A stored run as exports see it: its surface and its objects in a frame that stands upright on the floor.
+"""A stored run in a frame that stands upright on the floor: its surface, its objects, and points on the surface.
 
-The room's frame: metres, z up, the floor at z = 0. It is the world turned by the smallest angle that makes it upright,
-and moved along z; so where the world's z is up, x and y are the world's own.
+The room frame is in meters, z up, the floor at z = 0: the world, rotated by the smallest angle that makes it upright,
+and translated along z. If the world's z is up, x and y are the world's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from framework.data import Box, Float64, InstanceMesh, Int32, UInt8
+from framework.data import Bool, Box, Float32, Float64, InstanceMesh, Int32, Int64, UInt8
 from framework.errors import DataError
 from framework.files.atomic_write import is_there
 from framework.files.tum_trajectory import read_tum
@@ -32,11 +32,14 @@ from framework.runs.run_directory import LIKELY
 from framework.runs.stored_map import read_labeled_mesh
 from framework.runs.stored_runs import INSTANCES, MESH, TRAJECTORY, read_figures
 
-LONGEST_NAME = 60  # characters of a class, in the names of files and of nodes
+LONGEST_NAME = 60  # characters of a class in names of files and nodes
 UP = np.array([0.0, 0.0, 1.0])
-HIGHEST = 1e4  # m, of a floor; vertices are float32
-SPECK = 0.01  # of an object's vertices: labels leak through edges of depth, and would widen its box
-SHORTEST_UP = 1e-6  # of a vector that may say what is up
+HIGHEST = 1e4  # limit of the floor height, m; vertices are float32
+SPECK = 0.01  # fraction of an object's vertices: loose pieces at depth edges would widen its box
+MOST_POINTS = 2**24  # of a room; 100 m^2 of surface have 4 million at 1 cm voxels
+LEVEL = float(np.cos(np.radians(30.0)))  # minimum z of the normal of a supporting surface
+UPRIGHT = float(np.sin(np.radians(20.0)))  # maximum |z| of the normal of a wall
+SHORTEST_UP = 1e-6  # minimum length of an up direction
 
 
 @dataclass(frozen=True)
@@ -46,20 +49,20 @@ class RoomObject:
     id: int
     class_name: str
     confidence: float  # in [0, 1]
-    probability: float | None  # of its class, in [0, 1]; None = the record does not tell
-    vertices: Int32  # (M,) of the room's mesh, M > 0, without specks
+    probability: float | None  # of its class, in [0, 1]; None = unknown
+    vertices: Int32  # (M,) indices into the room's mesh, M > 0, without specks
     box: Box  # upright, in the room
-    color: UInt8  # (3,) sRGB, of its own: that of overview.png
-    class_color: UInt8  # (3,) sRGB, of all objects of its class
+    color: UInt8  # (3,) sRGB, as in overview.png
+    class_color: UInt8  # (3,) sRGB
 
     @property
     def name(self) -> str:
-        """`chair_7`, each object another one."""
+        """Return a unique name: `chair_7`."""
         return plain_name(self.class_name, self.id)
 
     @property
     def footprint(self) -> Float64:
-        """(4, 2) m, the corners of its box on the floor, counterclockwise from above."""
+        """Return (4, 2) m, the corners of its box on the floor, counterclockwise from above."""
         (x, y, _), (width, depth, _) = self.box.center, self.box.extent
         first, second = self.box.rotation[:2, 0] * width / 2, self.box.rotation[:2, 1] * depth / 2
         corners = [-first - second, first - second, first + second, second - first]
@@ -67,34 +70,34 @@ class RoomObject:
 
     @property
     def base(self) -> float:
-        """m, of its lowest point."""
+        """Return the height of its lowest point, m."""
         return float(self.box.center[2] - self.box.extent[2] / 2)
 
     @property
     def top(self) -> float:
-        """m, of its highest point."""
+        """Return the height of its highest point, m."""
         return float(self.box.center[2] + self.box.extent[2] / 2)
 
 
 @dataclass(frozen=True)
 class UprightRoom:
-    """A stored run's surface and objects."""
+    """The surface and objects of a stored run."""
 
-    mesh: InstanceMesh  # vertices in the room; labels of all objects, also of those that are not among `objects`
+    mesh: InstanceMesh  # in the room frame; with the labels of all objects, also of those not in `objects`
     objects: tuple[RoomObject, ...]  # by id
-    poses: Float64  # (F, 4, 4) T_room_camera of the frames that were mapped
+    poses: Float64  # (F, 4, 4) T_room_camera of the mapped frames
     T_room_world: Float64  # (4, 4)
-    up_known: bool  # else the world's z is taken for up
-    floor_known: bool  # else z = 0 is where the world has it
+    up_known: bool  # false: the world's z is used
+    floor_known: bool  # false: z = 0 as in the world
 
     @cached_property
     def surface(self) -> Surface:
         return Surface(self.mesh.vertices, self.mesh.triangles)
 
     def chosen(self, asked: Sequence[str], min_confidence: float) -> UprightRoom:
-        """With the objects that are asked for, by id or class, and with a class those of some confidence; all = ().
+        """Return the room with the objects that have these ids or classes; () = all.
 
-        Raises DataError for an object or a class that there is not.
+        Objects that are not chosen by id need the minimum confidence. Raises DataError for an unknown id or class.
         """
         likely = [one for one in self.objects if one.confidence >= min_confidence]
         if not asked:
@@ -114,21 +117,21 @@ class UprightRoom:
 
 
 def plain_name(class_name: str, key: int) -> str:
-    """`chair_7`: letters of ASCII, digits and underscores, so that it may name a file, a node or a prim."""
+    """Return a name for files, nodes and prims: ASCII letters, digits and underscores, such as `chair_7`."""
     plain = re.sub(r"[^A-Za-z0-9]+", "_", class_name).strip("_")[:LONGEST_NAME]
     return f"{plain if plain[:1].isalpha() else f'object_{plain}'.rstrip('_')}_{key}"
 
 
 def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None = None) -> UprightRoom:
-    """The room of a run, whole or partial; `up` (3,) and `floor` (m along up) say what its record does not tell.
+    """Read the room of a completed or partial run; `up` (3,) and `floor` (m along up) override its metrics.
 
-    Raises DataError where there is no run, or its files cannot be read or are not of one run.
+    Raises DataError for missing, invalid or inconsistent files.
     """
     figures = read_figures(run)
     instances: Sequence[StoredInstance] = []
     if is_there(run / INSTANCES):
         mesh, instances = read_labeled_mesh(run)
-    else:  # of a run that ended early
+    else:  # a partial run
         mesh = read_mesh(run / MESH)
     direction = _direction(f"{run}: map.up", figures) if up is None else _unit("up", up)
     height = _height(f"{run}: map.floor_m", figures.get("map.floor_m") if floor is None and up is None else floor)
@@ -146,7 +149,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
 
 
 def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple[RoomObject, ...]:
-    """Those that have vertices in a room's mesh, by id, without their specks: loose pieces of less than SPECK."""
+    """Return the objects with vertices in a room's mesh by id, without loose pieces of less than SPECK."""
     pieces = _pieces(mesh)
     order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
     ids = mesh.instance_ids[order]
@@ -165,7 +168,7 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
         found.append(
             RoomObject(
                 id=one.id,
-                class_name=one.class_name.encode(errors="backslashreplace").decode(),  # it may be no text
+                class_name=one.class_name.encode(errors="backslashreplace").decode(),  # may not be valid text
                 confidence=one.confidence,
                 probability=one.probability,
                 vertices=own,
@@ -178,7 +181,7 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
 
 
 def _pieces(mesh: InstanceMesh) -> Int32:
-    """(V,) the number of the piece that each vertex is in: what triangles join whose corners are of one object."""
+    """Return (V,) the connected piece of each vertex; only triangles within one object connect."""
     ids = mesh.instance_ids[mesh.triangles]
     joined = mesh.triangles[(ids > 0).all(axis=1) & (ids == ids[:, :1]).all(axis=1)]
     edges = np.concatenate([joined[:, :2], joined[:, 1:]]).T
@@ -187,7 +190,7 @@ def _pieces(mesh: InstanceMesh) -> Int32:
 
 
 def facing(box: Box) -> Box:
-    """The same upright box, with that of its sides for the first that is nearest to the room's x axis."""
+    """Return the same upright box with its first axis nearest to the room's x axis."""
     angle = float(np.arctan2(box.rotation[1, 0], box.rotation[0, 0]))
     turns = round(angle / (np.pi / 2))
     yaw = angle - turns * np.pi / 2
@@ -199,7 +202,7 @@ def facing(box: Box) -> Box:
 
 
 def upright(up: Float64, floor: float) -> Float64:
-    """T_room_world (4, 4): the smallest turn that takes the unit vector `up` to z, and `floor` m along it to z = 0."""
+    """Return T_room_world (4, 4): the smallest rotation of the unit vector `up` to z, with `floor` m along it at 0."""
     T = np.eye(4)
     across, cosine = skew(np.cross(up, UP)), float(up @ UP)
     T[:3, :3] += across + across @ across / (1 + cosine) if cosine > -1 + 1e-9 else np.diag([0.0, -2.0, -2.0])
@@ -232,3 +235,66 @@ def _hint(word: str, objects: Sequence[RoomObject]) -> str:
         return ", which has none"
     close = get_close_matches(word, names, n=1)
     return f"; did you mean {close[0]!r}?" if close else f"; it has {', '.join(names)}, and their ids"
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """P points on a room's surface, evenly spread whatever the size of its triangles."""
+
+    points: Float32  # (P, 3) m, room
+    normal_z: Float32  # (P,) of the unit normal
+    owner: Int32  # (P,) id of the object that contains the whole triangle, 0 = none
+
+    @property
+    def level(self) -> Bool:
+        """Return (P,) true if it faces up."""
+        return np.asarray(self.normal_z > LEVEL)
+
+    @property
+    def upright(self) -> Bool:
+        """Return (P,) true if it may be part of a wall."""
+        return np.asarray(np.abs(self.normal_z) < UPRIGHT)
+
+
+def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
+    """Return the centers of a room's triangles, which are split into pieces with sides of at most `spacing` m.
+
+    Raises DataError for more than MOST_POINTS.
+    """
+    vertices, triangles = room.mesh.vertices, room.mesh.triangles
+    corners = vertices[triangles]  # (F, 3, 3)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0)
+    cuts = np.maximum(np.ceil(longest / spacing), 1)
+    if float((cuts**2).sum()) > MOST_POINTS:
+        raise DataError(
+            f"the surface is too large for points {spacing:g} m apart: raise the resolution, or map with larger voxels"
+        )
+    normals = room.surface.face_normals
+    normal_z = (normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-20)).astype(np.float32)
+    owner = np.zeros(len(vertices), np.int32)
+    for one in room.objects:
+        owner[one.vertices] = one.id
+    ids = owner[triangles]
+    of_triangle = np.where((ids == ids[:, :1]).all(axis=1), ids[:, 0], 0).astype(np.int32)
+    points, chosen = [], []
+    for n in np.unique(cuts).astype(np.int64).tolist():
+        these = np.flatnonzero(cuts == n)
+        weights = middles(n)
+        points.append(np.einsum("kc,fcx->fkx", weights, corners[these]).reshape(-1, 3))
+        chosen.append(np.repeat(these, len(weights)))
+    which: Int64 = np.concatenate(chosen) if chosen else np.zeros(0, np.int64)
+    return SurfacePoints(
+        np.concatenate(points).astype(np.float32) if points else np.zeros((0, 3), np.float32),
+        normal_z[which],
+        of_triangle[which],
+    )
+
+
+def middles(n: int) -> Float64:
+    """Return (n^2, 3) barycentric coordinates of the centers of equal pieces of a triangle, n along each side."""
+    i, j = (index.ravel() for index in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+    up, down = i + j < n, i + j < n - 1
+    first = np.stack([i[up] + 1 / 3, j[up] + 1 / 3], axis=1)
+    second = np.stack([i[down] + 2 / 3, j[down] + 2 / 3], axis=1)
+    ij = np.concatenate([first, second]) / n
+    return np.column_stack([1 - ij.sum(axis=1), ij])

@@ -1,13 +1,13 @@
-"""Universal Scene Description for simulators: visible meshes, collision proxies and semantic labels.
+"""Universal Scene Description for simulators: visible meshes, collision shapes and semantic labels.
 
-    /World                      kind = assembly, z up, metres
+    /World                      kind = assembly, z up, meters
       PhysicsScene              gravity
-      room                      the rest of the room: its own triangles collide, as what stands fast
+      room                      the rest of the room: static, its triangles collide
       chair_7                   kind = component; UsdSemantics label "class"; UsdPhysics rigid body, not enabled
-        visual                  Mesh with displayColor, linear
+        visual                  Mesh with linear displayColor
         collision               Mesh (convex hull) or Cube, purpose = guide
 
-An object stands on the origin of its own prim. It stays where it is until `physics:rigidBodyEnabled` is set.
+An object stands at the origin of its prim, and is static until `physics:rigidBodyEnabled` is set.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from framework.files.atomic_write import written_whole
 
 MISSING = "USD files need the package usd-core: pip install instancemap[usd]"
 NOT_WRITTEN = "USD could not write it"
-THINNEST = 0.002  # m, of a box that things collide with: what was seen from one side may be flat
+THINNEST = 0.002  # minimum side of a collision box, m: an object seen from one side may be flat
 GRAVITY = 9.81  # m/s^2
 
 
 class Collision(Enum):
-    """What an object collides by."""
+    """The collision shape of an object."""
 
-    HULL = "hull"  # its convex hull, or its box where it is flat
+    HULL = "hull"  # convex hull, or the box of a flat object
     BOX = "box"
 
 
 def check_usd() -> None:
-    """Raises DataError, which says what to install, where USD is not."""
+    """Raise DataError with the extra to install if USD is missing."""
     try:
         import pxr  # noqa: F401
     except ImportError as error:
@@ -47,15 +47,9 @@ def check_usd() -> None:
 
 
 def write_usd(
-    path: Path,
-    parts: Sequence[Part],
-    coloring: Coloring = Coloring.APPEARANCE,
-    collision: Collision = Collision.HULL,
+    path: Path, parts: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE, collision: Collision = Collision.HULL
 ) -> None:
-    """Writes parts as one stage, each where it stands; the same parts give the same bytes.
-
-    Raises DataError where usd-core is not installed, or the disk does not take the file.
-    """
+    """Write parts as one stage, in the room frame; the same parts give the same bytes. Raises DataError."""
     check_usd()
     from pxr import Gf, Kind, Tf, Usd, UsdGeom, UsdPhysics
 
@@ -101,7 +95,7 @@ def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> 
     assert one is not None
     root = UsdGeom.Xform.Define(stage, f"/World/{part.name}")
     prim = root.GetPrim()
-    root.AddTransformOp().Set(Gf.Matrix4d(part.T_room_part.T.tolist()))  # rows there are columns here
+    root.AddTransformOp().Set(Gf.Matrix4d(part.T_room_part.T.tolist()))  # USD transposes matrices
     Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
     UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr(Vt.TokenArray([one.class_name]))
     prim.SetCustomDataByKey("instancemap:id", one.id)
@@ -115,7 +109,7 @@ def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> 
 
 
 def _add_proxy(stage: Any, path: str, vertices: Float32, collision: Collision) -> None:
-    """What an object collides by, which is not rendered."""
+    """Add the collision shape of an object, which is not rendered."""
     from pxr import Gf, UsdGeom, UsdPhysics
 
     hull = convex_hull(vertices) if collision is Collision.HULL else None
@@ -153,10 +147,7 @@ def _color(mesh: Any, colors: UInt8) -> None:
 
 
 def convex_hull(vertices: Float32) -> tuple[Float32, Int32] | None:
-    """The vertices (H, 3) and the triangles, facing out, of the convex hull of points (M, 3) m.
-
-    None of what spans none: fewer than four points, or points in a plane.
-    """
+    """Return the vertices (H, 3) and outward triangles of the convex hull of points (M, 3) m; None = no volume."""
     try:
         hull = ConvexHull(vertices.astype(np.float64))
     except (QhullError, ValueError):

@@ -27,14 +27,7 @@ from framework.rendering.overview import write_overview
 from framework.runs.inputs import INPUTS, inputs_sha256
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
-from framework.runs.metrics import (
-    Metrics,
-    class_name,
-    instance_metrics,
-    room_metrics,
-    run_metrics,
-    trajectory_metrics,
-)
+from framework.runs.metrics import Metrics, class_name, instance_metrics, room_metrics, run_metrics, trajectory_metrics
 from framework.runs.provenance import code_version, config_hash, environment
 from framework.runs.stored_runs import (
     CONFIG,

@@ -15,7 +15,7 @@ from framework.errors import ConfigError
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Compiles the kernels of a run with the default stages, which numba stores for later runs of this "
-        "installation. Compiled kernels are skipped.",
+        "installation. Compiled kernels are skipped."
     )
     parser.add_argument("words", metavar="WORD", nargs="*", help="only kernels whose names contain one of these")
     parser.add_argument("--all", action="store_true", help="also the kernels of other stages")

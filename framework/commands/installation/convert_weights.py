@@ -14,7 +14,7 @@ from framework.errors import ConfigError
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="Converts a Mask R-CNN of torchvision or detectron2 for detector=mask_rcnn.",
+        description="Converts a Mask R-CNN of torchvision or detectron2 for detector=mask_rcnn."
     )
     parser.add_argument("source", metavar="IN", type=Path, help="name of a published network, or a .pth or .pkl file")
     parser.add_argument("target", metavar="OUT", type=Path, help="the .safetensors file to write")

@@ -24,7 +24,7 @@ LEGEND = "ok: available   --: missing, optional   !!: missing or broken, require
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Checks the installation and prints the fix for each problem. Paste the output into an issue: it"
-        " does not contain your user name or home folder. Exits with 1 if a run with the default stages cannot work.",
+        " does not contain your user name or home folder. Exits with 1 if a run with the default stages cannot work."
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args([word for word in sys.argv[1:] if not word.startswith("debug=")])

@@ -74,7 +74,7 @@ VARIANTS = {  # by stage: a parameter for an option that inherits
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="Writes a repository with a plugin of your own, which works at once: package, option, tests, CI.",
+        description="Writes a repository with a plugin of your own, which works at once: package, option, tests, CI."
     )
     parser.add_argument("stage", metavar="STAGE", choices=GROUPS, help=", ".join(GROUPS))
     parser.add_argument("name", metavar="NAME", help="of the option, such as my_refiner: refiner=my_refiner")

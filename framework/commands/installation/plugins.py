@@ -25,15 +25,7 @@ from framework.commands.command_line import arguments, one_line_errors
 from framework.config.composition import config_loader, one_line
 from framework.config.hydra_api import CachingConfigRepository
 from framework.errors import ConfigError, DataError
-from framework.registry import (
-    GROUPS,
-    check_option,
-    composition,
-    find_class,
-    holds_one,
-    parameter_fields,
-    plugin_fields,
-)
+from framework.registry import GROUPS, check_option, composition, find_class, holds_one, parameter_fields, plugin_fields
 
 COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)

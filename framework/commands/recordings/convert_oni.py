@@ -26,7 +26,7 @@ PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # a higher level takes longer than playi
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="Converts an OpenNI recording to SceneNN's images. Needs OpenNI 2: apt-get install libopenni2-0.",
+        description="Converts an OpenNI recording to SceneNN's images. Needs OpenNI 2: apt-get install libopenni2-0."
     )
     parser.add_argument("source", metavar="FILE.oni", type=Path, help="the recording, oni/NNN.oni")
     parser.add_argument("target", metavar="OUT", type=Path, help="the scene's folder, DIR/NNN; without images")

@@ -17,7 +17,7 @@ def main() -> None:
     default = BenchmarkSettings()
     parser = argparse.ArgumentParser(
         description="Writes synthetic rooms to DIR in SceneNN's format: images, depth, trajectory, labeled mesh. The "
-        "same parameters give the same bytes. Existing rooms are kept.",
+        "same parameters give the same bytes. Existing rooms are kept."
     )
     add = parser.add_argument
     add("directory", metavar="DIR", type=Path, help="new folder, or one that this command began")

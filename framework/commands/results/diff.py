@@ -24,7 +24,7 @@ UNCHANGED = (Kind.STAYED, Kind.NOT_SEEN)
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Lists the objects that appeared, vanished or moved between two runs, with probabilities. Both "
-        "need the same world frame: run the second with localize_in=FIRST, or both with given poses.",
+        "need the same world frame: run the second with localize_in=FIRST, or both with given poses."
     )
     parser.add_argument("before", metavar="FIRST", type=Path, help="run directory of the first visit")
     parser.add_argument("after", metavar="SECOND", type=Path, help="run directory of the second visit")

@@ -25,7 +25,7 @@ REFUSED = "refused: "  # prefix of an error
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Re-evaluates the instances of stored runs from mesh.ply and instances.json, updates these metrics "
-        "in metrics.json and prints the changes. Other metrics, such as those of the trajectory, are not changed.",
+        "in metrics.json and prints the changes. Other metrics, such as those of the trajectory, are not changed."
     )
     parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory, or a folder of them")
     parser.add_argument(

@@ -12,7 +12,7 @@ from framework.commands.command_line import arguments, one_line_errors
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Exports the scene of a run, its separate objects (upright, at the origin, in meters), a floor "
-        "plan or a scene graph to the formats of other programs.",
+        "plan or a scene graph to the formats of other programs."
     )
     add = parser.add_argument
     formats = ("glb", "ply", "usd", "obj", "floorplan", "graph")

@@ -14,7 +14,7 @@ from framework.queries.text_search import BY, WITH_EMBEDDINGS, Match, QueryResul
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Ranks the objects of a stored run by a text query: by image embeddings if the run has any "
-        f"({WITH_EMBEDDINGS}), else by class names and surface colors.",
+        f"({WITH_EMBEDDINGS}), else by class names and surface colors."
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
     parser.add_argument("text", metavar="WORDS", help='text query: "a red chair"')

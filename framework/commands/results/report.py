@@ -21,7 +21,7 @@ COMPARISON = "comparison.html"
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Writes an interactive HTML report of a run: map, objects, trajectory, times, and errors if ground "
-        "truth is known. For several runs, it writes a report of each and a comparison. A report is a single file.",
+        "truth is known. For several runs, it writes a report of each and a comparison. A report is a single file."
     )
     parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory")
     default = f"default: {REPORT} in the run directory, or {COMPARISON} in the common folder of the runs"

@@ -25,8 +25,7 @@ from framework.exporting.decimation import decimated
 from framework.exporting.exports import Chosen, ExportFormat, export
 from framework.exporting.glb import glb
 from framework.exporting.object_meshes import Coloring, linear, parts
-from framework.exporting.surface_points import surface_points
-from framework.exporting.upright_room import UprightRoom, facing, objects_of, read_room
+from framework.exporting.upright_room import UprightRoom, facing, objects_of, read_room, surface_points
 from framework.exporting.usd import Collision, convex_hull
 from framework.rendering.palette import instance_colors
 from framework.runs.instances_file import StoredInstance

@@ -18,8 +18,7 @@ from framework.exporting.exports import Chosen, ExportFormat, export
 from framework.exporting.occupancy import FREE, OCCUPIED, UNKNOWN, Plan, levels, looked_through, plan
 from framework.exporting.relations import relations
 from framework.exporting.rooms import rooms
-from framework.exporting.surface_points import middles, surface_points
-from framework.exporting.upright_room import UprightRoom, read_room
+from framework.exporting.upright_room import UprightRoom, middles, read_room, surface_points
 from framework.rendering.viewpoint import looking
 from tests.support.scenes.exported_room import CUBE, TABLE, Y_UP, Block, ExportedRoom
 
