@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from framework.data import Float32, Int32
+from framework.data import Float32, Int32, Int64
 from framework.detection.mask_rcnn.resnet import ResNet, ResNetShape
 from framework.detection.mask_rcnn.roi_align import roi_align
 from framework.detection.masks.boxes import anchor_grid, clip, decode, suppress_boxes
@@ -71,6 +71,7 @@ class MaskRCNN(nn.Module):
         self.rpn = nn.ModuleDict({"head": head})
         self.roi_heads = RoiHeads(architecture)
         self._anchors = [_anchors(side, architecture) for side in architecture.anchor_sides]
+        self._grids: tuple[list[tuple[int, int]], list[Float32]] = [], []  # the last levels' shapes and anchors
 
     @property
     def dtype(self) -> torch.dtype:
@@ -101,14 +102,17 @@ class MaskRCNN(nn.Module):
         )
 
     def anchors(self, pyramid: Sequence[Tensor]) -> list[Float32]:
-        """Return the (A, 4) anchors of each level."""
+        """Return the (A, 4) anchors of each level; the next call for the same shapes returns the same arrays."""
         shapes = [(level.shape[2], level.shape[3]) for level in pyramid]
-        height, width = (STRIDES[0] * cells for cells in shapes[0])
-        truncated = self.architecture.truncated_strides
-        return [
-            anchor_grid(anchors, rows, columns, (height // rows, width // columns) if truncated else stride)
-            for anchors, (rows, columns), stride in zip(self._anchors, shapes, STRIDES, strict=True)
-        ]
+        if shapes != self._grids[0]:
+            height, width = (STRIDES[0] * cells for cells in shapes[0])
+            truncated = self.architecture.truncated_strides
+            grids = [
+                anchor_grid(anchors, rows, columns, (height // rows, width // columns) if truncated else stride)
+                for anchors, (rows, columns), stride in zip(self._anchors, shapes, STRIDES, strict=True)
+            ]
+            self._grids = shapes, grids
+        return self._grids[1]
 
     def classify(self, pyramid: Sequence[Tensor], boxes: Tensor) -> tuple[Tensor, Tensor]:
         """Return (logits (P, 1 + C), deltas (P, 1 + C, 4)) of boxes (P, 4) of one image."""
@@ -241,7 +245,7 @@ def propose(
     for level, of_level in enumerate(anchors):
         own = slice(start, start + len(of_level))
         start += len(of_level)
-        best = np.argsort(-objectness[own], kind="stable")[:before_nms]
+        best = best_first(objectness[own], before_nms)
         decoded = clip(decode(of_level[best], deltas[own][best], extent), shape, extent)
         wide = (decoded[:, 2:] - decoded[:, :2] + extent >= 1e-3).all(axis=1)
         boxes.append(decoded[wide])
@@ -250,6 +254,15 @@ def propose(
     all_boxes, all_levels = np.concatenate(boxes), np.concatenate(levels)
     kept = suppress_boxes(all_boxes, np.concatenate(scores), PROPOSAL_NMS, all_levels, limit=after_nms, extent=extent)
     return all_boxes[kept]
+
+
+def best_first(scores: Float32, count: int) -> Int64:
+    """Return the indices of the `count` highest scores, best first and equal ones in order, without a full sort."""
+    if count >= len(scores):
+        return np.asarray(np.argsort(-scores, kind="stable"), np.int64)
+    lowest = np.partition(scores, len(scores) - count)[len(scores) - count]
+    candidates = np.flatnonzero(scores >= lowest)
+    return np.asarray(candidates[np.argsort(-scores[candidates], kind="stable")[:count]], np.int64)
 
 
 def select(

@@ -1,9 +1,11 @@
-"""Fused normalization: the same network, fewer layers."""
+"""Fused normalization, anchors of a pyramid, and the selection of the best anchors."""
 
+import numpy as np
+import pytest
 import torch
 from torch import nn
 
-from framework.detection.mask_rcnn.network import fuse_batch_norms
+from framework.detection.mask_rcnn.network import best_first, fuse_batch_norms
 from tests.support.networks.tiny_mask_rcnn import tiny_network
 
 
@@ -17,3 +19,23 @@ def test_a_fused_network_computes_the_same():
         for expected, found in zip(network.extract(images), fused.extract(images), strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
             assert expected.std() > 0.1
+
+
+@pytest.mark.parametrize("count", [1, 40, 99, 100, 200])
+@pytest.mark.parametrize("decimals", [0, 6])  # 0: many equal scores
+def test_best_first_equals_stable_sort(count, decimals):
+    scores = np.random.default_rng(3).normal(size=100).round(decimals).astype(np.float32)
+    np.testing.assert_array_equal(best_first(scores, count), np.argsort(-scores, kind="stable")[:count])
+
+
+def test_anchors_follow_the_shapes_of_the_pyramid():
+    network = tiny_network()
+    counts = []
+    for height in (64, 64, 128, 64):
+        images = network.normalize(torch.zeros(1, 3, height, 96))
+        with torch.inference_mode():
+            pyramid = network.extract(images)
+        anchors = network.anchors(pyramid)
+        counts.append([len(of_level) for of_level in anchors])
+        assert counts[-1] == [3 * level.shape[2] * level.shape[3] for level in pyramid]
+    assert counts[0] == counts[1] == counts[3] != counts[2]
