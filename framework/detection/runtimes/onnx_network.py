@@ -134,6 +134,8 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     cuda = CUDA in onnxruntime.get_available_providers()
     if device == "cuda" and not cuda:
         raise ConfigError("detector.device must be cpu or auto without onnxruntime-gpu and a GPU, found cuda")
+    if cuda and device != "cpu":
+        onnxruntime.preload_dlls()  # from pip's nvidia packages, which the dynamic linker does not search
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = cv2.getNumThreads()
     options.inter_op_num_threads = 1

@@ -85,6 +85,19 @@ def test_cuda_where_there_is_none_is_refused(tmp_path):
         OnnxNetwork(path, "", "cuda", 0)
 
 
+@pytest.mark.parametrize(("device", "loaded"), [("cpu", 0), ("auto", 1)])
+def test_cuda_libraries_are_loaded_before_the_session(tmp_path, monkeypatch, device, loaded):
+    import onnxruntime
+
+    calls = []
+    start = onnxruntime.InferenceSession
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider"])
+    monkeypatch.setattr(onnxruntime, "preload_dlls", lambda: calls.append("libraries"))
+    monkeypatch.setattr(onnxruntime, "InferenceSession", lambda p, o, **_: calls.append("session") or start(p, o))
+    OnnxNetwork(doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8)), "", device, 0)
+    assert calls == ["libraries"] * loaded + ["session"]
+
+
 def test_files_that_are_not_it(tmp_path):
     with pytest.raises(DataError, match=r"detector\.weights: there is no file .*absent\.onnx"):
         find_file(tmp_path / "absent.onnx")
