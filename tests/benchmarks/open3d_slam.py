@@ -20,18 +20,20 @@ BLOCKS = {0.01: 16_000, 0.02: 4_000}  # by voxel size, m: room for all that the 
 class Open3DSlam:
     """One map and one camera; the steps of a frame are separate, so that each can be timed. No labels."""
 
-    def __init__(self, first: Frame, voxel_size: float, method: Method = Method.PointToPlane) -> None:
-        device = o3d.core.Device("CPU:0")
+    def __init__(
+        self, first: Frame, voxel_size: float, method: Method = Method.PointToPlane, device: str = "CPU:0"
+    ) -> None:
+        self._device = o3d.core.Device(device)
         camera = first.camera
         K = o3d.core.Tensor(camera.K, o3d.core.float64)
         self._T_world_camera = np.eye(4) if first.T_world_camera is None else first.T_world_camera
         self._method = method
         self._color = method != Method.PointToPlane
         self._model = o3d.t.pipelines.slam.Model(
-            voxel_size, BLOCK, BLOCKS[voxel_size], o3d.core.Tensor(self._T_world_camera), device
+            voxel_size, BLOCK, BLOCKS[voxel_size], o3d.core.Tensor(self._T_world_camera), self._device
         )
-        self._input = o3d.t.pipelines.slam.Frame(camera.height, camera.width, K, device)
-        self._view = o3d.t.pipelines.slam.Frame(camera.height, camera.width, K, device)
+        self._input = o3d.t.pipelines.slam.Frame(camera.height, camera.width, K, self._device)
+        self._view = o3d.t.pipelines.slam.Frame(camera.height, camera.width, K, self._device)
         self._K = K
         self._camera = camera
         self._frames = 0
@@ -39,8 +41,10 @@ class Open3DSlam:
     def load(self, frame: Frame) -> None:
         """Hands over the images; not part of what is timed."""
         depth = np.round(frame.depth * DEPTH_SCALE).astype(np.uint16)
-        self._input.set_data_from_image("depth", o3d.t.geometry.Image(o3d.core.Tensor(depth)))
-        self._input.set_data_from_image("color", o3d.t.geometry.Image(o3d.core.Tensor(frame.color)))
+        self._input.set_data_from_image("depth", o3d.t.geometry.Image(o3d.core.Tensor(depth, device=self._device)))
+        self._input.set_data_from_image(
+            "color", o3d.t.geometry.Image(o3d.core.Tensor(frame.color, device=self._device))
+        )
 
     def __call__(self, frame: Frame, _detections: Detections) -> Pose:
         """All steps of a frame; what is lost is not integrated."""
