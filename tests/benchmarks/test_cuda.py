@@ -33,8 +33,7 @@ from tests.benchmarks.test_detectors import RANDOM
 from tests.support import registered
 
 DEVICE = "cuda"
-IMAGES = 40  # per detector
-WARM_UP = 10  # images
+IMAGES, WARM_UP = 40, 10  # per detector and device
 LONGEST = 6.0  # s per detector and device; the warm-up takes at most a quarter of it
 MATCH = 0.5  # lowest mask IoU of two detections of one object
 VOXEL_SIZE = 0.01  # m
@@ -141,8 +140,8 @@ def test_cuda_detector(
         overrides = [f"detector.weights={shared / 'weights' / WEIGHTS[name]}"]
 
     def measure() -> dict[str, tuple[list[float], list[Detections]]]:
-        built = partial(registered.built, "detector", option)
-        return {setting: run(built(*chosen, *overrides), images(name)) for setting, chosen in settings(option)}
+        built = partial(registered.built, "detector", option, *overrides)
+        return {setting: run(built(*chosen), images(name)) for setting, chosen in settings(option)}
 
     try:
         measured = benchmark.pedantic(measure, rounds=1)
