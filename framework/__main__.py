@@ -118,8 +118,7 @@ def main() -> None:
     if word in ("--help", "-h", "help"):
         width = max(map(len, COMMANDS))
         listed = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items())
-        print(HELP.format(program=program, commands=listed), end="")
-        flush_output()
+        flush_output(HELP.format(program=program, commands=listed))
         return
     if word == "--version":
         print(f"instancemap {framework.__version__}")
@@ -140,10 +139,11 @@ def main() -> None:
         flush_output()
 
 
-def flush_output() -> None:
-    """Flush stdout; exit with an error if that fails and no other error is being reported."""
+def flush_output(rest: str = "") -> None:
+    """Write `rest` and flush stdout; exit with an error if that fails and no other error is being reported."""
     reported = sys.exc_info()[0] is not None
     try:
+        sys.stdout.write(rest)
         sys.stdout.flush()
     except OSError as error:
         # redirect the rest of the buffer to nowhere: Python flushes it again at exit, and would report that

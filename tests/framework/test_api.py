@@ -139,8 +139,8 @@ def test_what_is_no_frame_is_told() -> None:
         ("detection_cache=bogus", "detection_cache must be one of off, read_write, read_only"),
         ("seed=-1", "seed must be a whole number"),
         ("~refiner", "refiner: expected a plugin's config .*; choose refiner=NAME"),
-        ("dataset=desk", "dataset=desk is of a run on the command line; here the frames are yours"),
-        ("hydra.run.dir=x", "hydra.run.dir=x is of a run on the command line"),
+        ("dataset=desk", "dataset=desk is only for the command line"),
+        ("hydra.run.dir=x", "hydra.run.dir=x is only for the command line"),
         (None, "Mapper takes words such as 'fuser.voxel_size=0.02', found None"),
     ],
 )

@@ -47,6 +47,7 @@ def test_types_are_written_as_they_are_read() -> None:
     assert any(getattr(kind, "instance_class", None) is Grid for kernel in grids for kind in kernel.signature)
 
 
+@pytest.mark.acceptance
 def test_runs_call_what_is_listed() -> None:
     """The demo, a room, each other refiner, fuser and tracker: `python -m tests.support.kernel_calls` updates it."""
     if missing := [kernel for kernel in listed(DEFAULT, OTHERS) if not kernel.is_compiled()]:

@@ -102,6 +102,7 @@ def test_what_stands_elsewhere_has_moved(before: Visit) -> None:
     assert told(found, Kind.VANISHED) == told(found, Kind.APPEARED) == []
 
 
+@pytest.mark.acceptance
 def test_a_noisy_detector_makes_up_no_changes() -> None:
     one, other = (visit(changed_room(k), "detector=simulated", f"seed={k}") for k in (0, 1))
     found = changes(one, other)

@@ -39,6 +39,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.acceptance
 def test_two_processes_write_what_one_writes(root: Path, tmp_path: Path) -> None:
     alone = SceneNNScene(tmp_path / "008", SPEC, RECORDING)
     alone.write_walk()

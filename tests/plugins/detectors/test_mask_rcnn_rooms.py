@@ -38,6 +38,7 @@ def test_it_is_small_and_says_what_it_is(detector: MaskRCNNDetector) -> None:
     assert card["mask_ap50"] >= 0.5, "over the nine classes, on rooms held out in training"
 
 
+@pytest.mark.acceptance
 def test_it_finds_objects_in_rooms_that_nobody_has_seen(detector: MaskRCNNDetector, tmp_path: Path) -> None:
     """Few pictures, so a loose bound: what it reaches on many is in its card."""
     render_rooms(tmp_path, ROOMS, 2, 10, 1)

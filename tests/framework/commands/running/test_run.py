@@ -293,6 +293,7 @@ def test_a_place_that_nobody_chose_is_named_after_the_dataset(tmp_path: Path) ->
     assert (place / "metrics.json").is_file()
 
 
+@pytest.mark.acceptance
 def test_runs_and_sweeps_of_the_same_moment_have_places_of_their_own(tmp_path: Path) -> None:
     runs = [begin(tmp_path, "hydra.run.dir=${new_directory:runs/now}") for _ in range(2)]
     assert [end(process)[0] for process in runs] == [0, 0]

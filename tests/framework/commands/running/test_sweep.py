@@ -118,6 +118,7 @@ def test_another_launcher_goes_on_where_the_first_ended(
     assert recorded(directory) == before
 
 
+@pytest.mark.acceptance
 def test_a_killed_sweep_goes_on_to_the_same_table(
     whole: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
@@ -199,7 +200,7 @@ def test_runs_that_differ_in_what_changes_no_result_have_places_of_their_own(tmp
     assert done.stderr.count("kept: the complete record in") == 2
 
 
-@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("told", [pytest.param(signal.SIGINT, marks=pytest.mark.acceptance), signal.SIGTERM])
 def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, told: signal.Signals) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     process = begin(tmp_path, *BY_JOBLIB, "row=all", "dataset.slow_s=1")
@@ -221,9 +222,9 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
     ("told", "all_at_once", "n_jobs", "seeds", "at_work"),
     [
         (signal.SIGINT, False, 2, "1,2,3", 2),
-        (signal.SIGTERM, True, 2, "1,2,3", 2),
-        (signal.SIGINT, True, 3, "1,2", 2),  # more than there is work for
-        (signal.SIGINT, False, 1, "1,2", 1),  # which joblib starts no worker for
+        pytest.param(signal.SIGTERM, True, 2, "1,2,3", 2, marks=pytest.mark.acceptance),
+        pytest.param(signal.SIGINT, True, 3, "1,2", 2, marks=pytest.mark.acceptance),  # more workers than runs
+        (signal.SIGINT, False, 1, "1,2", 1),  # joblib starts no worker
     ],
 )
 def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
