@@ -33,7 +33,7 @@ def check_intervals(stage: str, plugin: object, **intervals: str) -> None:
 
 
 def require(holds: bool, name: str, value: object, allowed: str) -> None:
-    """Raises ConfigError unless the condition holds, in one line like "detector.nms must be in (0, 1], found 2"."""
+    """Raise ConfigError unless the condition holds: "detector.nms_iou must be in (0, 1], found 2"."""
     if not holds:
         raise ConfigError(f"{name} must be {allowed}, found {value}")
 

@@ -93,7 +93,7 @@ def _rows(output: Float32, columns: int, other_layout: str) -> Float32:
         return table
     if table.ndim == 2 and table.shape[0] == columns:
         return table.T
-    hint = f"detector.labels or detector.layout (perhaps {other_layout})" if other_layout else "detector.labels"
+    hint = "detector.label_space" + (f" or detector.layout (perhaps {other_layout})" if other_layout else "")
     raise DataError(
         f"the network's output must have {columns} columns for its box and classes, found the shape {output.shape}:"
         f" choose other {hint}"
@@ -174,7 +174,7 @@ def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
     used = (column != -1) & (scores > 0)
     if (beyond := column[used & ((column < 0) | (column >= classes))]).size:
         raise DataError(
-            f"the network's labels must be 1 to {classes}, found {beyond.max() + 1}: choose other detector.labels"
+            f"the network's labels must be 1 to {classes}, found {beyond.max() + 1}: choose other detector.label_space"
         )
     check_scores(scores)
     own = scores[used]

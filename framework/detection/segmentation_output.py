@@ -89,7 +89,7 @@ class SegmentationLayout:
         if not _are_labels(labels, self.classes):
             raise DataError(
                 f"the network's sixth column must be labels from 0 to {self.classes - 1}, found {labels.min():g} to"
-                f" {labels.max():g}: choose other detector.labels"
+                f" {labels.max():g}: choose other detector.label_space"
             )
         class_scores = np.zeros((len(rows), self.classes), np.float32)
         class_scores[np.arange(len(rows)), labels.astype(np.int64)] = rows[:, SCORE]
@@ -107,7 +107,7 @@ class SegmentationLayout:
         ).any():  # None: every known export with suppression has corners
             raise DataError(
                 "the network's boxes cannot be corners, because one of a confident detection ends before it begins:"
-                " set detector.boxes=CENTER"
+                " set detector.box_format=CENTER"
             )
         return boxes * np.array([self.shape[1], self.shape[0]] * 2, np.float32) if unit else boxes
 
@@ -190,7 +190,7 @@ def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness:
     fix = f"set detector.objectness={str(not objectness).lower()} or" if other in shape[1:] else "choose"
     return (
         f"the network's output must have {columns} columns for box, classes and {count} coefficients, or"
-        f" {COEFFICIENTS + count} with suppression inside, found the shape {shape}: {fix} other detector.labels"
+        f" {COEFFICIENTS + count} with suppression inside, found the shape {shape}: {fix} other detector.label_space"
     )
 
 
@@ -207,7 +207,7 @@ def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
         return None
     raise DataError(
         f"the network's boxes may be corners or center and size ({ordered:.0%} of them could be corners): set"
-        " detector.boxes=CENTER or CORNER"
+        " detector.box_format=CENTER or CORNER"
     )
 
 

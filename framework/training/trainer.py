@@ -38,19 +38,19 @@ class Schedule:
     learning_rate: float = 1e-3  # > 0, the largest (AdamW)
     weight_decay: float = 1e-2  # >= 0
     warmup: int = 300  # steps, >= 0, of linear warmup; then the learning rate falls as a cosine to a hundredth
-    averaging: float = 0.998  # in [0, 1), decay of the moving average of the weights, which is saved
-    checkpoint_every: int = 250  # steps, >= 1
+    ema_decay: float = 0.998  # in [0, 1), decay of the moving average of the weights, which is saved
+    checkpoint_interval: int = 250  # steps, >= 1
     bfloat16: bool = False  # products in 16 bits, sums and weights in 32
     seed: int = 0
     budget: Budget = field(default_factory=Budget)
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "checkpoint_every"):
+        for name in ("steps", "batch", "checkpoint_interval"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("weight_decay", "warmup"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "0 or positive")
         require(self.learning_rate > 0, "learning_rate", self.learning_rate, "positive")
-        require(0 <= self.averaging < 1, "averaging", self.averaging, "in [0, 1)")
+        require(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "in [0, 1)")
 
     def rate(self, step: int) -> float:
         """Return the learning rate of a step."""
@@ -93,7 +93,7 @@ class Trainer:
                 self.step += 1
                 bar.update()
                 bar.set_postfix(loss=f"{sum(terms.values()):.3f}")
-                if self.step % self.schedule.checkpoint_every == 0 or self.step == self.schedule.steps:
+                if self.step % self.schedule.checkpoint_interval == 0 or self.step == self.schedule.steps:
                     self._save()
 
     def trained(self) -> MaskRCNN:
@@ -138,7 +138,7 @@ class Trainer:
 
     @torch.no_grad()
     def _average(self) -> None:
-        keep = min(self.schedule.averaging, (1 + self.step) / (10 + self.step))  # forgets the first weights faster
+        keep = min(self.schedule.ema_decay, (1 + self.step) / (10 + self.step))  # forgets the first weights faster
         for name, value in self.network.state_dict().items():
             if value.is_floating_point():
                 self.averaged[name].lerp_(value, 1 - keep)

@@ -36,14 +36,14 @@ class MaskRCNNDetector(Detector):
     The network is torchvision's or detectron2's, published for COCO and downloaded once, or one that was trained or
     converted here. The class distribution of a detection is the box head's softmax, renormalized without the
     background; its score is the probability of its class including the background. After suppression within a class,
-    `agnostic_nms` removes duplicates across classes, so that an ambiguous object is returned once, with both classes in
-    its distribution. After construction, `weights` is the file, and `domain` the images that it is for.
+    `agnostic_nms_iou` removes duplicates across classes: an ambiguous object is returned once, with both classes in its
+    distribution. After construction, `weights` is the file, and `domain` the images that it is for.
     """
 
     weights: Path = Path("resnet50_fpn_coco")  # published name, or file; relative: to the working, then project folder
     score_threshold: float = 0.1  # in [0, 1); low, because weak detections can still update existing instances
-    nms: float = 0.5  # IoU in (0, 1] above which a box is suppressed by a better one of its class
-    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask is suppressed by a better one of any class; 1 = off
+    nms_iou: float = 0.5  # IoU in (0, 1] above which a box is suppressed by a better one of its class
+    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
     proposals_before_nms: int = 1000  # >= 1, best anchors of each pyramid level that are decoded
     proposals: int = 300  # >= 1, regions for the box head; 1000 as published, with little gain at twice the time
     max_detections: int = 100  # >= 1, per image
@@ -56,9 +56,8 @@ class MaskRCNNDetector(Detector):
     reads = ("color",)
 
     def __post_init__(self) -> None:
-        check_intervals(
-            "detector", self, score_threshold="[0, 1)", nms="(0, 1]", agnostic_nms="(0, 1]", mask_threshold="(0, 1)"
-        )
+        check_intervals("detector", self, score_threshold="[0, 1)", mask_threshold="(0, 1)")
+        check_intervals("detector", self, nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
         most = {"proposals_before_nms": MOST_PROPOSALS, "proposals": MOST_PROPOSALS, "max_detections": MOST_DETECTIONS}
         for name, limit in most.items():
             check_count(f"detector.{name}", getattr(self, name), limit)
@@ -94,9 +93,8 @@ class MaskRCNNDetector(Detector):
         )
         logits, deltas = network.classify(pyramid, self._on_device(proposals))
         probabilities = self._finite(torch.softmax(logits.float(), dim=1))
-        boxes, proposal, label = select(
-            proposals, probabilities, self._finite(deltas), shape, self.score_threshold, self.nms, self.max_detections
-        )
+        limits = self.score_threshold, self.nms_iou, self.max_detections
+        boxes, proposal, label = select(proposals, probabilities, self._finite(deltas), shape, *limits)
         if len(boxes) == 0:
             return Detections.none(frame.camera.shape, self.classes)
 
@@ -108,7 +106,7 @@ class MaskRCNNDetector(Detector):
         )
         objects = probabilities[proposal, 1:]
         shares = objects / objects.sum(axis=1, keepdims=True)
-        return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms)
+        return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms_iou)
 
     def _resize(self, frame: Frame) -> Tensor:
         """Return the network's input before normalization (1, 3, H, W), RGB, 0..255."""

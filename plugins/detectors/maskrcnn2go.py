@@ -64,14 +64,14 @@ class MaskRCNN2Go(Detector):
     On x86 CPUs with VNNI (since about 2020) the network computes in its 8-bit integers, in one thread per frame;
     elsewhere in float with the same weights. The class distribution of a detection is the box head's softmax over 80
     classes, renormalized without the background; its score is the probability of its class including the background.
-    After suppression within a class, `agnostic_nms` removes duplicates across classes, so that an ambiguous object does
-    not start two map instances.
+    After suppression within a class, `agnostic_nms_iou` removes duplicates across classes: an ambiguous object does not
+    start two map instances.
     """
 
     weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # folder; relative: to the working, then project folder
     score_threshold: float = 0.1  # in [0, 1); low, because weak detections can still update existing instances
-    nms: float = 0.3  # IoU in (0, 1] above which a box is suppressed by a better one of its class
-    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask is suppressed by a better one of any class; 1 = off
+    nms_iou: float = 0.3  # IoU in (0, 1] above which a box is suppressed by a better one of its class
+    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
     proposals: int = 120  # >= 1, regions for the box head; the network was trained with 100 to 120
     max_detections: int = 100  # >= 1, per image
     short_side: int = 320  # px >= 32, to which images are resized; the network was trained at 320
@@ -83,9 +83,8 @@ class MaskRCNN2Go(Detector):
     reads = ("color",)
 
     def __post_init__(self) -> None:
-        check_intervals(
-            "detector", self, score_threshold="[0, 1)", nms="(0, 1]", agnostic_nms="(0, 1]", mask_threshold="(0, 1)"
-        )
+        check_intervals("detector", self, score_threshold="[0, 1)", mask_threshold="(0, 1)")
+        check_intervals("detector", self, nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
         check_count("detector.proposals", self.proposals, MOST_PROPOSALS)
         check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
         require(self.short_side >= 32, "detector.short_side", self.short_side, "at least 32 px")
@@ -134,7 +133,7 @@ class MaskRCNN2Go(Detector):
         logits, deltas = self._box_head(self._pool(features, proposals))
         probabilities = torch.softmax(logits, dim=1).cpu().numpy()
         own_deltas = deltas.cpu().numpy().reshape(*probabilities.shape, 4)
-        limits = self.score_threshold, self.nms, self.max_detections
+        limits = self.score_threshold, self.nms_iou, self.max_detections
         boxes, proposal, label = select(proposals, probabilities, own_deltas, shape, *limits, EXTENT)
         if len(boxes) == 0:
             return Detections.none(frame.camera.shape, self.classes)
@@ -145,7 +144,7 @@ class MaskRCNN2Go(Detector):
         )
         objects = probabilities[proposal, 1:]
         shares = objects / objects.sum(axis=1, keepdims=True)
-        return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms)
+        return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms_iou)
 
     def _resize(self, frame: Frame) -> Tensor:
         """Return the network's input (1, 3, H, W), RGB, 0..255."""

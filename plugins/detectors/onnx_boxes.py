@@ -33,11 +33,11 @@ class OnnxBoxes(Detector):
 
     weights: Path = field(metadata={"where": WHERE})  # ONNX file; relative: to the working, then project folder
     sha256: str = ""  # expected hash of the file; "" = any
-    labels: str = "coco"  # the network's classes: a label space, or a text file with one name per line
+    label_space: str = "coco"  # the network's classes: a label space, or a text file with one name per line
     layout: OutputLayout = OutputLayout.yolox  # of the outputs
     score_threshold: float = 0.1  # in (0, 1); low, because weak detections can still update existing instances
-    nms: float = 0.45  # IoU in (0, 1] above which a box is suppressed by a better one of its class
-    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask is suppressed by a better one of any class; 1 = off
+    nms_iou: float = 0.45  # IoU in (0, 1] above which a box is suppressed by a better one of its class
+    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
     max_detections: int = 100  # >= 1, per image
     input_size: int = 0  # px, side of the input of a network that takes any size; 0 = the network's own
     placement: Placement = Placement.top_left  # of the image in the input
@@ -52,10 +52,10 @@ class OnnxBoxes(Detector):
     reads = ("color", "depth", "camera")
 
     def __post_init__(self) -> None:
-        check_intervals("detector", self, score_threshold="(0, 1)", nms="(0, 1]", agnostic_nms="(0, 1]")
+        check_intervals("detector", self, score_threshold="(0, 1)", nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
         check_intervals("detector", self, min_foreground_fraction="[0, 1]", max_slant="(0, 90)", min_readings="[0, 1]")
         check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
-        self._labels = read_labels(self.labels)
+        self._labels = read_labels(self.label_space)
         self._meaning = to_coco(self._labels)
         self.classes = self._meaning.classes
         self.boxes_without_depth = 0  # since the detector was built
@@ -65,7 +65,7 @@ class OnnxBoxes(Detector):
     def detect(self, frame: Frame) -> Detections:
         outputs, letterbox = self._network(frame.color)
         candidates = decode(self.layout, outputs, self._network.shape, len(self._labels))
-        best = candidates.best(self.score_threshold, self.nms, self.max_detections)
+        best = candidates.best(self.score_threshold, self.nms_iou, self.max_detections)
         class_probabilities, known = self._meaning.apply(candidates.class_scores[best])
         best, class_probabilities = best[known], class_probabilities[known]
         masks, found = masks_in_boxes(
@@ -79,7 +79,7 @@ class OnnxBoxes(Detector):
         if not found.all():
             self._report_dropped(frame, found)
         scores = candidates.class_scores[best].max(axis=1).clip(0, 1)
-        return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms)
+        return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
 
     def _report_dropped(self, frame: Frame, found: Bool) -> None:
         """Count and log dropped boxes: the first time as a warning, then for debugging."""

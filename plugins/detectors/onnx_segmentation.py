@@ -37,13 +37,13 @@ class OnnxSegmentation(Detector):
 
     weights: Path  # ONNX file; relative: to the working, then project folder
     sha256: str = ""  # expected hash of the file; "" = any
-    labels: str = "coco"  # the network's classes: a label space, or a text file with one name per line
+    label_space: str = "coco"  # the network's classes: a label space, or a text file with one name per line
     objectness: bool = False  # True = an objectness precedes the class scores, as in YOLOv5
-    boxes: BoxKind = BoxKind.AUTO  # the four numbers of a box
+    box_format: BoxKind = BoxKind.AUTO  # the four numbers of a box
     class_spread: float = 1.0  # in [0, 1], with suppression inside: fraction of 1 - score for the other classes
     score_threshold: float = 0.1  # in (0, 1); low, because weak detections can still update existing instances
-    nms: float = 0.45  # IoU in (0, 1] above which a box is suppressed by a better one of its class
-    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask is suppressed by a better one of any class; 1 = off
+    nms_iou: float = 0.45  # IoU in (0, 1] above which a box is suppressed by a better one of its class
+    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
     max_detections: int = 100  # >= 1, per image
     mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
     input_size: int = 0  # px, side of the input of a network that takes any size; 0 = the network's own
@@ -56,10 +56,10 @@ class OnnxSegmentation(Detector):
     reads = ("color",)
 
     def __post_init__(self) -> None:
-        check_intervals("detector", self, score_threshold="(0, 1)", nms="(0, 1]", agnostic_nms="(0, 1]")
+        check_intervals("detector", self, score_threshold="(0, 1)", nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
         check_intervals("detector", self, class_spread="[0, 1]", mask_threshold="(0, 1)")
         check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
-        self._labels = read_labels(self.labels)
+        self._labels = read_labels(self.label_space)
         self._meaning = to_coco(self._labels)
         self.classes = self._meaning.classes
         self._network = ImageNetwork(self)
@@ -67,7 +67,7 @@ class OnnxSegmentation(Detector):
             self._network.outputs_for_black(),
             classes=len(self._labels),
             objectness=self.objectness,
-            boxes=self.boxes,
+            boxes=self.box_format,
             shape=self._network.shape,
             input_channels_last=self._network.channels_last,
             metadata=self._network.metadata,
@@ -78,7 +78,7 @@ class OnnxSegmentation(Detector):
         outputs, letterbox = self._network(frame.color)
         output = self._layout.read(outputs)
         candidates = output.candidates
-        best = candidates.best(self.score_threshold, self.nms, self.max_detections)
+        best = candidates.best(self.score_threshold, self.nms_iou, self.max_detections)
         class_probabilities, known = self._meaning.apply(candidates.class_scores[best])
         best, class_probabilities = best[known], class_probabilities[known]
         scores = candidates.class_scores[best].max(axis=1).clip(0, 1)
@@ -92,10 +92,10 @@ class OnnxSegmentation(Detector):
             frame.camera.shape,
             self.mask_threshold,
         )
-        return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms)
+        return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
 
     def _log_classes(self) -> None:
-        """Log one-class outputs, and class names in the file that differ from `labels`."""
+        """Log one-class outputs, and class names in the file that differ from `label_space`."""
         if self._layout.suppressed:
             log.info(
                 "%s reports one class per detection; the other classes get detector.class_spread=%g of the rest",
@@ -105,6 +105,5 @@ class OnnxSegmentation(Detector):
         names = self._network.metadata.names
         different = [(k, a, b) for k, (a, b) in enumerate(zip(names, self._labels, strict=False)) if a != b]
         if different:
-            number, theirs, ours = different[0]
-            log.warning("%s names %d of its %d classes otherwise than detector.labels=%s: %d is %r there, %r here",
-                        self.weights.name, len(different), len(names), self.labels, number, theirs, ours)  # fmt: skip
+            log.warning("%s names %d of its %d classes differently than detector.label_space=%s: %d is %r, not %r",
+                        self.weights.name, len(different), len(names), self.label_space, *different[0])  # fmt: skip

@@ -31,31 +31,31 @@ class OpenVocabulary(Detector):
     The score is the largest p. Words that are COCO names are evaluated as these classes; others are not evaluated.
     """
 
-    words: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # to search for, all different
+    text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # to search for, all different
     model: str = "google/owlv2-base-patch16-ensemble"  # OWLv2: id on huggingface.co, or a folder
     revision: str = "main"  # branch, tag or commit of a model id
-    masks: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2 or EdgeTAM (needs timm): id or folder; "" = from depth
-    masks_revision: str = "main"  # branch, tag or commit of a model id for masks
+    mask_model: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2 or EdgeTAM (needs timm): id or folder; "" = from depth
+    mask_model_revision: str = "main"  # branch, tag or commit of a model id for masks
     score_threshold: float = 0.1  # in (0, 1)
-    nms: float = 0.5  # IoU in (0, 1] above which a box is suppressed by a better one of any word
-    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask is suppressed by a better one; 1 = off
+    nms_iou: float = 0.5  # IoU in (0, 1] above which a box is suppressed by a better one of any word
+    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a mask is suppressed by a better one; 1 = off
     max_detections: int = 50  # >= 1, per image
     half_precision: bool = True  # half precision on CUDA
     device: str = "auto"  # auto, cpu or cuda; auto = cuda if available
     reads = ("color", "depth", "camera")
 
     def __post_init__(self) -> None:
-        check_intervals("detector", self, score_threshold="(0, 1)", nms="(0, 1]", agnostic_nms="(0, 1]")
+        check_intervals("detector", self, score_threshold="(0, 1)", nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
         check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
-        names = [word.strip() for word in self.words]
+        names = [word.strip() for word in self.text_queries]
         fits = 1 <= len(names) <= MOST_WORDS and all(names) and len({*names, SOMETHING_ELSE}) == len(names) + 1
-        require(fits, "detector.words", self.words, f"1 to {MOST_WORDS} different words, not {SOMETHING_ELSE!r}")
+        allowed = f"1 to {MOST_WORDS} different words, not {SOMETHING_ELSE!r}"
+        require(fits, "detector.text_queries", self.text_queries, allowed)
         device = torch_device(self.device)
         self.classes = (*names, SOMETHING_ELSE)
         self._boxes = TextPromptedBoxes(self.model, self.revision, names, device, self.half_precision)
-        self._masks = (
-            BoxPromptedMasks(self.masks, self.masks_revision, device, self.half_precision) if self.masks else None
-        )
+        mask_model = self.mask_model, self.mask_model_revision, device, self.half_precision
+        self._masks = BoxPromptedMasks(*mask_model) if self.mask_model else None
         commits = [commit_of(model.folder) for model in (self._boxes, self._masks) if model is not None]
         self._commits = " ".join(filter(None, commits))
 
@@ -66,13 +66,13 @@ class OpenVocabulary(Detector):
         boxes, probabilities = self._boxes(frame.color)
         scores = probabilities.max(axis=1)
         good = np.flatnonzero(scores >= self.score_threshold)
-        kept = good[suppress_boxes(boxes[good], scores[good], self.nms, limit=self.max_detections, extent=0.0)]
+        kept = good[suppress_boxes(boxes[good], scores[good], self.nms_iou, limit=self.max_detections, extent=0.0)]
         if self._masks is not None:
             masks = self._masks(frame.color, boxes[kept])
         else:
             masks, _ = masks_in_boxes(boxes[kept], frame.depth, frame.camera, SIGNIFICANCE, MAX_SLANT, MIN_READINGS)
         distributions = word_distributions(probabilities[kept], self.score_threshold)
-        return without_duplicates(masks, scores[kept], distributions, self.classes, self.agnostic_nms)
+        return without_duplicates(masks, scores[kept], distributions, self.classes, self.agnostic_nms_iou)
 
 
 def word_distributions(probabilities: Float32, threshold: float) -> Float32:

@@ -43,7 +43,7 @@ class Precomputed(Detector):
     """
 
     path: Path  # JSON file or folder
-    labels: str = "coco"  # of the file: a label space, or a text file with one name per line
+    label_space: str = "coco"  # of the file: a label space, or a text file with one name per line
     category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id, used without category_name
     score_threshold: float = 0.0  # in [0, 1]; detections below are dropped
     class_spread: float = 1.0  # in [0, 1], fraction of 1 - score for the other classes
@@ -53,9 +53,9 @@ class Precomputed(Detector):
     def __post_init__(self) -> None:
         check_bounds(self, score_threshold=(0.0, 1.0), class_spread=(0.0, 1.0))
         self.path = Path(self.path).expanduser()
-        self._labels = read_labels(self.labels)
+        self._labels = read_labels(self.label_space)
         if len(set(self._labels)) < len(self._labels):
-            raise ConfigError(f"detector.labels: {self.labels} has a name twice")
+            raise ConfigError(f"detector.label_space: {self.label_space} has a name twice")
         if self.path.is_dir():
             stored = read_mask_folder(self.path, self._labels)
         else:

@@ -72,7 +72,7 @@ class TransformersSegmentation(Detector):
     model: str = "facebook/mask2former-swin-tiny-coco-instance"  # id on huggingface.co, or a folder
     revision: str = "main"  # branch, tag or commit of a model id
     score_threshold: float = 0.1  # in [0, 1); low, because weak detections can still update existing instances
-    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask is suppressed by a better one of any class; 1 = off
+    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
     max_detections: int = 100  # >= 1, per image: the queries with the best class
     short_side: int = 0  # px, to which images are resized; 0 = as published
     long_side: int = 0  # px >= short_side, bound on the other side; 0 if short_side is 0
@@ -82,7 +82,7 @@ class TransformersSegmentation(Detector):
     reads = ("color",)
 
     def __post_init__(self) -> None:
-        check_intervals("detector", self, score_threshold="[0, 1)", agnostic_nms="(0, 1]", mask_threshold="(0, 1)")
+        check_intervals("detector", self, score_threshold="[0, 1)", agnostic_nms_iou="(0, 1]", mask_threshold="(0, 1)")
         check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
         short, long = self.short_side, self.long_side
         require(short == 0 or short >= 32, "detector.short_side", short, "0 (as published) or at least 32 px")
@@ -124,7 +124,7 @@ class TransformersSegmentation(Detector):
         order = np.argsort(-scores, kind="stable")
         order = order[scores[order] > self.score_threshold]
         masks, scores, candidates = inside.cpu().numpy()[order], scores[order], candidates[order]
-        return without_duplicates(masks, scores, class_probabilities[candidates], self.classes, self.agnostic_nms)
+        return without_duplicates(masks, scores, class_probabilities[candidates], self.classes, self.agnostic_nms_iou)
 
     def _predict(self, pixels: Tensor) -> tuple[Float32, Tensor]:
         """Return the queries' class logits (Q, C or C + 1) and mask logits (Q, h, w), float32 on the device."""

@@ -54,14 +54,14 @@ class Open3dOdometry(PoseTracker):
     iterations_fine: int = 3  # >= 1, at full resolution
     max_depth: float = 5.0  # m, > 0; farther readings are ignored
     max_distance: float = 0.07  # m, > 0, between the depths of corresponding pixels
-    max_step: float = 0.3  # m, > 0, between frames; a larger step is lost
-    max_turn: float = 0.35  # rad, > 0, between frames; a larger turn is lost
+    max_translation: float = 0.3  # m, > 0, between frames; a larger step is lost
+    max_rotation: float = 0.35  # rad, > 0, between frames; a larger turn is lost
     min_matched: float = 0.3  # in [0, 1], ratio of the frame's readings with a correspondence
 
     def __post_init__(self) -> None:
         check_bounds(
             self, iterations_coarse=(1, 1000), iterations_middle=(1, 1000), iterations_fine=(1, 1000),
-            max_depth=(1e-3, 1e3), max_distance=(1e-4, 10.0), max_step=(1e-3, 100.0), max_turn=(1e-3, 3.15),
+            max_depth=(1e-3, 1e3), max_distance=(1e-4, 10.0), max_translation=(1e-3, 100.0), max_rotation=(1e-3, 3.15),
             min_matched=(0.0, 1.0),
         )  # fmt: skip
         from open3d.t.pipelines import odometry
@@ -117,7 +117,7 @@ class Open3dOdometry(PoseTracker):
             return np.eye(4), f"{matched:.0%} of the frame's readings have a partner"
         step = float(np.linalg.norm(T_last_camera[:3, 3]))
         turn = rotation_angle(T_last_camera[:3, :3])
-        if step > self.max_step or turn > self.max_turn:
+        if step > self.max_translation or turn > self.max_rotation:
             return np.eye(4), f"a step of {step:.2f} m and {np.degrees(turn):.0f} deg is not plausible"
         return T_last_camera, ""
 

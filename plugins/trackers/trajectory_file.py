@@ -29,14 +29,14 @@ class TrajectoryFile(PoseTracker):
     """Returns the pose in a TUM file nearest in time to the frame; frames without one are skipped.
 
     By default the trajectory is moved rigidly so that the first frame with a pose defines the world, as in
-    `PoseTracker`. `world=FILE` keeps the file's world, in which the sequence's true poses are meaningless. Raises
+    `PoseTracker`. `world_frame=FILE` keeps the file's world, in which the sequence's true poses are meaningless. Raises
     DataError, naming file and line, for poses that are not finite or not rigid and for timestamps that do not increase.
     """
 
     path: Path
     max_time_difference: float = 0.02  # s, >= 0, between a frame and its pose; 2/3 of a frame at 30 Hz
     time_offset: float = 0.0  # s, added to the file's timestamps
-    world: World = World.FIRST_FRAME
+    world_frame: World = World.FIRST_FRAME
 
     def __post_init__(self) -> None:
         check_bounds(self, max_time_difference=(0.0, 1e6), time_offset=(-1e12, 1e12))
@@ -45,7 +45,7 @@ class TrajectoryFile(PoseTracker):
         if len(timestamps) == 0:
             raise DataError(f"{self.path} holds no pose: expected a trajectory in TUM format")
         self._timestamps = timestamps + self.time_offset
-        self._T_world_file: Float64 | None = np.eye(4) if self.world is World.FILE else None
+        self._T_world_file: Float64 | None = np.eye(4) if self.world_frame is World.FILE else None
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         """Raises NoPoseError for a frame without a pose in the file."""

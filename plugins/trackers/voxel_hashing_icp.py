@@ -69,8 +69,8 @@ class VoxelHashingIcp(PoseTracker):
     intensity_noise: float = 0.05  # of [0, 1], > 0, standard deviation of an intensity difference
     color_weight: float = 0.1  # lambda, >= 0; 0 = ICP alone
     depth_weight: float = 1.0  # 1, or 0 = color alone
-    max_step: float = 0.3  # m, > 0, between frames; a larger step is lost
-    max_turn: float = 0.35  # rad, > 0, between frames; a larger turn is lost
+    max_translation: float = 0.3  # m, > 0, between frames; a larger step is lost
+    max_rotation: float = 0.35  # rad, > 0, between frames; a larger turn is lost
     min_visible: float = 0.05  # in [0, 1], ratio of the frame's points that fall on the map
     min_matched: float = 0.4  # in [0, 1], ratio of the points in view with a weight
     min_information: float = 1e-3  # in [0, 1], smallest eigenvalue of A over the mean; less leaves a motion open
@@ -84,11 +84,13 @@ class VoxelHashingIcp(PoseTracker):
             self, finest_scale=(1 / 64, 1.0), iterations_coarse=(0, 1000), iterations_middle=(0, 1000),
             iterations_fine=(1, 1000), max_distance=(1e-4, 10.0), close_distance=(1e-4, 10.0),
             min_normal_dot=(-1.0, 1.0), geometric_scale=(1e-3, 1e3), photometric_scale=(1e-3, 1e3),
-            intensity_noise=(1e-3, 1.0), color_weight=(0.0, 1e3), depth_weight=(0.0, 1.0), max_step=(1e-3, 100.0),
-            max_turn=(1e-3, 3.15), min_visible=(0.0, 1.0), min_matched=(0.0, 1.0), min_information=(0.0, 1.0),
-            min_agreement=(0.0, 1.0), max_occluded=(0.0, 1.0),
+            intensity_noise=(1e-3, 1.0), color_weight=(0.0, 1e3), depth_weight=(0.0, 1.0),
+            max_translation=(1e-3, 100.0), max_rotation=(1e-3, 3.15), min_visible=(0.0, 1.0),
+            min_matched=(0.0, 1.0), min_information=(0.0, 1.0), min_agreement=(0.0, 1.0), max_occluded=(0.0, 1.0),
         )  # fmt: skip
-        require(np.log2(self.finest_scale) % 1 == 0, "VoxelHashingIcp.finest", self.finest_scale, "1, 1/2, 1/4, ...")
+        require(
+            np.log2(self.finest_scale) % 1 == 0, "VoxelHashingIcp.finest_scale", self.finest_scale, "1, 1/2, 1/4, ..."
+        )
         self._weights = Weights(*(np.float32(getattr(self, name)) for name in Weights._fields))
         self._T_world_last: Float64 | None = None  # the last trusted pose
         self._T_last_next = np.eye(4)  # motion to the next frame under constant velocity
@@ -191,7 +193,7 @@ class VoxelHashingIcp(PoseTracker):
 
     def _is_jump(self, T_last_next: Float64) -> bool:
         step, turn = np.linalg.norm(T_last_next[:3, 3]), rotation_angle(T_last_next[:3, :3])
-        return bool(step > self.max_step or turn > self.max_turn)
+        return bool(step > self.max_translation or turn > self.max_rotation)
 
     def _trust(self, seen: FrameFeatures, T_world_camera: Float64) -> Pose:
         self._T_world_last = T_world_camera

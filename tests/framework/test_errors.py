@@ -20,10 +20,10 @@ def test_a_usual_message_is_left_as_it_is() -> None:
     "given", ["x" * 100_000, "x y " * 30_000, "\udcff" * 1000, "\x1b[2J" * 1000, "\n" * 5000, "a\u2028b" * 1000, "\0"]
 )
 def test_a_long_or_unprintable_name_is_shortened_and_escaped(given: str) -> None:
-    said = str(ConfigError(f"detector.labels: there is no {given}; did you mean 'coco'?"))
+    said = str(ConfigError(f"detector.label_space: there is no {given}; did you mean 'coco'?"))
     assert said.isprintable()
     assert len(said) <= 1000
-    assert said.startswith("detector.labels: there is no ")
+    assert said.startswith("detector.label_space: there is no ")
     assert str(ConfigError(said)) == said, "once is enough"
     assert one_line(ValueError(given)).isprintable()
     assert said.encode()

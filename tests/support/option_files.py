@@ -130,7 +130,7 @@ def _onnx_boxes(folder: Path) -> list[str]:
     rows = np.zeros((21, 5 + len(CLASSES)))
     rows[[5, 10]] = [[0.5, 0.5, np.log(2), np.log(2), 0.9, 0.7, 0.1], [0, 0, np.log(2), np.log(2), 0.8, 0.1, 0.6]]
     weights = constant_network(folder / "tiny.onnx", (1, 3, 32, 32), {"output": rows[None]})
-    return [f"detector.weights={weights}", f"detector.labels={folder / 'labels.txt'}"]
+    return [f"detector.weights={weights}", f"detector.label_space={folder / 'labels.txt'}"]
 
 
 def _onnx_segmentation(folder: Path) -> list[str]:
@@ -143,13 +143,13 @@ def _onnx_segmentation(folder: Path) -> list[str]:
     rows = np.array([[30, 40, 30, 20, 0.6, 0.1, -1, 0], [40, 50, 20, 20, 0.05, 0.4, 0, 1]])
     outputs = {"output0": rows.T[None], "output1": np.stack([ramp, ramp.T])[None]}
     weights = constant_network(folder / "tiny.onnx", (1, 3, 80, 80), outputs)
-    return [f"detector.weights={weights}", f"detector.labels={folder / 'labels.txt'}"]
+    return [f"detector.weights={weights}", f"detector.label_space={folder / 'labels.txt'}"]
 
 
 def _precomputed(folder: Path) -> list[str]:
     path = folder / "detections.json"
     write_detections(path, SphereDetector(), CornerRoom())
-    return [f"detector.path={path}", f"detector.labels={write_labels(path, SphereDetector().classes)}"]
+    return [f"detector.path={path}", f"detector.label_space={write_labels(path, SphereDetector().classes)}"]
 
 
 def _transformers_segmentation(folder: Path) -> list[str]:
@@ -171,7 +171,7 @@ def _open_vocabulary(folder: Path) -> list[str]:
     from tests.support.networks.tiny_open_vocabulary import write_owlv2, write_sam
 
     boxes, masks = write_owlv2(folder / "owlv2"), write_sam(folder / "sam", "sam")
-    return [f"detector.model={boxes}", f"detector.masks={masks}", "detector.words=[red chair,bed]"]
+    return [f"detector.model={boxes}", f"detector.mask_model={masks}", "detector.text_queries=[red chair,bed]"]
 
 
 def _rf_detr_seg(folder: Path) -> list[str]:

@@ -55,7 +55,7 @@ def job(config: DictConfig) -> None:
     write_detections(out, detector, sequence)
     how = f"detector=precomputed detector.path={out}"
     if detector.classes != COCO:
-        how += f" detector.labels={write_labels(out, detector.classes)}"
+        how += f" detector.label_space={write_labels(out, detector.classes)}"
     log.info("read it with: %s", how)
 
 

@@ -77,13 +77,13 @@ class BoxPromptedMasks:
     def __init__(self, model: str, revision: str, device: torch.device, half_precision: bool) -> None:
         transformers = imported_transformers()
         self.folder = find_model(model, revision)
-        config = read_part("detector.masks", self.folder, "its config.json", transformers.AutoConfig)
+        config = read_part("detector.mask_model", self.folder, "its config.json", transformers.AutoConfig)
         if config.model_type not in SAM_FAMILY:
             raise ConfigError(
-                f"detector.masks must be a SAM, a SAM 2 or an EdgeTAM, found {model}, a {config.model_type}"
+                f"detector.mask_model must be a SAM, a SAM 2 or an EdgeTAM, found {model}, a {config.model_type}"
             )
         class_name, self._stretched = SAM_FAMILY[config.model_type]
-        network = read_part("detector.masks", self.folder, "its weights", getattr(transformers, class_name))
+        network = read_part("detector.mask_model", self.folder, "its weights", getattr(transformers, class_name))
         self._network = ready(network, device, half_precision)
         prompts = config.prompt_encoder_config
         side = prompts.image_size if self._stretched else config.vision_config.image_size
@@ -108,7 +108,7 @@ class BoxPromptedMasks:
         logits = output.pred_masks[0, :, 0].float()
         if not torch.isfinite(logits).all():
             raise DataError(
-                f"detector.masks: the output of {self._model} is not finite; try detector.half_precision=false"
+                f"detector.mask_model: the output of {self._model} is not finite; try detector.half_precision=false"
             )
         whole = functional.interpolate(logits[None], (self._side, self._side), mode="bilinear", align_corners=False)
         inside = whole[..., : resized[1], : resized[0]]

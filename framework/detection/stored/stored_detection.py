@@ -83,7 +83,7 @@ def read_score(found: Any) -> float:
 def read_label(found: Any, index: Mapping[str, int]) -> str:
     """Return a name of the label space. Raises DataError for other values."""
     if not isinstance(found, str) or found not in index:
-        raise DataError(f"{found!r} is not one of the {len(index)} labels: set detector.labels to the file's own")
+        raise DataError(f"{found!r} is not one of the {len(index)} labels: set detector.label_space to the file's own")
     return found
 
 

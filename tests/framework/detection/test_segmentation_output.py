@@ -112,7 +112,7 @@ def test_a_network_that_sees_nothing_in_black_shows_its_unit_later(count):
 
 def test_detections_whose_boxes_end_before_they_begin_are_no_corners():
     boxes = cells()[50:53]
-    with pytest.raises(DataError, match=r"ends before it begins: set detector\.boxes=CENTER"):
+    with pytest.raises(DataError, match=r"ends before it begins: set detector\.box_format=CENTER"):
         seen(detections(boxes, 0.9, 1))
     _, output = seen(detections(boxes, 0.9, 1), boxes=BoxKind.CENTER)
     np.testing.assert_allclose(output.candidates.boxes, as_corners(boxes), atol=1e-4)
@@ -157,11 +157,11 @@ MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells()
 @pytest.mark.parametrize(
     ("table", "given", "message"),
     [
-        (dense(MIXED), {}, r"may be corners or center and size .*detector\.boxes=CENTER or CORNER"),
+        (dense(MIXED), {}, r"may be corners or center and size .*detector\.box_format=CENTER or CORNER"),
         (dense(cells() / 8), {}, "neither in px of its input 64x96 nor in 0..1"),
         (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 126\): set detector.objectness=true"),
         (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 126\): set detector.objectness=false"),
-        (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression inside, .*other detector\.labels"),
+        (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression inside, .*other detector\.label_space"),
         (detections(as_corners(cells()), 0.9, 3), {}, r"labels from 0 to 2, found 3 to 3: choose other detector"),
         (detections(as_corners(cells()), 1.5, 1), {}, r"scores must be in \[0, 1\], found 0 to 1.5"),
         (np.zeros((1, 11, 11)), {}, "as many candidates as columns, 11"),

@@ -24,7 +24,7 @@ TINY = Architecture(
     head_features=16,
     anchor_sides=(16, 24, 32, 48, 64),
 )
-SHORT = Schedule(steps=6, batch=2, warmup=2, checkpoint_every=3, budget=Budget(50, 30, 16))
+SHORT = Schedule(steps=6, batch=2, warmup=2, checkpoint_interval=3, budget=Budget(50, 30, 16))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,9 @@ def network() -> MaskRCNN:
 
 @pytest.mark.integration
 def test_it_learns(pictures: RoomPictures, tmp_path: Path) -> None:
-    schedule = Schedule(steps=40, batch=2, learning_rate=3e-3, warmup=5, checkpoint_every=40, budget=Budget(50, 30, 16))
+    schedule = Schedule(
+        steps=40, batch=2, learning_rate=3e-3, warmup=5, checkpoint_interval=40, budget=Budget(50, 30, 16)
+    )
     trainer = Trainer(network(), pictures, schedule, tmp_path, "cpu")
     trainer.run()
     losses = [sum(terms.values()) for terms in trainer.history]
@@ -111,7 +113,7 @@ def test_rooms_that_were_not_rendered(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"steps": 0}, {"batch": 0}, {"learning_rate": 0.0}, {"averaging": 1.0}, {"checkpoint_every": 0}]
+    "wrong", [{"steps": 0}, {"batch": 0}, {"learning_rate": 0.0}, {"ema_decay": 1.0}, {"checkpoint_interval": 0}]
 )
 def test_senseless_schedules_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):

@@ -38,7 +38,7 @@ def detector(path):
 
 def test_the_score_is_the_classes_share_of_all_and_the_row_its_share_of_objects(path):
     """Without suppression across classes, each detection is a label of a proposal with that proposal's softmax."""
-    detector, frame = MaskRCNNDetector(weights=path, device="cpu", agnostic_nms=1.0), noise(0)
+    detector, frame = MaskRCNNDetector(weights=path, device="cpu", agnostic_nms_iou=1.0), noise(0)
     seen = []
     classify = detector._network.classify
     detector._network.classify = lambda *a: seen.append(classify(*a)) or seen[-1]
@@ -67,7 +67,7 @@ def test_detections_keep_the_contract(detector):
     areas = overlaps.diagonal()
     iou = overlaps / (areas[:, None] + areas - overlaps)
     np.fill_diagonal(iou, 0)
-    assert iou.max() <= detector.agnostic_nms
+    assert iou.max() <= detector.agnostic_nms_iou
 
 
 def test_same_input_same_output_and_the_input_stays_as_it_was(detector):
@@ -93,7 +93,7 @@ def test_numbers_of_proposals_and_detections(path, monkeypatch):
     propose = mask_rcnn.propose
     monkeypatch.setattr(mask_rcnn, "propose", lambda *a: given.append(propose(*a)) or given[-1])
     few = MaskRCNNDetector(
-        weights=path, device="cpu", proposals=7, max_detections=3, agnostic_nms=1.0, score_threshold=0.0
+        weights=path, device="cpu", proposals=7, max_detections=3, agnostic_nms_iou=1.0, score_threshold=0.0
     )
     assert len(few.detect(noise(4))) == 3
     assert len(given[0]) == 7
@@ -179,8 +179,8 @@ def test_half_precision_finds_the_same(path):
     ("parameters", "fault"),
     [
         ({"score_threshold": 1.0}, r"detector\.score_threshold must be in \[0, 1\), found 1.0"),
-        ({"nms": 0.0}, r"detector\.nms must be in \(0, 1\]"),
-        ({"agnostic_nms": 1.1}, r"detector\.agnostic_nms must be in \(0, 1\]"),
+        ({"nms_iou": 0.0}, r"detector\.nms_iou must be in \(0, 1\]"),
+        ({"agnostic_nms_iou": 1.1}, r"detector\.agnostic_nms_iou must be in \(0, 1\]"),
         ({"proposals_before_nms": 0}, r"detector\.proposals_before_nms must be at least 1"),
         ({"proposals": 0}, r"detector\.proposals must be at least 1"),
         ({"max_detections": 0}, r"detector\.max_detections must be at least 1"),

@@ -174,8 +174,8 @@ def test_no_two_masks_of_one_object(detector):
     areas = overlaps.diagonal()
     iou = overlaps / (areas[:, None] + areas - overlaps)
     np.fill_diagonal(iou, 0)
-    assert iou.max() <= detector.agnostic_nms
-    assert len(MaskRCNN2Go(device="cpu", agnostic_nms=1.0).detect(frame)) > len(overlaps)
+    assert iou.max() <= detector.agnostic_nms_iou
+    assert len(MaskRCNN2Go(device="cpu", agnostic_nms_iou=1.0).detect(frame)) > len(overlaps)
 
 
 @pytest.mark.parametrize("shape", [(480, 640), (33, 57), (240, 1280), (1, 1), (5, 2000)])
@@ -228,8 +228,8 @@ def test_damaged_weights_are_refused(tmp_path):
     [
         {"score_threshold": 1.0},
         {"score_threshold": float("nan")},
-        {"nms": 0.0},
-        {"agnostic_nms": 1.5},
+        {"nms_iou": 0.0},
+        {"agnostic_nms_iou": 1.5},
         {"proposals": 0},
         {"max_detections": 0},
         {"short_side": 8},

@@ -76,7 +76,7 @@ def tiny(folder, layout, **parameters):
     labels = folder / "labels.txt"
     labels.write_text("\n".join(LABELS))
     weights = constant_network(folder / "tiny.onnx", (1, 3, *SHAPE), outputs_of(layout))
-    return OnnxBoxes(weights=weights, sha256="", labels=str(labels), layout=layout, device="cpu", **parameters)
+    return OnnxBoxes(weights=weights, sha256="", label_space=str(labels), layout=layout, device="cpu", **parameters)
 
 
 @pytest.mark.parametrize("layout", OutputLayout)
@@ -104,7 +104,7 @@ def test_where_the_image_lies_in_the_input_is_undone(tmp_path, placement):
     detector = OnnxBoxes(
         weights=weights,
         sha256="",
-        labels=str(labels),
+        label_space=str(labels),
         layout=OutputLayout.yolo,
         placement=placement,
         device="cpu",
@@ -135,9 +135,15 @@ def test_two_boxes_of_one_thing_come_back_as_the_better(tmp_path):
     labels = tmp_path / "labels.txt"
     labels.write_text("\n".join(LABELS))
     weights = constant_network(tmp_path / "n.onnx", (1, 3, *SHAPE), {"y": rows[None]})
-    parameters = {"weights": weights, "sha256": "", "labels": str(labels), "layout": OutputLayout.yolo, "device": "cpu"}
+    parameters = {
+        "weights": weights,
+        "sha256": "",
+        "label_space": str(labels),
+        "layout": OutputLayout.yolo,
+        "device": "cpu",
+    }
     np.testing.assert_allclose(OnnxBoxes(**parameters).detect(frame()).scores, [0.6])
-    np.testing.assert_allclose(OnnxBoxes(**parameters, agnostic_nms=1.0).detect(frame()).scores, [0.6, 0.5])
+    np.testing.assert_allclose(OnnxBoxes(**parameters, agnostic_nms_iou=1.0).detect(frame()).scores, [0.6, 0.5])
 
 
 def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_path):
@@ -146,7 +152,7 @@ def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_pat
         OnnxBoxes(weights=weights, sha256="", layout=OutputLayout.yolo, device="cpu")
     (tmp_path / "labels.txt").write_text("chair\nflibbertigibbet")
     with pytest.raises(ConfigError, match="flibbertigibbet"):
-        OnnxBoxes(weights=weights, labels=str(tmp_path / "labels.txt"), layout=OutputLayout.yolo, device="cpu")
+        OnnxBoxes(weights=weights, label_space=str(tmp_path / "labels.txt"), layout=OutputLayout.yolo, device="cpu")
 
 
 @pytest.mark.parametrize(
@@ -154,8 +160,8 @@ def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_pat
     [
         {"score_threshold": 0.0},
         {"score_threshold": float("nan")},
-        {"nms": 0.0},
-        {"agnostic_nms": 1.5},
+        {"nms_iou": 0.0},
+        {"agnostic_nms_iou": 1.5},
         {"max_detections": 0},
         {"min_foreground_fraction": 1.1},
         {"max_slant": 90.0},

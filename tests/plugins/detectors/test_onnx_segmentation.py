@@ -42,7 +42,7 @@ def tiny(folder, objectness=False, transposed=False, **parameters):
     labels = folder / "labels.txt"
     labels.write_text("\n".join(LABELS))
     weights = constant_network(folder / "tiny.onnx", (1, 3, SIZE, SIZE), outputs(objectness, transposed))
-    return OnnxSegmentation(weights=weights, labels=str(labels), objectness=objectness, device="cpu", **parameters)
+    return OnnxSegmentation(weights=weights, label_space=str(labels), objectness=objectness, device="cpu", **parameters)
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_tensorflow_export_channels_last_and_unit_boxes(tmp_path):
     weights = constant_network(
         tmp_path / "n.onnx", (1, SIZE, SIZE, 3), {"a": np.moveaxis(prototypes, 1, -1), "b": table}
     )
-    detector = OnnxSegmentation(weights=weights, labels=str(tmp_path / "labels.txt"), device="cpu")
+    detector = OnnxSegmentation(weights=weights, label_space=str(tmp_path / "labels.txt"), device="cpu")
     check_cup_and_chair(detector.detect(frame()))
 
 
@@ -96,7 +96,7 @@ def suppressed(folder, **parameters):
     label, best = scores.argmax(axis=1)[:, None], scores.max(axis=1)[:, None]
     rows = np.concatenate([center - size / 2, center + size / 2, best, label, table[0, :, 7:]], axis=1)
     weights = constant_network(folder / "n.onnx", (1, 3, SIZE, SIZE), {"a": rows[None], "b": prototypes})
-    return OnnxSegmentation(weights=weights, labels=str(folder / "labels.txt"), device="cpu", **parameters)
+    return OnnxSegmentation(weights=weights, label_space=str(folder / "labels.txt"), device="cpu", **parameters)
 
 
 @pytest.mark.parametrize(("spread", "expected"), [(1.0, [0.6, 0.5]), (0.5, [0.8, 0.7]), (0.0, [1.0, 1.0])])
@@ -119,9 +119,9 @@ def test_other_names_in_the_file_are_told(tmp_path, caplog):
     model = onnx.load(tmp_path / "tiny.onnx")
     onnx.helper.set_model_props(model, {"names": "{0: 'chair', 1: 'fork', 2: 'wall'}"})
     onnx.save(model, tmp_path / "named.onnx")
-    OnnxSegmentation(weights=tmp_path / "named.onnx", labels=str(tmp_path / "labels.txt"), device="cpu")
-    assert "named.onnx names 1 of its 3 classes otherwise" in caplog.text
-    assert "1 is 'fork' there, 'cup' here" in caplog.text
+    OnnxSegmentation(weights=tmp_path / "named.onnx", label_space=str(tmp_path / "labels.txt"), device="cpu")
+    assert "named.onnx names 1 of its 3 classes differently" in caplog.text
+    assert "1 is 'fork', not 'cup'" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_pat
     (tmp_path / "labels.txt").write_text("\n".join(LABELS))
     weights = constant_network(tmp_path / "n.onnx", (1, 3, SIZE, SIZE), {**outputs(), **changed})
     with pytest.raises(DataError, match=message):
-        OnnxSegmentation(weights=weights, labels=str(tmp_path / "labels.txt"), device="cpu")
+        OnnxSegmentation(weights=weights, label_space=str(tmp_path / "labels.txt"), device="cpu")
 
 
 @pytest.mark.parametrize(
@@ -144,8 +144,8 @@ def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_pat
     [
         {"class_spread": 1.1},
         {"score_threshold": 0.0},
-        {"nms": 1.1},
-        {"agnostic_nms": 0.0},
+        {"nms_iou": 1.1},
+        {"agnostic_nms_iou": 0.0},
         {"max_detections": 0},
         {"mask_threshold": 1.0},
         {"padding": -1},

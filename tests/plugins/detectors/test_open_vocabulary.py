@@ -147,7 +147,7 @@ def test_the_distribution_is_by_odds_and_has_something_else() -> None:
 @pytest.mark.parametrize("masks", ["sam", "depth"])
 def test_detections_are_what_both_networks_say(owlv2: Path, masks: str, tmp_path: Path) -> None:
     folder = str(write_sam(tmp_path / "sam", "sam2")) if masks == "sam" else ""
-    detector = OpenVocabulary(["red chair", "bed"], str(owlv2), masks=folder, score_threshold=0.2, device="cpu")
+    detector = OpenVocabulary(["red chair", "bed"], str(owlv2), mask_model=folder, score_threshold=0.2, device="cpu")
     assert detector.classes == ("red chair", "bed", SOMETHING_ELSE)
     shape = (64, 64)
     boxes = [[4, 4, 28, 28], [5, 4, 28, 28], [35, 35, 60, 60], [0, 0, 63, 63]]
@@ -165,28 +165,30 @@ def test_detections_are_what_both_networks_say(owlv2: Path, masks: str, tmp_path
 @pytest.mark.parametrize(
     ("words", "fault"),
     [
-        ("[]", "detector.words must be 1 to 500 different words"),
+        ("[]", "detector.text_queries must be 1 to 500 different words"),
         ("[chair,chair]", "different words"),
         ("[chair,' ']", "different words"),
         ("['something else']", "different words"),
-        ("3", "words"),
+        ("3", "text_queries"),
     ],
 )
 def test_words_must_be_different_and_some(words: str, fault: str) -> None:
     with pytest.raises(ConfigError, match=fault):
-        registered.built("detector", "open_vocabulary", f"detector.words={words}")
+        registered.built("detector", "open_vocabulary", f"detector.text_queries={words}")
 
 
 def test_other_models_are_refused_by_name(owlv2: Path, tmp_path: Path) -> None:
     siglip = str(write_image_text(tmp_path / "siglip"))
     with pytest.raises(ConfigError, match=r"detector\.model must be an OWLv2, found .*, a siglip"):
-        OpenVocabulary(model=siglip, masks="", device="cpu")
-    with pytest.raises(ConfigError, match=r"detector\.masks must be a SAM, a SAM 2 or an EdgeTAM, found .*, a siglip"):
-        OpenVocabulary(model=str(owlv2), masks=siglip, device="cpu")
+        OpenVocabulary(model=siglip, mask_model="", device="cpu")
+    with pytest.raises(
+        ConfigError, match=r"detector\.mask_model must be a SAM, a SAM 2 or an EdgeTAM, found .*, a siglip"
+    ):
+        OpenVocabulary(model=str(owlv2), mask_model=siglip, device="cpu")
     (owlv2 / "config.json").rename(owlv2 / "away.json")
     try:
         with pytest.raises(DataError, match=r"its config\.json could not be read"):
-            OpenVocabulary(model=str(owlv2), masks="", device="cpu")
+            OpenVocabulary(model=str(owlv2), mask_model="", device="cpu")
     finally:
         (owlv2 / "away.json").rename(owlv2 / "config.json")
 

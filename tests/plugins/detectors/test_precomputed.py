@@ -120,7 +120,7 @@ def test_names_that_are_left_out_have_no_probability_and_rounded_rows_are_normal
 )
 def test_category_ids(tmp_path: Path, ids: CategoryIds, labels: str, category_id: int, name: str) -> None:
     numbered = entry(category_name=None, category_id=category_id)
-    found = detected(tmp_path, numbered, category_ids=ids, labels=labels)
+    found = detected(tmp_path, numbered, category_ids=ids, label_space=labels)
     assert found.classes[int(found.class_probabilities[0].argmax())] == name
 
 
@@ -128,7 +128,7 @@ def test_other_labels_become_cocos(tmp_path: Path, caplog: pytest.LogCaptureFixt
     """A wall is no object: dropped, and told."""
     entries = [entry(category_name="sofa", score=0.9), entry(category_name="wall", score=0.8)]
     with caplog.at_level(logging.INFO):
-        found = detected(tmp_path, *entries, labels="nyu40")
+        found = detected(tmp_path, *entries, label_space="nyu40")
     assert [found.classes[k] for k in found.class_probabilities.argmax(axis=1)] == ["couch"]
     assert found.class_probabilities.max() == pytest.approx(0.9)
     assert "1 of 2 detections are of no class of COCO's and are dropped: wall" in caplog.text
@@ -155,7 +155,7 @@ def test_written_detections_come_back_to_the_bit(tmp_path: Path, detector: Any) 
     expected = [detector.detect(one) for one in room]
     assert write_detections(path, detector, room) == sum(map(len, expected)) > 6
     labels = "coco" if detector.classes == COCO else str(write_labels(path, detector.classes))
-    again = Precomputed(path, labels=labels)
+    again = Precomputed(path, label_space=labels)
     assert again.classes == detector.classes
     for one, before in zip(room, expected, strict=True):
         after = again.detect(one)
@@ -330,7 +330,7 @@ def test_a_file_that_may_be_of_another_sequence_is_doubted_once(
 
 def test_ids_of_coco_need_cocos_labels(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="FROM_ONE or FROM_ZERO"):
-        Precomputed(write(tmp_path, entry(category_name=None, category_id=1)), labels="nyu40")
+        Precomputed(write(tmp_path, entry(category_name=None, category_id=1)), label_space="nyu40")
 
 
 def test_parameters_are_checked(tmp_path: Path) -> None:
@@ -341,7 +341,7 @@ def test_parameters_are_checked(tmp_path: Path) -> None:
 
 def test_a_file_of_no_class_that_counts_is_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="none of the 1 detections is of a class"):
-        Precomputed(write(tmp_path, entry(category_name="wall")), labels="nyu40")
+        Precomputed(write(tmp_path, entry(category_name="wall")), label_space="nyu40")
     (tmp_path / "labels.txt").write_text("chair\nchair\n")
     with pytest.raises(ConfigError, match="has a name twice"):
-        Precomputed(write(tmp_path, entry()), labels=str(tmp_path / "labels.txt"))
+        Precomputed(write(tmp_path, entry()), label_space=str(tmp_path / "labels.txt"))

@@ -44,7 +44,7 @@ def built(folder, **parameters):
 
 @pytest.fixture(params=MODELS)
 def detector(request, folders):
-    return built(folders[request.param], score_threshold=0.02, agnostic_nms=0.9)
+    return built(folders[request.param], score_threshold=0.02, agnostic_nms_iou=0.9)
 
 
 class TestContract(DetectorContract):
@@ -106,7 +106,7 @@ def test_decoding_agrees_with_a_slow_one(folders, kind):
         camera = Camera(96, 96, 60.0, 60.0, 47.5, 47.5)
     image = frame(1, camera)
     sides = {} if kind == "rf_detr" else {"short_side": min(camera.shape), "long_side": max(camera.shape)}
-    detector = built(folders[kind], score_threshold=0.05, agnostic_nms=1.0, **sides)
+    detector = built(folders[kind], score_threshold=0.05, agnostic_nms_iou=1.0, **sides)
     with torch.inference_mode():
         expected = slow_decoding(detector, kind, image, 0.05)
     found = detector.detect(image)
@@ -124,7 +124,7 @@ def test_agrees_with_mask2formers_own_decoding(folders):
     camera = Camera(384, 384, 300.0, 300.0, 191.5, 191.5)  # the size at which it always decodes
     image = frame(2, camera)
     folder = folders["mask2former"]
-    detector = built(folder, score_threshold=0.05, agnostic_nms=1.0, short_side=384, long_side=384)
+    detector = built(folder, score_threshold=0.05, agnostic_nms_iou=1.0, short_side=384, long_side=384)
     processor = Mask2FormerImageProcessorPil(size={"height": 384, "width": 384})
     with torch.inference_mode():
         inputs = processor(images=image.color, return_tensors="pt")
@@ -150,7 +150,7 @@ def test_agrees_with_eomts_own_decoding(folders):
     from transformers import EomtImageProcessorPil
 
     image = frame(3, CAMERA)  # 48 rows on 64: padded below
-    detector = built(folders["eomt"], score_threshold=0.03, agnostic_nms=1.0)
+    detector = built(folders["eomt"], score_threshold=0.03, agnostic_nms_iou=1.0)
     processor = EomtImageProcessorPil(size={"shortest_edge": 64, "longest_edge": 64}, do_pad=True)
     with torch.inference_mode():
         inputs = processor(images=image.color, return_tensors="pt")
@@ -236,11 +236,11 @@ def test_resampling_leaves_the_padding_out():
 
 def test_duplicates_and_weak_ones_fall(folders):
     image = frame(1)
-    everything = built(folders["mask2former"], score_threshold=0.0, agnostic_nms=1.0).detect(image)
-    fewer = built(folders["mask2former"], score_threshold=0.0, agnostic_nms=0.2).detect(image)
+    everything = built(folders["mask2former"], score_threshold=0.0, agnostic_nms_iou=1.0).detect(image)
+    fewer = built(folders["mask2former"], score_threshold=0.0, agnostic_nms_iou=0.2).detect(image)
     assert 0 < len(fewer) < len(everything)
     least = float(np.median(everything.scores))
-    strong = built(folders["mask2former"], score_threshold=least, agnostic_nms=1.0).detect(image)
+    strong = built(folders["mask2former"], score_threshold=least, agnostic_nms_iou=1.0).detect(image)
     np.testing.assert_array_equal(strong.scores, everything.scores[everything.scores > np.float32(least)])
     assert len(built(folders["mask2former"], score_threshold=0.0, max_detections=2).detect(image)) <= 2
 
@@ -257,7 +257,7 @@ def test_an_output_that_is_not_finite_is_an_error(folders):
     ("parameters", "message"),
     [
         ({"score_threshold": 1.0}, "score_threshold"),
-        ({"agnostic_nms": 0.0}, "agnostic_nms"),
+        ({"agnostic_nms_iou": 0.0}, "agnostic_nms_iou"),
         ({"max_detections": 0}, "max_detections"),
         ({"mask_threshold": 1.0}, "mask_threshold"),
         ({"short_side": 31}, "short_side"),
@@ -289,7 +289,7 @@ def test_offline_a_model_that_is_not_here_says_what_to_do(monkeypatch, variable)
 def coco_rf_detr(folder, names):
     """A tiny RF-DETR-Seg with the head of those trained on COCO, whose config calls the classes `names`."""
     write_network(folder, "rf_detr", names)
-    return built(folder, score_threshold=0.02, agnostic_nms=1.0)
+    return built(folder, score_threshold=0.02, agnostic_nms_iou=1.0)
 
 
 IN_A_ROW = {**dict(enumerate(COCO)), **dict.fromkeys(range(80, 91), "N/A")}

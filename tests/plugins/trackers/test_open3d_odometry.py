@@ -94,7 +94,7 @@ def test_a_video_that_begins_covered_begins_with_its_first_reading(frames: list[
     assert_near(poses[-1], frames[3], 0.01)
 
 
-@pytest.mark.parametrize("bound", [{"max_step": 1e-3}, {"max_turn": 1e-3}])
+@pytest.mark.parametrize("bound", [{"max_translation": 1e-3}, {"max_rotation": 1e-3}])
 def test_a_step_beyond_what_is_plausible_is_lost(frames: list[Frame], bound: dict[str, float]) -> None:
     pose = run(Open3dOdometry(**bound), [frames[0], frames[2]])[1]
     assert pose.lost

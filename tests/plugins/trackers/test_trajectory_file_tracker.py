@@ -51,7 +51,7 @@ def test_without_true_poses_the_first_frame_is_the_identity(path: Path) -> None:
 
 
 def test_the_files_own_world_can_be_kept(path: Path) -> None:
-    tracker = TrajectoryFile(path, world=World.FILE)
+    tracker = TrajectoryFile(path, world_frame=World.FILE)
     for k, frame in enumerate(CornerRoom(frames=3)):
         np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, T_FILE_WORLD @ pose_at(k), atol=1e-9)
 

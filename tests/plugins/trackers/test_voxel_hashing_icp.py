@@ -177,7 +177,7 @@ def test_the_map_is_seen_from_where_a_steady_motion_leads(monkeypatch: pytest.Mo
     np.testing.assert_allclose(seen_from, [last @ inverse(before) @ last], atol=1e-9)
 
 
-@pytest.mark.parametrize("bound", [{"max_step": 0.002}, {"max_turn": 0.001}])
+@pytest.mark.parametrize("bound", [{"max_translation": 0.002}, {"max_rotation": 0.001}])
 def test_a_step_beyond_what_is_plausible_is_lost(bound: dict[str, float]) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(2)[:1] + walk(60)[4:5])]
     assert not any(pose.lost for pose in run(VoxelHashingIcp(finest_scale=1.0), frames)[0])

@@ -42,7 +42,7 @@ def test_writes_a_file_that_precomputed_reads(tmp_path: Path) -> None:
     )
     how = done.stderr.split("read it with: ")[1].split()
     path, labels = (argument.split("=")[1] for argument in how[1:])
-    detector = Precomputed(Path(path), labels=labels)
+    detector = Precomputed(Path(path), label_space=labels)
     assert [len(detector.detect(frame)) for frame in CornerRoom()] == [2, 0, 2, 2, 2, 2]
 
 
