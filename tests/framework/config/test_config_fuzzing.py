@@ -25,7 +25,7 @@ defaults:
   - _self_
 _target_: plugins.detectors.precomputed.Precomputed
 path: /nowhere/results.json # of a program
-labels: coco
+label_space: coco
 category_ids: FROM_ONE
 score_threshold: 0.1
 class_spread: 1.0
