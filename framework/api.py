@@ -192,9 +192,7 @@ class Mapper(Map):
             else:
                 camera = camera or self._camera
                 if depth is None:
-                    raise DataError(
-                        f"Mapper.add takes a Frame, or colour and depth, found {type(color).__name__} alone"
-                    )
+                    raise DataError(f"Mapper.add takes a Frame, or color and depth, found {type(color).__name__} alone")
                 if camera is None:
                     raise DataError("Mapper.add needs the camera once: camera=Camera(width, height, fx, fy, cx, cy)")
                 time = self._frames / FRAME_RATE if timestamp is None else timestamp

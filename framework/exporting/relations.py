@@ -30,7 +30,7 @@ STACKED = 0.5  # minimum fraction of the foot above the support
 WITHIN = 0.9  # minimum fraction of a surface in the box of its container
 SECTORS = 36  # number of directions around an object; the legs of a table fill few
 ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in a bowl, and on a covered shelf
-BESIDE = 0.3  # maximum distance of neighbors, m
+MAX_NEIGHBOR_DISTANCE = 0.3  # m
 ON_WALL = 0.10  # maximum distance from a wall, m
 HANGING = 0.7  # minimum fraction of points near a wall
 STRAY = 2.0  # % of a surface at its lower and upper end that may be noise
@@ -59,12 +59,12 @@ def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:
         things.append(_Thing(one.id, one, points, level))
     standing = [relation for thing in things if (relation := _standing(thing, things, plan)) is not None]
     joined = {frozenset((relation.source, relation.target)) for relation in standing}
-    beside = [
+    neighbors = [
         Relation(a.id, "next_to", b.id, {"distance": gap})
         for a, b in combinations(things, 2)
-        if frozenset((a.id, b.id)) not in joined and (gap := _gap(a, b)) <= BESIDE
+        if frozenset((a.id, b.id)) not in joined and (gap := _gap(a, b)) <= MAX_NEIGHBOR_DISTANCE
     ]
-    return standing + beside
+    return standing + neighbors
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def _gap(a: _Thing, b: _Thing) -> float:
     if min(a.top, b.top) < max(a.base, b.base):
         return float("inf")
     fewer, more = sorted((a, b), key=lambda thing: thing.tree.n)
-    distance, _ = more.tree.query(fewer.tree.data, distance_upper_bound=BESIDE)
+    distance, _ = more.tree.query(fewer.tree.data, distance_upper_bound=MAX_NEIGHBOR_DISTANCE)
     return float(np.min(distance))
 
 

@@ -355,7 +355,7 @@ class FuserContract:
 
 
 def fused(fuser: MapFuser, frames: int = 5) -> MapFuser:
-    """The fuser, once it has seen so many frames of the room."""
+    """Return the fuser after it has fused `frames` frames of the room."""
     for k in range(frames):
         frame = frame_at(k)
         fuser.fuse(frame, Pose(pose_at(k)), exact_clusters(frame))

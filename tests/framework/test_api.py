@@ -126,7 +126,7 @@ def test_a_mapper_is_pickled(room: CornerRoom, fuser: str) -> None:
 
 
 def test_what_is_no_frame_is_told() -> None:
-    with pytest.raises(DataError, match=r"Mapper\.add takes a Frame, or colour and depth, found NoneType alone"):
+    with pytest.raises(DataError, match=r"Mapper\.add takes a Frame, or color and depth, found NoneType alone"):
         Mapper(*STAGES).add(None)  # type: ignore[arg-type]
 
 

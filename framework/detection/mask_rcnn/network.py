@@ -104,7 +104,8 @@ class MaskRCNN(nn.Module):
     def anchors(self, pyramid: Sequence[Tensor]) -> list[Float32]:
         """Return the (A, 4) anchors of each level; the next call for the same shapes returns the same arrays."""
         shapes = [(level.shape[2], level.shape[3]) for level in pyramid]
-        if shapes != self._grids[0]:
+        known, grids = self._grids
+        if shapes != known:
             height, width = (STRIDES[0] * cells for cells in shapes[0])
             truncated = self.architecture.truncated_strides
             grids = [
@@ -112,7 +113,7 @@ class MaskRCNN(nn.Module):
                 for anchors, (rows, columns), stride in zip(self._anchors, shapes, STRIDES, strict=True)
             ]
             self._grids = shapes, grids
-        return self._grids[1]
+        return grids
 
     def classify(self, pyramid: Sequence[Tensor], boxes: Tensor) -> tuple[Tensor, Tensor]:
         """Return (logits (P, 1 + C), deltas (P, 1 + C, 4)) of boxes (P, 4) of one image."""

@@ -148,7 +148,7 @@ def test_frames_by_hand_are_frames() -> None:
 def test_frames_that_are_none_are_told() -> None:
     frame = CornerRoom()[0]
     mapper = Mapper(*STAGES)
-    with pytest.raises(DataError, match="takes a Frame, or colour and depth, found ndarray alone"):
+    with pytest.raises(DataError, match="takes a Frame, or color and depth, found ndarray alone"):
         mapper.add(frame.color)
     with pytest.raises(DataError, match="needs the camera once"):
         mapper.add(frame.color, frame.depth, pose=frame.T_world_camera)

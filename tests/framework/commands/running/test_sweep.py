@@ -200,17 +200,17 @@ def test_runs_that_differ_in_what_changes_no_result_have_places_of_their_own(tmp
     assert done.stderr.count("kept: the complete record in") == 2
 
 
-@pytest.mark.parametrize("told", [pytest.param(signal.SIGINT, marks=pytest.mark.acceptance), signal.SIGTERM])
-def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, told: signal.Signals) -> None:
+@pytest.mark.parametrize("signal_sent", [pytest.param(signal.SIGINT, marks=pytest.mark.acceptance), signal.SIGTERM])
+def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, signal_sent: signal.Signals) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     process = begin(tmp_path, *BY_JOBLIB, "row=all", "dataset.slow_s=1")
     wait_until(lambda: len(begun(tmp_path)) == 2, process)
     family = psutil.Process(process.pid).children(recursive=True)
-    process.send_signal(told)
+    process.send_signal(signal_sent)
     sent = time.monotonic()
     done = end(process)
     assert time.monotonic() - sent < 15
-    assert done.returncode == 128 + told
+    assert done.returncode == 128 + signal_sent
     assert done.stderr.splitlines()[-1] in ("interrupted by Ctrl-C", "ended by SIGTERM")
     assert not psutil.wait_procs(family, timeout=10)[1]
 
@@ -219,7 +219,7 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
 
 
 @pytest.mark.parametrize(
-    ("told", "all_at_once", "n_jobs", "seeds", "at_work"),
+    ("signal_sent", "all_at_once", "n_jobs", "seeds", "at_work"),
     [
         (signal.SIGINT, False, 2, "1,2,3", 2),
         pytest.param(signal.SIGTERM, True, 2, "1,2,3", 2, marks=pytest.mark.acceptance),
@@ -228,7 +228,7 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
     ],
 )
 def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
-    tmp_path: Path, told: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
+    tmp_path: Path, signal_sent: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
 ) -> None:
     """A terminal sends Ctrl-C to the workers, too; `kill` does not."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
@@ -236,11 +236,11 @@ def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
     process = begin(tmp_path, *by_joblib, "row=all", f"seed={seeds}", *ENDLESS, "fuser.note=${seed}.note")
     wait_until(lambda: len(list(tmp_path.glob("*.note"))) == at_work, process)
     if all_at_once:
-        os.killpg(process.pid, told)
+        os.killpg(process.pid, signal_sent)
     else:
-        process.send_signal(told)
+        process.send_signal(signal_sent)
     done = end(process)
-    assert done.returncode == 128 + told
+    assert done.returncode == 128 + signal_sent
     ending = "once the runs in work have left their records" if n_jobs > 1 else "after this frame"
     assert done.stderr.count(f"ending {ending}; a second time ends at once") == 1
     assert done.stderr.splitlines()[-1] in ("interrupted by Ctrl-C", "ended by SIGTERM")
