@@ -144,11 +144,11 @@ def test_networks_list_every_option_with_weights() -> None:
     found: set[str] = set()
     for path in (CHECKOUT / "conf" / "detector").glob("*.yaml"):
         content: dict[str, Any] = yaml.safe_load(path.read_text())
-        given = {key: content[key] for key in ("weights", "model", "masks") if content.get(key, "???") != "???"}
+        given = {key: content[key] for key in ("weights", "model", "mask_model") if content.get(key, "???") != "???"}
         for key, value in given.items():
             found.add(value if value in PUBLISHED else path.stem if len(given) == 1 else f"{path.stem}.{key}")
     assert found | PUBLISHED.keys() == set(named)
-    assert {"with_embeddings", "open_vocabulary.model", "open_vocabulary.masks"} < found
+    assert {"with_embeddings", "open_vocabulary.model", "open_vocabulary.mask_model"} < found
 
 
 def test_networks_list_a_new_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
