@@ -238,11 +238,14 @@ def test_every_row_of_an_experiment_is_named(name: str) -> None:
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)
-def test_every_benchmark_is_there(command: str) -> None:
-    """Running them takes minutes: pytest's status is 5 where nothing would be run."""
-    line = [sys.executable, *shlex.split(command)[1:], "--collect-only", "--quiet"]
-    done = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stdout
+def test_shown_benchmark_exists(command: str) -> None:
+    folder, _, keyword = command.split()[3:]
+    tests = [
+        f"{path.stem}::{name}"
+        for path in (CHECKOUT / folder).glob("test_*.py")
+        for name in re.findall(r"^def (test_\w+)", path.read_text(), re.MULTILINE)
+    ]
+    assert any(keyword in test for test in tests)
 
 
 def _kth(override: str, k: int) -> str:

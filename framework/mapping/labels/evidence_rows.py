@@ -28,7 +28,6 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
-from framework.runtime.memory import PagesAhead
 
 INSTANCE_SLOTS = 4  # of a voxel in compact storage
 RESERVED = 128  # labeled voxels reserved per block of the budget; most blocks have fewer, and the array grows
@@ -63,14 +62,13 @@ class EvidenceRows:
         self.evicted = 0  # slots given to another label so far
         self._instance_slots = INSTANCE_SLOTS
         self._class_slots = CLASS_SLOTS
-        self._pages = PagesAhead()
         self._free()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without reserved capacity, which is gigabytes."""
         rows = {name: getattr(self, name)[: self.row_count] for name in ("_labeled", "_row_bits")}
         used = {**rows, "_slots": self._slots[: self.voxel_count]}
-        return {**vars(self), **used, "evidence": None, "_pages": PagesAhead()}
+        return {**vars(self), **used, "evidence": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -167,8 +165,6 @@ class EvidenceRows:
             self._slots = grown(self._slots, max(voxels, 2 * len(self._slots)))
         self.row_count, self.voxel_count = rows, voxels
         self._lay_out()
-        self._pages.ask([self._labeled], rows)
-        self._pages.ask([self._slots], voxels)
 
     def _make_room_for_instances(self, new: int) -> None:
         """Double the slots until every voxel has `new` free ones."""

@@ -22,7 +22,6 @@ import numpy.typing as npt
 from framework.data import Int32, UInt8
 from framework.errors import MapFullError
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS, NO_KEY, insert_blocks, rehash
-from framework.runtime.memory import PagesAhead
 
 try:
     import resource
@@ -102,12 +101,11 @@ class VoxelGrid:
             region_blocks=np.empty((64, REGION_BLOCKS), np.int32),
             **reserved(max_blocks, _free_blocks),
         )
-        self._pages = PagesAhead()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without reserved capacity, which is gigabytes."""
         blocks = {name: getattr(self.grid, name)[: self.block_count] for name in OF_BLOCKS}
-        return {**vars(self), "grid": self.grid._replace(**blocks), "_pages": PagesAhead()}
+        return {**vars(self), "grid": self.grid._replace(**blocks)}
 
     @property
     def byte_count(self) -> int:
@@ -128,7 +126,6 @@ class VoxelGrid:
                 self.grid, coords, done, self.region_count, self.block_count, blocks
             )
             if done == len(coords):
-                self._pages.ask((getattr(self.grid, name) for name in OF_BLOCKS), self.block_count)
                 return blocks
             if self.block_count == self.max_blocks:
                 raise MapFullError(
