@@ -17,30 +17,27 @@ import pytest
 from framework.__main__ import COMMANDS, leave_working_folder, main, module_of
 from framework.files.search_paths import CONF
 from framework.runs.provenance import config_hash
+from tests.support.forked_commands import FAKE_CONF, clean_environment, completed
 
 pytestmark = pytest.mark.integration
 
 CHECKOUT = Path(__file__).resolve().parents[2]
-FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
+STAGES = ("dataset", "detector", "tracker", "refiner", "fuser")
+FAKE_STAGES = ["--config-dir", str(FAKE_CONF), *(f"{stage}=fake" for stage in STAGES)]
 RECORD = {"config.yaml", "metrics.json", "instances.json", "mesh.ply", "trajectory.txt", "timings.csv", "map.npz"}
 
 
 def command(*arguments: str) -> list[str]:
-    fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf")]
-    return [sys.executable, "-m", "framework", *fakes, *FAKES, *arguments]
+    return [sys.executable, "-m", "framework", *FAKE_STAGES, *arguments]
 
 
 def environment() -> dict[str, str]:
-    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
-    return clean | {"PYTHONPATH": str(CHECKOUT)}
+    return clean_environment() | {"PYTHONPATH": str(CHECKOUT)}
 
 
 def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.CompletedProcess[str]:
     places = [f"hydra.run.dir={directory}", f"hydra.sweep.dir={directory}"]
-    line = command(*places, *arguments)
-    if sweep:
-        line.insert(3, "-m")
-    return subprocess.run(line, cwd=directory, env=environment(), capture_output=True, text=True, timeout=120)
+    return completed(directory, *["-m"] * sweep, *FAKE_STAGES, *places, *arguments)
 
 
 @pytest.mark.parametrize(
@@ -147,8 +144,7 @@ def test_debug_shows_the_traceback(tmp_path: Path) -> None:
 
 
 def words(*arguments: str, directory: Path) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "framework", *arguments]
-    return subprocess.run(line, cwd=directory, env=environment(), capture_output=True, text=True, timeout=120)
+    return completed(directory, *arguments)
 
 
 def test_help_lists_the_commands_and_each_is_there(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -25,7 +27,12 @@ def names(stage: str, kind: type = object) -> list[str]:
 
 
 def composed(stage: str, name: str, *overrides: str) -> DictConfig:
-    """The main config with this option and no other stage."""
+    """Return the main config with this option and no other stage."""
+    return copy.deepcopy(_composed(stage, name, *overrides))
+
+
+@functools.cache
+def _composed(stage: str, name: str, *overrides: str) -> DictConfig:
     others = [f"~{other}" for other in GROUPS if other != stage]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", overrides=[f"{stage}={name}", *others, *overrides])

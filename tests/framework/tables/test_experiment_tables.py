@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +15,7 @@ from framework.runs.provenance import config_hash
 from framework.synthetic.scenenn_scene import BenchmarkSettings
 from framework.tables.experiment_tables import write_tables
 from framework.tables.layouts import head
+from tests.support.forked_commands import completed
 
 pytestmark = pytest.mark.integration
 
@@ -347,9 +346,8 @@ def test_heads_have_units() -> None:
 
 
 def test_the_command(sweep: Path) -> None:
-    line = [sys.executable, "-m", "framework", "tables", str(sweep)]
-    done = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, timeout=60)
+    done = completed(CHECKOUT, "tables", str(sweep))
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("# ablation_x")
-    wrong = subprocess.run([*line, "nowhere"], cwd=CHECKOUT, capture_output=True, text=True, timeout=60)
+    wrong = completed(CHECKOUT, "tables", str(sweep), "nowhere")
     assert (wrong.returncode, wrong.stderr) == (1, "error: nowhere is not a folder with records of runs\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -11,6 +10,7 @@ import pytest
 
 from framework.geometry import inverse
 from tests.framework.checking.test_recording_check import DESK
+from tests.support.forked_commands import completed
 from tests.support.recordings.damaged import write_damaged
 
 pytestmark = pytest.mark.integration
@@ -19,10 +19,7 @@ CHECKOUT = Path(__file__).resolve().parents[4]
 
 
 def checked(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "framework", "check", *arguments]
-    return subprocess.run(
-        line, cwd=place, env={"PYTHONPATH": str(CHECKOUT)}, capture_output=True, text=True, check=False
-    )
+    return completed(place, "check", *arguments)
 
 
 @pytest.fixture(scope="module")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +12,7 @@ import pytest
 from framework.commands.running.detect import write_detections
 from framework.errors import DataError
 from plugins.detectors.precomputed import Precomputed
+from tests.support.forked_commands import FAKE_CONF, completed
 from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
 pytestmark = pytest.mark.integration
@@ -22,11 +21,8 @@ CHECKOUT = Path(__file__).resolve().parents[4]
 
 
 def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), "detector=fake", "dataset=fake"]
-    line = [sys.executable, "-m", "framework", "detect", *fakes, *arguments]
-    environment = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
-    environment["PYTHONPATH"] = str(CHECKOUT)
-    return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
+    fakes = ["--config-dir", str(FAKE_CONF), "detector=fake", "dataset=fake"]
+    return completed(directory, "detect", *fakes, *arguments)
 
 
 def test_writes_a_file_that_precomputed_reads(tmp_path: Path) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +21,7 @@ from framework.registry import build
 from framework.runs.provenance import config_hash
 from framework.synthetic.benchmark import SCENES
 from framework.tables.published import read_published
+from tests.support.forked_commands import FAKE_CONF, completed
 
 pytestmark = pytest.mark.integration
 
@@ -33,10 +32,7 @@ ONLY_THE_USER_KNOWS = ("dataset.root=somewhere", "detector.weights=somewhere")
 
 
 def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "framework", "--config-dir", str(FAKES), "experiment=fake_ablation", *arguments]
-    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
-    environment = clean | {"PYTHONPATH": str(CHECKOUT)}
-    return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
+    return completed(directory, "--config-dir", str(FAKE_CONF), "experiment=fake_ablation", *arguments)
 
 
 def table(directory: Path) -> dict[str, dict[str, str]]:
@@ -122,14 +118,15 @@ def test_a_row_may_be_called_by_a_number() -> None:
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_row_of_every_experiment_composes_and_is_another(experiment: str) -> None:
-    """The command's own way of composing a row; the stages that the rows change are built, too."""
+@pytest.mark.parametrize("all_rows", [False, pytest.param(True, marks=pytest.mark.acceptance)])
+def test_rows_of_experiment_compose_and_differ(experiment: str, all_rows: bool) -> None:
+    """Compose rows as the command does, and build the stages that rows change. Two rows without `all_rows`."""
     hashes: dict[str, str] = {}
     with_parent = experiment.endswith(("_replica", "_scannet"))
     paths = [f"++{path}" for path in ONLY_THE_USER_KNOWS] if with_parent else []
     with initialize_config_dir(str(CONF), version_base="1.3"):
         rows = compose("config", overrides=[f"experiment={experiment}"]).rows
-    for row in list(rows)[:2] if with_parent else rows:  # the others are those of the parent
+    for row in rows if all_rows else list(rows)[-2:]:
         config, choices = composed([f"experiment={experiment}", f"row={row}", "seed=1", *paths])
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)

@@ -8,7 +8,6 @@ import resource
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,7 @@ import pytest
 
 from framework.files.directory_lock import locked
 from framework.runs.stored_runs import MAPPED
+from tests.support.forked_commands import FAKE_CONF, ForkedCommand
 
 pytestmark = pytest.mark.integration
 
@@ -27,30 +27,13 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
 PATIENCE_S = 120
 
 
-def begin(directory: Path, *arguments: str, before: Callable[[], object] | None = None) -> subprocess.Popen[str]:
-    """A run of stages that do nothing much, in `directory`; `before` is called in its process."""
-    line = [
-        sys.executable,
-        "-m",
-        "framework",
-        "--config-dir",
-        str(CHECKOUT / "tests" / "support" / "fake_conf"),
-        *FAKES,
-    ]
-    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
-    return subprocess.Popen(
-        [*line, *arguments],
-        cwd=directory,
-        env=clean | {"PYTHONPATH": str(CHECKOUT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=before,
-    )
+def begin(directory: Path, *arguments: str, before: Callable[[], object] | None = None) -> ForkedCommand:
+    """Start a run of fake stages in `directory`; `before` is called in its process."""
+    return ForkedCommand(directory, "--config-dir", str(FAKE_CONF), *FAKES, *arguments, before=before)
 
 
-def end(process: subprocess.Popen[str]) -> tuple[int, str]:
-    """Exit status and stderr."""
+def end(process: ForkedCommand) -> tuple[int | None, str]:
+    """Return exit status and stderr."""
     try:
         _, stderr = process.communicate(timeout=PATIENCE_S)
     except subprocess.TimeoutExpired:
@@ -59,7 +42,7 @@ def end(process: subprocess.Popen[str]) -> tuple[int, str]:
     return process.returncode, stderr
 
 
-def wait_for(file: Path, process: subprocess.Popen[str]) -> None:
+def wait_for(file: Path, process: ForkedCommand) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not file.exists():
         assert process.poll() is None, process.communicate()[1]
@@ -70,6 +53,11 @@ def wait_for(file: Path, process: subprocess.Popen[str]) -> None:
 def figures(directory: Path, name: str = "metrics.partial.json") -> dict[str, object]:
     read: dict[str, object] = json.loads((directory / name).read_text())
     return read
+
+
+def limit_file_size() -> None:
+    """Limit files to 64 KiB. The kernel then answers as on a full disk."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))
 
 
 def ignore_ctrl_c() -> None:
@@ -143,17 +131,10 @@ def test_a_stage_that_ends_the_process_leaves_a_partial_record(tmp_path: Path) -
 
 
 def test_on_a_full_disk_the_small_files_are_written(tmp_path: Path) -> None:
-    """No file may have more than 64 KiB here: what the kernel answers then is what it answers on a full disk."""
     place = tmp_path / "run"
     place.mkdir()
     (place / "mesh.ply").write_text("of an earlier run")
-    status, stderr = end(
-        begin(
-            tmp_path,
-            f"hydra.run.dir={place}",
-            before=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16)),
-        )
-    )
+    status, stderr = end(begin(tmp_path, f"hydra.run.dir={place}", before=limit_file_size))
     assert status == 3
     assert "Traceback" not in stderr
     left = {path.name for path in place.iterdir()}

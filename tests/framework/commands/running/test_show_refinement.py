@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +11,7 @@ from PIL import Image
 from framework.commands.running.show_refinement import TRIED, called, detected
 from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError, FrameError
+from tests.support.forked_commands import FAKE_CONF, completed
 from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
 pytestmark = pytest.mark.integration
@@ -21,11 +20,8 @@ CHECKOUT = Path(__file__).resolve().parents[4]
 
 
 def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), "detector=fake", "dataset=fake"]
-    line = [sys.executable, "-m", "framework", "show-refinement", *fakes, *arguments]
-    environment = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
-    environment["PYTHONPATH"] = str(CHECKOUT)
-    return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
+    fakes = ["--config-dir", str(FAKE_CONF), "detector=fake", "dataset=fake"]
+    return completed(directory, "show-refinement", *fakes, *arguments)
 
 
 def test_draws_one_frame(tmp_path: Path) -> None:

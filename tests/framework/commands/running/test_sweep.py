@@ -190,6 +190,7 @@ def test_a_sweep_without_an_experiment_is_resumed(tmp_path: Path) -> None:
     assert {name: second[name] for name in first} == first
 
 
+@pytest.mark.acceptance
 def test_runs_that_differ_in_what_changes_no_result_have_places_of_their_own(tmp_path: Path) -> None:
     """As those of a sweep that times them; workers name them alike."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
@@ -200,7 +201,8 @@ def test_runs_that_differ_in_what_changes_no_result_have_places_of_their_own(tmp
     assert done.stderr.count("kept: the complete record in") == 2
 
 
-@pytest.mark.parametrize("signal_sent", [pytest.param(signal.SIGINT, marks=pytest.mark.acceptance), signal.SIGTERM])
+@pytest.mark.parametrize("signal_sent", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.acceptance
 def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, signal_sent: signal.Signals) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     process = begin(tmp_path, *BY_JOBLIB, "row=all", "dataset.slow_s=1")
@@ -224,7 +226,7 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
         (signal.SIGINT, False, 2, "1,2,3", 2),
         pytest.param(signal.SIGTERM, True, 2, "1,2,3", 2, marks=pytest.mark.acceptance),
         pytest.param(signal.SIGINT, True, 3, "1,2", 2, marks=pytest.mark.acceptance),  # more workers than runs
-        (signal.SIGINT, False, 1, "1,2", 1),  # joblib starts no worker
+        pytest.param(signal.SIGINT, False, 1, "1,2", 1, marks=pytest.mark.acceptance),  # joblib starts no worker
     ],
 )
 def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
@@ -253,6 +255,7 @@ def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
         assert {path.name for path in file.parent.iterdir()} >= set(MAPPED)
 
 
+@pytest.mark.acceptance
 def test_a_second_signal_ends_the_workers_at_once(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     slow_record = ("fuser.slow_save_s=100", "fuser.note=${seed}.note")
@@ -309,7 +312,11 @@ def test_two_sweeps_do_not_share_a_place(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("package", "arguments"),
     [
-        ("hydra_plugins.hydra_submitit_launcher", ["launcher=submitit_local"]),
+        pytest.param(
+            "hydra_plugins.hydra_submitit_launcher",
+            ["launcher=submitit_local"],
+            marks=pytest.mark.acceptance,
+        ),
         pytest.param(
             "hydra_plugins.hydra_ray_launcher",
             ["launcher=ray", "hydra.launcher.ray.init.num_cpus=2"],
