@@ -166,7 +166,6 @@ RUNNABLE = {  # what to append, by a command that then takes seconds
     "python -m framework export outputs/demo --to floorplan graph --robot-height 0.5": [],
     "python -m framework plugins": [],
     "python -m framework plugins detector": [],
-    "python -m framework doctor": [],
     "python -m framework new-plugin refiner my_refiner": [],
 }
 LEFT_BEHIND = [

@@ -106,9 +106,9 @@ def test_eleven_damaged_recordings(
     [
         ({"pose": scalar_first}, "dataset.quaternion_order=WXYZ"),
         ({"pose": in_millimetres}, "dataset.pose_unit=0.001"),
-        ({"depth_late": 2}, DELAY + "2"),
-        ({"depth_late": -1}, DELAY + "-1"),
-        ({"scale": 0.01}, SCALE + "5000"),
+        pytest.param({"depth_late": 2}, DELAY + "2", marks=pytest.mark.acceptance),
+        pytest.param({"depth_late": -1}, DELAY + "-1", marks=pytest.mark.acceptance),
+        pytest.param({"scale": 0.01}, SCALE + "5000", marks=pytest.mark.acceptance),
         ({"poses_late": 3, "pose": both}, f"{POSES}3 {KIND}T_CAMERA_WORLD {AXES}OPENGL"),
         ({"poses_late": -3, "depth_late": -3}, f"{POSES}-3 {DELAY}-3"),
     ],

@@ -191,6 +191,7 @@ def test_an_installed_package_examines_itself_and_writes_plugins(place: Path) ->
     assert (place / "instancemap-other" / "instancemap_other" / "other.py").exists()
 
 
+@pytest.mark.acceptance
 def test_installed_package_maps_the_desk(place: Path) -> None:
     """The command without a dataset, and the Python example of the README, each on a few frames."""
     assert run(place, "instancemap", "--version") == f"instancemap {framework.__version__}\n"
