@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-import tests.support.cores  # noqa: F401  # isort: skip; before numba is loaded, which reads what it sets
+import tests.support.cores  # isort: skip; before numba is loaded, which reads what it sets
 
 pytest.register_assert_rewrite("framework.testing")  # before they are loaded
 
+import tests.support.cached_lights  # noqa: E402, F401
 from framework.config import composition  # noqa: E402
 from tests.support.scenes.corner_room import CornerRoom  # noqa: E402
 

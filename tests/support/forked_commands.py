@@ -20,6 +20,7 @@ LIBRARIES = [
     "framework.commands.running.sweep",
     "framework.rendering.overview",
     "scipy.spatial.transform",
+    "tests.support.cached_lights",
     "matplotlib.font_manager",
 ]
 _context = multiprocessing.get_context("forkserver")

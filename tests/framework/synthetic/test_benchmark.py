@@ -46,13 +46,12 @@ def test_the_scenes_have_names_of_their_own_and_each_class_is_promised_by_at_lea
     assert min(promised.values()) >= 2
 
 
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.acceptance) for seed in SEEDS[1:])])
 @pytest.mark.parametrize("name", ROOMS)
-def test_a_scene_holds_what_it_promises(name: str) -> None:
-    for seed in SEEDS:
-        rng = np.random.default_rng([seed, ROOMS.index(name)])
-        found = classes_of(piece for make in SCENES[name].groups for piece in make(rng).pieces)
-        for class_name, least in SCENES[name].holds.items():
-            assert found[class_name] >= least, (seed, class_name)
+def test_scene_has_declared_objects(name: str, seed: int) -> None:
+    rng = np.random.default_rng([seed, ROOMS.index(name)])
+    found = classes_of(piece for make in SCENES[name].groups for piece in make(rng).pieces)
+    assert all(found[class_name] >= least for class_name, least in SCENES[name].holds.items())
 
 
 @pytest.mark.parametrize("name", ROOMS)

@@ -52,10 +52,12 @@ def test_two_processes_write_what_one_writes(root: Path, tmp_path: Path) -> None
     assert len(written) == 2 * RECORDING.frames + 4
 
 
+@pytest.mark.acceptance
 def test_two_scenes_of_one_spec_differ(root: Path) -> None:
     assert trajectory_file(root / "007").read_bytes() != trajectory_file(root / "008").read_bytes()
 
 
+@pytest.mark.acceptance
 def test_what_is_complete_is_kept_and_what_is_missing_is_written_again(root: Path) -> None:
     before, written = times(root), contents(root)
     color_file, _ = frame_files(root / "007", 4)
@@ -72,6 +74,7 @@ def test_what_is_complete_is_kept_and_what_is_missing_is_written_again(root: Pat
     assert all(after[name] == before[name] for name in after if name.startswith("008"))
 
 
+@pytest.mark.acceptance
 def test_what_all_scenes_share(root: Path) -> None:
     assert (root / "release.txt").read_text() == f"synthetic {GENERATION}, seed 1, 10 frames\n"
     assert json.loads((root / "synthesize.json").read_text())["generation"] == GENERATION

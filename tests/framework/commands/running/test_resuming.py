@@ -85,7 +85,8 @@ def test_the_desk_is_gone_on_with(tmp_path: Path) -> None:
     check_halves(tmp_path, DESK)
 
 
-def test_the_kitchen_is_gone_on_with(tmp_path: Path, shared_data: Path) -> None:
+@pytest.mark.acceptance
+def test_resumed_kitchen_is_the_same(tmp_path: Path, shared_data: Path) -> None:
     check_halves(tmp_path, RgbdFolder(shared_data / "redkitchen", stride=3))
 
 
