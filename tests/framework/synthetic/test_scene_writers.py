@@ -83,6 +83,7 @@ def test_what_all_scenes_share(root: Path) -> None:
     assert not list(root.rglob(".*")), "nothing unfinished is left"
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize(
     "other", [BenchmarkSettings(seed=2, frames=10, width=64), BenchmarkSettings(seed=1, frames=9, width=64)]
 )
