@@ -19,16 +19,16 @@ behind:
     scene = load_map("outputs/demo/map.npz")
     chairs = scene.instances("chair")
     it = scene.nearest((1.0, 0.0, 2.0))
-    mesh = scene.mesh()  # vertices, triangles, colour, instance and class of each vertex; scene.mesh(it) of one object
-    view = scene.view(camera, T_world_camera)  # depth, normals, colour and instances, as the camera would see them
+    mesh = scene.mesh()  # vertices, triangles, color, instance and class of each vertex; scene.mesh(it) of one object
+    view = scene.view(camera, T_world_camera)  # depth, normals, color and instances, as the camera would see them
 
 `export("outputs/demo", "glb", "usd")` writes a run for other programs; `query("outputs/demo", "a red chair").objects`
 are what these words mean, best first.
 
 Several threads may ask one Mapper, while it maps, too: questions wait for the frame in work.
 
-Metres, seconds, radians; camera axes x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a;
-pixel centres at integers; instance 0 = none. Every fault that is yours to mend is an InstanceMapError of one line.
+Meters, seconds, radians; camera axes x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a;
+pixel centers at integers; instance 0 = none. Every fault that is yours to mend is an InstanceMapError of one line.
 
 Stages of your own are dataclasses that implement Detector, PoseTracker, ClusterRefiner or MapFuser. They go together
 as `Pipeline(detector, tracker, refiner, fuser).run(sequence)`, or are chosen by name once a YAML registers them

@@ -59,7 +59,7 @@ def main() -> None:
     surface = Surface.seen_from(last.vertices, last.triangles, path)
     camera, T_world_camera = best_view(surface, only(last.instance_ids, likely), path, WIDTH, HEIGHT)
     centroids = {}
-    for mesh, likely in maps:  # an instance has the colour of where it was last
+    for mesh, likely in maps:  # an instance has the color of where it was last
         for key in likely:
             centroids[key] = mesh.vertices[mesh.instance_ids == key].mean(axis=0)
     colors = dict(

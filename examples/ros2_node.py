@@ -3,7 +3,7 @@
     python examples/ros2_node.py --ros-args -r color:=/camera/color/image_raw \\
         -r depth:=/camera/aligned_depth_to_color/image_raw -r camera_info:=/camera/color/camera_info
 
-Depth must be registered to colour. Each marker is the box around one object in the map's world; its text is the class.
+Depth must be registered to color. Each marker is the box around one object in the map's world; its text is the class.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class InstanceMapNode(Node):
         camera = Camera(info.width, info.height, info.k[0], info.k[4], info.k[2], info.k[5])
         stamp = color.header.stamp.sec + 1e-9 * color.header.stamp.nanosec
         try:
-            added = self.mapper.add(rgb(color), metres(depth), camera=camera, timestamp=stamp)
+            added = self.mapper.add(rgb(color), meters(depth), camera=camera, timestamp=stamp)
         except FrameError as error:
             self.get_logger().warning(str(error))
             return
@@ -60,7 +60,7 @@ def rgb(image: Image) -> np.ndarray:
     return pixels[..., ::-1] if image.encoding == "bgr8" else pixels
 
 
-def metres(image: Image) -> np.ndarray:
+def meters(image: Image) -> np.ndarray:
     kind, unit = (np.float32, 1.0) if image.encoding == "32FC1" else (np.uint16, 0.001)
     values = np.frombuffer(bytes(image.data), kind).reshape(image.height, -1)[:, : image.width] * np.float32(unit)
     return np.nan_to_num(values, nan=0.0, posinf=0.0).astype(np.float32)

@@ -187,4 +187,4 @@ def _obj(meshes: Mapping[str, InstanceMesh]) -> str:
             scene.add_geometry(shape, name, name)
     export_obj: Callable[..., str] = trimesh.exchange.obj.export_obj
     text = export_obj(scene, include_normals=False, digits=OBJ_DIGITS, header=None)
-    return f"# InstanceMap; metres, z up; colours behind the vertices: x y z r g b\n{text}\n"
+    return f"# InstanceMap; meters, z up; colors behind the vertices: x y z r g b\n{text}\n"

@@ -42,7 +42,7 @@ BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # possible lengths of t
 BAR_SHARE = 0.25  # maximum length of the scale bar by the plan's width
 MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1), (-0.6, -1))
 """Offsets of a name that are tried, in its own widths and heights."""
-COORDINATES = "metres in the room: x, y; z is up, and the floor at 0. They are not longitude and latitude."
+COORDINATES = "meters in the room: x, y; z is up, and the floor at 0. They are not longitude and latitude."
 DIGITS = 4  # decimal places, of meters
 
 

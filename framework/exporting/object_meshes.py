@@ -88,7 +88,7 @@ def _decimated(found: Sequence[Part], most: Sequence[int]) -> list[Part]:
     return fewer
 
 
-GREY = (176, 176, 172)  # of the rest of the room
+GRAY = (176, 176, 172)  # of the rest of the room
 
 
 class Coloring(Enum):
@@ -103,11 +103,11 @@ def part_colors(parts: Sequence[Part], coloring: Coloring) -> list[UInt8]:
     """Return the vertex colors (V, 3) of each part, sRGB."""
     if coloring is Coloring.APPEARANCE:
         return [part.mesh.colors for part in parts]
-    grey = np.array(GREY, np.uint8)
+    gray = np.array(GRAY, np.uint8)
     found = []
     for part in parts:
         one = part.object
-        own = grey if one is None else one.color if coloring is Coloring.INSTANCE else one.class_color
+        own = gray if one is None else one.color if coloring is Coloring.INSTANCE else one.class_color
         found.append(np.tile(own, (len(part.mesh.vertices), 1)))
     return found
 

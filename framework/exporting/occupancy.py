@@ -165,5 +165,5 @@ def write_ros_map(directory: Path, found: Plan) -> list[Path]:
 
 def levels(found: Plan) -> UInt8:
     """Return the image (H, W); its first row has the highest y."""
-    grey = np.where(found.occupied, OCCUPIED, np.where(found.free, FREE, UNKNOWN)).astype(np.uint8)
-    return np.ascontiguousarray(grey[::-1])
+    gray = np.where(found.occupied, OCCUPIED, np.where(found.free, FREE, UNKNOWN)).astype(np.uint8)
+    return np.ascontiguousarray(gray[::-1])

@@ -41,7 +41,7 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
             raise FrameError(f"{name} is damaged: {in_one_line(error)}") from error
     image = _decode_png(name, data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image.dtype != np.uint8:
-        raise FrameError(f"{name}: colour must be 8 bits a channel, found {image.dtype}")
+        raise FrameError(f"{name}: color must be 8 bits a channel, found {image.dtype}")
     return np.asarray(image, np.uint8)
 
 

@@ -57,7 +57,7 @@ def _tensor(array: Array) -> o3d.core.Tensor:
 
 
 def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:
-    """Rays (A, B, 6) through the image points u, v (px, pixel centres at integers), which broadcast to (A, B).
+    """Rays (A, B, 6) through the image points u, v (px, pixel centers at integers), which broadcast to (A, B).
 
     The direction has length 1 along the optical axis, so that the distance of a hit is its depth.
     """
@@ -70,5 +70,5 @@ def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) 
 
 
 def image_rays(camera: Camera, T_world_camera: Float64) -> Float32:
-    """The rays (H, W, 6) through all pixel centres."""
+    """The rays (H, W, 6) through all pixel centers."""
     return pixel_rays(camera, T_world_camera, np.arange(camera.width)[None, :], np.arange(camera.height)[:, None])

@@ -20,7 +20,7 @@ from framework.synthetic.paints import Material, Texture
 from framework.synthetic.surfaces import Surfaces, assemble
 
 HEIGHT = 2.55  # m
-WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear colour of lamps and of daylight
+WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear color of lamps and of daylight
 
 
 class RoomKind(StrEnum):

@@ -1,4 +1,4 @@
-"""The labelled mesh that belongs to a video: the exact surfaces in small triangles, as far as the camera saw them."""
+"""The labeled mesh that belongs to a video: the exact surfaces in small triangles, as far as the camera saw them."""
 
 from __future__ import annotations
 

@@ -31,8 +31,8 @@ from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 GENERATION = 3  # of the rooms that this code makes: raise it when they change, so that none are mixed
 ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini
 NOISE, MAX_RANGE = 1.0, 6.0  # the sensor's noise, 1 = a Kinect v1; its range, m
-EXPOSURE = 1 / 60  # s, of colour, amid which the pose is true: a lamp at home leaves a camera no shorter one
-TRUTH_VIEWS = 60  # frames whose view makes up the labelled mesh; neighbours show nearly the same
+EXPOSURE = 1 / 60  # s, of color, amid which the pose is true: a lamp at home leaves a camera no shorter one
+TRUTH_VIEWS = 60  # frames whose view makes up the labeled mesh; neighbors show nearly the same
 FASTEST = 5.0  # haste: 2.2 m/s, a run
 LARGEST_ID = 934338  # of SceneNN's own labels, which have no order
 PNG = (
@@ -128,7 +128,7 @@ class SceneNNScene:
         return len(frames)
 
     def write_frame(self, index: int) -> None:
-        """Colour and depth of frame `index`, counted from 0."""
+        """Color and depth of frame `index`, counted from 0."""
         T_world_camera = self.path.pose(index)
         picture = self.renderer.render(self.camera, T_world_camera)
         rng = np.random.default_rng([*self._stream, index])
@@ -141,7 +141,7 @@ class SceneNNScene:
         _write_png(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
 
     def write_truth(self) -> int:
-        """The labelled mesh and what its labels mean, and no frame; what is never read is not in it."""
+        """The labeled mesh and what its labels mean, and no frame; what is never read is not in it."""
         frames, name = self.recording.frames, self.folder.name
         every = -(-frames // TRUTH_VIEWS)
         views = (self.path.pose(index) for index in range(0, frames, every))
@@ -186,7 +186,7 @@ class SceneNNScene:
 
 
 def frame_files(folder: Path, index: int) -> tuple[Path, Path]:
-    """Colour and depth of frame `index`, which counts from 0: the files' names count from 1."""
+    """Color and depth of frame `index`, which counts from 0: the files' names count from 1."""
     return folder / "image" / f"image{index + 1:05d}.png", folder / "depth" / f"depth{index + 1:05d}.png"
 
 

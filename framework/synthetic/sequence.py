@@ -21,8 +21,8 @@ from framework.synthetic.walk import FRAME_RATE, plan_path
 
 MOST_FRAMES = 10**6  # nine hours
 MOST_SIDE = 5792  # px; its square is MOST_PIXELS
-FOCAL_LENGTH = 525.0 / 640  # image widths: a Kinect's colour camera
-TRUTH_VIEWS = 60  # frames whose exact depth makes up the true surface; neighbours show nearly the same
+FOCAL_LENGTH = 525.0 / 640  # image widths: a Kinect's color camera
+TRUTH_VIEWS = 60  # frames whose exact depth makes up the true surface; neighbors show nearly the same
 
 
 @dataclass
@@ -60,7 +60,7 @@ class Synthetic(RGBDSequence):
         if not (math.isfinite(self.noise) and self.noise >= 0):
             raise ConfigError(f"dataset.noise must be 0 (exact) or positive, found {self.noise}")
         if not self.max_depth > 0:
-            raise ConfigError(f"dataset.max_depth must be positive metres, found {self.max_depth}")
+            raise ConfigError(f"dataset.max_depth must be positive meters, found {self.max_depth}")
         check_truth_voxel(self.ground_truth_spacing)
         self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride, self.frame_fraction, self.seed)
         self.name = self.scene
@@ -106,7 +106,7 @@ class Synthetic(RGBDSequence):
         return self._renderer.depth_and_ids(self.camera, T_world_camera)
 
     def scene_truth(self) -> SceneTruth:
-        """The labelled surface within the sensor's range in the chosen frames, from their exact depth."""
+        """The labeled surface within the sensor's range in the chosen frames, from their exact depth."""
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
         chosen = sorted({*self._chosen[::every], self._chosen[-1]})
         return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)

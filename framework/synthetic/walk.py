@@ -78,7 +78,7 @@ def plan_path(
 
 
 def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
-    """Centre and radii of the longest ellipse (of the RADII) that keeps its DISTANCE."""
+    """Center and radii of the longest ellipse (of the RADII) that keeps its DISTANCE."""
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     free, width, depth = layout.free, layout.width, layout.depth
     rows, columns = free.shape

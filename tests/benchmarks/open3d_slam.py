@@ -9,7 +9,7 @@ from framework.data import Detections, Float64, Frame, Pose
 
 Method = o3d.t.pipelines.odometry.Method
 
-DEPTH_SCALE = 1000.0  # units per metre: depth goes in as uint16 millimetres
+DEPTH_SCALE = 1000.0  # units per meter: depth goes in as uint16 millimeters
 MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; the latter is our fuser's
 MAX_DEPTH_DIFFERENCE = 0.07  # m, the default
 TRUNCATION = 8.0  # voxels, the default
@@ -74,11 +74,11 @@ class Open3DSlam:
         self._frames += 1
 
     def render(self) -> None:
-        """What its tracker needs: the depth of the full image, and colour where the method uses it."""
+        """What its tracker needs: the depth of the full image, and color where the method uses it."""
         self._model.synthesize_model_frame(self._view, DEPTH_SCALE, MIN_DEPTH, MAX_DEPTH, TRUNCATION, self._color)
 
     def render_all(self) -> None:
-        """Depth, normals and colour of the full image."""
+        """Depth, normals and color of the full image."""
         self._model.voxel_grid.ray_cast(
             self._model.frustum_block_coords,
             self._K,

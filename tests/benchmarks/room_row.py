@@ -99,7 +99,7 @@ def _render(
     color: UInt8,
     ids: Int32,
 ) -> None:
-    """Depth along z, colour and instance ids of every pixel, in closed form."""
+    """Depth along z, color and instance ids of every pixel, in closed form."""
     ox, oy, oz = np.float32(T[0, 3]), np.float32(T[1, 3]), np.float32(T[2, 3])
     for v in prange(depth.shape[0]):
         for u in range(depth.shape[1]):

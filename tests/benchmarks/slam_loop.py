@@ -47,7 +47,7 @@ class SlamLoop:
         return sum(pose.lost for pose in self.poses)
 
     def render_all(self, frame: Frame) -> None:
-        """Depth, normals, colour, instance and class ids of the full image, from where the camera was last."""
+        """Depth, normals, color, instance and class ids of the full image, from where the camera was last."""
         self.fuser.scene.render(frame.camera, self.poses[-1].T_world_camera)
 
     def _watch_rendering(self) -> None:

@@ -177,7 +177,7 @@ def test_slam_long_walk(benchmark, tables) -> None:
             ["map at the end, MiB", mib(at_700[0]), mib(at_2000[0]), NOTHING, NOTHING],
             ["map at the end, bytes a voxel", *(f"{b / n:.1f}" for b, n, *_ in (at_700, at_2000)),
              f"{at_2000[0] / at_2000[1] / (at_700[0] / at_700[1]):.2f}", NOTHING],
-            ["its labels, bytes a labelled voxel", *(f"{b / n:.1f}" for *_, b, n in (at_700, at_2000)),
+            ["its labels, bytes a labeled voxel", *(f"{b / n:.1f}" for *_, b, n in (at_700, at_2000)),
              f"{at_2000[2] / at_2000[3] / (at_700[2] / at_700[3]):.2f}", NOTHING],
         ],
         [
@@ -212,7 +212,7 @@ def trajectories(tables) -> Table:
         "Trajectories, 1 cm voxels", ["video", "tracker", "ATE, mm", "end, mm off", "lost", "target"], notes=[
             "ATE: RMSE after rigid alignment. End: distance of the last pose from the true one, without alignment; the "
             "first pose is given.",
-            "The true poses of redkitchen are KinectFusion's, good to a centimetre or two.",
+            "The true poses of redkitchen are KinectFusion's, good to a centimeter or two.",
         ]
     )  # fmt: skip
     tables.append(table)

@@ -79,17 +79,17 @@ def node_class(monkeypatch: pytest.MonkeyPatch) -> type[Any]:
     return node
 
 
-def messages(k: int, encoding: str, in_metres: bool) -> tuple[Message, Message, Message]:
+def messages(k: int, encoding: str, in_meters: bool) -> tuple[Message, Message, Message]:
     frame = DESK[k]
     color = frame.color if encoding == "rgb8" else frame.color[..., ::-1]
     padded = np.pad(color.reshape(480, -1), ((0, 0), (0, 32)))  # rows may be longer than the image
-    depth = frame.depth if in_metres else np.rint(1000 * frame.depth).astype(np.uint16)
-    if in_metres:
+    depth = frame.depth if in_meters else np.rint(1000 * frame.depth).astype(np.uint16)
+    if in_meters:
         depth = np.where(depth > 0, depth, np.nan).astype(np.float32)
     K = frame.camera.K.ravel().tolist()
     image = Message(height=480, width=640, step=padded.shape[1], encoding=encoding, data=padded.tobytes())
     image.header.stamp = Message(sec=int(frame.timestamp), nanosec=int(1e9 * (frame.timestamp % 1)))
-    kind = "32FC1" if in_metres else "16UC1"
+    kind = "32FC1" if in_meters else "16UC1"
     return (
         image,
         Message(height=480, width=640, step=640 * depth.itemsize, encoding=kind, data=depth.tobytes()),
@@ -97,11 +97,11 @@ def messages(k: int, encoding: str, in_metres: bool) -> tuple[Message, Message, 
     )
 
 
-@pytest.mark.parametrize(("encoding", "in_metres"), [("rgb8", False), ("bgr8", True)])
-def test_it_maps_what_comes_and_publishes_objects(node_class: type[Any], encoding: str, in_metres: bool) -> None:
+@pytest.mark.parametrize(("encoding", "in_meters"), [("rgb8", False), ("bgr8", True)])
+def test_it_maps_what_comes_and_publishes_objects(node_class: type[Any], encoding: str, in_meters: bool) -> None:
     node = node_class("fuser.voxel_size=0.02")
     for k in range(8):
-        node.map(*messages(k, encoding, in_metres))
+        node.map(*messages(k, encoding, in_meters))
     assert node.warned == []
     found = node.mapper.instances()
     assert len(found) >= 2

@@ -38,7 +38,7 @@ def overrides(stage: str, name: str, folder: Path) -> list[str]:
 
 
 def _images(color: str, depth: str, first: int = 0) -> None:
-    """The corner room's, in millimetres; the names get the frame's number, counted from `first`."""
+    """The corner room's, in millimeters; the names get the frame's number, counted from `first`."""
     for frame in CornerRoom(frames=FRAMES):
         for path, image in (
             (Path(color.format(first + frame.index)), frame.color[..., ::-1]),

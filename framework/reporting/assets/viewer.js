@@ -1,7 +1,7 @@
 "use strict";
 
-// The map in 3D: colours, instances or classes; objects that are clicked on; the map as it grew.
-// Colours are mixed as overview.png has them: instances in one colour, some texture showing through.
+// The map in 3D: colors, instances or classes; objects that are clicked on; the map as it grew.
+// Colors are mixed as overview.png has them: instances in one color, some texture showing through.
 
 const VERTEX_SHADER = `
   attribute float firstSeen;

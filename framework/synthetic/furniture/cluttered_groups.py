@@ -1,4 +1,4 @@
-"""Hard cases as groups: things lying on beds, couches and tables, rows of equal objects, and neighbours that touch."""
+"""Hard cases as groups: things lying on beds, couches and tables, rows of equal objects, and neighbors that touch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BORDER = 0.06  # m, of a bed or a couch on which nothing lies
 ARM = 0.24  # m, the widest arm of a couch
 SINK = 0.012  # m, how deep things lie in what is soft
 PLACES = 60  # tried for each thing that lies about
-TOUCHING = (0.001, 0.005)  # m, between neighbours of which a sensor cannot tell that they are two
+TOUCHING = (0.001, 0.005)  # m, between neighbors of which a sensor cannot tell that they are two
 LADEN_CHAIRS = 0.5  # share of the chairs along a wall on which something lies
 SEAT = 0.19  # m, from the front of a chair to the middle of its seat
 LEATHER_COUCHES = 0.3  # share of the couches that are of black leather

@@ -111,7 +111,7 @@ def test_poses_that_are_given_in_other_axes_are_right_when_read_so() -> None:
 
 
 def test_a_unit_that_is_set_is_kept_while_axes_are_sought() -> None:
-    """In millimetres and inverted: with the unit set, the direction alone is left to be named."""
+    """In millimeters and inverted: with the unit set, the direction alone is left to be named."""
 
     def stored(T: Float64) -> Float64:
         inverted = inverse(T)

@@ -51,7 +51,7 @@ def scalar_first(T: Float64) -> Float64:
     return misread
 
 
-def in_millimetres(T: Float64) -> Float64:
+def in_millimeters(T: Float64) -> Float64:
     moved = T.copy()
     moved[:3, 3] *= 1000
     return moved
@@ -105,7 +105,7 @@ def test_eleven_damaged_recordings(
     ("damage", "setting"),
     [
         ({"pose": scalar_first}, "dataset.quaternion_order=WXYZ"),
-        ({"pose": in_millimetres}, "dataset.pose_unit=0.001"),
+        ({"pose": in_millimeters}, "dataset.pose_unit=0.001"),
         pytest.param({"depth_late": 2}, DELAY + "2", marks=pytest.mark.acceptance),
         pytest.param({"depth_late": -1}, DELAY + "-1", marks=pytest.mark.acceptance),
         pytest.param({"scale": 0.01}, SCALE + "5000", marks=pytest.mark.acceptance),

@@ -334,7 +334,7 @@ def test_scannets_first_names_are_known(shared_data: Path) -> None:
     assert len(names) == 17
     assert names.count("chair") == 4  # stools
     unknown = [instance for instance, name in mesh.class_names.items() if name is None]
-    assert unknown == [56], "what nobody labelled is one instance more than the 55 objects"
+    assert unknown == [56], "what nobody labeled is one instance more than the 55 objects"
     groups = read_aggregation(scene.folder / "scene0000_00.aggregation.json")
     segments = json.loads((scene.folder / "scene0000_00_vh_clean_2.0.010000.segs.json").read_text())["segIndices"]
     for label, count in (("trashcan", 3), ("dishrack", 1)):

@@ -156,7 +156,7 @@ def test_without_instances_there_is_no_truth(folder):
     assert sequence.scene_truth() is None
 
 
-def test_scene_truth_lies_on_the_labelled_surface(folder):
+def test_scene_truth_lies_on_the_labeled_surface(folder):
     truth = RgbdFolder(folder, stop=1).scene_truth()
     assert truth.class_names == {7: "chair", 300: None}
     depth, ids = depth_mm(0) / 1000, RgbdFolder(folder)[0].truth.instance_ids

@@ -60,7 +60,7 @@ def test_a_frame_holds_what_the_files_hold(folder: Path) -> None:
     assert (frame.index, frame.timestamp) == (2, color_time(2))
     inside = np.s_[40:440, 40:600]  # where the undistorted image has all of what was recorded
     assert (frame.color[inside] == (20, 20, 30)).all()
-    assert (frame.depth[inside] == 2).all()  # 5000 units a metre
+    assert (frame.depth[inside] == 2).all()  # 5000 units a meter
     assert frame.T_world_camera is not None
     np.testing.assert_allclose(frame.T_world_camera[:3, 3], [2 / 30, 0, 0], atol=1e-4)  # times have four digits
     assert frame.camera == PUBLISHED[Intrinsics.FREIBURG1].camera

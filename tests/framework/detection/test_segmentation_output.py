@@ -13,7 +13,7 @@ ULTRALYTICS = ExportMetadata(author="Ultralytics")
 
 
 def cells():
-    """Boxes of all cells of the strides 8, 16 and 32: centre x, y, width, height, px."""
+    """Boxes of all cells of the strides 8, 16 and 32: center x, y, width, height, px."""
     rng = np.random.default_rng(0)
     rows = []
     for stride in (8, 16, 32):

@@ -60,7 +60,7 @@ def test_the_truth_has_no_faults() -> None:
     assert table["score, standard deviation"] == pytest.approx(0.1)
 
 
-def test_a_mask_that_takes_in_a_neighbour() -> None:
+def test_a_mask_that_takes_in_a_neighbor() -> None:
     """Of the chair's 400 px 300 are covered by 500: IoU 300 / 600."""
     table = counted(detections((block(5, 0, 25, 20), 0, 0.8), (BED, 0, 0.6)))
     assert table["mask IoU"] == pytest.approx((300 / 600 + 1) / 2)

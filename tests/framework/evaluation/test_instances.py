@@ -24,7 +24,7 @@ def line(count: int, offset: float = 0.0) -> np.ndarray:
 
 
 def scene(runs: Sequence[tuple[int, int]], class_names: Mapping[int, str | None]) -> SceneTruth:
-    """Points on a line, labelled by runs of (instance id, points)."""
+    """Points on a line, labeled by runs of (instance id, points)."""
     ids = np.repeat([k for k, _ in runs], [n for _, n in runs]).astype(np.int32)
     return SceneTruth(line(len(ids)), ids, class_names)
 
@@ -32,7 +32,7 @@ def scene(runs: Sequence[tuple[int, int]], class_names: Mapping[int, str | None]
 def prediction(
     truth: SceneTruth, runs: Sequence[tuple[int, int]], claims: Mapping[int, tuple[str, float]]
 ) -> PredictedInstances:
-    """The truth's points labelled anew; `claims` give class and confidence of each predicted id."""
+    """The truth's points labeled anew; `claims` give class and confidence of each predicted id."""
     ids = np.repeat([k for k, _ in runs], [n for _, n in runs]).astype(np.int32)
     return PredictedInstances(
         truth.points_world[: len(ids)],
@@ -140,7 +140,7 @@ def test_a_prediction_mostly_on_unknown_instances_is_ignored():
 
 
 def test_what_nobody_looked_for_is_neither_right_nor_wrong():
-    """A right chair, and a right keyboard where only chairs and beds are labelled; a wrong bed stays wrong."""
+    """A right chair, and a right keyboard where only chairs and beds are labeled; a wrong bed stays wrong."""
     truth = replace(scene([(1, 100), (0, 300)], {1: "chair"}), classes=("chair", "bed"))
     found = [(1, 100), (2, 100), (0, 100), (3, 100)]
     claims = {1: ("chair", 0.8), 2: ("keyboard", 0.9), 3: ("bed", 0.7)}
@@ -183,11 +183,11 @@ def test_labels_are_carried_within_5_cm(distance, iou):
 
 def test_a_nearer_vertex_of_no_instance_wins():
     truth = scene([(1, 100)], {1: "chair"})
-    labelled = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
+    labeled = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     with_background = replace(
-        labelled,
-        points_world=np.concatenate([labelled.points_world + np.float32([0, 0.03, 0]), truth.points_world[:40]]),
-        instance_ids=np.concatenate([labelled.instance_ids, np.zeros(40, np.int32)]),
+        labeled,
+        points_world=np.concatenate([labeled.points_world + np.float32([0, 0.03, 0]), truth.points_world[:40]]),
+        instance_ids=np.concatenate([labeled.instance_ids, np.zeros(40, np.int32)]),
     )
     assert evaluate(with_background, truth).best_ious == {1: 0.6}
 

@@ -31,7 +31,7 @@ def areas(vertices: np.ndarray, triangles: Int32) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("n", "most"), [(120, 8000), (120, 300), (420, 9000)])  # the last is clustered before
-def test_surface_colours_and_labels_are_kept(n: int, most: int) -> None:
+def test_surface_colors_and_labels_are_kept(n: int, most: int) -> None:
     mesh = wavy_plane(n)
     light = with_finer_objects(mesh, most)
     assert 0.6 * most < len(light.triangles) <= most

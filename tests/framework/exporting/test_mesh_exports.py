@@ -1,4 +1,4 @@
-"""Scenes and objects as other programs read them: where they stand, how large they are, what colours they have."""
+"""Scenes and objects as other programs read them: where they stand, how large they are, what colors they have."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_where_z_is_up_the_room_has_the_worlds_x_and_y(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "ending"), [(ExportFormat.PLY, "ply"), (ExportFormat.OBJ, "obj"), (ExportFormat.GLB, "glb")]
 )
-def test_objects_stand_on_the_origin_in_metres(kind: ExportFormat, ending: str, run: Path, tmp_path: Path) -> None:
+def test_objects_stand_on_the_origin_in_meters(kind: ExportFormat, ending: str, run: Path, tmp_path: Path) -> None:
     written = export(run, [kind], tmp_path, Chosen(("cube", "1")))
     assert sorted(path.name for path in written) == [f"cube_2.{ending}", f"dining_table_1.{ending}"]
     for name, (x, y, z) in (("dining_table_1", TABLE_SIZE), ("cube_2", CUBE_SIZE)):
@@ -337,7 +337,7 @@ def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> No
     assert "cube \\ud800" in [node.get("extras", {}).get("class") for node in nodes]
 
 
-def test_an_object_has_the_colour_of_overview_png_in_all_files(tmp_path: Path) -> None:
+def test_an_object_has_the_color_of_overview_png_in_all_files(tmp_path: Path) -> None:
     """Also in its own file, and where another one is unlikely, or is not exported."""
     run = ExportedRoom().write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())

@@ -1,4 +1,4 @@
-"""Floor plans, ROS maps and scene graphs of rooms whose every centimetre is known."""
+"""Floor plans, ROS maps and scene graphs of rooms whose every centimeter is known."""
 
 from __future__ import annotations
 
@@ -142,25 +142,25 @@ def test_what_the_ros_map_says_is_what_map_server_reads(run: Path, low: Plan, tm
     said = yaml.safe_load((tmp_path / "map.yaml").read_text())
     image = Image.open(tmp_path / said["image"])
     assert (image.format, image.mode, image.size) == ("PPM", "L", (43, 33))
-    grey = np.asarray(image)
-    np.testing.assert_array_equal(grey, levels(low))
-    # map_server: p = (255 - grey) / 255; occupied above one threshold, free below the other
-    p = (255 - grey.astype(float)) / 255
-    assert {level: bool(p[grey == level].max() < said["free_thresh"]) for level in (FREE, UNKNOWN, OCCUPIED)} == {
+    gray = np.asarray(image)
+    np.testing.assert_array_equal(gray, levels(low))
+    # map_server: p = (255 - gray) / 255; occupied above one threshold, free below the other
+    p = (255 - gray.astype(float)) / 255
+    assert {level: bool(p[gray == level].max() < said["free_thresh"]) for level in (FREE, UNKNOWN, OCCUPIED)} == {
         FREE: True,
         UNKNOWN: False,
         OCCUPIED: False,
     }
-    assert (p[grey == OCCUPIED] > said["occupied_thresh"]).all()
-    assert (p[grey == UNKNOWN] < said["occupied_thresh"]).all()
+    assert (p[gray == OCCUPIED] > said["occupied_thresh"]).all()
+    assert (p[gray == UNKNOWN] < said["occupied_thresh"]).all()
     # the pixel of a leg, by the origin of the lower left corner
     x, y, turn = said["origin"]
     assert turn == 0
     column, row = int((0.825 + OFF - x) / said["resolution"]), int((1.025 + OFF - y) / said["resolution"])
-    assert grey[len(grey) - 1 - row, column] == OCCUPIED
+    assert gray[len(gray) - 1 - row, column] == OCCUPIED
 
 
-def test_footprints_are_polygons_in_metres(run: Path, tmp_path: Path) -> None:
+def test_footprints_are_polygons_in_meters(run: Path, tmp_path: Path) -> None:
     export(run, [ExportFormat.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION))
     found = json.loads((tmp_path / "floor_plan.geojson").read_text())
     assert found["type"] == "FeatureCollection"

@@ -1,4 +1,4 @@
-"""Maps side by side: the same object in the same colour at the same place."""
+"""Maps side by side: the same object in the same color at the same place."""
 
 from __future__ import annotations
 

@@ -37,14 +37,14 @@ def test_jpegs_have_opencvs_pixels(parameters: tuple[int, int]) -> None:
     np.testing.assert_array_equal(decode_color("x", data.tobytes()), cv2.imdecode(data, cv2.IMREAD_COLOR_RGB))
 
 
-def test_grey_jpegs_have_three_equal_channels() -> None:
-    grey = cv2.imencode(".jpg", PICTURE[..., 0])[1]
-    np.testing.assert_array_equal(decode_color("x", grey.tobytes()), cv2.imdecode(grey, cv2.IMREAD_COLOR_RGB))
+def test_gray_jpegs_have_three_equal_channels() -> None:
+    gray = cv2.imencode(".jpg", PICTURE[..., 0])[1]
+    np.testing.assert_array_equal(decode_color("x", gray.tobytes()), cv2.imdecode(gray, cv2.IMREAD_COLOR_RGB))
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
 def test_a_jpeg_that_was_cut_and_closed_is_damaged(share: float) -> None:
-    """OpenCV gives a picture that is grey from the cut on."""
+    """OpenCV gives a picture that is gray from the cut on."""
     data = JPEG[: int(share * len(JPEG))] + END
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
     assert message(data).startswith("picture.jpg is damaged: ")

@@ -144,9 +144,9 @@ def test_what_is_written_is_read_back_exactly(tmp_path, data, count, types):
 
 
 def test_the_golden_bytes(tmp_path):
-    write_ply(tmp_path / "a.ply", VERTICES[:3], np.array([[0, 1, 2]], np.int32), {"label": LABELS[:3]}, ["metres"])
+    write_ply(tmp_path / "a.ply", VERTICES[:3], np.array([[0, 1, 2]], np.int32), {"label": LABELS[:3]}, ["meters"])
     expected = (
-        b"ply\nformat binary_little_endian 1.0\ncomment metres\nelement vertex 3\nproperty float x\nproperty float y\n"
+        b"ply\nformat binary_little_endian 1.0\ncomment meters\nelement vertex 3\nproperty float x\nproperty float y\n"
     )
     expected += (
         b"property float z\nproperty int label\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"

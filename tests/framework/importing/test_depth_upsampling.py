@@ -58,14 +58,14 @@ def test_it_does_what_the_loops_do() -> None:
 
 @pytest.mark.parametrize("factor", [0.25, 0.5, 0.8])
 def test_planes_are_exact_and_nothing_lies_between_two_surfaces(factor: float) -> None:
-    """The pixel centres of both sizes are where `Camera.scaled` says."""
+    """The pixel centers of both sizes are where `Camera.scaled` says."""
     coarse = COLOR.scaled(factor)
     truth, _, color, ids = look(COLOR, np.eye(4))
     depth = look(coarse, np.eye(4))[0].astype(np.float32)
     found = upsampled(depth, color, COLOR, COLOR, color)
     steps = cv2.dilate(truth, np.ones((15, 15))) > 1.03 * cv2.erode(truth, np.ones((15, 15)))
     plain = (ids == 0) & ~steps
-    plain[[0, 1, -1, -2]] = plain[:, [0, 1, -1, -2]] = False  # beyond the outermost centres of coarse pixels
+    plain[[0, 1, -1, -2]] = plain[:, [0, 1, -1, -2]] = False  # beyond the outermost centers of coarse pixels
     assert plain.mean() > 0.2
     assert np.abs(found - truth)[plain].max() < 1e-4
     lowest, highest = cv2.erode(truth, np.ones((15, 15))), cv2.dilate(truth, np.ones((15, 15)))

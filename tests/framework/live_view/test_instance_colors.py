@@ -1,4 +1,4 @@
-"""An instance keeps its colour, and near ones differ."""
+"""An instance keeps its color, and near ones differ."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from framework.rendering.palette import instance_colors
 from tests.support.scenes.corner_room import CAMERA, CLASSES, CornerRoom, look, pose_at
 
 
-def test_those_that_come_later_change_no_colour() -> None:
+def test_those_that_come_later_change_no_color() -> None:
     centroids = {key: np.random.default_rng(key).uniform(0, 2, 3) for key in (3, 5, 9, 12)}
     colors = InstanceColors()
     colors.add({key: centroids[key] for key in (5, 3)})

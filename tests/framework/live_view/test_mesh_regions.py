@@ -9,7 +9,7 @@ from framework.live_view.mesh_regions import MeshPart, MeshRegions, Region
 
 
 def sheet(width: int, height: int, spacing: float = 0.1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A grid of vertices about the origin, its triangles, and colours."""
+    """A grid of vertices about the origin, its triangles, and colors."""
     x, y = np.meshgrid(np.arange(width) - width // 2, np.arange(height) - height // 2, indexing="ij")
     vertices = (np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) * spacing).astype(np.float32)
     corner = (np.arange(width - 1)[:, None] * height + np.arange(height - 1)).ravel()
@@ -18,7 +18,7 @@ def sheet(width: int, height: int, spacing: float = 0.1) -> tuple[np.ndarray, np
 
 
 def corners(vertices: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """(F, 18) positions and colours of each triangle's corners, sorted."""
+    """(F, 18) positions and colors of each triangle's corners, sorted."""
     rows = np.concatenate([vertices, colors.astype(np.float32)], axis=1)[triangles].reshape(len(triangles), -1)
     return rows[np.lexsort(rows.T)]
 

@@ -135,7 +135,7 @@ def test_what_changed_is_told_with_each_frame() -> None:
 
 
 def test_frames_by_hand_are_frames() -> None:
-    """Colour, depth, pose and camera make the map that the frames of a sequence make."""
+    """Color, depth, pose and camera make the map that the frames of a sequence make."""
     by_hand, by_frame = Mapper(*STAGES, "detector=none"), Mapper(*STAGES, "detector=none")
     for k, frame in enumerate(CornerRoom()):
         by_frame.add(frame)
@@ -169,7 +169,7 @@ def test_stages_and_parameters_go_by_name(value: str) -> None:
 
 
 def test_by_hand_and_by_the_command_line_it_is_the_same_map_to_the_byte(tmp_path: Path) -> None:
-    """The beginning of the demo, tracked and labelled by the network."""
+    """The beginning of the demo, tracked and labeled by the network."""
     asked = ("fuser.voxel_size=0.02", "seed=3")
     line = [sys.executable, "-m", "framework", "dataset=desk", "dataset.stop=6", *asked, "hydra.run.dir=run"]
     done = subprocess.run(

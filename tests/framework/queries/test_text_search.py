@@ -1,4 +1,4 @@
-"""Objects by words: with embeddings, and by names and measured colours."""
+"""Objects by words: with embeddings, and by names and measured colors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A lit surface in its own colours and in its instances': on planes the picture is known exactly."""
+"""A lit surface in its own colors and in its instances': on planes the picture is known exactly."""
 
 from __future__ import annotations
 

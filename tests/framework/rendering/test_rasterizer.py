@@ -26,7 +26,7 @@ def drawn(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray, camera: Ca
 
 
 def met_by_rays(caster: RayCaster, triangles: np.ndarray, T: np.ndarray, du: float, dv: float) -> np.ndarray:
-    """The same of rays (du, dv) px aside of the pixel centres."""
+    """The same of rays (du, dv) px aside of the pixel centers."""
     u, v = np.arange(CAMERA.width)[None, :] + du, np.arange(CAMERA.height)[:, None] + dv
     hits = caster.cast(pixel_rays(CAMERA, T, u, v))
     weights = np.stack([1 - hits.uv.sum(axis=-1), hits.uv[..., 0], hits.uv[..., 1]], axis=-1)

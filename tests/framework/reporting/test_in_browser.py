@@ -87,7 +87,7 @@ def canvas(page: Any) -> np.ndarray:
 
 
 def colored(image: np.ndarray) -> float:
-    """The share of the pixels that have a colour."""
+    """The share of the pixels that have a color."""
     return float((np.ptp(image, axis=2) > 60).mean())
 
 
@@ -118,7 +118,7 @@ def test_a_click_on_an_object_shows_its_numbers(pages: list[Path], opened: Any, 
     assert page.locator("#panel .details").count() == 0
 
 
-def test_the_views_colour_the_map_otherwise(pages: list[Path], opened: Any) -> None:
+def test_the_views_color_the_map_otherwise(pages: list[Path], opened: Any) -> None:
     page = opened(pages[0])
     own = canvas(page)
     page.get_by_role("button", name="Instances").click()

@@ -44,7 +44,7 @@ def test_each_object_is_a_node_with_its_class() -> None:
     assert content == scene_glb(mesh, np.linspace(0, 1, 8, dtype=np.float32), {5: "<b>cup</b>"}, UP)
 
 
-def test_colours_are_linear_and_first_sights_are_there() -> None:
+def test_colors_are_linear_and_first_sights_are_there() -> None:
     first_seen = np.linspace(0, 1, 8, dtype=np.float32)
     tree, binary = tree_of(scene_glb(two_squares(), first_seen, {5: "cup"}, UP))
     [attributes] = [m["primitives"][0]["attributes"] for m in tree["meshes"] if m["name"] == "cup_5"]

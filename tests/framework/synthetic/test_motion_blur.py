@@ -14,7 +14,7 @@ POSE = look(np.array([0.3, -0.2, 1.4]), 0.4, -0.2, 0.1)
 
 
 def moved(right=0.0, down=0.0, ahead=0.0, turn=0.0):
-    """POSE (4, 4) moved by metres along the camera's axes, then turned by `turn` rad about its y axis."""
+    """POSE (4, 4) moved by meters along the camera's axes, then turned by `turn` rad about its y axis."""
     T = np.eye(4)
     T[:3, 3] = right, down, ahead
     c, s = np.cos(turn), np.sin(turn)

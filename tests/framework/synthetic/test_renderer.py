@@ -21,14 +21,14 @@ from framework.synthetic.walk import look
 pytestmark = pytest.mark.integration
 
 CAMERA = Camera(64, 48, 50.0, 55.0, 30.7, 22.9)
-GREY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))
+GRAY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))
 
 
 def scene(*solids):
     objects = []
     for instance, solid in enumerate(solids):
         piece = Furniture("thing", "chair" if instance else None)
-        piece.add(solid, GREY)
+        piece.add(solid, GRAY)
         objects.append((instance, piece))
     return assemble(objects)
 
@@ -78,10 +78,10 @@ def test_a_lamp_casts_a_shadow():
 
 def test_tone_curve_rises_from_black_to_white():
     light = np.linspace(0, 3, 500, dtype=np.float32)[:, None].repeat(3, axis=1)
-    grey = to_srgb(light)[:, 0].astype(int)
-    assert grey[0] == 0
-    assert grey[-1] == 255
-    assert (np.diff(grey) >= 0).all()
+    gray = to_srgb(light)[:, 0].astype(int)
+    assert gray[0] == 0
+    assert gray[-1] == 255
+    assert (np.diff(gray) >= 0).all()
 
 
 # The kernels against the obvious
@@ -160,14 +160,14 @@ def test_a_picture_is_that_of_rays_shaded_one_by_one():
         smooth += np.minimum(np.where(same[:, None], light[v, u], sample), WHITE) / len(EDGE_SAMPLES)
     light[v, u] = smooth
     difference = np.abs(picture.color.astype(int) - to_srgb(light.astype(np.float32)))
-    assert difference.max() <= 1  # a grey level, by rounding
+    assert difference.max() <= 1  # a gray level, by rounding
     assert (difference > 0).mean() < 0.02
     for a, b in zip(renderer.depth_and_ids(CAMERA, T), (picture.depth, picture.instance_ids), strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(cast_ids(renderer.surfaces, renderer.caster, CAMERA, T), picture.instance_ids)
 
 
-def test_other_materials_change_the_colours_and_nothing_else():
+def test_other_materials_change_the_colors_and_nothing_else():
     renderer = furnished()
     T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
     table = renderer.surfaces.material_table.copy()
@@ -185,7 +185,7 @@ def test_dark_materials_lose_their_share_and_shiny_ones_at_a_slant():
     lamp = [globe(np.array([0.0, 2.0, 0.0]), 0.1, (1, 1, 1))]
     for dark, shiny in ((0.0, 0.0), (0.3, 0.0), (0.2, 0.8)):
         piece = Furniture("wall", None)
-        piece.add(wall, replace(GREY, dark=dark, shiny=shiny))
+        piece.add(wall, replace(GRAY, dark=dark, shiny=shiny))
         picture = Renderer(assemble([(0, piece)]), lamp).render(CAMERA, T)
         turned = np.minimum(1, (1 - picture.incidence) / (1 - np.cos(np.deg2rad(60))))
         assert np.ptp(turned) > 0.3

@@ -130,8 +130,8 @@ def slow_measure(depth, incidence, noise, max_range, rng):
     pixel = np.float32(noise * 0.8 * CAMERA.width / 640)
     v = np.clip(np.arange(CAMERA.height)[:, None] + np.rint(pixel * lateral_v).astype(int), 0, CAMERA.height - 1)
     u = np.clip(np.arange(CAMERA.width)[None, :] + np.rint(pixel * lateral_u).astype(int), 0, CAMERA.width - 1)
-    neighbour = depth[v, u]
-    z = np.where((np.abs(neighbour - depth) > np.float32(0.05) * depth) & (neighbour > 0), neighbour, depth)
+    neighbor = depth[v, u]
+    z = np.where((np.abs(neighbor - depth) > np.float32(0.05) * depth) & (neighbor > 0), neighbor, depth)
     t = np.minimum(theta, np.float32(np.deg2rad(80)))
     sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(np.maximum(z, 0.1)) * t**2 / (np.pi / 2 - t) ** 2
     scale = np.float32(8 * 580 * 0.075)
@@ -152,10 +152,10 @@ def test_readings_are_those_of_the_arithmetic_on_whole_images_to_the_bit(noise):
         np.testing.assert_array_equal(measure(depth, cosine, noise, seed, 6.0), expected)
 
 
-def test_the_grain_of_colour_is_rounded_and_clipped():
+def test_the_grain_of_color_is_rounded_and_clipped():
     color = np.random.default_rng(0).integers(0, 256, (24, 32, 3)).astype(np.uint8)
     grain = normal_quantiles()[random_bits(color.shape, np.random.default_rng(1)) >> 4]
-    for noise in (1.0, 40.0):  # grey levels beyond both ends
+    for noise in (1.0, 40.0):  # gray levels beyond both ends
         expected = np.clip(np.rint(color + np.float32(noise * 1.5) * grain), 0, 255).astype(np.uint8)
         np.testing.assert_array_equal(noisy_color(color, noise, np.random.default_rng(1)), expected)
     assert noisy_color(color, 0.0, np.random.default_rng(1)) is color
@@ -201,7 +201,7 @@ def test_the_share_of_readings_lost_is_the_one_asked_for_and_comes_in_patches(sh
     lost = np.array([measure_unread(share, seed=seed) == 0 for seed in range(20)])
     assert lost.mean() == pytest.approx(share, abs=0.02)
     beside = (lost[:, :, 1:] == lost[:, :, :-1]).mean()
-    assert beside > 1 - 0.3 * 2 * share * (1 - share), "neighbours are lost together"
+    assert beside > 1 - 0.3 * 2 * share * (1 - share), "neighbors are lost together"
 
 
 def test_a_screen_has_no_reading_and_other_surfaces_keep_all_theirs():

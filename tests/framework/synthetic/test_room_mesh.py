@@ -16,7 +16,7 @@ from framework.synthetic.room_mesh import seen_from, tessellate, visible_mesh
 from framework.synthetic.surfaces import assemble
 from framework.synthetic.walk import look
 
-GREY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))
+GRAY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))
 CAMERA = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
 AHEAD = look(np.array([0.0, 0.0, 0.0]), 0.0, 0.0, 0.0)  # from the origin along +x
 
@@ -26,7 +26,7 @@ def scene(*solids):
     objects = []
     for instance, solid in enumerate(solids):
         piece = Furniture("thing", "chair" if instance else None)
-        piece.add(solid, GREY)
+        piece.add(solid, GRAY)
         objects.append((instance, piece))
     return assemble(objects)
 
@@ -126,7 +126,7 @@ def test_a_screen_is_not_in_the_mesh_nor_what_lies_closely_behind_it():
     for instance, (side, x, dark) in enumerate(((3.0, 3.0, 0.9), (1.0, 2.998, 1.0))):
         piece = Furniture("thing", None)
         face = panel(side, side).moved(z=-side / 2).turned("z", np.pi / 2).moved(x=x)
-        piece.add(face, replace(GREY, dark=dark))
+        piece.add(face, replace(GRAY, dark=dark))
         objects.append((instance, piece))
     surfaces = assemble(objects)
     np.testing.assert_array_equal(surfaces.unreadable, surfaces.instance_ids == 1)

@@ -122,7 +122,7 @@ def test_the_mesh_shows_what_the_renderer_sees(scene: SceneNNScene, mesh: PlyMes
 
 
 @pytest.mark.parametrize("index", SHOWN)
-def test_depth_is_in_millimetres_and_agrees_with_the_mesh(scene: SceneNNScene, mesh: PlyMesh, index: int) -> None:
+def test_depth_is_in_millimeters_and_agrees_with_the_mesh(scene: SceneNNScene, mesh: PlyMesh, index: int) -> None:
     color_file, depth_file = frame_files(scene.folder, index)
     depth_mm = read_uint16(depth_file).astype(np.float64)
     assert depth_mm.max() <= 6000
@@ -154,7 +154,7 @@ def test_impossible_recordings_are_refused(wrong: dict[str, float]) -> None:
 def test_at_half_the_rate_each_frame_shows_and_blurs_what_every_other_one_did(
     scene: SceneNNScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scenenn_scene, "NOISE", 0.0)  # of colour: a frame's grain is its own
+    monkeypatch.setattr(scenenn_scene, "NOISE", 0.0)  # of color: a frame's grain is its own
     (tmp_path / "image").mkdir()
     (tmp_path / "depth").mkdir()
     half = replace(RECORDING, rate=RECORDING.rate / 2)

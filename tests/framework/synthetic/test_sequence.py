@@ -50,8 +50,8 @@ def test_frames_carry_everything(bedroom):
 def test_every_surface_has_gradient(bedroom):
     """Photometric alignment needs texture in every part of the image, walls and floor included."""
     for k in (0, 80, 160):
-        grey = bedroom[k].color.astype(float).mean(axis=2)
-        tiles = grey.reshape(6, 20, 8, 20).transpose(0, 2, 1, 3).reshape(48, -1)
+        gray = bedroom[k].color.astype(float).mean(axis=2)
+        tiles = gray.reshape(6, 20, 8, 20).transpose(0, 2, 1, 3).reshape(48, -1)
         assert np.median(tiles.std(axis=1)) > 3
 
 
@@ -101,7 +101,7 @@ def test_seed_and_scene_each_give_another_room(bedroom):
 
 
 def test_points_of_one_frame_are_found_in_another(exact):
-    """Exact poses and pixel convention: a surface point lies in both pictures at its depth and in its colour."""
+    """Exact poses and pixel convention: a surface point lies in both pictures at its depth and in its color."""
     a, b = exact[60], exact[72]
     v, u = np.nonzero(a.depth > 0)
     pixels = np.stack([u, v], axis=1).astype(np.int32)

@@ -51,7 +51,7 @@ def step(
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_color_at_the_true_pose_asks_for_no_step(level: int) -> None:
-    """A shift of half a pixel between the levels of frame and model would be a step of several millimetres."""
+    """A shift of half a pixel between the levels of frame and model would be a step of several millimeters."""
     T = pose(0.03, -0.02, 0.01, (0.01, 0.02, -0.01))
     xi, equations = step(WALL, WALL.frame(T), level, inverse(T_VIEW) @ T, COLOR)
     assert equations.matched > 0.5 * CAMERA.width * CAMERA.height / 4**level
@@ -109,7 +109,7 @@ def test_points_whose_normals_differ_do_not_match() -> None:
 
 
 def with_noisy_normals(model: ModelView) -> ModelView:
-    """As a map of one frame has them, a few metres away."""
+    """As a map of one frame has them, a few meters away."""
     noisy = model.normals + np.random.default_rng(0).normal(0, 0.5, model.normals.shape).astype(np.float32)
     noisy /= np.linalg.norm(noisy, axis=0)
     return model._replace(normals=np.where(model.depth > 0, noisy, 0).astype(np.float32))

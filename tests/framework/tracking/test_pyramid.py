@@ -40,10 +40,10 @@ def test_finest_chooses_the_first_level() -> None:
 
 
 def test_a_halved_view_of_the_map_closes_holes_of_a_pixel() -> None:
-    grey = np.array([[10, 20, 30, 0], [30, 40, 50, 0], [0, 0, 0, 0], [0, 70, 0, 0]], np.uint8)
-    view = SimpleNamespace(color=np.repeat(grey[..., None], 3, axis=2), depth=(grey > 0).astype(np.float32))
+    gray = np.array([[10, 20, 30, 0], [30, 40, 50, 0], [0, 0, 0, 0], [0, 70, 0, 0]], np.uint8)
+    view = SimpleNamespace(color=np.repeat(gray[..., None], 3, axis=2), depth=(gray > 0).astype(np.float32))
     full, half, quarter = model_intensities(view, 3)
-    np.testing.assert_allclose(full, np.where(grey > 0, grey / 255, -1), atol=1e-6)
+    np.testing.assert_allclose(full, np.where(gray > 0, gray / 255, -1), atol=1e-6)
     np.testing.assert_allclose(half, [[25 / 255, 40 / 255], [-1, -1]], atol=1e-6)  # one mapped pixel is too few
     np.testing.assert_allclose(quarter, [[32.5 / 255]], atol=1e-6)
 

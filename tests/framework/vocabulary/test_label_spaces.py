@@ -60,7 +60,7 @@ def test_coco_is_left_as_it_is():
     assert to_coco(read_labels("coco_panoptic")).classes == COCO
 
 
-def test_columns_of_one_meaning_add_up_and_the_rest_is_renormalised():
+def test_columns_of_one_meaning_add_up_and_the_rest_is_renormalized():
     mapping = to_coco(["wall", "swivel chair", "sofa", "armchair", "person"])
     assert mapping.classes == ("person", "chair", "couch")
     rows = np.array([[0.5, 0.125, 0.125, 0.125, 0.125], [0, 0.3, 0.4, 0.3, 0], [0.2, 0.1, 0.5, 0.1, 0.1]], np.float32)

@@ -1,4 +1,4 @@
-"""Queries taken apart, and the names of colours."""
+"""Queries taken apart, and the names of colors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from framework.vocabulary.text_queries import ObjectWords, object_words
         ("a red chair", ("chair",), ("red",), ()),
         ("The two RED Chairs!", ("chair",), ("red",), ()),
         ("sofa", ("couch",), (), ()),
-        ("grey dining tables", ("dining table",), ("gray",), ()),
+        ("gray dining tables", ("dining table",), ("gray",), ()),
         ("knives, mice and people", ("knife", "mouse", "person"), (), ()),
         ("an orange orange", ("orange",), ("orange",), ()),
         ("orange", ("orange",), (), ()),
@@ -24,7 +24,7 @@ from framework.vocabulary.text_queries import ObjectWords, object_words
         ("teddy bears", ("teddy bear",), (), ()),
         ("the fridge", ("refrigerator",), (), ()),
         ("light blue couch", ("couch",), ("blue",), ()),
-        ("dark grey, pale chairs", ("chair",), ("gray",), ("pale",)),
+        ("dark gray, pale chairs", ("chair",), ("gray",), ("pale",)),
         ("a red light", (), ("red",), ("light",)),
         ("traffic light", ("traffic light",), (), ()),
         ("a blob", (), (), ("blob",)),

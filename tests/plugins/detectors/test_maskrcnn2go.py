@@ -69,7 +69,7 @@ def test_expected_objects_are_found(detector, scene, index, expected):
 
 
 def test_the_mask_of_the_true_bed_sits_on_it(detector):
-    """Replica's rendering has instance ground truth: the detection that is sure of a bed covers the labelled bed."""
+    """Replica's rendering has instance ground truth: the detection that is sure of a bed covers the labeled bed."""
     root = SHARED / "data" / "replica_floor2"
     if not root.is_dir():
         pytest.skip(f"{root} is absent")

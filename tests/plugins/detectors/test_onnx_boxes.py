@@ -188,8 +188,8 @@ def shared_frame(shared, scene, index):
     if color is None:
         pytest.skip(f"{folder} has no frame {index}")
     depth = cv2.imread(str(folder / "depth" / f"{index:06d}.png"), cv2.IMREAD_UNCHANGED)
-    metres = np.where(depth == 65535, 0, depth / 1000).astype(np.float32)
-    return Frame(index, 0.0, color[..., ::-1].copy(), metres, Camera(640, 480, 585.0, 585.0, 319.5, 239.5))
+    meters = np.where(depth == 65535, 0, depth / 1000).astype(np.float32)
+    return Frame(index, 0.0, color[..., ::-1].copy(), meters, Camera(640, 480, 585.0, 585.0, 319.5, 239.5))
 
 
 @pytest.fixture(scope="module")

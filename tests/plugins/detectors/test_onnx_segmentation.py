@@ -30,7 +30,7 @@ def outputs(objectness=False, transposed=False):
     prototypes = np.stack(
         [np.tile(np.arange(cells) - 10.4, (cells, 1)), np.tile(np.arange(cells) - 25.4, (cells, 1)).T]
     )
-    boxes = [[20, 30, 30, 20], [60, 50, 20, 20], [40, 40, 9, 9], [60, 50, 19, 20]]  # centre and size
+    boxes = [[20, 30, 30, 20], [60, 50, 20, 20], [40, 40, 9, 9], [60, 50, 19, 20]]  # center and size
     scores = [[0.1, 0.6, 0.1], [0.4, 0.05, 0.05], [0.0, 0.2, 0.9], [0.3, 0.0, 0.0]]
     coefficients = [[-1, 0], [0, 1], [1, 1], [0, 1]]
     certain = np.ones((4, 1 if objectness else 0))
@@ -62,7 +62,7 @@ def test_boxes_scores_and_masks(tmp_path, objectness, transposed):
 
 
 def check_cup_and_chair(found):
-    # A pixel u of the image has its centre at (u + 0.5) / 2 in the input and at a half of that, less 0.5, in cells.
+    # A pixel u of the image has its center at (u + 0.5) / 2 in the input and at a half of that, less 0.5, in cells.
     cup = ((U + 0.5) / 4 - 0.5 < 10.4) & (U >= 10) & (U < 70) & (V >= 20) & (V < 60)
     chair = (((V + 0.5) / 2 + 10) / 2 - 0.5 > 25.4) & (U >= 100) & (U < 140) & (V >= 60) & (V < 100)
     np.testing.assert_array_equal(found.masks, [cup, chair])

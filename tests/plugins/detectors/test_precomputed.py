@@ -100,7 +100,7 @@ def test_whole_distributions_are_kept_to_the_bit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.class_probabilities, [row, row])
 
 
-def test_names_that_are_left_out_have_no_probability_and_rounded_rows_are_normalised(tmp_path: Path) -> None:
+def test_names_that_are_left_out_have_no_probability_and_rounded_rows_are_normalized(tmp_path: Path) -> None:
     found = detected(tmp_path, entry(class_probabilities={"chair": 0.66, "couch": 0.32}))
     expected = np.zeros(80)
     expected[CHAIR], expected[COCO.index("couch")] = 0.66 / 0.98, 0.32 / 0.98

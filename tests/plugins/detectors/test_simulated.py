@@ -59,7 +59,7 @@ def same(a, b):
 
 
 def count_of(detector, mask, frames=400):
-    """In how many frames a detection's centre pixel lies in `mask`."""
+    """In how many frames a detection's center pixel lies in `mask`."""
     return sum(bool((d.masks & mask).any()) for d in (detector.detect(frame(k)) for k in range(frames)))
 
 
@@ -118,7 +118,7 @@ def test_split_objects_come_back_as_two_halves_of_the_whole():
     assert rate == pytest.approx(0.25, abs=0.05)
 
 
-def test_touching_neighbours_merge_and_others_do_not():
+def test_touching_neighbors_merge_and_others_do_not():
     detections = replace(PERFECT, merge_rate=1.0).detect(frame())
     assert len(detections) == 3
     assert sum((mask == np.isin(IDS, (5, 6))).all() for mask in detections.masks) == 1
@@ -245,7 +245,7 @@ THING[80:110, 20:50] = 32  # one that touches nothing
 ROOM = FrameTruth(THING, {5: "chair", **dict.fromkeys(range(31, 200))})
 
 
-def test_an_object_takes_the_same_neighbour_with_it_in_all_frames():
+def test_an_object_takes_the_same_neighbor_with_it_in_all_frames():
     taken = []
     for seed in range(200):
         detector = replace(PERFECT, attach_rate=0.3, seed=seed)

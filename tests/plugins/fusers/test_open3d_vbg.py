@@ -83,7 +83,7 @@ def test_a_voxel_counts_as_boyer_and_moore_do(votes: list[int]) -> None:
     assert set(scene.grid.flat("votes")[counted]) == {count}
 
 
-def voxel_centres(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
+def voxel_centers(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
     """Flat numbers and places (m) of all voxels, the slow and obvious way."""
     r, size = scene.grid.settings.block_resolution, scene.grid.settings.voxel_size
     hashmap = scene.grid.blocks.hashmap()
@@ -103,7 +103,7 @@ def test_the_voxels_in_the_band_under_a_mask_vote_and_no_others(frames: list[Fra
     scene.integrate(frame, T)
     mask = masks_of(frame)[0]
     scene.vote(frame, T, np.where(mask, 7, 0).astype(np.int32), band=2.0)
-    numbers, places = voxel_centres(scene)
+    numbers, places = voxel_centers(scene)
     x, y, z = ((places - T[:3, 3]) @ T[:3, :3]).T
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = (np.rint(CAMERA.fx * x / z + CAMERA.cx), np.rint(CAMERA.fy * y / z + CAMERA.cy))

@@ -63,7 +63,7 @@ def test_a_carpet_between_slats_leaves_and_the_slats_stay() -> None:
 
 
 def test_a_slanted_surface_may_go_on_behind_an_occluder() -> None:
-    """At 0.8 m of depth a metre aside; at 4 m aside it would be a step."""
+    """At 0.8 m of depth a meter aside; at 4 m aside it would be a step."""
     x = (U - CAMERA.cx) / CAMERA.fx
     slanted = 2.0 / (1 - 0.8 * x)  # z = 2 + 0.8 x z
     pole = (U >= 20) & (U < 30)

@@ -20,7 +20,7 @@ from tests.support.scenes.papered_room import CAMERA, papered_frame
 LOOKING_INTO_A_CORNER = exp_se3(np.array([0, 0, 0, 0.5, 0.6, 0]))
 BEST = [
     ({}, 0.01),
-    # as Open3D computes it, colour drifts by a third of the motion even in exact images
+    # as Open3D computes it, color drifts by a third of the motion even in exact images
     ({"method": Method.HYBRID, "reference": Reference.PREVIOUS_FRAME}, 0.05),
     ({"method": Method.INTENSITY, "reference": Reference.PREVIOUS_FRAME}, 0.05),
 ]
@@ -42,25 +42,25 @@ def run(tracker: Open3dOdometry, frames: list[Frame]) -> list[Pose]:
     return poses
 
 
-def assert_near(pose: Pose, frame: Frame, metres: float) -> None:
+def assert_near(pose: Pose, frame: Frame, meters: float) -> None:
     assert frame.T_world_camera is not None
     error = inverse(frame.T_world_camera) @ pose.T_world_camera
-    assert np.linalg.norm(error[:3, 3]) < metres
-    assert rotation_angle(error[:3, :3]) < metres
+    assert np.linalg.norm(error[:3, 3]) < meters
+    assert rotation_angle(error[:3, :3]) < meters
 
 
-@pytest.mark.parametrize(("parameters", "metres"), BEST)
-def test_a_known_motion_is_recovered(frames: list[Frame], parameters: dict, metres: float) -> None:
+@pytest.mark.parametrize(("parameters", "meters"), BEST)
+def test_a_known_motion_is_recovered(frames: list[Frame], parameters: dict, meters: float) -> None:
     poses = run(Open3dOdometry(**parameters), frames)
     assert not any(pose.lost for pose in poses)
     for pose, frame in zip(poses, frames, strict=True):
-        assert_near(pose, frame, metres)
+        assert_near(pose, frame, meters)
     assert np.linalg.norm(poses[-1].T_world_camera[:3, 3] - poses[0].T_world_camera[:3, 3]) > 0.05, "it did move"
 
 
-@pytest.mark.parametrize(("parameters", "metres"), BEST)
+@pytest.mark.parametrize(("parameters", "meters"), BEST)
 def test_frames_that_tell_nothing_are_lost_and_tracking_resumes(
-    frames: list[Frame], parameters: dict, metres: float
+    frames: list[Frame], parameters: dict, meters: float
 ) -> None:
     rng = np.random.default_rng(0)
     shape = CAMERA.shape
@@ -76,7 +76,7 @@ def test_frames_that_tell_nothing_are_lost_and_tracking_resumes(
     assert poses[5].reason
     assert "\n" not in poses[5].reason
     np.testing.assert_array_equal(poses[5].T_world_camera, poses[3].T_world_camera)
-    assert_near(poses[-1], frames[7], metres)
+    assert_near(poses[-1], frames[7], meters)
 
 
 def test_a_map_that_shows_nothing_is_lost_with_open3ds_reason(frames: list[Frame]) -> None:

@@ -64,7 +64,7 @@ def wall() -> list[Frame]:
     return [dataclasses.replace(f, depth=f.depth + n) for f, n in zip(exact, noise, strict=True)]
 
 
-def test_colour_holds_on_to_a_flat_wall(wall: list[Frame]) -> None:
+def test_color_holds_on_to_a_flat_wall(wall: list[Frame]) -> None:
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), wall)
     assert not any(p.lost for p in poses)
     assert drift(poses[-1], wall[-1]) < 0.01
@@ -85,8 +85,8 @@ def test_the_drift_in_an_exact_room_is_a_fraction_of_a_voxel() -> None:
     assert drift(poses[-1], frames[39]) < 0.002
 
 
-def test_colour_does_no_harm_where_geometry_suffices(shared_data: Path) -> None:
-    """A real kitchen: with colour the trajectory is not worse than without."""
+def test_color_does_no_harm_where_geometry_suffices(shared_data: Path) -> None:
+    """A real kitchen: with color the trajectory is not worse than without."""
     frames = list(RgbdFolder(shared_data / "redkitchen", stop=80, stride=2))
     truth = [f.T_world_camera for f in frames]
     both, alone = (evaluate(truth, run(VoxelHashingIcp(color_weight=w), frames)[0]) for w in (0.1, 0.0))
@@ -206,7 +206,7 @@ def test_a_jump_is_tracked_or_told(missing: int, frames: list[Frame], surface, c
 
 
 def test_a_jump_in_a_real_video_is_tracked_or_told(shared_data: Path) -> None:
-    """As above, against the poses that the data come with, which are good to a centimetre or two."""
+    """As above, against the poses that the data come with, which are good to a centimeter or two."""
     frames = list(RgbdFolder(shared_data / "redkitchen", stop=70))
     shown = [*frames[:25], *frames[45:55], *frames[55:5:-2]]
     poses, _ = run(VoxelHashingIcp(), shown)

@@ -52,8 +52,8 @@ def test_a_known_motion_is_recovered(color_weight: float) -> None:
     assert drift(poses[-1], frames[-1])[1] < 0.003
 
 
-def test_colour_holds_what_geometry_does_not() -> None:
-    """Facing one textured wall, geometry alone cannot see sideways motion; with colour it is seen."""
+def test_color_holds_what_geometry_does_not() -> None:
+    """Facing one textured wall, geometry alone cannot see sideways motion; with color it is seen."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     frames = [wall.frame(T, k) for k, T in enumerate(walk(20))]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)

@@ -26,7 +26,7 @@ class PhoneFrame:
     """What a phone sees at one moment."""
 
     timestamp: float  # s
-    camera: Camera  # of colour
+    camera: Camera  # of color
     color: UInt8  # (H, W, 3) RGB
     depth_mm: UInt16  # (h, w)
     confidence: UInt8  # (h, w), 0 to 2
@@ -125,7 +125,7 @@ def room_frames(count: int = 4) -> list[PhoneFrame]:
 def check_imported(
     folder: Path, frames: Sequence[PhoneFrame], scale: float = 1.0, least: int = 1, tells_up: bool = True
 ) -> None:
-    """The folder, read as it is mapped, shows the room where it is: size, intrinsics, poses, up, colour and depth."""
+    """The folder, read as it is mapped, shows the room where it is: size, intrinsics, poses, up, color and depth."""
     sequence = RgbdFolder(folder)
     assert sequence.camera == frames[0].camera.scaled(scale)
     assert len(sequence) == len(frames)
@@ -194,7 +194,7 @@ def write_r3d(path: Path, frames: Sequence[PhoneFrame], confident: bool = True) 
 
 
 def write_scanner_app(folder: Path, frames: Sequence[PhoneFrame]) -> None:
-    """As "All Data" of a low resolution scan: every frame has depth and a pose, colour is kept of some."""
+    """As "All Data" of a low resolution scan: every frame has depth and a pose, color is kept of some."""
     for k, frame in enumerate(frames):
         write_png(folder / f"depth_{k:05d}.png", frame.depth_mm)
         write_png(folder / f"conf_{k:05d}.png", frame.confidence)
@@ -215,7 +215,7 @@ def write_scanner_app(folder: Path, frames: Sequence[PhoneFrame]) -> None:
 
 
 def write_polycam(folder: Path, frames: Sequence[PhoneFrame], prefix: str = "") -> None:
-    """As the raw data of polyform's README; with the prefix corrected_, what the app has optimised."""
+    """As the raw data of polyform's README; with the prefix corrected_, what the app has optimized."""
     keyframes = folder / "keyframes"
     (keyframes / f"{prefix}cameras").mkdir(parents=True)
     for frame in frames:

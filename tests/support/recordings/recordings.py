@@ -18,7 +18,7 @@ from tests.support.scenes.corner_room import GridFuser, KeepAll
 
 
 def write_color(path: Path, rgb: tuple[int, int, int], shape: tuple[int, int] = (480, 640)) -> None:
-    """An image of one colour."""
+    """An image of one color."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.full((*shape, 3), rgb[::-1], np.uint8))
 

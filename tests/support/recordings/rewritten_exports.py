@@ -14,7 +14,7 @@ MOST = 300  # detections, where suppression is inside
 
 
 class Surgery:
-    """Puts nodes behind the two outputs of a YOLO segmentation network, boxes as centre and size in px."""
+    """Puts nodes behind the two outputs of a YOLO segmentation network, boxes as center and size in px."""
 
     def __init__(self, source: Path) -> None:
         self.model = onnx.load(source)

@@ -24,7 +24,7 @@ from tests.support.scenes.corner_room import look, pose_at
 START = 1_600_000_000  # s
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 COUNT = 4
-DEPTH_LATE = 0.004  # s, of each depth image after its colour image
+DEPTH_LATE = 0.004  # s, of each depth image after its color image
 
 
 @dataclass
@@ -185,7 +185,7 @@ def time_of(k: int) -> float:
 
 
 def seen(k: int, camera: Camera = ROOM) -> tuple[np.ndarray, np.ndarray]:
-    """Colour and exact depth (m) of frame k."""
+    """Color and exact depth (m) of frame k."""
     depth, _, color, _ = look(camera, pose_at(k))
     return color, depth
 
@@ -201,16 +201,16 @@ def compressed_depth(depth: np.ndarray) -> tuple[bytes, str]:
     return struct.pack("<iff", 0, a, b) + png(stored), "32FC1; compressedDepth png"
 
 
-def millimetres(depth: np.ndarray) -> np.ndarray:
+def millimeters(depth: np.ndarray) -> np.ndarray:
     return np.rint(1000 * depth).astype(np.uint16)
 
 
 def add_camera_of_ros(bag: BagWriter, depth: str = "aligned_depth_to_color") -> None:
-    """Topics as of realsense2_camera with align_depth, colour and depth of the room."""
+    """Topics as of realsense2_camera with align_depth, color and depth of the room."""
     for k in range(COUNT):
         color, metric = seen(k)
         bag.add_image(time_of(k), "/camera/color/image_raw", color, "rgb8", padding=16)
-        bag.add_image(time_of(k) + DEPTH_LATE, f"/camera/{depth}/image_raw", millimetres(metric), "16UC1")
+        bag.add_image(time_of(k) + DEPTH_LATE, f"/camera/{depth}/image_raw", millimeters(metric), "16UC1")
         bag.add_camera(time_of(k), "/camera/color/camera_info", ROOM)
         bag.add_camera(time_of(k), f"/camera/{depth}/camera_info", ROOM)
 

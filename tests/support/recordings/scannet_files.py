@@ -30,7 +30,7 @@ class Shot:
 
 
 def shots(count: int = 3) -> list[Shot]:
-    """Smooth colours, a slanted depth, and a camera that moves by 5 cm a frame along x."""
+    """Smooth colors, a slanted depth, and a camera that moves by 5 cm a frame along x."""
     u, v = np.meshgrid(np.arange(COLOR_CAMERA.width), np.arange(COLOR_CAMERA.height))
     x, y = np.meshgrid(np.arange(DEPTH_CAMERA.width), np.arange(DEPTH_CAMERA.height))
     made = []
@@ -77,7 +77,7 @@ def write_sens(path: Path, frames: list[Shot], **options: object) -> None:
 
 
 def write_exported(folder: Path, frames: list[Shot], suffix: str = ".png") -> None:
-    """What `SensReader/python/reader.py` writes; colour as PNG unless told, so that it stays exact."""
+    """What `SensReader/python/reader.py` writes; color as PNG unless told, so that it stays exact."""
     for name in ("color", "depth", "pose", "intrinsic"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     for k, shot in enumerate(frames):

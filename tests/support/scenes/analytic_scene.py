@@ -31,7 +31,7 @@ class Scene:
     contrast: float = 0.5  # of the texture, in [0, 1]
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(depth m (H, W) float32, colour (H, W, 3) uint8, surface number (H, W) int32, 0 = nothing)."""
+        """(depth m (H, W) float32, color (H, W, 3) uint8, surface number (H, W) int32, 0 = nothing)."""
         v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         directions = rays @ T_world_camera[:3, :3].T
@@ -57,7 +57,7 @@ class Scene:
         return np.where(np.isfinite(depth), depth, 0).astype(np.float32), color, surface
 
     def _texture(self, points: np.ndarray) -> np.ndarray:
-        """A solid texture of a few wave lengths, so that every view of a point has the same colour."""
+        """A solid texture of a few wave lengths, so that every view of a point has the same color."""
         x, y, z = (points[..., i] for i in range(3))
         waves = [
             np.sin(7 * x + 3 * y) + np.sin(11 * z - 5 * x + 1) + np.sin(17 * y + 4 * z),

@@ -49,7 +49,7 @@ def walk(R: np.ndarray = Z_UP, n: int = 20) -> np.ndarray:
 
 @dataclass
 class BoxesRoom(RGBDSequence):
-    """The room as a data set without frames: its labelled surface only."""
+    """The room as a data set without frames: its labeled surface only."""
 
     scene: str = "boxes"  # "gone": cannot be read
 

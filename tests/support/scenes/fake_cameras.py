@@ -77,7 +77,7 @@ class _Images:
 
 
 def _image(pixels: np.ndarray, shift: int = 0) -> SimpleNamespace:
-    """An image, moved by so many pixels where it is of another camera than the colour."""
+    """An image, moved by so many pixels where it is of another camera than the color."""
     pixels = np.roll(pixels, shift, axis=1)
     pixels.setflags(write=False)  # it is the library's
     height, width = pixels.shape[:2]

@@ -11,7 +11,7 @@ from framework.data import Camera, Frame
 
 CAMERA = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
 HALF = np.array([2.0, 1.2, 2.5])  # m, half the room's size
-RESOLUTION = 160  # px a metre
+RESOLUTION = 160  # px a meter
 
 
 @cache

@@ -70,7 +70,7 @@ def test_a_recording_becomes_the_images_of_a_scene(tmp_path, monkeypatch, capsys
     assert f"{tmp_path / '011'}: 4 frames; skipped 0 color" in capsys.readouterr().out
 
 
-def test_colour_and_depth_have_times_of_their_own(tmp_path, monkeypatch, source):
+def test_color_and_depth_have_times_of_their_own(tmp_path, monkeypatch, source):
     deliver(monkeypatch, 3)
     convert_oni.convert(source, tmp_path / "011")
     assert (tmp_path / "011/timestamp.txt").read_text() == "1 7 0\n2 1007 1000\n3 2007 2000\n"

@@ -47,7 +47,7 @@ def write(request: pytest.FixtureRequest) -> Writer:
 
 
 def write_labels(scene: Path) -> None:
-    """A wall 2 m in front of the first camera: left of x = 0 a chair, right of x = 0.3 what nobody labelled."""
+    """A wall 2 m in front of the first camera: left of x = 0 a chair, right of x = 0.3 what nobody labeled."""
     x, y = np.meshgrid(np.linspace(-1.5, 1.5, 31), np.linspace(-1.5, 1.5, 31))
     vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(30)[:, None] * 31 + np.arange(30)).ravel()
@@ -228,7 +228,7 @@ def test_a_folder_that_is_no_scan_says_what_is_missing(tmp_path: Path) -> None:
         ScanNet(tmp_path, SCENE)
 
 
-def test_truth_is_the_labelled_mesh(tmp_path: Path, write: Writer) -> None:
+def test_truth_is_the_labeled_mesh(tmp_path: Path, write: Writer) -> None:
     write(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     sequence = opened(

@@ -1,4 +1,4 @@
-"""ScanNet's labelled mesh: exact instances from segments and objects, and what each kind of name becomes."""
+"""ScanNet's labeled mesh: exact instances from segments and objects, and what each kind of name becomes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read(folder: Path, groups: list[dict[str, Any]], segments: list[int] | None 
 
 def test_segments_become_the_instances_of_objects(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "office chair", 70, 9), group(4, "couch", 5), group(1, "wall", 3)])
-    # the wall is known to be no instance; what nobody labelled is one more, of no known class
+    # the wall is known to be no instance; what nobody labeled is one more, of no known class
     np.testing.assert_array_equal(mesh.instance_ids, [0, 0, 1, 1, 5, 5, 1, 1, 6, 6])
     assert mesh.class_names == {1: "chair", 5: "couch", 6: None}
     assert mesh.instance_ids.dtype == np.int32
@@ -54,7 +54,7 @@ def test_segments_become_the_instances_of_objects(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.triangles, [[0, 1, 2]])
 
 
-def test_where_all_is_labelled_there_is_no_further_instance(tmp_path: Path) -> None:
+def test_where_all_is_labeled_there_is_no_further_instance(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "bed", 3, 70, 5, 9, 11), group(1, "floor", 12)])
     np.testing.assert_array_equal(mesh.instance_ids, [1] * 9 + [0])
     assert mesh.class_names == {1: "bed"}

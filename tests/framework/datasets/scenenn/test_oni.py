@@ -62,7 +62,7 @@ def test_openni_unpacks_its_codecs(tmp_path):
 
 
 @played
-def test_depth_in_tenths_of_a_millimetre_is_rounded_to_millimetres(tmp_path):
+def test_depth_in_tenths_of_a_millimeter_is_rounded_to_millimeters(tmp_path):
     frames = frames_of(OniFile(recording(pixel_format=oni.DEPTH_100_UM)).write(tmp_path / "a.oni"))
     expected = np.floor(np.array(depths()) / 10 + 0.5)
     np.testing.assert_array_equal([frame.depth_mm for frame in frames], expected)

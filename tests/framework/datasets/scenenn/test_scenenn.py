@@ -190,7 +190,7 @@ def test_a_bad_line_of_timestamps_is_named(root: Path, line: str) -> None:
         SceneNN(root, "016")
 
 
-def test_without_a_labelled_mesh_there_is_no_truth(root: Path) -> None:
+def test_without_a_labeled_mesh_there_is_no_truth(root: Path) -> None:
     (root / "016" / "016.xml").unlink()
     sequence = SceneNN(root, "016")
     assert sequence.scene_truth() is None

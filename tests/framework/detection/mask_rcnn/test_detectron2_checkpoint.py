@@ -114,7 +114,7 @@ class Detectron2:
         return [*levels, functional.max_pool2d(levels[-1], 1, 2)]
 
     def anchors(self, pyramid):
-        """(A, 4): centred at the cells' corners (OFFSET 0), sizes and ratios unrounded."""
+        """(A, 4): centered at the cells' corners (OFFSET 0), sizes and ratios unrounded."""
         anchors = []
         for level, stride, side in zip(pyramid, (4, 8, 16, 32, 64), (32, 64, 128, 256, 512), strict=True):
             for y in range(level.shape[2]):

@@ -95,7 +95,7 @@ def test_half_precision_places_boxes_in_single(path):
     np.testing.assert_allclose(half.float(), single, atol=0.03)
 
 
-def test_a_linear_ramp_is_pooled_to_the_centres_of_the_bins(path):
+def test_a_linear_ramp_is_pooled_to_the_centers_of_the_bins(path):
     y, x = np.meshgrid(np.arange(20.0), np.arange(27.0), indexing="ij")
     ramp = torch.from_numpy((3 * x - 2 * y).astype(np.float32))[None, None]
     box = torch.tensor([[32.0, 48.0, 32.0 + 6 * 32, 48.0 + 6 * 16]])  # bins of 2 x 1 cells

@@ -59,7 +59,7 @@ def test_where_nothing_is_significant_the_heaviest_mode_is_taken():
     assert len(np.unique(depth[mask])) == 1
 
 
-def test_two_things_at_one_depth_are_told_apart_and_the_centres_is_taken():
+def test_two_things_at_one_depth_are_told_apart_and_the_centers_is_taken():
     depth = np.where(disk(14) | disk(8, u=95), np.float32(1.5), wall())
     np.testing.assert_array_equal(mask_of(depth), disk(14))
 
@@ -87,7 +87,7 @@ def test_the_largest_step_grows_with_depth_and_focal_length():
             assert mask.all() == joined
 
 
-def test_the_component_is_that_of_a_plain_labelling():
+def test_the_component_is_that_of_a_plain_labeling():
     rng = np.random.default_rng(3)
     for _ in range(20):
         depth = np.where(rng.random((30, 40)) < 0.62, 1.0, rng.choice([0.0, 2.0], (30, 40))).astype(np.float32)

@@ -120,15 +120,15 @@ def integer_network(kind, args, weight, weight_scale, bias):
 
 @pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
 def test_numbers_are_rounded_to_the_nearest_and_halves_to_even_ones(memory_format):
-    quantisation = Quantization(0.25, 100)
+    quantization = Quantization(0.25, 100)
     steps = torch.arange(-1000, 1000).reshape(1, 5, 20, 20) / 2  # halves of steps, beyond both ends
-    found = quantisation.quantize((steps * 0.25).contiguous(memory_format=memory_format))
+    found = quantization.quantize((steps * 0.25).contiguous(memory_format=memory_format))
     assert found.dtype == torch.uint8
     np.testing.assert_array_equal(found, np.clip(np.rint(steps.numpy() + 100), 0, 255))
     uneven = torch.from_numpy(np.random.default_rng(3).normal(0, 20, (3, 7, 5, 4)).astype(np.float32))
     found = Quantization(0.0312, 7).quantize(uneven)
     np.testing.assert_array_equal(found, (uneven * (1 / 0.0312)).add(7).round().clamp(0, 255).to(torch.uint8))
-    assert quantisation.quantize(uneven[:0]).shape == (0, 7, 5, 4)
+    assert quantization.quantize(uneven[:0]).shape == (0, 7, 5, 4)
 
 
 @in_integers

@@ -49,7 +49,7 @@ FIELDS = ("masks", "boxes", "scores", "class_probabilities")
 
 @dataclass
 class Noise(Detector):
-    """Random detections of the colours and the parameter; counts how often it is asked."""
+    """Random detections of the colors and the parameter; counts how often it is asked."""
 
     strength: float = 1.0
     broken_at: int = -1

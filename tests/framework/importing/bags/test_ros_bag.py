@@ -32,7 +32,7 @@ from tests.support.recordings.ros_bags import (
     add_camera_of_ros,
     add_realsense,
     compressed_depth,
-    millimetres,
+    millimeters,
     png,
     seen,
     time_of,
@@ -134,7 +134,7 @@ def test_encodings_of_color(tmp_path: Path, encoding: str) -> None:
         "mono8": color[..., 1],
     }[encoding]
     bag.add_image(time_of(0), "/rgb/image", stored, encoding, padding=3)
-    bag.add_image(time_of(0), "/depth/image", millimetres(depth), "16UC1")
+    bag.add_image(time_of(0), "/depth/image", millimeters(depth), "16UC1")
     bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
     [frame] = RgbdFolder(tmp_path / "out")
@@ -151,7 +151,7 @@ def test_encodings_of_depth(tmp_path: Path, kind: str) -> None:
         color, depth = seen(k)
         bag.add_image(time_of(k), "/rgb/image", color, "rgb8")
         bag.add_camera(time_of(k), "/rgb/camera_info", ROOM)
-        stored, topic = millimetres(depth), "/depth/image"
+        stored, topic = millimeters(depth), "/depth/image"
         match kind:
             case "32FC1":
                 bag.add_image(time_of(k), topic, np.where(depth > 0, depth, np.nan).astype("<f4"), kind)
@@ -179,7 +179,7 @@ def test_compressed_color(tmp_path: Path, kind: str) -> None:
         write_jpeg(tmp_path / "image.jpg", color)
         data = (tmp_path / "image.jpg").read_bytes() if kind == "jpeg" else png(color[..., ::-1])
         bag.add_compressed(time_of(k), "/camera/rgb/image_raw/compressed", data, f"rgb8; {kind} compressed bgr8")
-        bag.add_image(time_of(k), "/camera/depth/image_raw", millimetres(depth), "16UC1")
+        bag.add_image(time_of(k), "/camera/depth/image_raw", millimeters(depth), "16UC1")
         bag.add_camera(time_of(k), "/camera/rgb/camera_info", ROOM)
     assert not imported(bag.write(tmp_path / "a.bag"), tmp_path / "out")
     check_room(tmp_path / "out", posed=False)
@@ -209,7 +209,7 @@ def test_depth_of_the_same_camera_in_another_size_is_taken(tmp_path: Path) -> No
     half = ROOM.scaled(0.5)
     for k in range(COUNT):
         bag.add_image(time_of(k), "/camera/color/image_raw", seen(k)[0], "rgb8")
-        bag.add_image(time_of(k), "/camera/depth/image_raw", millimetres(look(half, pose_at(k))[0]), "16UC1")
+        bag.add_image(time_of(k), "/camera/depth/image_raw", millimeters(look(half, pose_at(k))[0]), "16UC1")
         bag.add_camera(time_of(k), "/camera/color/camera_info", ROOM)
         bag.add_camera(time_of(k), "/camera/depth/camera_info", half)
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
@@ -240,7 +240,7 @@ def test_headers_of_another_clock_fall_back_to_the_times_of_recording(tmp_path: 
     for k in range(COUNT):
         color, depth = seen(k)
         bag.add_image(time_of(k), "/camera/color/image_raw", color, "rgb8", stamp=0)
-        bag.add_image(time_of(k) + 0.001, "/camera/depth_registered/image", millimetres(depth), "16UC1", stamp=0)
+        bag.add_image(time_of(k) + 0.001, "/camera/depth_registered/image", millimeters(depth), "16UC1", stamp=0)
     bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM)
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
     check_room(tmp_path / "out", posed=False)
@@ -251,7 +251,7 @@ def test_images_without_a_partner_in_time_are_no_frames(tmp_path: Path) -> None:
     color, depth = seen(0)
     for k in range(COUNT):
         bag.add_image(time_of(k), "/camera/color/image_raw", color, "rgb8")
-    bag.add_image(time_of(2) + 0.003, "/camera/depth_registered/image", millimetres(depth), "16UC1")
+    bag.add_image(time_of(2) + 0.003, "/camera/depth_registered/image", millimeters(depth), "16UC1")
     bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM)
     path = bag.write(tmp_path / "bag")
     assert open_source(path).count == 1
@@ -271,7 +271,7 @@ def two_cameras() -> BagWriter:
     color, depth = seen(0)
     for side in ("left", "right"):
         bag.add_image(time_of(0), f"/{side}/color/image", color, "rgb8")
-        bag.add_image(time_of(0), f"/{side}/depth/image", millimetres(depth), "16UC1")
+        bag.add_image(time_of(0), f"/{side}/depth/image", millimeters(depth), "16UC1")
         bag.add_camera(time_of(0), f"/{side}/color/camera_info", ROOM)
         bag.add_pose(time_of(0), f"/{side}/pose", pose_at(0))
     return bag
@@ -313,7 +313,7 @@ def test_registered_depth_and_uncompressed_color_come_first(tmp_path: Path) -> N
     bag = BagWriter()
     add_camera_of_ros(bag)
     color, depth = seen(0)
-    bag.add_image(time_of(0), "/camera/depth/image_rect_raw", millimetres(2 * depth), "16UC1")
+    bag.add_image(time_of(0), "/camera/depth/image_rect_raw", millimeters(2 * depth), "16UC1")
     bag.add_image(time_of(0), "/camera/infra1/image_rect_raw", color[..., 0], "mono8")
     bag.add_compressed(time_of(0), "/camera/color/image_raw/compressed", b"no picture", "jpeg")
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
@@ -472,7 +472,7 @@ def test_a_damaged_packed_image_is_one_frame(tmp_path: Path, depth: bytes) -> No
     for k in range(COUNT):
         color, metric = seen(k)
         bag.add_image(time_of(k), "/rgb/image", color, "rgb8")
-        data = depth if k == 1 else bytes(12) + png(millimetres(metric))
+        data = depth if k == 1 else bytes(12) + png(millimeters(metric))
         bag.add_compressed(time_of(k), "/depth/image/compressedDepth", data, "16UC1; compressedDepth png")
     bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
     [fault] = imported(bag.write(tmp_path / "bag"), tmp_path / "out")

@@ -194,8 +194,8 @@ def test_color_belongs_to_the_surface_and_not_to_the_air_before_it() -> None:
     assert (grid.color[active][air] == 0).all()
 
 
-def test_air_has_no_colour_to_be_averaged_with() -> None:
-    """A wall comes nearer to where air was seen before: its colour is its own, not a mixture with black."""
+def test_air_has_no_color_to_be_averaged_with() -> None:
+    """A wall comes nearer to where air was seen before: its color is its own, not a mixture with black."""
     integrator = new_integrator()
     for depth, frames in ((1.5, 5), (1.4, 13)):
         wall = np.full(CAMERA.shape, depth, np.float32)

@@ -134,7 +134,7 @@ def copied(surface: UnlabeledMesh) -> UnlabeledMesh:
 
 
 def test_only_changed_blocks_are_read_again(sphere: VoxelGrid) -> None:
-    """A block that is written without a word keeps its old surface; named, it and its neighbours get the new one."""
+    """A block that is written without a word keeps its old surface; named, it and its neighbors get the new one."""
     nets = SurfaceNets(sphere)
     before = copied(nets.extract())
     block = int(np.bincount(before.voxels // 512).argmax())

@@ -1,4 +1,4 @@
-"""Views of the map against closed-form depth, normals and colour."""
+"""Views of the map against closed-form depth, normals and color."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_views_from_outside_and_of_an_empty_map() -> None:
 @pytest.mark.parametrize("d", [0.0, -0.0, 1e-20, -1e-20])
 def test_a_ray_along_a_slab_leaves_it_by_another_side(d: float) -> None:
     """Else it would crawl through unmapped space a thousandth of a voxel at a time, as the middle column of a camera
-    with cx at a pixel's centre does.
+    with cx at a pixel's center does.
     """
     direction = tuple(np.float32([d, d, 1.0]))
     start = tuple(np.float32([0.03, -0.05, 0.01]))

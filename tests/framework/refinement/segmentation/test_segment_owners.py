@@ -39,7 +39,7 @@ def test_pose_is_recovered_and_points_are_those_of_lift(flat):
     everything = lifted(np.ones_like(mask), frame)
     found = points_at(everything.pixels, frame, T_world_camera)
     assert found.dtype == np.float32
-    assert np.abs(found - everything.points_world).max() < 2e-5, "from 150 points, up to a metre from them"
+    assert np.abs(found - everything.points_world).max() < 2e-5, "from 150 points, up to a meter from them"
     np.testing.assert_allclose(points_at(everything.pixels, frame, T_WORLD_CAMERA), everything.points_world, atol=1e-6)
 
 
