@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
+from itertools import pairwise
 from pathlib import Path
 
 from hydra.conf import HydraConf
@@ -152,7 +153,7 @@ def is_of_sweep(hydra_config: HydraConf) -> bool:
 def _config_dirs(words: list[str]) -> list[Path]:
     """Return the folders of --config-dir on Hydra's command line."""
     folders = []
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for word, following in pairwise([*words, ""]):
         option, equals, value = word.partition("=")
         if option in ("--config-dir", "-cd"):
             folders.append(Path(value if equals else following))

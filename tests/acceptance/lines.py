@@ -118,7 +118,8 @@ def long_tests() -> Measured:
     "0 failing commands, fresh virtual environment", "framework", "plugins", "conf", "instancemap.py", "pyproject.toml"
 )
 def wheel() -> Measured:
-    """Install the wheel in a new environment and use it from an empty folder."""
+    """Install the wheel in a new environment and use it from an empty folder, as the README does."""
+    example = (CHECKOUT / "README.md").read_text().split("```python\n")[1].split("```")[0]
     with tempfile.TemporaryDirectory() as directory:
         wheels, environment, empty = (Path(directory, name) for name in ("wheels", "environment", "empty"))
         empty.mkdir()
@@ -130,14 +131,18 @@ def wheel() -> Measured:
         subprocess.run(install, check=True)
         alone = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         commands = (
-            ["--version"],
-            ["hydra.run.dir=outputs/desk"],
-            ["report", "outputs/desk"],
-            ["new-plugin", "refiner", "my_refiner"],
+            ["instancemap", "--version"],
+            ["instancemap"],  # no words: the desk, in a new folder of outputs/
+            ["instancemap", "hydra.run.dir=outputs/desk"],
+            ["instancemap", "report", "outputs/desk"],
+            ["python", "-c", example],
+            ["instancemap", "new-plugin", "refiner", "my_refiner"],
+            ["python", "-m", "pip", "install", "-q", "-e", "instancemap-my-refiner[test]"],
+            ["pytest", "-q", "instancemap-my-refiner"],
         )
         statuses = [
-            subprocess.run([str(programs / "instancemap"), *words], cwd=empty, env=alone, check=False).returncode
-            for words in commands
+            subprocess.run([programs / program, *words], cwd=empty, env=alone, check=False).returncode
+            for program, *words in commands
         ]
     failed = sum(status != 0 for status in statuses)
     return failed, failed == 0

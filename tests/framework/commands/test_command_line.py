@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.commands.command_line import directory_name, print_for_directories
+from framework.commands.command_line import _config_dirs, directory_name, print_for_directories
 from framework.errors import DataError
 
 pytestmark = pytest.mark.integration
@@ -51,3 +51,16 @@ def test_a_command_whose_reader_has_gone_ends_without_a_word(command: str) -> No
     ended = subprocess.run(arguments, stdout=writer, stderr=subprocess.PIPE, check=False)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (-signal.SIGPIPE, b"")
+
+
+@pytest.mark.parametrize(
+    ("words", "folders"),
+    [
+        ([], []),
+        (["--config-dir"], [""]),
+        (["--config-dir", "mine", "seed=1", "--config-dir=theirs"], ["mine", "theirs"]),
+    ],
+)
+def test_config_dirs_of_any_command_line(words: list[str], folders: list[str]) -> None:
+    """Also of the command without arguments, which maps the desk."""
+    assert _config_dirs(words) == [Path(folder) for folder in folders]
