@@ -40,7 +40,9 @@ from framework.interfaces import (
     PoseTracker,
     RGBDSequence,
     SceneMap,
+    StageTimer,
     Viewer,
+    untimed,
 )
 from framework.pipeline import Pipeline
 from framework.queries.map_queries import Map
@@ -80,6 +82,7 @@ __all__ = [
     "QueryResult",
     "RGBDSequence",
     "SceneMap",
+    "StageTimer",
     "View",
     "Viewer",
     "configure_process",
@@ -87,6 +90,7 @@ __all__ = [
     "load_map",
     "open_dataset",
     "query",
+    "untimed",
 ]
 
 
@@ -213,7 +217,7 @@ class Mapper(Map):
         """Detect and map a frame, and show it in the viewer."""
         pipeline, journal = self.pipeline, self._journal
         try:
-            with journal.timed(frame.index, "detect"):
+            with journal.timed(frame.index, "detection"):
                 detections = pipeline.detector.detect(frame)
             pose = pipeline.map_frame(frame, detections, journal)
         except FrameError as error:

@@ -15,8 +15,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from framework.data import (
     Array,
@@ -37,6 +39,16 @@ from framework.errors import ConfigError
 
 FrameReader = Callable[[], Frame]
 """Reads one available frame. Raises FrameError if the frame is unusable."""
+
+FusionStage = Literal["association", "update", "integration"]
+
+StageTimer = Callable[[FusionStage], AbstractContextManager[None]]
+"""Measures a stage of a fuser, as in `with timer("association"): ...`. The times of one stage in a frame are added."""
+
+
+def untimed(stage: FusionStage) -> AbstractContextManager[None]:
+    """Measure nothing."""
+    return nullcontext()
 
 
 class RGBDVideo(ABC):
@@ -157,8 +169,11 @@ class MapFuser(ABC):
     scene: SceneMap
 
     @abstractmethod
-    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         """Integrate `frame`, taken at `pose`, and the evidence of its `clusters`.
+
+        `timer` measures data association, the update of labels and instances, and the integration of depth and color.
+        A fuser that does not use it reports their total time as `fusion`.
 
         Raises:
             MapFullError: the block budget of the map is reached.

@@ -1,4 +1,4 @@
-"""The loop: detect, track, lift, refine, fuse."""
+"""The loop: detection, tracking, lifting, refinement, fusion."""
 
 from __future__ import annotations
 
@@ -211,25 +211,25 @@ class Pipeline:
             detect_ms = 1e3 * (time.perf_counter() - began)
         except FrameError as error:
             return error
-        times = [StageTime(frame.index, "read", read_ms), StageTime(frame.index, "detect", detect_ms)]
+        times = [StageTime(frame.index, "reading", read_ms), StageTime(frame.index, "detection", detect_ms)]
         return frame, detections, times
 
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
         """Track, lift, refine and fuse one frame. Raises FrameError if it is unusable."""
-        with journal.timed(frame.index, "track"):
+        with journal.timed(frame.index, "tracking"):
             pose = self.tracker.track(frame, self.fuser.scene)
         if not isinstance(cast(object, pose), Pose):
             raise DataError(f"frame {frame.index}: a tracker must return a Pose, found {type(pose).__name__}")
         journal.frame_tracked(frame, pose)
         if pose.lost:
             return pose
-        with journal.timed(frame.index, "lift"):
+        with journal.timed(frame.index, "lifting"):
             clusters = lift(detections, frame, pose)
-        with journal.timed(frame.index, "refine"):
+        with journal.timed(frame.index, "refinement"):
             clusters = refine(self.refiner, clusters, frame)
         journal.frames_in_map += 1
-        with journal.timed(frame.index, "fuse"):
-            self.fuser.fuse(frame, pose, clusters)
+        with journal.fusing(frame.index) as timer:
+            self.fuser.fuse(frame, pose, clusters, timer)
         journal.frame_fused(frame)
         return pose
 

@@ -17,7 +17,7 @@ from framework.figures.figure_choice import FigureChoice
 from framework.figures.figure_page import Page
 from framework.figures.map_figure import CaptionedLine, map_figure, panel_size
 from framework.figures.map_panels import panel_line
-from framework.figures.stage_times import WINDOW, MeanTimes, stage_times_figure
+from framework.figures.stage_times import COLUMNS, WINDOW, MeanTimes, stage_times_figure
 from framework.runs.reevaluation import Truth
 from framework.runs.run_rows import Run, RunRow, natural, rows_of
 from framework.runs.stored_map import StoredMap
@@ -115,10 +115,11 @@ def _stage_times(pictured: Pictured) -> Page:
         raise DataError("no timings.csv can be read; the log says why")
     counts = "/".join(map(str, dict.fromkeys(one.count for one in shown)))
     sequences = [pictured.called(run) for run in pictured.runs if any(run in times for times in read.values())]
+    stages = "; ".join(f"{name}: {' and '.join(added)}" for name, added in COLUMNS.items())
     note = (
-        f"Mean of {counts} sequences ({', '.join(sequences)}) of running medians over {WINDOW} frames; bands: fastest "
-        f"to slowest sequence. Right: median over all frames, and × the median of the last third of the frames divided "
-        f"by that of the first third."
+        f"{stages}. Mean of {counts} sequences ({', '.join(sequences)}) of running medians over {WINDOW} frames. "
+        "Bands: fastest to slowest sequence. Right: median over all frames, and × the median of the last third of the "
+        "frames divided by that of the first third."
     )
     if any(one.longest > one.frames[-1] for one in shown):
         note += " Lines end with the shortest sequence."

@@ -18,24 +18,20 @@ from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SM
 from framework.runs.timings_file import StageTimes
 
 WINDOW = 9  # frames, of the running median
-SUM = "sum"
-COLORS = {
-    "detect": "#0072b2",
-    "track": "#009e73",
-    "lift": "#8c6bb1",
-    "refine": "#d55e00",
-    "fuse": "#b5830a",
-    SUM: "#20242a",
+COLUMNS = {
+    "Mask R-CNN": ("detection",),
+    "data association": ("lifting", "association"),
+    "GMM": ("refinement",),
+    "map integration": ("update", "integration"),
 }
-"""By stage, in the order of the pipeline; suitable for color-blind readers."""
-
-STAGES = tuple(stage for stage in COLORS if stage != SUM)
+"""The stages whose times add up to a line, by its name in the paper."""
+COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # for color-blind readers
 RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # ms a frame
 PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights of a diagram, its heading and its axis labels
-LEFT_MM, RIGHT_MM = 9.5, 27.5  # left and right of the diagram
+LEFT_MM, RIGHT_MM = 9.5, 25.5  # left and right of the diagram
 PLOT_WIDTH_MM = COLUMN_MM - LEFT_MM - RIGHT_MM
-LABEL_PLACES_MM = (2.2, 2.8, 20.0, 27.0)  # right of the diagram: line end, stage, median, growth
-LABEL_MM = 2.9  # line spacing of the labels
+LABEL_PLACES_MM = (2.2, 2.8, 12.5)  # right of the diagram: line end, name and median, growth
+LABEL_MM, LABEL_LINE_MM = 6.4, 2.6  # distance of the labels, and of their two lines
 LOWEST_MS = 0.1  # shorter times are drawn with this value
 
 
@@ -44,7 +40,7 @@ class MeanTimes:
     """The smoothed times of several sequences, up to the end of the shortest one."""
 
     frames: Int64  # (G,) frame numbers
-    mean: Mapping[str, Float64]  # by stage, and SUM: (G,) ms, NaN = unknown
+    mean: Mapping[str, Float64]  # by name in COLUMNS: (G,) ms, NaN = unknown
     lowest: Mapping[str, Float64]  # of the fastest sequence at each frame
     highest: Mapping[str, Float64]  # of the slowest sequence at each frame
     count: int  # sequences
@@ -56,27 +52,27 @@ class MeanTimes:
         end = min(int(run.frames[-1]) for run in runs)
         frames = np.unique(np.concatenate([run.frames[run.frames <= end] for run in runs]))
         mean, lowest, highest = {}, {}, {}
-        for stage in COLORS:
+        for name in COLUMNS:
             smooth = np.full((len(runs), len(frames)), np.nan)
             for line, run in zip(smooth, runs, strict=True):
                 line[np.searchsorted(frames, run.frames[run.frames <= end])] = running_median(
-                    _of_stage(run, stage), WINDOW
+                    _column(run, name), WINDOW
                 )[run.frames <= end]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RuntimeWarning)  # where all are NaN
-                mean[stage] = np.nanmean(smooth, axis=0)
-                lowest[stage], highest[stage] = np.nanmin(smooth, axis=0), np.nanmax(smooth, axis=0)
+                mean[name] = np.nanmean(smooth, axis=0)
+                lowest[name], highest[name] = np.nanmin(smooth, axis=0), np.nanmax(smooth, axis=0)
         return cls(frames, mean, lowest, highest, len(runs), max(int(run.frames[-1]) for run in runs))
 
     @property
-    def stages(self) -> list[str]:
-        """Stages with known times."""
-        return [stage for stage, values in self.mean.items() if np.isfinite(values).any()]
+    def columns(self) -> list[str]:
+        """Columns with known times."""
+        return [name for name, values in self.mean.items() if np.isfinite(values).any()]
 
-    def growth(self, stage: str) -> float:
+    def growth(self, name: str) -> float:
         """Return the ratio of the medians over the last and the first third of the frames, NaN if unknown."""
         third = max(1, len(self.frames) // 3)
-        first, last = self.mean[stage][:third], self.mean[stage][-third:]
+        first, last = self.mean[name][:third], self.mean[name][-third:]
         if not np.isfinite(first).any() or not np.isfinite(last).any():
             return float("nan")
         return float(np.nanmedian(last) / max(np.nanmedian(first), 1e-9))
@@ -115,19 +111,18 @@ def stage_times_figure(rows: Mapping[str, MeanTimes | None], note: str) -> Page:
     return page
 
 
-def _of_stage(run: StageTimes, stage: str) -> Float64:
+def _column(run: StageTimes, name: str) -> Float64:
+    """Return the sum (F,) of the stages of a column; NaN where one of them did not run."""
     nothing = np.full(len(run.frames), np.nan)
-    if stage == SUM:
-        return np.asarray(np.sum([run.milliseconds.get(one, nothing) for one in STAGES], axis=0), np.float64)
-    return run.milliseconds.get(stage, nothing)
+    return np.asarray(np.sum([run.milliseconds.get(stage, nothing) for stage in COLUMNS[name]], axis=0), np.float64)
 
 
 def _draw(axes: Axes, times: MeanTimes) -> None:
-    for stage in times.stages:
-        low, mean, high = (np.maximum(one[stage], LOWEST_MS) for one in (times.lowest, times.mean, times.highest))
-        color = COLORS[stage]
+    for name in times.columns:
+        low, mean, high = (np.maximum(one[name], LOWEST_MS) for one in (times.lowest, times.mean, times.highest))
+        color = COLORS[name]
         axes.fill_between(times.frames, low, high, color=color, alpha=0.14, linewidth=0)
-        axes.plot(times.frames, mean, color=color, linewidth=1.1 if stage == SUM else 0.9, solid_capstyle="round")
+        axes.plot(times.frames, mean, color=color, linewidth=0.9, solid_capstyle="round")
     axes.set_yscale("log")
     axes.set_xlim(times.frames[0], max(times.frames[-1], times.frames[0] + 1))
     lowest, highest = axes.get_ylim()
@@ -151,20 +146,21 @@ def _draw(axes: Axes, times: MeanTimes) -> None:
 
 
 def _draw_labels(axes: Axes, times: MeanTimes) -> None:
-    """Draw the stage, its median and its growth at the right end of each line."""
+    """Draw the name, the median and the growth at the right end of each line."""
     low, high = np.log10(axes.get_ylim())
-    ends = [np.maximum(times.mean[stage][np.isfinite(times.mean[stage])][-1], LOWEST_MS) for stage in times.stages]
+    ends = [np.maximum(times.mean[name][np.isfinite(times.mean[name])][-1], LOWEST_MS) for name in times.columns]
     heights = [float((np.log10(end) - low) / (high - low)) for end in ends]  # as shares of the diagram
-    line_x, stage_x, median_x, growth_x = (1 + place / PLOT_WIDTH_MM for place in LABEL_PLACES_MM)
-    for stage, height, place in zip(times.stages, heights, spread(heights, LABEL_MM / PLOT_MM), strict=True):
-        color = COLORS[stage]
+    line_x, name_x, growth_x = (1 + place / PLOT_WIDTH_MM for place in LABEL_PLACES_MM)
+    half = LABEL_LINE_MM / 2 / PLOT_MM
+    for name, height, place in zip(times.columns, heights, spread(heights, LABEL_MM / PLOT_MM), strict=True):
+        color = COLORS[name]
         axes.plot([1, line_x], [height, place], color=color, linewidth=0.5, transform=axes.transAxes, clip_on=False)
         beside: dict[str, Any] = {"va": "center", "transform": axes.transAxes}
-        axes.text(stage_x, place, stage, fontsize=SMALL_PT, color=color, weight="bold", **beside)
-        median, growth = float(np.nanmedian(times.mean[stage])), times.growth(stage)
-        axes.text(median_x, place, _short(median), fontsize=SMALL_PT, color=color, ha="right", **beside)
+        axes.text(name_x, place + half, name, fontsize=SMALL_PT, color=color, weight="bold", **beside)
+        median, growth = float(np.nanmedian(times.mean[name])), times.growth(name)
+        axes.text(name_x, place - half, _short(median), fontsize=SMALL_PT, color=color, **beside)
         if np.isfinite(growth):
-            axes.text(growth_x, place, f"×{growth:.2f}", fontsize=NOTE_PT, color=FAINT_INK, ha="right", **beside)
+            axes.text(growth_x, place - half, f"×{growth:.2f}", fontsize=NOTE_PT, color=FAINT_INK, **beside)
 
 
 def _short(milliseconds: float) -> str:

@@ -23,14 +23,17 @@ LOG = "log"
 FRAME, SECONDS = "frame", "seconds"  # timelines: Frame.index, and s since the first frame
 
 STAGE_COLORS = {
-    "read": (120, 126, 134),
-    "detect": (0, 114, 178),
-    "track": (0, 158, 115),
-    "lift": (140, 107, 177),
-    "refine": (213, 94, 0),
-    "fuse": (181, 131, 10),
+    "reading": (120, 126, 134),
+    "detection": (0, 114, 178),
+    "tracking": (0, 158, 115),
+    "lifting": (140, 107, 177),
+    "refinement": (213, 94, 0),
+    "association": (194, 96, 154),
+    "update": (75, 163, 199),
+    "integration": (181, 131, 10),
+    "fusion": (125, 102, 8),
 }
-"""RGB, as in the figure of stage times, by stage."""
+"""RGB by stage, as in a report."""
 
 TIMES_SHOWN = 300  # frames before the current one
 EYE_BACK, EYE_ABOVE = 1.2, 0.8  # m, from the first camera to the eye

@@ -18,8 +18,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.spatial import ConvexHull, QhullError
 
 from framework.data import Box, Float64
-from framework.figures.stage_times import STAGES, WINDOW, running_median
+from framework.figures.stage_times import WINDOW, running_median
 from framework.runs.timings_file import StageTimes
+from framework.runtime.run_log import FUSION, STAGES
 
 WIDTH, HEIGHT, FLAT_HEIGHT, TIMES_HEIGHT, GROWTH_HEIGHT = 560.0, 380.0, 180.0, 240.0, 390.0  # px
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px around the axes
@@ -38,18 +39,21 @@ COLORS = {
     "accent": "#2f5bea",
     "truth": "#8a9099",
     "bad": "#c93a32",
-    "read": "#9aa5b1",
-    "detect": "#0072b2",
-    "track": "#009e73",
-    "lift": "#8c6bb1",
-    "refine": "#d55e00",
-    "fuse": "#b5830a",
+    "reading": "#9aa5b1",
+    "detection": "#0072b2",
+    "tracking": "#009e73",
+    "lifting": "#8c6bb1",
+    "refinement": "#d55e00",
+    "association": "#c2609a",
+    "update": "#4ba3c7",
+    "integration": "#b5830a",
+    "fusion": "#7d6608",
     "run-3": "#a2459e",
     "run-4": "#8a6d00",
     "run-5": "#5b6570",
 }
 """The light colors of report.css by the name of their variable, which replaces them in the SVG."""
-RUN_COLORS = ("accent", "refine", "track", "run-3", "run-4", "run-5")
+RUN_COLORS = ("accent", "refinement", "tracking", "run-3", "run-4", "run-5")
 RUN_WIDTHS = (6.0, 4.5, 3.0, 2.2, 1.6, 1.2)  # px: coinciding paths remain visible
 VARIABLES = {color: f"var(--{name})" for name, color in COLORS.items()}
 
@@ -91,7 +95,7 @@ def box_corners(box: Box) -> Float64:
 def stage_rows(times: StageTimes) -> list[StageRow]:
     """Return the stages that ran, in their order."""
     rows = []
-    for stage in ("read", *STAGES):
+    for stage in (*STAGES, FUSION):
         values = times.milliseconds.get(stage, np.zeros(0))
         if np.isfinite(values).any():
             rows.append(StageRow(stage, *np.nanpercentile(values, [5, 50, 95]).tolist()))

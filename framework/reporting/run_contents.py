@@ -26,6 +26,7 @@ from framework.runs.stored_runs import (
     read_record,
 )
 from framework.runs.timings_file import StageTimes, read_timings
+from framework.runtime.run_log import FUSION, FUSION_STAGES
 
 TIMINGS_HEADER = "frame,stage,milliseconds\n"
 
@@ -82,9 +83,11 @@ class RunContents:
     @property
     def tracked_frames(self) -> tuple[int, ...]:
         """Frame numbers of `poses`, empty if unknown."""
-        if self.times is None or "fuse" not in self.times.milliseconds:
+        if self.times is None:
             return ()
-        numbers = self.times.frames[np.isfinite(self.times.milliseconds["fuse"])].tolist()
+        milliseconds = self.times.milliseconds
+        fused = [milliseconds[stage] for stage in (*FUSION_STAGES, FUSION) if stage in milliseconds]
+        numbers = self.times.frames[np.isfinite(fused).any(axis=0)].tolist() if fused else []
         return tuple(numbers) if len(numbers) == len(self.poses) else ()
 
     @property

@@ -14,13 +14,12 @@ from framework.evaluation.instances import PredictedInstances, Transfer
 from framework.files.hashing import add_values
 from framework.interfaces import RGBDVideo, SceneMap
 from framework.mapping.gravity import floor_height
-from framework.runtime.run_log import RunResult
+from framework.runtime.run_log import STAGES, RunResult
 
 Metrics = dict[str, float | int | str | bool | None]
 
 MAIN_FIGURES = ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou")  # of `instances.`, for both label transfers
 TRUTH = "truth_sha256"  # key of the hash of the ground truth
-STAGES_TIMED = ("read", "detect", "track", "lift", "refine", "fuse")
 
 
 def run_metrics(result: RunResult) -> Metrics:
@@ -34,7 +33,7 @@ def run_metrics(result: RunResult) -> Metrics:
         "pose_source": result.pose_source,
         **{f"map.{name}": value for name, value in asdict(result.scene.statistics).items()},
     }
-    for stage in STAGES_TIMED:
+    for stage in dict.fromkeys([*STAGES, *(time.stage for time in result.timings)]):
         milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
         metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None
         metrics[f"stage_ms.{stage}.p95"] = float(np.percentile(milliseconds, 95)) if milliseconds else None

@@ -20,6 +20,7 @@ from framework.files.json_file import read_json
 from framework.files.yaml_file import load_yaml
 from framework.runs.inputs import INPUTS, inputs_sha256
 from framework.runs.provenance import code_version, config_hash, environment, shows_speed, speed_settings
+from framework.runs.timings_file import current_key
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"  # exists only for completed runs
@@ -202,7 +203,7 @@ def _read_flat(path: Path) -> dict[str, Any]:
     for key, value in content.items():
         if key.startswith(FIGURES) and value is not None and not is_number(value):
             raise DataError(f"{path}: {key} must be a number or null, found {value!r}")
-    return content
+    return {current_key(key): value for key, value in content.items()}
 
 
 def is_number(value: Any) -> TypeGuard[float]:

@@ -14,6 +14,11 @@ from framework.errors import DataError
 from framework.files.atomic_write import read_text
 
 HEADER = ["frame", "stage", "milliseconds"]
+OLD_STAGES = {
+    **{"read": "reading", "detect": "detection", "track": "tracking", "lift": "lifting"},
+    **{"refine": "refinement", "fuse": "fusion"},
+}
+"""Names of the stages before 0.1.0, which stored runs and sweeps may have."""
 LARGEST = 2**53  # limit of frame numbers, which are exact in float64
 
 
@@ -23,6 +28,12 @@ class StageTimes:
 
     frames: Int64  # (F,) frame numbers, ascending
     milliseconds: Mapping[str, Float64]  # by stage: (F,), NaN = not run, as after a lost pose
+
+
+def current_key(key: str) -> str:
+    """Return a key of metrics.json with the current name of its stage."""
+    parts = key.split(".")
+    return ".".join([parts[0], OLD_STAGES.get(parts[1], parts[1]), *parts[2:]]) if parts[0] == "stage_ms" else key
 
 
 def read_timings(path: Path) -> StageTimes:
@@ -43,7 +54,7 @@ def read_timings(path: Path) -> StageTimes:
             raise DataError(
                 f"{path}, line {number}: expected a frame, a stage and a time, found {','.join(line)!r:.60}"
             )
-        taken[frame, stage] = milliseconds
+        taken[frame, OLD_STAGES.get(stage, stage)] = milliseconds
     if not taken:
         raise DataError(f"{path} has no times")
     frames = sorted({frame for frame, _ in taken})

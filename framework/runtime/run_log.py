@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import takewhile
+from typing import get_args
 
 import numpy as np
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from framework.data import Array, Float64, Frame, Pose
 from framework.errors import FrameError, NoPoseError
-from framework.interfaces import PoseTracker, SceneMap
+from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
 from framework.runtime.progress import Progress
 
 log = logging.getLogger(__name__)
 
 SKIPS_LOGGED = 10  # later unusable frames are only counted, so that a broken disk does not flood the log
+FUSION_STAGES: tuple[str, ...] = get_args(FusionStage)
+STAGES = ("reading", "detection", "tracking", "lifting", "refinement", *FUSION_STAGES)
+FUSION = "fusion"  # the total of FUSION_STAGES, if the fuser does not time them
 COUNT_INTERVAL_S = 1.0  # how often the progress bar asks the map for its number of instances
 
 
@@ -28,7 +33,7 @@ class StageTime:
     """How long one stage took for one frame."""
 
     frame: int  # Frame.index
-    stage: str  # read, detect, track, lift, refine or fuse
+    stage: str  # one of STAGES, or FUSION
     milliseconds: float
 
 
@@ -128,6 +133,22 @@ class Journal:
         started = time.perf_counter()
         yield
         self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
+
+    @contextmanager
+    def fusing(self, frame: int) -> Iterator[StageTimer]:
+        """Record the times of the fuser's stages, if the body succeeds."""
+        seconds: defaultdict[str, float] = defaultdict(float)
+
+        @contextmanager
+        def timer(stage: FusionStage) -> Iterator[None]:
+            started = time.perf_counter()
+            yield
+            seconds[stage] += time.perf_counter() - started
+
+        started = time.perf_counter()
+        yield timer
+        of_stages = seconds or {FUSION: time.perf_counter() - started}
+        self.timings += [StageTime(frame, stage, 1e3 * spent) for stage, spent in of_stages.items()]
 
     def stage_ms(self, frame: int) -> dict[str, float]:
         """Return the time of each stage, ms, of the last frame, whose index is `frame`."""

@@ -14,6 +14,7 @@ from framework.runs.metrics import is_evaluation
 from framework.runs.run_rows import CHOICE, Mean, Run, RunRow, natural, rows_of
 from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
 from framework.runs.sweep_file import SWEEP, asked_runs, sweep_rows
+from framework.runs.timings_file import current_key
 from framework.tables.published import (
     DATASET,
     MADE_UP,
@@ -27,7 +28,7 @@ from framework.tables.published import (
 PLAIN = (
     *("instances.ap50", "instances.ap50_agnostic", "instances.ap25", "instances.ap", "instances.mean_iou"),
     *("instances.count", "trajectory.ate_rmse_m", "frames_lost", "fps"),
-    *("stage_ms.refine.median", "stage_ms.fuse.median"),
+    *(f"stage_ms.{stage}.median" for stage in ("refinement", "association", "update", "integration", "fusion")),
 )
 """The columns without an experiment, if the runs have these figures: keys of metrics.json."""
 
@@ -84,7 +85,8 @@ class TableChoice:
     @classmethod
     def of(cls, node: Any) -> TableChoice:
         """Return the choice of a config's `table`; raise ConfigError for unknown keys and wrong types."""
-        return cls(**checked_block(cls, "table", node))
+        choice = cls(**checked_block(cls, "table", node))
+        return replace(choice, columns=[current_key(key) for key in choice.columns])  # a stored sweep may be older
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import is_dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ from framework.errors import DataError
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 from framework.refinement.lifting import lift
 from framework.registry import GROUPS, build, find_class, parameters
+from framework.runtime.run_log import FUSION_STAGES
 from framework.testing.corner_room import (
     CAMERA,
     CLASSES,
@@ -312,6 +314,21 @@ class FuserContract:
         blind = replace(frame_at(1), depth=np.zeros(CAMERA.shape, np.float32))
         fuser.fuse(blind, pose, nothing_in(blind, pose))
         assert not fuser.scene.instances()
+
+    def test_fuser_times_its_stages_one_by_one(self) -> None:
+        begun: list[str] = []
+        ended: list[str] = []
+
+        @contextmanager
+        def timer(stage: str) -> Iterator[None]:
+            assert begun == ended, f"{stage} is timed within {begun[-1]}"
+            begun.append(stage)
+            yield
+            ended.append(stage)
+
+        frame = frame_at(0)
+        self.plugin().fuse(frame, Pose(pose_at(0)), exact_clusters(frame), timer)
+        assert set(begun) <= set(FUSION_STAGES)
 
     def test_fuser_maps_its_depth_range(self) -> None:
         fuser = self.plugin()

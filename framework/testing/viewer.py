@@ -18,7 +18,10 @@ from framework.testing.contracts import same
 from framework.testing.corner_room import CAMERA, RoomMap, frame_at, pose_at, spheres_in
 
 FRAMES, LOST, SKIPPED, NOTHING_FOUND, BLIND = 8, 2, 3, 4, 5
-STAGE_MS = {"read": 1.0, "detect": 20.0, "track": 5.0, "lift": 0.5, "refine": 3.0, "fuse": 10.0}
+STAGE_MS = {
+    **{"reading": 1.0, "detection": 20.0, "tracking": 5.0, "lifting": 0.5, "refinement": 3.0},
+    **{"association": 2.0, "update": 3.0, "integration": 5.0},
+}
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,9 @@ def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detect
                 viewer.skip(f"frame {k} cannot be read")
             elif k == LOST:
                 lost = Pose(pose_at(k), lost=True, reason="too dark")
-                viewer.show(frame, found, lost, {stage: STAGE_MS[stage] for stage in ("read", "detect", "track")})
+                viewer.show(
+                    frame, found, lost, {stage: STAGE_MS[stage] for stage in ("reading", "detection", "tracking")}
+                )
             else:
                 viewer.show(frame, found, Pose(pose_at(k)), STAGE_MS)
     with scene.call():

@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters, Pose
-from framework.interfaces import MapFuser, SceneMap
+from framework.interfaces import MapFuser, SceneMap, StageTimer, untimed
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import Association
 from framework.mapping.labels.label_evidence_kernels import Combine
@@ -40,17 +40,21 @@ class BayesianTsdf(MapFuser):
     def resume(self, scene: SceneMap) -> None:
         self.scene = self.voxels.continued(scene, RULE)
 
-    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
-        points = list_points_by_pixel(clusters, frame.depth.shape)
-        overlaps = self.association.look_up(self.scene, frame, pose, points)
-        matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
-        seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
-        evidence = self.evidence(clusters)
-        measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULE)
-        self.scene.labels.update(seen, measurement)  # the sums of eqs. [7] and [8]
-        self.association.observe(self.scene.table, matches, evidence.classes)
-        self.association.merge(self.scene, matches)
+        with timer("association"):
+            points = list_points_by_pixel(clusters, frame.depth.shape)
+            overlaps = self.association.look_up(self.scene, frame, pose, points)
+            matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
+        with timer("integration"):
+            seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
+        with timer("update"):
+            evidence = self.evidence(clusters)
+            measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULE)
+            self.scene.labels.update(seen, measurement)  # the sums of eqs. [7] and [8]
+            self.association.observe(self.scene.table, matches, evidence.classes)
+        with timer("association"):
+            self.association.merge(self.scene, matches)
 
     def evidence(self, clusters: PointClusters) -> DetectionEvidence:
         """log P(O_u | I_t) of eqs. [7] and [8], that of the matched instance over any other's."""

@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 
 from framework.data import Frame, PointClusters, Pose
-from framework.interfaces import MapFuser, SceneMap
+from framework.interfaces import MapFuser, SceneMap, StageTimer, untimed
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import Association
 from framework.mapping.labels.label_evidence_kernels import Combine
@@ -45,17 +45,21 @@ class LabelVote(MapFuser):
     def resume(self, scene: SceneMap) -> None:
         self.scene = self.voxels.continued(scene, RULES[self.vote])
 
-    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
-        points = list_points_by_pixel(clusters, frame.depth.shape)
-        overlaps = self.association.look_up(self.scene, frame, pose, points)
-        matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
-        seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
-        weights = np.ones(len(clusters), np.float32)
-        if self.vote is Vote.MAX_SCORE:
-            weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # 0 is no evidence
-        evidence = vote_for_best(clusters, weights)
-        measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULES[self.vote])
-        self.scene.labels.update(seen, measurement)
-        self.association.observe(self.scene.table, matches, evidence.classes)
-        self.association.merge(self.scene, matches)
+        with timer("association"):
+            points = list_points_by_pixel(clusters, frame.depth.shape)
+            overlaps = self.association.look_up(self.scene, frame, pose, points)
+            matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
+        with timer("integration"):
+            seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
+        with timer("update"):
+            weights = np.ones(len(clusters), np.float32)
+            if self.vote is Vote.MAX_SCORE:
+                weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # 0 is no evidence
+            evidence = vote_for_best(clusters, weights)
+            measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULES[self.vote])
+            self.scene.labels.update(seen, measurement)
+            self.association.observe(self.scene.table, matches, evidence.classes)
+        with timer("association"):
+            self.association.merge(self.scene, matches)

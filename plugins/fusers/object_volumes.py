@@ -10,7 +10,7 @@ from framework.baselines.object_map import ObjectMap
 from framework.config.validation import check_bounds
 from framework.data import Bool, Float64, Frame, Int32, PointClusters, Pose
 from framework.geometry import require_pixels_inside
-from framework.interfaces import MapFuser
+from framework.interfaces import MapFuser, StageTimer, untimed
 from framework.mapping.instances.association import Matches, OverlapRule, Overlaps, count_overlaps, observe, vote_stride
 from framework.mapping.instances.instance_list import Confirmation
 from framework.mapping.instances.instance_table import InstanceRecord
@@ -53,16 +53,19 @@ class ObjectVolumes(MapFuser):
         confirmation = Confirmation(self.min_observations, min_confidence=0.0, min_area=self.min_area)
         self.scene: ObjectMap = ObjectMap(self.hashing.new_volume(), confirmation)
 
-    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
         require_pixels_inside(clusters, frame.depth.shape)
-        overlaps = self._look_up(frame, pose.T_world_camera, clusters)
-        matches = self._associate(overlaps, clusters, frame)
-        masks = _masks(clusters, matches.instance_ids, frame.depth.shape)
-        self.scene.integrate(frame, pose.T_world_camera, masks, self.hashing.near)
-        self._remove_empty(matches.instance_ids)
-        observe(self.scene.table, matches, clusters.class_probabilities.astype(np.float64), self.create_points)
-        self._remove_unlikely()
+        with timer("association"):
+            overlaps = self._look_up(frame, pose.T_world_camera, clusters)
+            matches = self._associate(overlaps, clusters, frame)
+        with timer("integration"):
+            masks = _masks(clusters, matches.instance_ids, frame.depth.shape)
+            self.scene.integrate(frame, pose.T_world_camera, masks, self.hashing.near)
+        with timer("update"):
+            self._remove_empty(matches.instance_ids)
+            observe(self.scene.table, matches, clusters.class_probabilities.astype(np.float64), self.create_points)
+            self._remove_unlikely()
 
     def _look_up(self, frame: Frame, T_world_camera: Float64, clusters: PointClusters) -> Overlaps:
         """Return the overlaps of the clusters with the objects of the map at the measured surface."""

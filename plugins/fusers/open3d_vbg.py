@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.config.validation import check_bounds
 from framework.data import Frame, Int32, PointClusters, Pose
-from framework.interfaces import MapFuser
+from framework.interfaces import MapFuser, StageTimer, untimed
 from framework.mapping.instances.association import Association
 from framework.mapping.instances.instance_list import Confirmation
 from framework.mapping.labels.label_rule import floored_log
@@ -48,17 +48,21 @@ class Open3DVoxelBlockGrid(MapFuser):
         )
         self.scene: Open3DMap = Open3DMap(settings, self.confirmation)
 
-    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
-        points = list_points_by_pixel(clusters, frame.depth.shape)
-        overlaps = self.association.look_up(self.scene, frame, pose, points)
-        matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
-        self.scene.integrate(frame, pose.T_world_camera)
-        seen_ids = _paint(clusters, matches.instance_ids, frame.depth.shape)
-        self.scene.vote(frame, pose.T_world_camera, seen_ids, self.tsdf.label_band)
-        class_evidence = floored_log(clusters.class_probabilities, self.class_floor)
-        self.association.observe(self.scene.table, matches, class_evidence)
-        self.association.merge(self.scene, matches)
+        with timer("association"):
+            points = list_points_by_pixel(clusters, frame.depth.shape)
+            overlaps = self.association.look_up(self.scene, frame, pose, points)
+            matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
+        with timer("integration"):
+            self.scene.integrate(frame, pose.T_world_camera)
+        with timer("update"):
+            seen_ids = _paint(clusters, matches.instance_ids, frame.depth.shape)
+            self.scene.vote(frame, pose.T_world_camera, seen_ids, self.tsdf.label_band)
+            class_evidence = floored_log(clusters.class_probabilities, self.class_floor)
+            self.association.observe(self.scene.table, matches, class_evidence)
+        with timer("association"):
+            self.association.merge(self.scene, matches)
 
 
 def _paint(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> Int32:

@@ -10,7 +10,7 @@ from framework.baselines.class_evidence import mask_classes
 from framework.baselines.semantic_map import AREA, MISSED, SemanticMap
 from framework.config.validation import check_bounds
 from framework.data import Float64, Frame, PointClusters, Pose
-from framework.interfaces import MapFuser
+from framework.interfaces import MapFuser, StageTimer, untimed
 from framework.mapping.labels.pixel_lists import list_points_by_pixel
 from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
@@ -34,12 +34,15 @@ class SemanticComponents(MapFuser):
         check_bounds(self, class_floor=(1e-6, 0.999), missed=MISSED, min_area=AREA)
         self.scene: SemanticMap = SemanticMap(self.hashing.new_volume(), self.missed, self.min_area)
 
-    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
-        points = list_points_by_pixel(clusters, frame.depth.shape)
-        masks = mask_classes(self._log_ratio(clusters), clusters, points, frame.index)
-        seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.hashing.near)
-        self.scene.labels.update(seen, masks)
+        with timer("update"):
+            points = list_points_by_pixel(clusters, frame.depth.shape)
+            masks = mask_classes(self._log_ratio(clusters), clusters, points, frame.index)
+        with timer("integration"):
+            seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.hashing.near)
+        with timer("update"):
+            self.scene.labels.update(seen, masks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
         """Return (N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, for eq. [7], with a floor.

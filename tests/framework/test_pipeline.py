@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from tqdm import TMonitor
 
 from framework.data import Array, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
-from framework.interfaces import SceneMap, Viewer
+from framework.interfaces import SceneMap, StageTimer, Viewer, untimed
 from framework.pipeline import Pipeline
 from framework.registry import assemble
 from framework.runtime.run_log import RunResult
@@ -59,9 +60,26 @@ def test_maps_every_frame_in_order(room: CornerRoom, prefetch: int) -> None:
     assert len(result.intervals) == 5
     assert sum(result.intervals) <= result.seconds
     assert result.fps_median == pytest.approx(1 / sorted(result.intervals)[2])
-    for stage in ("read", "detect", "track", "lift", "refine", "fuse"):
+    for stage in ("reading", "detection", "tracking", "lifting", "refinement", "fusion"):
         assert [time.frame for time in result.timings if time.stage == stage] == list(range(6))
     assert all(time.milliseconds >= 0 for time in result.timings)
+
+
+def test_timed_fuser_adds_times_of_a_stage(room: CornerRoom) -> None:
+    @dataclass
+    class Timed(GridFuser):
+        def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
+            with timer("association"):
+                time.sleep(0.003)
+            with timer("integration"):
+                super().fuse(frame, pose, clusters)
+            with timer("association"):
+                time.sleep(0.003)
+
+    timings = pipeline(fuser=Timed()).run(room).timings
+    assert [one.stage for one in timings if one.frame == 4][-2:] == ["association", "integration"]
+    assert all(one.milliseconds >= 6 for one in timings if one.stage == "association")
+    assert "fusion" not in {one.stage for one in timings}
 
 
 def test_worker_threads_change_nothing(room: CornerRoom) -> None:
@@ -164,7 +182,7 @@ def test_lost_frames_are_counted_and_not_fused(room: CornerRoom, caplog: pytest.
         "frame 2: lost: too few points associate",
         "frame 5: tracked again after 3 lost frames",
     ]
-    assert {time.frame for time in result.timings if time.stage == "fuse"} == {0, 1, 5}
+    assert {time.frame for time in result.timings if time.stage == "fusion"} == {0, 1, 5}
 
 
 def test_a_run_that_maps_nothing_is_an_error_that_says_what_became_of_its_frames() -> None:
@@ -215,10 +233,10 @@ def test_a_full_map_ends_the_run_with_what_there_is(room: CornerRoom) -> None:
 class _Fails(GridFuser):
     at: int = 3
 
-    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         if frame.index == self.at:
             raise MemoryError("Unable to allocate 40 GiB")
-        super().fuse(frame, pose, clusters)
+        super().fuse(frame, pose, clusters, timer)
 
 
 def test_a_fault_is_raised_and_what_it_left_is_there_for_who_asks(room: CornerRoom) -> None:
@@ -424,8 +442,8 @@ def test_a_viewer_hears_of_every_frame_in_order(prefetch: int, tmp_path: Path) -
         *("mapped 0 with 2", skipped, "mapped 2 with 2", "lost 3 with 2", "mapped 4 with 2", "mapped 5 with 2"),
         "end",
     ]
-    every = {"read", "detect", "track", "lift", "refine", "fuse"}
-    assert listener.stages == [every, every, {"read", "detect", "track"}, every, every]
+    every = {"reading", "detection", "tracking", "lifting", "refinement", "fusion"}
+    assert listener.stages == [every, every, {"reading", "detection", "tracking"}, every, every]
 
 
 @pytest.mark.parametrize("stages", [{"fuser": GridFuser(capacity=2)}, {"detector": SphereDetector(broken_at=0)}])

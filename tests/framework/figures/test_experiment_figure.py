@@ -26,6 +26,7 @@ from framework.runs.provenance import config_hash
 from tests.support.scenes.boxes_room import furnished, walk
 
 pytestmark = pytest.mark.usefixtures("fakes_registered")
+STAGE_MS = (("tracking", 20), ("refinement", 10), ("update", 10), ("integration", 20))
 ROWS = {"part": ["dataset.stop=8"], "whole": []}
 
 
@@ -55,7 +56,7 @@ def run(root: Path, row: str, scene: str, frames: int = 20) -> Path:
     write_mesh(directory / "mesh.ply", mesh)
     list_objects(directory, "chair", [1538, 1538])
     write_tum(directory / "trajectory.txt", np.arange(len(poses)) / 30, poses)
-    times = [f"{k},{stage},{ms}" for k in range(frames) for stage, ms in (("track", 20), ("refine", 10), ("fuse", 30))]
+    times = [f"{k},{stage},{ms}" for k in range(frames) for stage, ms in STAGE_MS]
     (directory / "timings.csv").write_text("\n".join(["frame,stage,milliseconds", *times]) + "\n")
     metrics: dict[str, Any] = {
         **{"frames": frames, "instances.count": 2, "instances.ap50": 0.5, "annotation_release": "made up"},
@@ -184,14 +185,15 @@ def test_stage_times_are_averaged_over_the_sequences(tmp_path: Path, caplog: pyt
     root = experiment(tmp_path / "figure3", kind="stage_times", names={"whole": "ours"})
     run(root, "whole", "011")
     run(root, "whole", "206", frames=12)
-    (run(root, "whole", "300") / "timings.csv").write_text("frame,stage,milliseconds\n0,fuse,x\n")
+    (run(root, "whole", "300") / "timings.csv").write_text("frame,stage,milliseconds\n0,integration,x\n")
     paths = write_figure(root)
     assert Image.open(paths[0]).size[0] == pytest.approx(88 / 25.4 * 200, abs=1)
-    assert [record.getMessage() for record in caplog.records][1].endswith("found '0,fuse,x'")
+    assert [record.getMessage() for record in caplog.records][1].endswith("found '0,integration,x'")
     found = texts(root)
-    assert {"track", "refine", "fuse", "30 ms", "not complete"} <= set(found)
+    assert {"GMM", "map integration", "30 ms", "not complete"} <= set(found)
+    assert "tracking" not in found
     note = " ".join(found[0].split())
-    assert note.startswith("Mean of 2 sequences (011, 206) ")
+    assert "map integration: update and integration. Mean of 2 sequences (011, 206) " in note
     assert "Lines end with the shortest sequence." in note
 
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from framework.figures.stage_times import COLORS, SUM, MeanTimes, running_median, spread, stage_times_figure
+from framework.figures.stage_times import COLUMNS, MeanTimes, running_median, spread, stage_times_figure
 from framework.runs.timings_file import StageTimes
 
-STAGES = [stage for stage in COLORS if stage != SUM]
+STAGES = [stage for stages in COLUMNS.values() for stage in stages]
 
 
 def run(frames: list[int], **milliseconds: list[float]) -> StageTimes:
@@ -46,25 +46,25 @@ def test_two_labels_that_touch_move_by_the_same() -> None:
 
 
 def test_the_mean_over_sequences_ends_with_the_shortest() -> None:
-    short = run([0, 2, 4], track=[1, 1, 1], fuse=[10, 10, 10])
-    long = run([0, 2, 4, 6, 8], track=[3, 3, 3, 99, 99], fuse=[20, 20, 20, 99, 99])
+    short = run([0, 2, 4], detection=[1, 1, 1], update=[4, 4, 4], integration=[6, 6, 6], tracking=[9, 9, 9])
+    last = {"update": [5, 5, 5, 99, 99], "integration": [15, 15, 15, 99, 99]}
+    long = run([0, 2, 4, 6, 8], detection=[3, 3, 3, 99, 99], **last)
     times = MeanTimes.of([short, long])
     np.testing.assert_array_equal(times.frames, [0, 2, 4])
-    np.testing.assert_array_equal(times.mean["fuse"], [15, 15, 15])
-    np.testing.assert_array_equal(times.lowest["fuse"], [10, 10, 10])
-    np.testing.assert_array_equal(times.highest["fuse"], [20, 20, 20])
-    assert (times.count, times.longest, times.stages) == (2, 8, ["track", "fuse"])
+    np.testing.assert_array_equal(times.mean["map integration"], [15, 15, 15])
+    np.testing.assert_array_equal(times.lowest["map integration"], [10, 10, 10])
+    np.testing.assert_array_equal(times.highest["map integration"], [20, 20, 20])
+    assert (times.count, times.longest, times.columns) == (2, 8, ["Mask R-CNN", "map integration"])
 
 
 def test_a_frame_that_one_sequence_lost_is_the_mean_of_the_others() -> None:
     full = {stage: [10.0, 10.0, 10.0] for stage in STAGES}
-    lost = run([0, 1, 2], **(full | {"fuse": [10, np.nan, 10]}))
+    lost = run([0, 1, 2], **(full | {"association": [10, np.nan, 10]}))
     double = run([0, 2], **{stage: [20.0, 20.0] for stage in STAGES})  # frame 1 could not be read
     times = MeanTimes.of([lost, double])
     np.testing.assert_array_equal(times.frames, [0, 1, 2])
-    np.testing.assert_array_equal(times.mean["detect"], [15, 10, 15])
-    np.testing.assert_array_equal(times.mean["fuse"], [15, np.nan, 15])
-    np.testing.assert_array_equal(times.mean[SUM], [75, np.nan, 75])
+    np.testing.assert_array_equal(times.mean["Mask R-CNN"], [15, 10, 15])
+    np.testing.assert_array_equal(times.mean["data association"], [30, np.nan, 30])
 
 
 def test_single_slow_frames_are_no_trend_and_growth_is_last_by_first() -> None:
@@ -72,18 +72,18 @@ def test_single_slow_frames_are_no_trend_and_growth_is_last_by_first() -> None:
     slow = [10.0] * 90
     slow[0], slow[50] = 4000.0, 900.0
     growing = list(np.linspace(10, 40, 90))
-    times = MeanTimes.of([run(frames, refine=slow, fuse=growing)])
-    assert times.mean["refine"].max() == 10
-    assert times.growth("refine") == 1
-    assert times.growth("fuse") == pytest.approx((10 + 30 * 74.5 / 89) / (10 + 30 * 14.5 / 89))
-    assert np.isnan(times.growth("track"))
+    times = MeanTimes.of([run(frames, refinement=slow, detection=growing)])
+    assert times.mean["GMM"].max() == 10
+    assert times.growth("GMM") == 1
+    assert times.growth("Mask R-CNN") == pytest.approx((10 + 30 * 74.5 / 89) / (10 + 30 * 14.5 / 89))
+    assert np.isnan(times.growth("map integration"))
 
 
 def test_a_row_without_runs_leaves_an_empty_diagram_that_says_so() -> None:
-    times = MeanTimes.of([run([0], refine=[1.0])])
+    times = MeanTimes.of([run([0], refinement=[1.0], fusion=[2.0])])
     page = stage_times_figure({"ours": times, "rival": None}, "a note")
     first, second = page.figure.axes
     assert [text.get_text() for text in second.texts] == ["not complete"]
     assert (len(second.lines), second.get_title(loc="left")) == (0, "rival")
-    assert {"refine", "1.0 ms", "×1.00"} <= {text.get_text() for text in first.texts}
-    assert "fuse" not in {text.get_text() for text in first.texts}
+    assert {"GMM", "1.0 ms", "×1.00"} <= {text.get_text() for text in first.texts}
+    assert "map integration" not in {text.get_text() for text in first.texts}

@@ -63,12 +63,12 @@ def test_all_is_told_and_the_last_map_is_whole(room: CornerRoom) -> None:
     scene, book = mapped(room), Notebook()
     background = DrawingThread(scene, book, frame_interval=1, map_interval=3600)
     for frame in room:
-        background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera, frame.index == 3), {"fuse": 1.5})
+        background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera, frame.index == 3), {"fusion": 1.5})
         background.skip(f"after {frame.index}")
     background.end()
     assert [note.index for note in book.notes] == list(range(6))
     assert [note.pose.lost for note in book.notes] == [index == 3 for index in range(6)]
-    assert book.notes[2].stage_ms == {"fuse": 1.5}
+    assert book.notes[2].stage_ms == {"fusion": 1.5}
     assert book.faults == [f"after {index}" for index in range(6)]
     assert book.pictures[-1].frame.index == 5
     assert book.maps[-1].index == 5

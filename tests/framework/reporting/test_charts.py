@@ -94,20 +94,20 @@ def times(frames: int) -> StageTimes:
     generator = np.random.default_rng(0)
     fuse = generator.uniform(10, 30, frames)
     fuse[frames // 2] = np.nan  # a lost frame
-    return StageTimes(np.arange(frames), {"track": generator.uniform(5, 6, frames), "fuse": fuse})
+    return StageTimes(np.arange(frames), {"tracking": generator.uniform(5, 6, frames), "integration": fuse})
 
 
 def test_stage_rows_have_median_and_percentile() -> None:
     given = times(200)
-    track, fuse = stage_rows(given)
-    assert (track.stage, fuse.stage) == ("track", "fuse")
-    assert fuse.median == pytest.approx(np.nanmedian(given.milliseconds["fuse"]))
-    assert fuse.p95 == pytest.approx(np.nanpercentile(given.milliseconds["fuse"], 95))
+    tracking, integration = stage_rows(given)
+    assert (tracking.stage, integration.stage) == ("tracking", "integration")
+    assert integration.median == pytest.approx(np.nanmedian(given.milliseconds["integration"]))
+    assert integration.p95 == pytest.approx(np.nanpercentile(given.milliseconds["integration"], 95))
     picture = stage_areas(given)
-    for stage in ("track", "fuse"):
+    for stage in ("tracking", "integration"):
         [area] = paths(picture, f"chart-stage-{stage}")
         assert len(area) > 300
-    assert "var(--track)" in picture
+    assert "var(--tracking)" in picture
 
 
 def test_svg_of_chart_is_deterministic_and_has_no_styles() -> None:
@@ -122,8 +122,8 @@ def test_scale_bar_length_is_round() -> None:
 
 
 def test_stage_areas_of_one_frame_is_valid() -> None:
-    parsed(stage_areas(StageTimes(np.array([3]), {"track": np.array([2.0])})))
-    parsed(stage_areas(StageTimes(np.array([3]), {"track": np.array([np.nan])})))
+    parsed(stage_areas(StageTimes(np.array([3]), {"tracking": np.array([2.0])})))
+    parsed(stage_areas(StageTimes(np.array([3]), {"tracking": np.array([np.nan])})))
 
 
 def test_growth_ends_with_all_objects_and_surface() -> None:

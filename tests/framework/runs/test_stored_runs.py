@@ -172,7 +172,7 @@ def test_times_of_other_settings_are_no_record_of_an_experiment_about_speed(
     caplog.set_level(logging.INFO)
     config = CONFIG | SETTINGS
     record_of(directory, config, monkeypatch)
-    about_results = {"table": {"columns": ["instances.ap50", "stage_ms.fuse.median"]}}
+    about_results = {"table": {"columns": ["instances.ap50", "stage_ms.fusion.median"]}}
     about_speed = {"table": {"columns": ["fps"]}}
     assert is_recorded(directory, OmegaConf.create(config | about_speed))
     assert is_recorded(directory, OmegaConf.create(config | changed | about_results))

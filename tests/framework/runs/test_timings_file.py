@@ -9,24 +9,31 @@ import pytest
 
 from framework.errors import DataError
 from framework.runs.run_directory import write_timings
-from framework.runs.timings_file import read_timings
+from framework.runs.timings_file import current_key, read_timings
 from framework.runtime.run_log import RunResult, StageTime
 from tests.support.scenes.corner_room import GridMap
 
 
 def test_what_a_run_wrote_is_read_back_with_gaps_where_a_stage_did_not_run(tmp_path: Path) -> None:
     times = (
-        *(StageTime(4, "track", 2.5), StageTime(4, "fuse", 20.0)),
-        StageTime(6, "track", 3.0),  # lost: not fused
-        *(StageTime(8, "track", 3.5), StageTime(8, "fuse", 0.0)),
+        *(StageTime(4, "tracking", 2.5), StageTime(4, "fusion", 20.0)),
+        StageTime(6, "tracking", 3.0),  # lost: not fused
+        *(StageTime(8, "tracking", 3.5), StageTime(8, "fusion", 0.0)),
     )
     result = RunResult(GridMap(10), frames=3, frames_skipped=0, tracked=(), timings=times, seconds=1.0)
     write_timings(tmp_path / "timings.csv", result)
     found = read_timings(tmp_path / "timings.csv")
     np.testing.assert_array_equal(found.frames, [4, 6, 8])
-    assert list(found.milliseconds) == ["track", "fuse"]
-    np.testing.assert_array_equal(found.milliseconds["track"], [2.5, 3, 3.5])
-    np.testing.assert_array_equal(found.milliseconds["fuse"], [20, np.nan, 0])
+    assert list(found.milliseconds) == ["tracking", "fusion"]
+    np.testing.assert_array_equal(found.milliseconds["tracking"], [2.5, 3, 3.5])
+    np.testing.assert_array_equal(found.milliseconds["fusion"], [20, np.nan, 0])
+
+
+def test_read_timings_old_stage_gets_current_name(tmp_path: Path) -> None:
+    (tmp_path / "timings.csv").write_text("frame,stage,milliseconds\n0,read,1\n0,fuse,2\n")
+    assert list(read_timings(tmp_path / "timings.csv").milliseconds) == ["reading", "fusion"]
+    assert current_key("stage_ms.track.p95") == "stage_ms.tracking.p95"
+    assert current_key("instances.ap50.track") == "instances.ap50.track"
 
 
 @pytest.mark.parametrize(
@@ -35,14 +42,14 @@ def test_what_a_run_wrote_is_read_back_with_gaps_where_a_stage_did_not_run(tmp_p
         ("", "line 1: expected frame,stage,milliseconds, found ''"),
         ("a,b\n", "line 1: expected frame,stage,milliseconds, found 'a,b'"),
         ("frame,stage,milliseconds\n", "has no times"),
-        ("frame,stage,milliseconds\n0,fuse,1\n0,fuse\n", "line 3: .* found '0,fuse'"),
-        ("frame,stage,milliseconds\n0,fuse,nan\n", "line 2: .* found '0,fuse,nan'"),
-        ("frame,stage,milliseconds\n0,fuse,-1\n", "line 2: "),
-        ("frame,stage,milliseconds\n1e3,fuse,1\n", "line 2: "),
-        (f"frame,stage,milliseconds\n{10**18},fuse,1\n", "line 2: "),
-        (f"frame,stage,milliseconds\n{'9' * 5000},fuse,1\n", "line 2: "),
+        ("frame,stage,milliseconds\n0,fusion,1\n0,fusion\n", "line 3: .* found '0,fusion'"),
+        ("frame,stage,milliseconds\n0,fusion,nan\n", "line 2: .* found '0,fusion,nan'"),
+        ("frame,stage,milliseconds\n0,fusion,-1\n", "line 2: "),
+        ("frame,stage,milliseconds\n1e3,fusion,1\n", "line 2: "),
+        (f"frame,stage,milliseconds\n{10**18},fusion,1\n", "line 2: "),
+        (f"frame,stage,milliseconds\n{'9' * 5000},fusion,1\n", "line 2: "),
         ('frame,stage,milliseconds\n0,"' + "x" * 200000, "cannot be read: field larger"),
-        ("frame,stage,milliseconds\n0,\x00,1\n0,fuse\n", "line 3: "),
+        ("frame,stage,milliseconds\n0,\x00,1\n0,fusion\n", "line 3: "),
     ],
 )
 def test_a_fault_is_one_line_that_names_the_place(tmp_path: Path, content: str, said: str) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from framework.data import Frame, PointClusters, Pose
 from framework.errors import DataError
-from framework.interfaces import FrameReader, LiveVideo, RGBDVideo
+from framework.interfaces import FrameReader, LiveVideo, RGBDVideo, StageTimer, untimed
 from framework.runs.metrics import run_metrics
 from framework.runs.run_directory import headline
 from framework.runtime.frame_stream import LiveFrames, stream_of
@@ -154,8 +154,8 @@ def test_no_frame_waits_behind_another() -> None:
 
     @dataclass
     class Slow(GridFuser):
-        def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
-            super().fuse(frame, pose, clusters)
+        def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
+            super().fuse(frame, pose, clusters, timer)
             waiting.append(video.read - len(waiting) - 1)
 
     pipeline(prefetch=5, fuser=Slow(slow_s=SLOW_S)).run(video)

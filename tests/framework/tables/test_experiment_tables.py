@@ -20,7 +20,8 @@ from tests.support.forked_commands import completed
 pytestmark = pytest.mark.integration
 
 CHECKOUT = Path(__file__).resolve().parents[3]
-TABLE = {"average_over": ["seed"], "baseline": "chain", "columns": ["instances.ap50", "stage_ms.refine.median"]}
+TABLE = {"average_over": ["seed"], "baseline": "chain", "columns": ["instances.ap50", "stage_ms.refinement.median"]}
+FUSER_HEADS = "association (ms), update (ms), integration (ms), fusion (ms)"
 ROWS = {"identity": ["refiner=identity"], "chain": [], "none_yet": ["refiner=none_yet"]}
 
 
@@ -30,7 +31,7 @@ def run(root: Path, row: str, seed: int, ap: float | None, ms: float, scene: str
     config = {"row": row, "seed": seed, "scene": scene, "refiner": {"kind": row}}
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     told = {
-        **{"instances.ap50": ap, "stage_ms.refine.median": ms, "pose_source": "ground_truth", "choice.fuser": "f"},
+        **{"instances.ap50": ap, "stage_ms.refinement.median": ms, "pose_source": "ground_truth", "choice.fuser": "f"},
         **{"config_hash": config_hash(config), "git_commit": "1234567890", "git_dirty": False},
         **{"environment.cpus": 2, "environment.processor": "Z80"},
     }
@@ -53,13 +54,13 @@ def test_every_figure_by_hand(sweep: Path) -> None:
     text = write_tables(sweep)
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[0] == "# ablation_x"
-    assert lines[2] == "| row | runs | AP50 | refine (ms) | poses |"
+    assert lines[2] == "| row | runs | AP50 | refinement (ms) | poses |"
     # 0.2, 0.4, 0.6: mean 0.4, sd 0.2; 0.5, 0.6, 1.0: mean 0.7, sd sqrt(0.14 / 2) = 0.2646
     assert "| identity | 3 | 0.400 ± 0.200 | 0.0 ± 0.0 | ground_truth |" in lines
     assert "| chain | 3 | 0.700 ± 0.265 | 151.0 ± 1.0 | ground_truth |" in lines
     # -0.3, -0.2, -0.4: mean -0.3, standard error 0.1 / sqrt(3) = 0.0577; t = 5.2 > 4.3
     assert "| identity | 3 | -0.300 ± 0.058 * | -151.0 ± 0.6 * |" in lines
-    assert "| less chain | pairs | AP50 | refine (ms) |" in lines
+    assert "| less chain | pairs | AP50 | refinement (ms) |" in lines
     assert (sweep / "table.md").read_text() == text
     assert "- What each row changes: identity: refiner=identity; chain: nothing; none_yet: refiner=none_yet." in lines
     assert "- Without a complete run: none_yet." in lines
@@ -166,7 +167,7 @@ def test_rows_go_by_the_names_that_they_are_given(sweep: Path) -> None:
 
 RUN_TIMES = {
     "average_over": ["seed"],
-    "columns": ["fps", "stage_ms.refine.median", "frames_lost"],
+    "columns": ["fps", "stage_ms.refinement.median", "frames_lost"],
     "published": "table1",
 }
 
@@ -184,7 +185,7 @@ def test_published_run_times_stand_below_those_on_scenenn(sweep: Path, annotatio
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": RUN_TIMES, "rows": ROWS})))
     text = write_tables(sweep)
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert lines[2] == "| row | runs | Hz | refine (ms) | frames lost | poses |"
+    assert lines[2] == "| row | runs | Hz | refinement (ms) | frames lost | poses |"
     assert "| the paper (published) | – | 10.8 | not known | – | tracked |" in lines
     assert "Voxblox++ (published)" not in text, "a line that says nothing"
     assert "- Published, the paper: DDNS 2020, article 2528954; all components on every frame of 640x480" in text
@@ -221,7 +222,7 @@ def test_published_numbers_do_not_stand_below_other_data(
 def test_a_published_row_without_a_number_of_the_columns_is_only_named(sweep: Path) -> None:
     """The paper's own is known in Hz, not here by stage, and it has no word about lost frames."""
     of_dataset(sweep, "scenenn")
-    for columns, named in ((["stage_ms.refine.median"], True), (["frames_lost"], False)):
+    for columns, named in ((["stage_ms.refinement.median"], True), (["frames_lost"], False)):
         table = RUN_TIMES | {"columns": columns}
         (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
         text = write_tables(sweep)
@@ -263,11 +264,11 @@ def test_records_without_an_experiment_make_a_table_too(tmp_path: Path) -> None:
         run(tmp_path, name, 0, None, 1.0, **poses)
     text = write_tables(tmp_path)
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert lines[2] == "| row | runs | ATE (m) | frames lost | Hz | refine (ms) | poses |"
+    assert lines[2] == "| row | runs | ATE (m) | frames lost | Hz | refinement (ms) | poses |"
     assert "| a | 1 | 0.012 | 2.00 | 21.5 | 1.000 | ground_truth |" in lines
-    assert "| less a | pairs | ATE (m) | frames lost | Hz | refine (ms) |" in lines
+    assert "| less a | pairs | ATE (m) | frames lost | Hz | refinement (ms) |" in lines
     told = "- Left out, as no run has them: AP50, AP50 agnostic, AP25, AP, mean IoU (only with true instances); "
-    assert [line for line in lines if "Left out" in line] == [told + "instances, fuse (ms)."]
+    assert [line for line in lines if "Left out" in line] == [told + f"instances, {FUSER_HEADS}."]
     assert "Transfer" not in text, "nothing was compared with true instances"
     assert "ap50" not in (tmp_path / "table.csv").read_text()
 
@@ -276,18 +277,18 @@ def test_a_figure_of_a_single_run_has_its_column(tmp_path: Path) -> None:
     run(tmp_path, "a", 0, None, 1.0, **{"instances.mean_iou": 0.0})
     run(tmp_path, "b", 0, 0.5, 1.0)
     lines = [" ".join(line.split()) for line in write_tables(tmp_path).splitlines()]
-    assert lines[2] == "| row | runs | AP50 | mean IoU | refine (ms) | poses |"
+    assert lines[2] == "| row | runs | AP50 | mean IoU | refinement (ms) | poses |"
     assert "| a | 1 | – | 0.000 | 1.000 | ground_truth |" in lines
     assert [line for line in lines if "Left out" in line] == [
         "- Left out, as no run has them: AP50 agnostic, AP25, AP (only with true instances); "
-        "instances, frames lost, Hz, fuse (ms); ATE (m) (only with true poses)."
+        f"instances, frames lost, Hz, {FUSER_HEADS}; ATE (m) (only with true poses)."
     ]
 
 
 def test_records_without_any_figure_make_a_table_of_dashes(tmp_path: Path) -> None:
-    run(tmp_path, "a", 0, None, 1.0, **{"stage_ms.refine.median": None})
+    run(tmp_path, "a", 0, None, 1.0, **{"stage_ms.refinement.median": None})
     text = write_tables(tmp_path)
-    assert text.splitlines()[2].count("|") == 15  # row, runs, poses, and all eleven figures
+    assert text.splitlines()[2].count("|") == 18  # row, runs, poses, and all 14 figures
     assert "Left out" not in text
 
 
@@ -340,9 +341,18 @@ def test_latex_and_markdown_escape(sweep: Path) -> None:
     assert all(line.startswith(("%", "\\")) or "&" in line or not line for line in latex.splitlines())
 
 
+def test_old_stage_names_in_runs_and_sweep_are_current(sweep: Path) -> None:
+    old = TABLE | {"columns": ["stage_ms.fuse.median"]}
+    (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": old, "rows": ROWS})))
+    run(sweep, "chain", 7, 0.5, 1.0, **{"stage_ms.fuse.median": 31.0})
+    lines = [" ".join(line.split()) for line in write_tables(sweep).splitlines()]
+    assert "| row | runs | fusion (ms) | poses |" in lines
+    assert "| chain | 4 | 31.0 (1 of 4) | ground_truth |" in lines
+
+
 def test_heads_have_units() -> None:
-    keys = ("instances.ap50_agnostic", "stage_ms.fuse.median", "stage_ms.fuse.p95", "trajectory.ate_rmse_m", "x.y")
-    assert [head(key) for key in keys] == ["AP50 agnostic", "fuse (ms)", "fuse (ms, p95)", "ATE (m)", "x.y"]
+    keys = ("instances.ap50_agnostic", "stage_ms.update.median", "stage_ms.update.p95", "trajectory.ate_rmse_m", "x.y")
+    assert [head(key) for key in keys] == ["AP50 agnostic", "update (ms)", "update (ms, p95)", "ATE (m)", "x.y"]
 
 
 def test_the_command(sweep: Path) -> None:

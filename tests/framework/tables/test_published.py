@@ -25,7 +25,7 @@ def test_the_papers_own_run_time() -> None:
     [known] = [row for row in read_published("table1").rows if row.values is not None]
     assert known.values is not None
     assert (known.system, known.values["fps",], known.decimals) == ("the paper", 10.8, 1)
-    assert known.values["stage_ms.fuse.median",] is None
+    assert known.values["stage_ms.integration.median",] is None
 
 
 @pytest.mark.parametrize("table", ["table2", "table3"])

@@ -35,6 +35,8 @@ from framework.interfaces import (
     PoseTracker,
     RGBDSequence,
     SceneMap,
+    StageTimer,
+    untimed,
 )
 from framework.testing.corner_room import CAMERA, CLASSES, frame_at, look, pose_at, spheres_in
 
@@ -227,7 +229,7 @@ class GridFuser(MapFuser):
     def __post_init__(self) -> None:
         self.scene: GridMap = GridMap(slow_save_s=self.slow_save_s)
 
-    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         time.sleep(self.slow_s)
         scene = self.scene
         if len(scene.vertices) >= self.capacity:
