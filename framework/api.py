@@ -114,7 +114,7 @@ def begin(config: DictConfig) -> Pipeline:
             fuser.resume(scene)
         tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene)
     compile_for_run()
-    return Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer)
+    return Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer, config.detection_interval)
 
 
 def scene_of(key: str, run: Path) -> SceneMap:
@@ -217,8 +217,8 @@ class Mapper(Map):
         """Detect and map a frame, and show it in the viewer."""
         pipeline, journal = self.pipeline, self._journal
         try:
-            with journal.timed(frame.index, "detection"):
-                detections = pipeline.detector.detect(frame)
+            detections, times = pipeline.detect(frame, self._frames - 1)
+            journal.timings += times
             pose = pipeline.map_frame(frame, detections, journal)
         except FrameError as error:
             pipeline.viewer.skip(str(error))

@@ -217,6 +217,7 @@ class Detections:
     exact: bool = False  # the masks are ground truth, which refiners do not change
     embeddings: Float32 | None = None  # (N, D) unit vectors, 0 = not computed; None = none were computed
     embedding_space: str = ""  # "MODEL@REVISION"; only embeddings of one space are comparable; "" = none
+    detected: bool = True  # False = the detector did not run, so a missing object is no evidence of absence
 
     def __post_init__(self) -> None:
         n, c = len(self.scores), len(self.classes)
@@ -228,7 +229,7 @@ class Detections:
         return len(self.scores)
 
     @classmethod
-    def none(cls, shape: tuple[int, int], classes: tuple[str, ...]) -> Detections:
+    def none(cls, shape: tuple[int, int], classes: tuple[str, ...], detected: bool = True) -> Detections:
         """Return no detections in an image of `shape` (height, width)."""
         return cls(
             masks=np.zeros((0, *shape), np.bool_),
@@ -236,6 +237,7 @@ class Detections:
             scores=np.zeros(0, np.float32),
             class_probabilities=np.zeros((0, len(classes)), np.float32),
             classes=classes,
+            detected=detected,
         )
 
 
@@ -256,6 +258,7 @@ class PointClusters:
     structure: Bool | None = None  # (H, W) pixels on floors and walls, which belong to no object; None = unknown
     embeddings: Float32 | None = None  # (N, D), as in Detections
     embedding_space: str = ""  # as in Detections
+    detected: bool = True  # as in Detections
 
     def __post_init__(self) -> None:
         p, n, c = len(self.points_world), len(self.scores), len(self.classes)

@@ -172,6 +172,7 @@ class MapFuser(ABC):
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         """Integrate `frame`, taken at `pose`, and the evidence of its `clusters`.
 
+        If `clusters.detected` is false, there are none, and instances in view do not lose confidence.
         `timer` measures data association, the update of labels and instances, and the integration of depth and color.
         A fuser that does not use it reports their total time as `fusion`.
 

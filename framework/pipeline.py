@@ -53,8 +53,13 @@ class Pipeline:
     fuser: MapFuser
     prefetch: int = 2  # frames that other threads read and detect ahead (live video: at most 1); 0 = none
     viewer: Viewer = field(default_factory=Viewer)
+    detection_interval: int = 1  # frames from one detection to the next; the frames between are tracked and mapped
 
     def __post_init__(self) -> None:
+        if self.detection_interval < 1:
+            raise ConfigError(
+                f"Pipeline.detection_interval: expected 1 or more frames, got {self.detection_interval}; set it to 1"
+            )
         if self.prefetch < 0:
             raise ConfigError(f"Pipeline.prefetch: must be 0 or more frames, found {self.prefetch}")
         self.viewer = GuardedViewer(self.viewer)
@@ -177,7 +182,7 @@ class Pipeline:
 
         def work(number: int) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
             with sharing.ahead(workers):
-                return self.read_and_detect(stream, turns.turn(number))
+                return self.read_and_detect(stream, turns.turn(number), number)
 
         # close the stream first: a worker may be waiting for a frame
         with closing(map_ahead(work, count(), prefetch, workers)) as outcomes, stream:
@@ -195,9 +200,12 @@ class Pipeline:
                 yield frame, detections
 
     def read_and_detect(
-        self, stream: FrameStream, turn: AbstractContextManager[None]
+        self, stream: FrameStream, turn: AbstractContextManager[None], number: int
     ) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
-        """Read the next frame in its `turn` and detect. Returns its stage times, too, or its error; None at the end."""
+        """Read the next frame, the `number`-th, in its `turn` and detect.
+
+        Returns its stage times, too, or its error; None at the end.
+        """
         try:
             with turn:
                 read_frame = stream.take()
@@ -205,14 +213,19 @@ class Pipeline:
                     return None
                 began = time.perf_counter()
                 frame = read_frame()
-                read_ms = 1e3 * (time.perf_counter() - began)
-            began = time.perf_counter()
-            detections = self.detector.detect(frame)
-            detect_ms = 1e3 * (time.perf_counter() - began)
+                reading = StageTime(frame.index, "reading", 1e3 * (time.perf_counter() - began))
+            detections, times = self.detect(frame, number)
         except FrameError as error:
             return error
-        times = [StageTime(frame.index, "reading", read_ms), StageTime(frame.index, "detection", detect_ms)]
-        return frame, detections, times
+        return frame, detections, [reading, *times]
+
+    def detect(self, frame: Frame, number: int) -> tuple[Detections, list[StageTime]]:
+        """Return the detections of the `number`-th frame of a video (from 0), and their time if detection ran."""
+        if number % self.detection_interval:
+            return Detections.none(frame.depth.shape, self.detector.classes, detected=False), []
+        began = time.perf_counter()
+        detections = self.detector.detect(frame)
+        return detections, [StageTime(frame.index, "detection", 1e3 * (time.perf_counter() - began))]
 
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
         """Track, lift, refine and fuse one frame. Raises FrameError if it is unusable."""

@@ -15,7 +15,18 @@ from pathlib import Path
 import numpy as np
 
 FILES = ("mesh.ply", "trajectory.txt", "instances.json")
-NOT_RESULTS = ("fps", "stage_ms.", "peak_rss", "environment.", "git_", "config_hash", "inputs_sha256", "time.", "code")
+NOT_RESULTS = (
+    "fps",
+    "stage_ms.",
+    "peak_rss",
+    "environment.",
+    "git_",
+    "config_hash",
+    "detection_interval",
+    "inputs_sha256",
+    "time.",
+    "code",
+)
 
 
 def results(directory: Path) -> dict[str, object]:

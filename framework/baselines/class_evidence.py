@@ -100,11 +100,13 @@ class ClassRows:
             raise DataError(f"a map tells {NO_CLASS} classes apart, and the detector has {classes}")
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
-    def update(self, seen: SeenBlocks, masks: MaskClasses) -> None:
-        """Update the voxels near the measured surface of the blocks that a frame has seen."""
+    def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
+        """Update the voxels near the measured surface of the blocks that a frame has seen; None = no detection."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.evidence.unmasked) < capacity:
             self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
+        if masks is None:
+            return
         wants_row = np.empty(len(seen.blocks), np.bool_)
         evicted = np.empty(len(seen.blocks), np.int32)
         find_blocks_under_masks(self.voxels.grid, seen, masks.cluster, wants_row)

@@ -24,7 +24,7 @@ from framework.runs.stored_map import StoredMap
 from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
 from framework.runs.sweep_file import SWEEP
 from framework.runs.timings_file import StageTimes, read_timings
-from framework.tables.table_notes import counted, machine
+from framework.tables.table_notes import counted, data, machine
 
 NAME = "figure"  # of the files, and of the config block
 
@@ -123,7 +123,7 @@ def _stage_times(pictured: Pictured) -> Page:
     )
     if any(one.longest > one.frames[-1] for one in shown):
         note += " Lines end with the shortest sequence."
-    return stage_times_figure(means, f"{note} {_origin(pictured.records)}")
+    return stage_times_figure(means, f"{note} Data: {data(pictured.records)}. {_origin(pictured.records)}")
 
 
 def _times_of(row: RunRow | None) -> dict[Run, StageTimes]:

@@ -40,4 +40,5 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
         exact=detections.exact,
         embeddings=detections.embeddings,
         embedding_space=detections.embedding_space,
+        detected=detections.detected,
     )

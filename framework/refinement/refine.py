@@ -15,12 +15,12 @@ from framework.refinement.refine_kernels import compress, part_starts
 
 
 def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> PointClusters:
-    """Return the refined clusters. Exact clusters, from true masks, stay unchanged.
+    """Return the refined clusters. Exact clusters, from true masks, stay unchanged, and so do frames without detection.
 
     Raises DataError if the refiner does not return PointClusters or returns pixels outside of the image: later stages
     index the frame with them unchecked.
     """
-    if clusters.exact:
+    if clusters.exact or not clusters.detected:
         return clusters
     refined = refiner.refine(clusters, frame)
     if not isinstance(cast(object, refined), PointClusters):

@@ -140,6 +140,7 @@ class RunRecord:
             **figures,
             "peak_rss_bytes": peak_memory(),
             "seed": self.config.get("seed"),
+            "detection_interval": self.config.get("detection_interval", 1),
             "config_hash": config_hash(self.config),
             INPUTS: self.inputs,
             **self.provenance,

@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MOST = {"seed": 2**63 - 1, "threads": 4096, "prefetch": 1000}  # torch takes no larger seed; no machine has more cores
+BOUNDS = {
+    "seed": (0, 2**63 - 1),  # that of torch
+    "threads": (0, 4096),  # no machine has more cores
+    "prefetch": (0, 1000),
+    "detection_interval": (1, 10**6),
+}
 DEVICES = ("auto", "cpu", "cuda")
 
 ENVIRONMENT = {
@@ -111,19 +116,20 @@ class Settings:
     device: str  # one of DEVICES; the stages that run networks read it
     threads: int  # 0 = all cores
     prefetch: int = 0  # number of prefetched frames, about 10 MB each with masks
+    detection_interval: int = 1  # frames
 
     def __post_init__(self) -> None:
-        for name, most in MOST.items():
+        for name, (least, most) in BOUNDS.items():
             value: object = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
-                raise ConfigError(f"{name} must be a whole number, 0 or more and at most {most}, found {value!r}")
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                raise ConfigError(f"{name} must be a whole number, {least} or more and at most {most}, found {value!r}")
         if self.device not in DEVICES:
             raise ConfigError(f"device must be one of {', '.join(DEVICES)}, found {self.device!r}")
 
     @classmethod
     def of(cls, config: DictConfig) -> Settings:
-        prefetch = config.get("prefetch", 0)  # a training has none
-        return cls(seed=config.seed, device=config.device, threads=config.threads, prefetch=prefetch)
+        of_runs = {name: config[name] for name in ("prefetch", "detection_interval") if name in config}
+        return cls(seed=config.seed, device=config.device, threads=config.threads, **of_runs)
 
     def apply(self) -> None:
         """Limit the threads of the libraries and seed their global generators, in a process of the command line.

@@ -10,7 +10,7 @@ from framework.evaluation.instances import MAX_DISTANCE
 from framework.registry import STAGES
 from framework.runs.metrics import is_evaluation
 from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, following
-from framework.runs.stored_runs import Record
+from framework.runs.stored_runs import Record, is_number
 from framework.tables.comparison import ComparisonTable, mean_by_sequence
 from framework.tables.layouts import head
 
@@ -33,6 +33,7 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
         yield f"In all: {fixed}."
     yield from _protocol(comparison)
     yield from _published(comparison)
+    yield f"Data: {data(comparison.records)}."
     yield f"Code: {counted(record.code for record in comparison.records)}."
     yield f"Machine: {counted(machine(record) for record in comparison.records)}."
     yield f"Config: config.yaml beside each run; SHA-256 of all their hashes: {digest(comparison.records)}."
@@ -148,6 +149,17 @@ def _same(records: Sequence[Record]) -> str:
     chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
+
+
+def data(records: Sequence[Record]) -> str:
+    """Return the datasets with the releases of their annotation, and the numbers of frames."""
+    names = (
+        f"{record.metrics.get(f'{CHOICE}dataset')}{record.annotation and f', annotation {record.annotation}'}"
+        for record in records
+    )
+    frames = sorted(number for record in records if is_number(number := record.metrics.get("frames")))
+    lengths = dict.fromkeys(f"{number:g}" for number in frames[:1] + frames[-1:])
+    return f"dataset={counted(names)}" + (f"; {' to '.join(lengths)} frames a run" if frames else "")
 
 
 def machine(record: Record) -> str:

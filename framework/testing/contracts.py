@@ -315,6 +315,19 @@ class FuserContract:
         fuser.fuse(blind, pose, nothing_in(blind, pose))
         assert not fuser.scene.instances()
 
+    def test_fuser_ignores_absence_without_detection(self) -> None:
+        fuser = fused(self.plugin())
+        before = fuser.scene.instances()
+        frame, pose = frame_at(4), Pose(pose_at(4))
+        nothing = replace(nothing_in(frame, pose), detected=False)
+        for index in range(5, 15):
+            fuser.fuse(replace(frame, index=index), pose, nothing)
+        after = fuser.scene.instances()
+        assert set(after) == set(before)
+        for key, instance in before.items():
+            assert after[key].confidence >= 0.99 * instance.confidence
+            assert after[key].observations == instance.observations
+
     def test_fuser_times_its_stages_one_by_one(self) -> None:
         begun: list[str] = []
         ended: list[str] = []

@@ -42,7 +42,7 @@ class SemanticComponents(MapFuser):
         with timer("integration"):
             seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.hashing.near)
         with timer("update"):
-            self.scene.labels.update(seen, masks)
+            self.scene.labels.update(seen, masks if clusters.detected else None)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
         """Return (N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, for eq. [7], with a floor.

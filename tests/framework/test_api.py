@@ -50,6 +50,17 @@ def test_a_mapper_makes_the_map_of_a_run(room: CornerRoom) -> None:
     assert list(mapper.instances()) == list(result.scene.instances()) != []
 
 
+def test_mapper_detection_interval_is_that_of_a_run(room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = Mapper(*STAGES, detection_interval=3)
+    detector, detected = mapper.pipeline.detector, []
+    detect = detector.detect
+    monkeypatch.setattr(detector, "detect", lambda frame: detected.append(frame.index) or detect(frame))
+    for frame in room:
+        mapper.add(frame)
+    assert detected == [0, 3]
+    assert {record.visible for record in mapper.scene.table.records.values()} == {2}
+
+
 def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) -> None:
     mapper = Mapper(*STAGES)
     mapper.add(room[0])

@@ -39,9 +39,9 @@ PATIENCE_S = 60.0  # kernels may have to be compiled
 PREFETCH = pytest.mark.parametrize("prefetch", [0, 1, 3])
 
 
-def pipeline(prefetch: int = 2, **stages: object) -> Pipeline:
+def pipeline(prefetch: int = 2, detection_interval: int = 1, **stages: object) -> Pipeline:
     chosen = {"detector": SphereDetector(), "tracker": GivenPose(), "refiner": KeepAll(), "fuser": GridFuser()} | stages
-    return Pipeline(**chosen, prefetch=prefetch)  # type: ignore[arg-type]
+    return Pipeline(**chosen, prefetch=prefetch, detection_interval=detection_interval)  # type: ignore[arg-type]
 
 
 def mapped(result: RunResult) -> GridMap:
@@ -80,6 +80,21 @@ def test_timed_fuser_adds_times_of_a_stage(room: CornerRoom) -> None:
     assert [one.stage for one in timings if one.frame == 4][-2:] == ["association", "integration"]
     assert all(one.milliseconds >= 6 for one in timings if one.stage == "association")
     assert "fusion" not in {one.stage for one in timings}
+
+
+@PREFETCH
+def test_detection_interval_detects_every_nth_frame(prefetch: int) -> None:
+    @dataclass
+    class Keeps(GridFuser):
+        def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
+            super().fuse(frame, pose, clusters)
+            kept.append((frame.index, clusters.detected, len(clusters)))
+
+    kept: list[tuple[int, bool, int]] = []
+    result = pipeline(prefetch, fuser=Keeps(), detection_interval=3).run(CornerRoom(frames=8, unreadable=1))
+    assert kept == [(k, k % 3 == 0, 2 * (k % 3 == 0)) for k in (0, 2, 3, 4, 5, 6, 7)]
+    assert [one.frame for one in result.timings if one.stage == "detection"] == [0, 3, 6]
+    assert len(result.tracked) == len(mapped(result).vertices) == 7
 
 
 def test_worker_threads_change_nothing(room: CornerRoom) -> None:
@@ -393,6 +408,8 @@ def test_a_detector_that_can_is_given_one_frame_at_a_time_where_there_are_no_cor
 def test_ahead_is_checked() -> None:
     with pytest.raises(ConfigError, match="prefetch"):
         pipeline(prefetch=-1)
+    with pytest.raises(ConfigError, match="detection_interval"):
+        pipeline(detection_interval=0)
 
 
 def test_quiet_when_not_a_terminal(room: CornerRoom, capfd: pytest.CaptureFixture[str]) -> None:

@@ -26,7 +26,7 @@ DESK = PROJECT_ROOT / "data" / "desk"
 WEIGHTS = Path("plugins/detectors/maskrcnn2go_int8")
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 OF_RENDERED_ROOMS = {"synthetic"}
-TIMED = {"table1_runtime", "figure3_stage_times"}
+TIMED = {"table1_runtime", "figure3_stage_times", "ablation_detection_interval"}
 
 
 def chosen(*overrides: str, main: str = "config") -> dict[str, str]:

@@ -239,5 +239,7 @@ def unpack(content: bytes, classes: tuple[str, ...]) -> Detections:
         exact=bool(stored["exact"][0]),
         embeddings=stored[EMBEDDINGS].copy() if EMBEDDINGS in stored else None,
         embedding_space=stored[SPACE].tobytes().decode() if SPACE in stored else "",
-        **{name: stored[name].copy() for name in KEPT},  # writable, as the detector's own arrays
+        boxes=stored["boxes"].copy(),  # writable, as the detector's own arrays
+        scores=stored["scores"].copy(),
+        class_probabilities=stored["class_probabilities"].copy(),
     )

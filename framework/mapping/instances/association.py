@@ -145,8 +145,10 @@ class Matches:
 def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min_pixels: int) -> None:
     """Update the table with the `class_evidence` (N, C) of the clusters.
 
-    An instance is in view if at least `min_pixels` see it, or if it was detected.
+    An instance is in view if at least `min_pixels` see it, or if it was detected. A frame without detection is ignored.
     """
+    if not matches.clusters.detected:
+        return
     instance_ids, scores = matches.instance_ids, matches.clusters.scores
     embeddings = weighted_embeddings(matches.clusters)
     if any(instance_ids[k] for k in embeddings):

@@ -195,6 +195,7 @@ def test_stage_times_are_averaged_over_the_sequences(tmp_path: Path, caplog: pyt
     note = " ".join(found[0].split())
     assert "map integration: update and integration. Mean of 2 sequences (011, 206) " in note
     assert "Lines end with the shortest sequence." in note
+    assert "annotation made up; 12 to 20 frames a run." in note
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,7 @@ def test_metrics_have_the_keys_of_the_design(record: RunRecord, room: CornerRoom
         *("instances.ap50_agnostic", "instances.mean_iou", "trajectory.ate_rmse_m", "trajectory.rpe_rmse_m"),
         *(
             "seed",
+            "detection_interval",
             "config_hash",
             "inputs_sha256",
             "git_commit",

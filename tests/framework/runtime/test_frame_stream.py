@@ -136,6 +136,14 @@ def test_a_live_video_that_is_slow_enough_is_mapped_whole(prefetch: int) -> None
 
 
 @PREFETCH
+def test_live_video_detects_every_nth_mapped_frame(prefetch: int) -> None:
+    video = LiveRoom(frames_sent=60, period_s=SLOW_S / 6)
+    result = pipeline(prefetch, detection_interval=2, fuser=GridFuser(slow_s=SLOW_S)).run(video)
+    detected = [one.frame for one in result.timings if one.stage == "detection"]
+    assert detected == [frame.index for frame in result.tracked][::2]
+
+
+@PREFETCH
 def test_when_mapping_is_behind_frames_are_dropped_and_counted(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
     video = LiveRoom(frames_sent=60, period_s=SLOW_S / 6)
     result = pipeline(prefetch, fuser=GridFuser(slow_s=SLOW_S)).run(video)

@@ -136,15 +136,17 @@ def test_where_the_system_tells_no_affinity_all_cores_count(monkeypatch: pytest.
     ("name", "value", "most"),
     [
         *[("prefetch", wrong, 1000) for wrong in ("x", -1, 1.5, 10**6, None, True)],
+        *[("detection_interval", wrong, 10**6) for wrong in (0, -1, 1.5, 10**7, None, True)],
         *[("threads", wrong, 4096) for wrong in (10**6, "all", None)],
         *[("seed", wrong, 2**63 - 1) for wrong in (2**63, 10**400, "x" * 100_000)],
     ],
 )
 def test_settings_are_within_bounds_that_the_message_says(name: str, value: object, most: int) -> None:
     config = OmegaConf.create({"seed": 0, "device": "cpu", "threads": 0, "prefetch": 2})
+    least = 1 if name == "detection_interval" else 0
     config[name] = value
     with pytest.raises(
-        ConfigError, match=f"^{name} must be a whole number, 0 or more and at most {most}, found"
+        ConfigError, match=f"^{name} must be a whole number, {least} or more and at most {most}, found"
     ) as told:
         Settings.of(config)
     assert len(str(told.value)) < 400

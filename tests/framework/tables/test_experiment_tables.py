@@ -350,6 +350,12 @@ def test_old_stage_names_in_runs_and_sweep_are_current(sweep: Path) -> None:
     assert "| chain | 4 | 31.0 (1 of 4) | ground_truth |" in lines
 
 
+def test_notes_name_data_without_evaluation(tmp_path: Path) -> None:
+    for seed, frames in enumerate((600, 90)):
+        run(tmp_path, "a", seed, None, 1.0, frames=frames, **{"choice.dataset": "desk"})
+    assert "- Data: dataset=desk; 90 to 600 frames a run.\n" in write_tables(tmp_path)
+
+
 def test_heads_have_units() -> None:
     keys = ("instances.ap50_agnostic", "stage_ms.update.median", "stage_ms.update.p95", "trajectory.ate_rmse_m", "x.y")
     assert [head(key) for key in keys] == ["AP50 agnostic", "update (ms)", "update (ms, p95)", "ATE (m)", "x.y"]
