@@ -155,12 +155,12 @@ def _draw_labels(axes: Axes, times: MeanTimes) -> None:
     for name, height, place in zip(times.columns, heights, spread(heights, LABEL_MM / PLOT_MM), strict=True):
         color = COLORS[name]
         axes.plot([1, line_x], [height, place], color=color, linewidth=0.5, transform=axes.transAxes, clip_on=False)
-        beside: dict[str, Any] = {"va": "center", "transform": axes.transAxes}
-        axes.text(name_x, place + half, name, fontsize=SMALL_PT, color=color, weight="bold", **beside)
+        style: dict[str, Any] = {"va": "center", "transform": axes.transAxes}
+        axes.text(name_x, place + half, name, fontsize=SMALL_PT, color=color, weight="bold", **style)
         median, growth = float(np.nanmedian(times.mean[name])), times.growth(name)
-        axes.text(name_x, place - half, _short(median), fontsize=SMALL_PT, color=color, **beside)
+        axes.text(name_x, place - half, _short(median), fontsize=SMALL_PT, color=color, **style)
         if np.isfinite(growth):
-            axes.text(growth_x, place - half, f"×{growth:.2f}", fontsize=NOTE_PT, color=FAINT_INK, **beside)
+            axes.text(growth_x, place - half, f"×{growth:.2f}", fontsize=NOTE_PT, color=FAINT_INK, **style)
 
 
 def _short(milliseconds: float) -> str:

@@ -15,8 +15,12 @@ from framework.files.atomic_write import read_text
 
 HEADER = ["frame", "stage", "milliseconds"]
 OLD_STAGES = {
-    **{"read": "reading", "detect": "detection", "track": "tracking", "lift": "lifting"},
-    **{"refine": "refinement", "fuse": "fusion"},
+    "read": "reading",
+    "detect": "detection",
+    "track": "tracking",
+    "lift": "lifting",
+    "refine": "refinement",
+    "fuse": "fusion",
 }
 """Names of the stages before 0.1.0, which stored runs and sweeps may have."""
 LARGEST = 2**53  # limit of frame numbers, which are exact in float64

@@ -128,8 +128,8 @@ class Settings:
 
     @classmethod
     def of(cls, config: DictConfig) -> Settings:
-        of_runs = {name: config[name] for name in ("prefetch", "detection_interval") if name in config}
-        return cls(seed=config.seed, device=config.device, threads=config.threads, **of_runs)
+        run_settings = {name: config[name] for name in ("prefetch", "detection_interval") if name in config}
+        return cls(seed=config.seed, device=config.device, threads=config.threads, **run_settings)
 
     def apply(self) -> None:
         """Limit the threads of the libraries and seed their global generators, in a process of the command line.

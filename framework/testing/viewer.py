@@ -19,8 +19,14 @@ from framework.testing.corner_room import CAMERA, RoomMap, frame_at, pose_at, sp
 
 FRAMES, LOST, SKIPPED, NOTHING_FOUND, BLIND = 8, 2, 3, 4, 5
 STAGE_MS = {
-    **{"reading": 1.0, "detection": 20.0, "tracking": 5.0, "lifting": 0.5, "refinement": 3.0},
-    **{"association": 2.0, "update": 3.0, "integration": 5.0},
+    "reading": 1.0,
+    "detection": 20.0,
+    "tracking": 5.0,
+    "lifting": 0.5,
+    "refinement": 3.0,
+    "association": 2.0,
+    "update": 3.0,
+    "integration": 5.0,
 }
 
 

@@ -13,7 +13,6 @@ from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import Association
 from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_for_best
-from framework.mapping.labels.pixel_lists import list_points_by_pixel
 
 
 class Vote(Enum):
@@ -48,9 +47,7 @@ class LabelVote(MapFuser):
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
         with timer("association"):
-            points = list_points_by_pixel(clusters, frame.depth.shape)
-            overlaps = self.association.look_up(self.scene, frame, pose, points)
-            matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
+            points, matches = self.association.match(self.scene, frame, pose, clusters)
         with timer("integration"):
             seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
         with timer("update"):

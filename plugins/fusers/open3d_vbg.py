@@ -13,7 +13,6 @@ from framework.interfaces import MapFuser, StageTimer, untimed
 from framework.mapping.instances.association import Association
 from framework.mapping.instances.instance_list import Confirmation
 from framework.mapping.labels.label_rule import floored_log
-from framework.mapping.labels.pixel_lists import list_points_by_pixel
 from framework.mapping.voxels.tsdf_volume import Tsdf
 
 if TYPE_CHECKING:
@@ -51,9 +50,7 @@ class Open3DVoxelBlockGrid(MapFuser):
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
         with timer("association"):
-            points = list_points_by_pixel(clusters, frame.depth.shape)
-            overlaps = self.association.look_up(self.scene, frame, pose, points)
-            matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
+            _, matches = self.association.match(self.scene, frame, pose, clusters)
         with timer("integration"):
             self.scene.integrate(frame, pose.T_world_camera)
         with timer("update"):

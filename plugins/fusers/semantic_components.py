@@ -38,11 +38,13 @@ class SemanticComponents(MapFuser):
         self.scene.begin(clusters.classes)
         with timer("update"):
             points = list_points_by_pixel(clusters, frame.depth.shape)
-            masks = mask_classes(self._log_ratio(clusters), clusters, points, frame.index)
+            masks = (
+                mask_classes(self._log_ratio(clusters), clusters, points, frame.index) if clusters.detected else None
+            )
         with timer("integration"):
             seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.hashing.near)
         with timer("update"):
-            self.scene.labels.update(seen, masks if clusters.detected else None)
+            self.scene.labels.update(seen, masks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
         """Return (N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, for eq. [7], with a floor.

@@ -132,7 +132,7 @@ def wheel() -> Measured:
         alone = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         commands = (
             ["instancemap", "--version"],
-            ["instancemap"],  # no words: the desk, in a new folder of outputs/
+            ["instancemap"],  # without arguments: the desk
             ["instancemap", "hydra.run.dir=outputs/desk"],
             ["instancemap", "report", "outputs/desk"],
             ["python", "-c", example],

@@ -18,6 +18,7 @@ CONFIG: dict[str, Any] = {
     "device": "cpu",
     "threads": 0,
     "prefetch": 0,
+    "detection_interval": 1,
     "detection_cache": "off",
     "dataset": {"_target_": "tests.support.scenes.corner_room.CornerRoom", "frames": 6},
     "detector": {"_target_": "tests.support.scenes.corner_room.SphereDetector"},

@@ -24,7 +24,7 @@ from framework.errors import DataError
 from framework.mapping.instances.association_kernels import count_votes, find_seen
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
-from framework.mapping.labels.pixel_lists import PixelLists, find_duplicates
+from framework.mapping.labels.pixel_lists import PixelLists, find_duplicates, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
 VOTES_ACROSS = 320  # pixels of an image row that vote; more take time without a benefit
@@ -202,6 +202,12 @@ class Association:
             merge_agreement=(0.0, 1.0),
         )
         self._merge_votes: Counter[tuple[int, int]] = Counter()  # frames that detect two as one, minus other frames
+
+    def match(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> tuple[PixelLists, Matches]:
+        """Return the clusters over each pixel, and their matches with old and new instances of the map."""
+        points = list_points_by_pixel(clusters, frame.depth.shape)
+        overlaps = self.look_up(scene, frame, pose, points)
+        return points, self.associate(scene.table, overlaps, clusters, points, frame.index)
 
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, points: PixelLists) -> Overlaps:
         """Return the overlaps of the clusters with the instances of the map at the measured surface."""

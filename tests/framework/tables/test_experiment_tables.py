@@ -267,8 +267,8 @@ def test_records_without_an_experiment_make_a_table_too(tmp_path: Path) -> None:
     assert lines[2] == "| row | runs | ATE (m) | frames lost | Hz | refinement (ms) | poses |"
     assert "| a | 1 | 0.012 | 2.00 | 21.5 | 1.000 | ground_truth |" in lines
     assert "| less a | pairs | ATE (m) | frames lost | Hz | refinement (ms) |" in lines
-    told = "- Left out, as no run has them: AP50, AP50 agnostic, AP25, AP, mean IoU (only with true instances); "
-    assert [line for line in lines if "Left out" in line] == [told + f"instances, {FUSER_HEADS}."]
+    absent = "- Left out, as no run has them: AP50, AP50 agnostic, AP25, AP, mean IoU (only with true instances); "
+    assert [line for line in lines if "Left out" in line] == [absent + f"instances, {FUSER_HEADS}."]
     assert "Transfer" not in text, "nothing was compared with true instances"
     assert "ap50" not in (tmp_path / "table.csv").read_text()
 
