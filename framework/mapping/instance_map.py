@@ -11,12 +11,11 @@ from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32,
 from framework.errors import DataError
 from framework.interfaces import Gravity, MapStatistics
 from framework.mapping.instances.association_kernels import look_up_instances
-from framework.mapping.instances.instance_list import Confirmation, InstanceTableMap
+from framework.mapping.instances.instance_list import Confirmation, InstanceClass, InstanceTableMap
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.label_evidence import Evidence
-from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.vertex_labels_kernels import label_vertices
 from framework.mapping.storage.map_file import (
     check_known,
@@ -34,7 +33,8 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.raycasting import render
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 
-FORMAT = 7  # of the map file; increment it when the meaning of the contents changes
+FORMAT = 8  # of the map file; increment it when the meaning of the contents changes
+LARGEST_SCALE = 2**40  # of quantized class scores
 
 
 class InstanceMap(InstanceTableMap):
@@ -43,16 +43,17 @@ class InstanceMap(InstanceTableMap):
     def __init__(
         self,
         volume: TsdfVolume,
+        labels: EvidenceRows,
+        logarithmic: bool,  # the evidence is log-likelihoods
         confirmation: Confirmation,
-        combine: Combine = Combine.SUM,
-        logarithmic: bool = True,
-        storage: Storage = Storage.COMPACT,
+        instance_class: InstanceClass = InstanceClass.DETECTIONS,
     ) -> None:
         self.classes: tuple[str, ...] = ()
         self.volume = volume
-        self.labels = EvidenceRows(volume.voxels, combine, storage)
-        self.table = InstanceTable(combine, logarithmic)
+        self.labels = labels
+        self.table = InstanceTable(labels.combine, logarithmic)
         self.confirmation = confirmation
+        self.instance_class = instance_class
 
     @property
     def statistics(self) -> MapStatistics:
@@ -74,6 +75,14 @@ class InstanceMap(InstanceTableMap):
         view = pinhole(frame.camera, T_world_camera)
         look_up_instances(self.volume.voxels.grid, self.labels.evidence, frame.depth, view, stride, instance_ids)
         return instance_ids
+
+    def class_evidence(self) -> dict[int, Float64]:
+        """Return the class evidence (C,) of each confirmed instance, by id, of its detections or of its voxels."""
+        if self.instance_class is InstanceClass.DETECTIONS:
+            return super().class_evidence()
+        counts = self.confirmation.counts(self.table)
+        evidence = self.labels.classes_of_instances(counts, len(self.classes))
+        return {int(k): evidence[k] for k in np.flatnonzero(counts)}
 
     def merge(self, kept: int, dropped: int) -> None:
         """See LabeledMap."""
@@ -111,6 +120,8 @@ class InstanceMap(InstanceTableMap):
             **voxels,
             "confirmation": asdict(self.confirmation),
             "storage": self.labels.storage.name,
+            "score_scale": self.labels.score_scale,
+            "instance_class": self.instance_class.name,
             "classes": self.classes,
             "evicted": self.labels.evicted,
             "table": plain_table(self.table),
@@ -124,7 +135,10 @@ class InstanceMap(InstanceTableMap):
             classes, storage = header.classes(), header.option("storage", Storage)
             table = table_of(header.part("table"), len(classes), arrays)
             volume = TsdfVolume.load(header, arrays, len(arrays["labeled"]))
-            scene = cls(volume, Confirmation.of(header.part("confirmation")), table.combine, table.logarithmic, storage)
+            labels = EvidenceRows(volume.voxels, table.combine, storage, header.whole("score_scale", 1, LARGEST_SCALE))
+            confirmation = Confirmation.of(header.part("confirmation"))
+            instance_class = header.option("instance_class", InstanceClass)
+            scene = cls(volume, labels, table.logarithmic, confirmation, instance_class)
             scene.begin(classes)
             expected = scene.labels.evidence._asdict()
             check_like(arrays, {"labeled": expected.pop("labeled")}, len(arrays["labeled"]))
@@ -136,8 +150,8 @@ class InstanceMap(InstanceTableMap):
             check_numbers("labeled", arrays["labeled"], len(arrays["instance_ids"]))
             check_known("class_ids", arrays["class_ids"], [*range(len(classes)), NO_CLASS])
             check_known("instance_ids", arrays["instance_ids"], [0, *table.records])
-            if (arrays["instance_ids"][:, 0] == 0).any() or (arrays["class_ids"][:, 0] == NO_CLASS).any():
-                raise DataError("instance_ids and class_ids must have a first one for each voxel with labels")
+            if (arrays["class_ids"][:, 0] == NO_CLASS).any():
+                raise DataError("class_ids must have a first one for each voxel with labels")
             scene.labels.fill(Evidence(**{name: arrays[name] for name in Evidence._fields}))
             scene.labels.evicted = header.whole("evicted")
             scene.table = table

@@ -1,4 +1,4 @@
-"""The paper's fuser: voxels carry class and instance distributions, updated by Bayes' rule."""
+"""Voxels with class and instance distributions, updated by Bayes' rule: section 3.2.3 of the paper."""
 
 from __future__ import annotations
 
@@ -15,25 +15,28 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.label_rule import DetectionEvidence, LabeledVoxels, LabelRule, floored_log
 
 RULE = LabelRule(Combine.SUM, logarithmic=True)
+LEAST_LIKELIHOOD = 1e-3  # of an instance: no single score decides
 
 
 @dataclass
 class BayesianTsdf(MapFuser):
-    """Two independent Bayesian recursions a voxel, eqs. [7] and [8] of the paper, as sums of log-likelihoods.
+    """Two independent Bayesian recursions per voxel, eqs. (7) and (8), as sums of log-likelihoods.
 
-    An instance's class distribution is the product of the distributions of all its detections.
+    The likelihood of the matched instance in eq. (8) is the score of the detection. The paper does not state that of
+    other instances: it is `instance_floor`, or with `instance_floor=0` the rest of the score divided equally among all
+    other instances and none.
     """
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
-    instance_floor: float = 0.05  # in (0, 1): P(O = another instance); the matched one has the detection's score
+    instance_floor: float = 0.05  # in [0, 1): likelihood of any other instance; 0 = the rest of the score, divided
     absence_likelihood: float = (
         0.7  # in (0, 1]: P(outside the mask | of the matched instance); 1 = no evidence of absence
     )
 
     def __post_init__(self) -> None:
-        check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(1e-6, 0.999), absence_likelihood=(1e-6, 1.0))
+        check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(0.0, 0.999), absence_likelihood=(1e-6, 1.0))
         self.scene: InstanceMap = self.voxels.new_map(RULE)
 
     def resume(self, scene: SceneMap) -> None:
@@ -46,18 +49,22 @@ class BayesianTsdf(MapFuser):
         with timer("integration"):
             seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
         with timer("update"):
-            evidence = self.evidence(clusters)
+            evidence = self.evidence(clusters, len(self.scene.table.records))
             measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULE)
             self.scene.labels.update(seen, measurement)  # the sums of eqs. [7] and [8]
             self.association.observe(self.scene.table, matches, evidence.classes)
         with timer("association"):
             self.association.merge(self.scene, matches)
 
-    def evidence(self, clusters: PointClusters) -> DetectionEvidence:
-        """log P(O_u | I_t) of eqs. [7] and [8], that of the matched instance over any other's."""
-        scores = np.maximum(clusters.scores, 2 * self.instance_floor)  # a detection never speaks against itself
+    def evidence(self, clusters: PointClusters, instances: int) -> DetectionEvidence:
+        """Return log P(O_u | I_t) of eqs. (7) and (8), of the matched instance relative to any other of `instances`."""
+        if self.instance_floor > 0:  # the score counts at least twice the floor, so that no detection opposes itself
+            ratio = np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor
+        else:
+            scores = np.clip(clusters.scores, LEAST_LIKELIHOOD, 1 - LEAST_LIKELIHOOD)
+            ratio = scores * max(instances, 1) / (1 - scores)  # the other instances - 1, and none
         return DetectionEvidence(
-            instances=np.asarray(np.log(scores / self.instance_floor), np.float32),
+            instances=np.asarray(np.log(ratio), np.float32),
             classes=floored_log(clusters.class_probabilities, self.class_floor),
             absence=float(np.log(self.absence_likelihood)),
         )

@@ -33,8 +33,22 @@ def fuse_masks(
     with an embedding (n, D) of this space where there are some.
     """
     assert frame.T_world_camera is not None
+    pose = Pose(frame.T_world_camera)
+    detections = detections_of(frame, masks, scores, probabilities, embeddings, space)
+    fuser.fuse(frame, pose, lift(detections, frame, pose))
+
+
+def detections_of(
+    frame: Frame,
+    masks: Sequence[np.ndarray],
+    scores: Sequence[float],
+    probabilities: Sequence[tuple[float, float]] | None = None,
+    embeddings: np.ndarray | None = None,
+    space: str = "words@1",
+) -> Detections:
+    """Return these masks as detections."""
     n = len(masks)
-    detections = Detections(
+    return Detections(
         masks=np.array(masks, np.bool_).reshape(n, *frame.depth.shape),
         boxes=np.zeros((n, 4), np.float32),
         scores=np.array(scores, np.float32),
@@ -43,5 +57,3 @@ def fuse_masks(
         embeddings=None if embeddings is None else embeddings.astype(np.float32),
         embedding_space="" if embeddings is None else space,
     )
-    pose = Pose(frame.T_world_camera)
-    fuser.fuse(frame, pose, lift(detections, frame, pose))

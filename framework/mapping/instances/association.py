@@ -1,6 +1,7 @@
 """Data association of a frame's clusters with the instances of the map.
 
-The pixels of a cluster vote for the instances of the map at the measured surface. Pairs may match if their overlap is
+The pixels of a cluster vote for the instances of the map at their positions, which are those of the voxels at the
+measured surface, or those of the ray-cast view, as in section 3.3 of the paper. Pairs may match if their overlap is
 large enough, by default over the smaller of the two, so that a part of an object matches the whole. Matching is one to
 one, best IoU first, so that a table does not match the book on it. An unmatched cluster is compared with the second
 most likely instances of the voxels before it creates a new one.
@@ -19,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.config.validation import check_bounds
-from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose
+from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose, View
 from framework.errors import DataError
 from framework.mapping.instances.association_kernels import count_votes, find_seen
 from framework.mapping.instances.instance_table import InstanceTable
@@ -28,6 +29,13 @@ from framework.mapping.labels.pixel_lists import PixelLists, find_duplicates, li
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
 VOTES_ACROSS = 320  # pixels of an image row that vote; more take time without a benefit
+
+
+class InstanceSource(Enum):
+    """The source of the instances that the pixels of a frame vote for."""
+
+    SURFACE_LOOKUP = "the voxels at the measured surface"
+    RAYCAST = "the object indices of the map, ray-cast from the pose of the frame"
 
 
 class OverlapRule(Enum):
@@ -128,6 +136,9 @@ class LabeledMap(Protocol):
         instance behind a new object.
         """
 
+    def render(self, camera: Camera, T_world_camera: Float64) -> View:
+        """Return the ray-cast view of the map."""
+
     def merge(self, kept: int, dropped: int) -> None:
         """Merge instance `dropped` into `kept`, in the table and in every voxel."""
 
@@ -173,6 +184,7 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 class Association:
     """Clusters update matched instances or create new ones; instances that are detected as one are merged."""
 
+    association: InstanceSource = InstanceSource.SURFACE_LOOKUP  # what clusters are compared with
     min_overlap: float = 0.35  # in [0, 1]: a cluster updates an instance above this overlap
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # what an overlap is counted over
     min_class_agreement: float = (
@@ -183,6 +195,9 @@ class Association:
     duplicate_overlap: float = 0.6  # in [0, 1]: a cluster that shares this with a better one creates nothing
     split_instances: bool = (
         True  # whether two clusters on one instance split it: the better one keeps it, the other is new
+    )
+    match_hidden: bool = (
+        True  # whether an unmatched cluster may match a second most likely instance; SURFACE_LOOKUP only
     )
     merge_overlap: float = 0.5  # in [0, 1]: two instances under one cluster above this are one object ...
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart ...
@@ -210,11 +225,14 @@ class Association:
         return points, self.associate(scene.table, overlaps, clusters, points, frame.index)
 
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, points: PixelLists) -> Overlaps:
-        """Return the overlaps of the clusters with the instances of the map at the measured surface."""
+        """Return the overlaps of the clusters with the instances of the map at their pixels."""
         stride = vote_stride(frame.camera)
+        if self.association is InstanceSource.RAYCAST:
+            view = scene.render(frame.camera, pose.T_world_camera)
+            return count_overlaps(points, np.ascontiguousarray(view.instance_ids[::stride, ::stride]), stride)
         seen, *hidden = scene.instances_seen(frame, pose.T_world_camera, stride)
         overlaps = count_overlaps(points, seen, stride)
-        return replace(overlaps, hidden=hidden[0]) if hidden else overlaps
+        return replace(overlaps, hidden=hidden[0]) if hidden and self.match_hidden else overlaps
 
     def associate(
         self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame_index: int

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 
 import cv2
 import numpy as np
@@ -16,6 +17,13 @@ from framework.mapping.instances.instance_table import InstanceRecord, InstanceT
 from framework.mapping.storage.map_header import MapHeader
 
 LEAST_VERTICES = 4  # that span a box
+
+
+class InstanceClass(Enum):
+    """The source of an instance's class distribution, which the paper leaves open."""
+
+    DETECTIONS = "the evidence of its detections"
+    VOXELS = "the evidence of its voxels, summed"
 
 
 @dataclass(frozen=True)
@@ -75,8 +83,13 @@ class InstanceTableMap(SceneMap):
         return frozenset(np.flatnonzero(self.confirmation.counts(self.table)).tolist())
 
     def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
+        evidence = self.class_evidence()
+        return {k: (int(evidence[k].argmax()), self.table.records[k].confidence) for k in evidence}
+
+    def class_evidence(self) -> dict[int, Float64]:
+        """Return the class evidence (C,) of each confirmed instance, by id: that of its detections."""
         confirmed = filter(self.confirmation.is_met, self.table.records.values())
-        return {record.id: (int(record.class_evidence.argmax()), record.confidence) for record in confirmed}
+        return {record.id: record.class_evidence for record in confirmed}
 
     def begin(self, classes: tuple[str, ...]) -> None:
         """Adopt the label space of the first frame. Raises DataError if a later frame has another one."""
@@ -85,11 +98,12 @@ class InstanceTableMap(SceneMap):
     def instances(self) -> Mapping[int, Instance]:
         """Return the instances that have vertices, by id, ascending; boxes are upright if gravity is known."""
         mesh, up, instances = self.mesh(), self.gravity().up, {}
+        class_evidence = self.class_evidence()
         for k, vertices in vertices_by_id(mesh.instance_ids).items():
             record, points = self.table.records[k], mesh.vertices[vertices]
             instances[k] = Instance(
                 id=k,
-                class_probabilities=self.table.class_probabilities(record),
+                class_probabilities=self.table.distribution(class_evidence[k]),
                 confidence=record.confidence,
                 observations=record.observations,
                 first_frame=record.first_frame,

@@ -138,8 +138,11 @@ class InstanceTable:
         a.last_frame = max(a.last_frame, b.last_frame)
 
     def class_probabilities(self, record: InstanceRecord) -> Float32:
-        """Return the class distribution (C,) of an instance: its normalized likelihood, or the normalized evidence."""
-        evidence = record.class_evidence
+        """Return the class distribution (C,) of an instance by its detections."""
+        return self.distribution(record.class_evidence)
+
+    def distribution(self, evidence: Float64) -> Float32:
+        """Return the distribution (C,) of class evidence: the normalized likelihood, or the normalized evidence."""
         likelihood = np.exp(evidence - evidence.max()) if self.logarithmic else evidence
         total = likelihood.sum()
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)

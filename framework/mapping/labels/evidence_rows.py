@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from framework.data import Int32, UInt8
+from framework.data import Bool, Float64, Int32, UInt8
 from framework.errors import DataError
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
 from framework.mapping.labels.evidence_rows_kernels import (
@@ -21,6 +21,7 @@ from framework.mapping.labels.evidence_rows_kernels import (
     label_new,
     merge_instances,
     number_new,
+    sum_classes_of_instances,
     update_rows,
 )
 from framework.mapping.labels.label_evidence import Evidence, Measurement
@@ -53,10 +54,17 @@ class NewVoxels(NamedTuple):
 class EvidenceRows:
     """Owns the label evidence of a grid and grows it. The kernels work on `self.evidence`."""
 
-    def __init__(self, voxels: VoxelGrid, combine: Combine = Combine.SUM, storage: Storage = Storage.COMPACT) -> None:
+    def __init__(
+        self,
+        voxels: VoxelGrid,
+        combine: Combine = Combine.SUM,
+        storage: Storage = Storage.COMPACT,
+        score_scale: int = 64,  # quantized class score of evidence 1
+    ) -> None:
         self.voxels = voxels
         self.combine = combine
         self.storage = storage
+        self.score_scale = score_scale
         self.row_count = 0
         self.voxel_count = 0  # with slots
         self.evicted = 0  # slots given to another label so far
@@ -108,8 +116,8 @@ class EvidenceRows:
 
     def update(self, seen: SeenBlocks, measurement: Measurement) -> None:
         """Update the voxels near the measured surface of the blocks that a frame has seen."""
-        if not measurement.instance_id.any():
-            return  # no evidence for or against any instance
+        if not (measurement.instance_id.any() or len(measurement.clusters)):
+            return  # no evidence for or against any instance, nor for any class
         new = NewVoxels(*np.empty((3, len(seen.blocks)), np.int32))
         evicted = np.empty(len(seen.blocks), np.int32)
         if self.storage is Storage.EXACT:
@@ -129,6 +137,15 @@ class EvidenceRows:
         """
         row_bits = self._row_bits[: self.row_count]
         merge_instances(self.evidence, row_bits, np.int32(kept), np.int32(dropped), int(self.combine))
+
+    def classes_of_instances(self, counts: Bool, classes: int) -> Float64:
+        """Return the evidence (ids + 1, classes) of each instance with counts[id]: the sum over its voxels.
+
+        A voxel belongs to its most likely instance among these.
+        """
+        sums = np.zeros((len(counts), classes), np.int64)
+        sum_classes_of_instances(self.in_use(), counts, sums)
+        return np.asarray(sums / self.score_scale)
 
     def _free(self) -> None:
         self._labeled = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from framework.mapping.labels.label_evidence_kernels import UNBOUNDED, add_evidence, best_first, update_voxel
+from framework.mapping.labels.class_slots import NO_CLASS
+from framework.mapping.labels.label_evidence_kernels import (
+    UNBOUNDED,
+    add_evidence,
+    best_counted_instance,
+    best_first,
+    update_voxel,
+)
 from framework.mapping.voxels.bit_slices import ONE
 from framework.mapping.voxels.integration_kernels import GROUP
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, device, one_more
@@ -163,3 +170,15 @@ def merge_instances(evidence, row_bits, kept, dropped, combine):
             for voxel in evidence.labeled[row]:
                 if voxel >= 0:
                     _merge_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], kept, dropped, combine)
+
+
+@njit(cache=True, nogil=True)
+def sum_classes_of_instances(evidence, counts, sums):
+    """Add the quantized class scores of every labeled voxel to those of its instance, sums (ids + 1, C)."""
+    for voxel in range(evidence.class_ids.shape[0]):
+        instance = best_counted_instance(evidence, voxel, counts)
+        for s in range(evidence.class_ids.shape[1] if instance > 0 else 0):
+            label = evidence.class_ids[voxel, s]
+            if label == NO_CLASS:  # slots are filled from the front
+                break
+            sums[instance, label] += evidence.class_value[voxel, s]

@@ -42,7 +42,7 @@ class Evidence(NamedTuple):
     """
 
     labeled: Int32  # (R, 512) the index of a voxel among those with slots, -1 = it has none
-    instance_ids: Int32  # (L, S), 0 = free slot
+    instance_ids: Int32  # (L, S), 0 = free slot; all are free if only unmatched clusters had updates
     instance_value: Float32  # (L, S) log-odds over the unnamed instances
     class_ids: UInt8  # (L, T), NO_CLASS = free slot
     class_value: Integers  # (L, T) quantized scores over the unnamed classes, int16 or in exact storage int64
@@ -53,7 +53,7 @@ class Measurement(NamedTuple):
 
     list_ids: Int32  # (H, W) the list of clusters of each pixel, as in PixelLists, 0 = no cluster
     offsets: Int32  # (L + 1,) start of each list in `clusters`
-    clusters: Int32  # (offsets[L],) only those associated with an instance
+    clusters: Int32  # (offsets[L],) those that update voxels
     instance_id: Int32  # (N,) the instance that each cluster was associated with, 0 = none
     instance_log_odds: Float32  # (N,) of that instance over any other
     absence: np.float32  # log-odds <= 0 of an instance that was matched in this frame, in voxels outside its mask

@@ -194,9 +194,9 @@ def update_voxel(evidence, voxel, measurement, list_id):
                 absent = True
     for entry in range(start, end):
         k = measurement.clusters[entry]
-        evicted += add_evidence(
-            ids, id_values, 0, measurement.instance_id[k], measurement.instance_log_odds[k], combine, UNBOUNDED
-        )
+        instance = measurement.instance_id[k]
+        if instance > 0:
+            evicted += add_evidence(ids, id_values, 0, instance, measurement.instance_log_odds[k], combine, UNBOUNDED)
         if combine == SUM:
             evicted += sum_classes(classes, class_values, measurement, k)
         else:

@@ -13,9 +13,9 @@ from framework.errors import ConfigError
 from framework.interfaces import SceneMap
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import Matches, class_agreement
-from framework.mapping.instances.instance_list import Confirmation
+from framework.mapping.instances.instance_list import Confirmation, InstanceClass
 from framework.mapping.instances.instance_table import InstanceTable
-from framework.mapping.labels.evidence_rows import Storage
+from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
 from framework.mapping.labels.label_evidence import (
     MAX_CLUSTER_SCORE,
     MAX_SCORE,
@@ -38,6 +38,10 @@ class LabelRule(NamedTuple):
     combine: Combine  # how new evidence is combined with old
     logarithmic: bool  # evidence is log-likelihoods; otherwise it is proportional, as votes are
     score_scale: int = 64  # quantized class score of evidence 1 in compact storage
+
+    def quantization(self, storage: Storage) -> int:
+        """Return the quantized class score of evidence 1."""
+        return self.score_scale if storage is Storage.COMPACT else self.score_scale << EXACT_BITS
 
 
 class DetectionEvidence(NamedTuple):
@@ -77,6 +81,8 @@ class LabeledVoxels:
     support_overlap: float = (
         0.6  # in [0, 1]: an instance covered so much by a cluster of another class lies on it; 1 = off
     )
+    update_unmatched: bool = False  # whether a cluster without an instance also updates the classes of its voxels
+    instance_class: InstanceClass = InstanceClass.DETECTIONS  # what the class of an instance is computed from
     storage: Storage = Storage.COMPACT  # COMPACT: the best few labels a voxel; EXACT: all of them, for comparison
 
     def __post_init__(self) -> None:
@@ -84,7 +90,9 @@ class LabeledVoxels:
 
     def new_map(self, rule: LabelRule) -> InstanceMap:
         """Return an empty map for this rule."""
-        return InstanceMap(self.hashing.new_volume(), self.confirmation, rule.combine, rule.logarithmic, self.storage)
+        volume = self.hashing.new_volume()
+        labels = EvidenceRows(volume.voxels, rule.combine, self.storage, rule.quantization(self.storage))
+        return InstanceMap(volume, labels, rule.logarithmic, self.confirmation, self.instance_class)
 
     def continued(self, scene: SceneMap, rule: LabelRule) -> InstanceMap:
         """Prepare a stored map for new frames. Raises ConfigError if it has other parameters or another rule."""
@@ -95,8 +103,8 @@ class LabeledVoxels:
             "fuser.voxel_size": (f"{scene.volume.voxel_size:g}", f"{own.volume.voxel_size:g}"),
             "fuser.storage": (scene.labels.storage.name, self.storage.name),
             "label rule of the fuser": (
-                (scene.table.combine.name, scene.table.logarithmic),
-                (rule.combine.name, rule.logarithmic),
+                (scene.table.combine.name, scene.table.logarithmic, scene.labels.score_scale),
+                (rule.combine.name, rule.logarithmic, own.labels.score_scale),
             ),
         }
         for name, was, now in zip(Sensor._fields, scene.volume.sensor, own.volume.sensor, strict=True):
@@ -108,6 +116,7 @@ class LabeledVoxels:
                     "start a new map"
                 )
         scene.confirmation = self.confirmation
+        scene.instance_class = self.instance_class
         scene.volume.voxels.max_blocks = self.hashing.max_blocks
         scene.volume.changed(NO_BLOCKS)
         scene.table.begin_recording()
@@ -117,7 +126,8 @@ class LabeledVoxels:
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
     ) -> Measurement:
         """Return the evidence of a frame's clusters for the voxels, by this rule."""
-        points = keep_on_top(points, matches.instance_ids, self.occlusion_area_ratio)
+        updating = np.ones_like(matches.instance_ids) if self.update_unmatched else matches.instance_ids
+        points = keep_on_top(points, updating, self.occlusion_area_ratio)
         supported = self.supported_instances(table, matches)
         if supported.any():
             points = remove_supports(points, supported, matches.overlaps.seen, matches.overlaps.stride)
@@ -125,7 +135,7 @@ class LabeledVoxels:
         matched[matches.instance_ids] = True
         relative, named, bits = named_classes(evidence.classes, rule.logarithmic)
         compact = self.storage is Storage.COMPACT
-        scale = rule.score_scale if compact else rule.score_scale << EXACT_BITS
+        scale = rule.quantization(self.storage)
         if compact and rule.combine is Combine.SUM:
             relative = np.clip(relative, -MAX_CLUSTER_SCORE / scale, MAX_CLUSTER_SCORE / scale)
         return Measurement(

@@ -87,7 +87,7 @@ def find_duplicates(points: PixelLists, scores: Float32, threshold: float) -> Bo
 
 
 def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> PixelLists:
-    """Return the lists of the clusters with an instance, (N,), 0 = none, without clusters below much smaller ones.
+    """Return the lists of the clusters with an instance (N,), 0 = none, without clusters below much smaller ones.
 
     Large masks are coarse, and cover small objects on the object: a book on a couch. So a pixel keeps only the clusters
     that are at most 1 / `area_ratio` times as large as the smallest one there; all, if `area_ratio` is 0.

@@ -10,6 +10,7 @@ from framework.baselines.open3d_grid import BlockGridSettings
 from framework.baselines.open3d_map import Open3DMap
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError, MapFullError
+from framework.mapping.instance_map import FORMAT
 from framework.mapping.instances.instance_list import Confirmation
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
@@ -335,7 +336,7 @@ def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path)
         with pytest.raises(DataError, match=r"map\.npz"):
             Open3DMap.load(path)
     BayesianTsdf().scene.save(path)
-    with pytest.raises(DataError, match="map format 7, this version reads open3d_vbg"):
+    with pytest.raises(DataError, match=f"map format {FORMAT}, this version reads open3d_vbg"):
         Open3DMap.load(path)
     with pytest.raises(DataError, match=r"none\.npz"):
         Open3DMap.load(tmp_path / "none.npz")
