@@ -59,12 +59,12 @@ class BayesianTsdf(MapFuser):
     def evidence(self, clusters: PointClusters, instances: int) -> DetectionEvidence:
         """Return log P(O_u | I_t) of eqs. (7) and (8), of the matched instance relative to any other of `instances`."""
         if self.instance_floor > 0:  # the score counts at least twice the floor, so that no detection opposes itself
-            ratio = np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor
+            log_odds = np.log(np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor)
         else:
             scores = np.clip(clusters.scores, LEAST_LIKELIHOOD, 1 - LEAST_LIKELIHOOD)
-            ratio = scores * max(instances, 1) / (1 - scores)  # the other instances - 1, and none
+            log_odds = np.log(scores * max(instances, 1) / (1 - scores))  # the other instances - 1, and none
         return DetectionEvidence(
-            instances=np.asarray(np.log(ratio), np.float32),
+            instances=np.asarray(log_odds, np.float32),
             classes=floored_log(clusters.class_probabilities, self.class_floor),
             absence=float(np.log(self.absence_likelihood)),
         )
