@@ -56,12 +56,11 @@ def test_a_detector_that_is_chosen_wins(dataset: str, detector: str) -> None:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiment_chooses_its_detector(experiment: str) -> None:
-    recorded = experiment.endswith(("_replica", "_scannet"))
-    expected = "mask_rcnn_rooms" if experiment in TIMED else "maskrcnn2go" if recorded else "simulated_yolo11n"
+    expected = "mask_rcnn_rooms" if experiment in TIMED else "simulated_yolo11n"
     assert chosen(f"experiment={experiment}")["detector"] == expected
 
 
-@pytest.mark.parametrize("experiment", ["table1_runtime", "ablation_fuser_replica"])
+@pytest.mark.parametrize("experiment", ["table1_runtime", "ablation_fuser"])
 def test_detector_of_experiment_wins_over_dataset_but_not_over_command_line(experiment: str) -> None:
     expected = chosen(f"experiment={experiment}")["detector"]
     assert chosen(f"experiment={experiment}", "dataset=synthetic")["detector"] == expected

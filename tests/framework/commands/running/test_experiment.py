@@ -14,10 +14,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from framework.commands.running.choices import with_row
-from framework.errors import ConfigError
+from framework.errors import ConfigError, InstanceMapError
 from framework.files.search_paths import CONF
-from framework.interfaces import ClusterRefiner, MapFuser
-from framework.registry import build
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker
+from framework.registry import build, stage_of
 from framework.runs.provenance import config_hash
 from framework.synthetic.benchmark import SCENES
 from framework.tables.published import read_published
@@ -28,7 +28,8 @@ pytestmark = pytest.mark.integration
 CHECKOUT = Path(__file__).resolve().parents[4]
 FAKES = CHECKOUT / "tests" / "support" / "fake_conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
-ONLY_THE_USER_KNOWS = ("dataset.root=somewhere", "detector.weights=somewhere")
+PRESETS = sorted(path.stem for path in (CONF / "preset").glob("*.yaml"))
+ONLY_THE_USER_KNOWS = ("++dataset.root=somewhere",)
 
 
 def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -118,25 +119,37 @@ def test_a_row_may_be_called_by_a_number() -> None:
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("preset", [None, *PRESETS])
 @pytest.mark.parametrize("all_rows", [False, pytest.param(True, marks=pytest.mark.acceptance)])
-def test_rows_of_experiment_compose_and_differ(experiment: str, all_rows: bool) -> None:
-    """Compose rows as the command does, and build the stages that rows change. Two rows without `all_rows`."""
+def test_every_preset_composes_with_every_row(experiment: str, preset: str | None, all_rows: bool) -> None:
+    """Compose rows as the command does, and build their stages. The first and the last row without `all_rows`."""
     hashes: dict[str, str] = {}
-    with_parent = experiment.endswith(("_replica", "_scannet"))
-    paths = [f"++{path}" for path in ONLY_THE_USER_KNOWS] if with_parent else []
+    asked = [f"experiment={experiment}", "seed=1", *ONLY_THE_USER_KNOWS] + ([f"preset={preset}"] if preset else [])
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        rows = compose("config", overrides=[f"experiment={experiment}"]).rows
-    for row in rows if all_rows else list(rows)[-2:]:
-        config, choices = composed([f"experiment={experiment}", f"row={row}", "seed=1", *paths])
+        rows = compose("config", overrides=asked).rows
+    for row in rows if all_rows else {next(iter(rows)), list(rows)[-1]}:
+        config, choices = composed([*asked, f"row={row}"])
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
         hashes[row] = config_hash({str(key): value for key, value in resolved.items()})
-        build(ClusterRefiner, config.refiner)
-        build(MapFuser, config.fuser)
+        for interface in (PoseTracker, ClusterRefiner, MapFuser):
+            build(interface, config[stage_of(interface)])
+        build_detector(config.detector)
+        given = next((change for change in rows[row] if change.startswith("preset=")), f"preset={preset or 'default'}")
+        assert f"preset={choices['preset']}" == given
         assert choices["experiment"] == experiment
         assert config.dataset.seed == 1
         assert config.row == row
-    assert len(set(hashes.values())) == len(hashes), "two rows are the same"
+    assert preset or len(set(hashes.values())) == len(hashes), "two rows are the same"
+
+
+def build_detector(node: DictConfig) -> None:
+    """Build a detector, or check that it names its missing files in one line."""
+    try:
+        build(Detector, node)
+    except InstanceMapError as error:
+        assert "\n" not in str(error)
+        assert str(node.weights) in str(error)
 
 
 def test_the_row_is_what_its_overrides_say() -> None:
@@ -146,11 +159,34 @@ def test_the_row_is_what_its_overrides_say() -> None:
     assert "hydra" not in config
 
 
-def test_the_recorded_flat_wins_over_the_rooms() -> None:
-    config, choices = composed(["experiment=ablation_fuser_replica", "row=label_count"])
+def test_sequences_choose_data_detector_and_pose_source() -> None:
+    config, choices = composed(["experiment=ablation_fuser", "sequences=replica_given_poses", "row=label_count"])
     assert (choices["dataset"], choices["detector"], choices["fuser"]) == ("rgbd_folder", "maskrcnn2go", "label_count")
     assert (config.dataset.frame_fraction, config.dataset.stride, config.fuser.voxel_size) == (0.85, 1, 0.05)
     assert config.fuser.storage == "EXACT"
+    assert choices["tracker"] == "ground_truth"
+
+
+@pytest.mark.parametrize("sequences", sorted(path.stem for path in (CONF / "sequences").glob("*.yaml")))
+def test_sequences_with_given_poses_track_nothing(sequences: str) -> None:
+    """The pose source of sequences takes precedence over the tracker of a preset, and the command line over both."""
+    given = sequences.endswith("_given_poses")
+    own = {preset: chosen(preset=preset)["tracker"] for preset in PRESETS}
+    for preset in PRESETS:
+        asked = {"experiment": "table3_map", "sequences": sequences, "preset": preset}
+        assert chosen(**asked)["tracker"] == ("ground_truth" if given else own[preset])
+        assert chosen(**asked, tracker="icp_only")["tracker"] == "icp_only"
+
+
+def chosen(**choices: str) -> dict[str, str]:
+    """Return the choices of Hydra by group."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", [f"{group}={name}" for group, name in choices.items()], return_hydra_config=True)
+    return {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
+
+
+def test_default_preset_changes_nothing() -> None:
+    assert composed(["preset=default"])[0] == composed(["~preset"])[0]
 
 
 @pytest.mark.parametrize("experiment", ["table1_runtime", "table2_class_ap", "table3_map", "figure3_stage_times"])
@@ -162,7 +198,9 @@ def test_one_word_measures_on_the_real_scenenn(experiment: str) -> None:
         HydraConfig.instance().set_config(asked)
         assert asked.hydra.sweep.dir.endswith(f"/{experiment}_scenenn")
     assert asked.hydra.runtime.choices.detector == "mask_rcnn"
-    assert asked.dataset.frame_ground_truth is False
+    assert (asked.dataset.frame_ground_truth, asked.dataset.stride) == (False, 1)
+    assert asked.detector.weights.startswith("resnet101")
+    assert asked.hydra.runtime.choices.tracker == "voxel_hashing_icp"
     sequences = asked.hydra.sweeper.params["dataset.scene"].split(",")
     assert set(sequences) <= set(read_published("table3").sequences)
     assert len(sequences) == (5 if experiment in ("table1_runtime", "figure3_stage_times") else 10)
@@ -184,26 +222,17 @@ def test_what_is_in_progress_depends_on_how_long_the_sequences_are(sequences: st
     assert config.dataset.stop == stop
 
 
-def test_variants_that_are_to_rank_alike_are_the_same_in_all_places() -> None:
-    rows = {}
-    for place in ("rooms", "replica", "scannet"):
-        config, choices = composed([f"experiment=ranks_{place}", "row=ours", "detector=none"])
-        rows[place] = OmegaConf.to_container(config.rows)
-        assert choices["tracker"] == "ground_truth"
-        assert choices["detector"] == "none"
-    assert rows["rooms"] == rows["replica"] == rows["scannet"]
-    assert len(rows["rooms"]) >= 12
+def test_ranks_have_a_folder_for_each_data_and_detector() -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose(
-            "config", overrides=["experiment=ranks_scannet", "detector=rf_detr_seg"], return_hydra_config=True
+            "config",
+            overrides=["experiment=ranks", "sequences=scannet_given_poses", "detector=rf_detr_seg"],
+            return_hydra_config=True,
         )
         HydraConfig.instance().set_config(asked)
-        assert asked.hydra.sweep.dir.endswith("/ranks_scannet_rf_detr_seg")
-    assert (asked.dataset.frame_fraction, asked.fuser.voxel_size, asked.hydra.sweeper.params.seed) == (
-        0.85,
-        0.02,
-        "0,1,2,3",
-    )
+        assert asked.hydra.sweep.dir.endswith("/ranks_scannet_given_poses_rf_detr_seg")
+    assert (asked.dataset.frame_fraction, asked.fuser.voxel_size) == (0.85, 0.02)
+    assert asked.hydra.sweeper.params.seed == "0,1,2,3"
 
 
 def test_the_command_line_wins_over_the_experiment() -> None:
