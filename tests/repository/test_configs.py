@@ -121,7 +121,7 @@ def test_the_main_config_reads_its_groups_in_the_order_that_lets_an_experiment_w
     defaults = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults)
     assert isinstance(defaults, list)
     assert defaults[0] == "_self_"
-    after_the_stages = ["dataset", "viewer", "launcher", "experiment"]  # which may override what stages are
+    after_the_stages = ["dataset", "viewer", "launcher", "preset", "experiment"]  # which may override what stages are
     stages = [stage for stage in STAGES if stage not in after_the_stages]
     assert [next(iter(entry)) for entry in defaults[1:]] == stages + after_the_stages
     assert defaults[-1] == {"experiment": None}
@@ -137,6 +137,6 @@ def test_what_changes_no_result_is_not_in_the_name_of_a_sweeps_run() -> None:
     for name, choice in (("table", TableChoice), ("figure", FigureChoice)):
         shown |= {f"{name}.{field.name}" for field in dataclasses.fields(choice)}
     assert shown - {"viewer._target_"} == {key for key in left_out if "." in key}
-    tells_runs_apart, no_key_of_the_config = {"hydra", "row", "rows"}, {"experiment", "launcher"}
+    tells_runs_apart, no_key_of_the_config = {"hydra", "row", "rows", "sequences"}, {"experiment", "launcher"}
     whole = {key for key in left_out if "." not in key}
     assert set(WITHOUT_EFFECT) - tells_runs_apart == whole - no_key_of_the_config
