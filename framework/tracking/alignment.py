@@ -3,10 +3,16 @@
     E(xi) = sum_i w_i (n_i . (T p_i - q_i))^2 + lambda sum_i v_i (I(pi(T p_i)) - I_frame,i)^2
 
 T = T_view_camera moves the frame's points p_i into the view, which gives each its model point q_i with normal n_i, and
-its model intensity. Residuals are divided by their expected noise, so both terms count standard deviations; w_i and v_i
-are Tukey's biweights. Beyond `FAR` a depth's standard deviation is its noise times depth / FAR: errors of
+its model intensity. With Tukey's biweights w_i and v_i, residuals are divided by their expected noise, so both terms
+count standard deviations. Beyond `FAR` a depth's standard deviation is its noise times depth / FAR: errors of
 structured-light cameras at that range cover whole image regions and do not average out. Gauss-Newton steps are twists
 in the view's frame: T <- exp(xi) T.
+
+`LinearWeights` replaces Tukey's weights by those of VoxelHashing's published code. Residuals are then in m and in [0, 1].
+With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
+
+    w_i = max(0, ((1 - d / max_distance) + (1 - z / max_depth)) / 2)
+    v_i = max(0, 1 - |dI| / max_intensity_difference)
 
 The kernels process points in batches of a fixed size: branch-free loops over fields of one array, which the compiler
 vectorizes, and separate loops that only fetch from images. Ignored points have weight 0. Sums are kept in lanes, so
@@ -93,6 +99,13 @@ class Weights(NamedTuple):
     depth_weight: np.float32  # 0 = color alone
 
 
+class LinearWeights(NamedTuple):
+    """The maxima of VoxelHashing's weights, which replace Tukey's."""
+
+    max_depth: np.float32  # m, z_max
+    max_intensity_difference: np.float32  # of [0, 1], at which a weight reaches 0
+
+
 class NormalEquations(NamedTuple):
     """The linearized problem and its point counts."""
 
@@ -107,7 +120,7 @@ class NormalEquations(NamedTuple):
 
 def linearize(
     level: PyramidLevel, model: ModelView, model_intensity: Float32, T_view_camera: Float64, weights: Weights,
-    brightness: float,
+    brightness: float, linear: LinearWeights | None = None,
 ) -> NormalEquations:  # fmt: skip
     """Return the normal equations of E at T_view_camera for one pyramid level of the frame.
 
@@ -118,7 +131,7 @@ def linearize(
     accumulate(
         FrameView(level.depth, level.intensity, level.normals, *intrinsics(level.camera)), model, model_intensity,
         np.float32(1 / scale), np.ascontiguousarray(T_view_camera[:3, :3], np.float32),
-        np.ascontiguousarray(T_view_camera[:3, 3], np.float32), weights, np.float32(brightness), sums,
+        np.ascontiguousarray(T_view_camera[:3, 3], np.float32), weights, linear, np.float32(brightness), sums,
     )  # fmt: skip
     total = sums.sum(axis=0)
     visible, matched, close, behind, matched_colors, compared = (int(count) for count in total[SUMS:])

@@ -140,10 +140,11 @@ def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
 
 
 @device
-def _add_geometry(model, R, weights, points, J):
+def _add_geometry(model, R, weights, linear, points, J):
     """Set the point-to-plane terms of a batch in J; return the counts (visible, matched, close, behind).
 
-    points[NEAR] is set to 1 where a point is within max_distance of its model point, 0 elsewhere.
+    points[NEAR] is set to 1 where a point is within max_distance of its model point, 0 elsewhere. With linear weights,
+    their normals must match, too.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     inv_fx, inv_fy = one / model.fx, one / model.fy
@@ -163,7 +164,8 @@ def _add_geometry(model, R, weights, points, J):
         qy = (np.floor(points[V + n]) + half - cy) * inv_fy * q
         ex, ey, ez = px - qx, py - qy, pz - q
         mapped = q > zero
-        near = mapped & (ex * ex + ey * ey + ez * ez <= max_distance2)
+        distance2 = ex * ex + ey * ey + ez * ez
+        near = mapped & (distance2 <= max_distance2)
         nx, ny, nz = points[MX + n], points[MY + n], points[MZ + n]
         fx, fy, fz = points[NX + n], points[NY + n], points[NZ + n]
         dot = (
@@ -174,8 +176,14 @@ def _add_geometry(model, R, weights, points, J):
         noise = axial_sigma_single(points[DEPTH + n])
         sigma = noise * max(one, points[DEPTH + n] * inv_far)
         distance = nx * ex + ny * ey + nz * ez
-        weight = _tukey(distance / sigma, scale) * strength / (sigma * sigma)
-        weight = weight if near & (dot > min_dot) else zero
+        matches = near & (dot > min_dot)
+        if linear is None:  # numba compiles only the branch for the type of `linear`
+            weight = _tukey(distance / sigma, scale) * strength / (sigma * sigma)
+        else:
+            nearness = (one - np.sqrt(distance2) / weights.max_distance) + (one - points[DEPTH + n] / linear.max_depth)
+            weight = max(half * nearness, zero) * strength
+            near = matches
+        weight = weight if matches else zero
         points[NEAR + n] = one if near else zero
         _write_term(J, n, weight, distance, nx, ny, nz, px, py, pz)
         apart = max(close_distance, np.float32(3.0) * noise)
@@ -209,7 +217,7 @@ def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
 
 
 @device
-def _add_photometry(model, inverse_scale, weights, brightness, points, J):
+def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J):
     """Set the photometric terms of a batch in J, with frame - model intensity; return counts (matched, compared)."""
     one, zero = np.float32(1.0), np.float32(0.0)
     noise, scale = weights.intensity_noise, weights.photometric_scale
@@ -229,7 +237,10 @@ def _add_photometry(model, inverse_scale, weights, brightness, points, J):
         gy = (low - top) * fy * inv_z
         gz = -(gx * px + gy * py) * inv_z
         error = change + brightness
-        weight = _tukey(error / noise, scale) * strength
+        if linear is None:
+            weight = _tukey(error / noise, scale) * strength
+        else:
+            weight = max(one - abs(error) / linear.max_intensity_difference, zero) * weights.color_weight
         weight = weight if seen else zero
         _write_term(J, n, weight, error, gx, gy, gz, px, py, pz)
         compared = one_more(compared, seen)
@@ -285,10 +296,11 @@ def _add_brightness(J, lanes):
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, brightness, sums):
+def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, linear, brightness, sums):
     """Sum the normal equations over a FrameView by chunks of rows into sums (CHUNKS, TERMS).
 
-    `R`, `t` are T_view_camera. `inverse_scale` is the width of model_intensity over that of the view.
+    `R`, `t` are T_view_camera. `inverse_scale` is the width of model_intensity over that of the view. `linear` is a
+    LinearWeights, or None for Tukey's weights.
     """
     height, width = frame.depth.shape
     shape, level_shape = model.depth.shape, model_intensity.shape
@@ -305,7 +317,7 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, brig
                 _load(frame, v, u0, points)
                 _project(frame, v, u0, model, shape, R, t, points, pixel)
                 _gather_model(flat_depth, flat_normals, size, pixel, points)
-                visible, matched, close, behind = _add_geometry(model, R, weights, points, J)
+                visible, matched, close, behind = _add_geometry(model, R, weights, linear, points, J)
                 _add_products(J, lanes)
                 total[SUMS] += visible
                 total[SUMS + 1] += matched
@@ -313,7 +325,7 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, brig
                 total[SUMS + 3] += behind
                 if weights.color_weight > np.float32(0.0):
                     _gather_intensities(flat_intensity, level_shape, inverse_scale, points, pixel)
-                    matched, compared = _add_photometry(model, inverse_scale, weights, brightness, points, J)
+                    matched, compared = _add_photometry(model, inverse_scale, weights, linear, brightness, points, J)
                     _add_products(J, lanes)
                     _add_brightness(J, lanes)
                     total[SUMS + 4] += matched

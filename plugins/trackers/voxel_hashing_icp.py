@@ -1,10 +1,11 @@
-"""The paper's tracker: alignment of each frame to the view ray-cast from the map, by geometry and color."""
+"""Frame-to-model tracking: alignment of each frame to the view ray-cast from the map, by geometry and color."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from framework.errors import DataError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.tracking.absolute_pose import AbsolutePose
-from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view, smoothed
+from framework.tracking.alignment import LinearWeights, NormalEquations, Weights, linearize, model_view, smoothed
 from framework.tracking.features import FrameFeatures
 from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, model_intensities
@@ -31,6 +32,13 @@ STEADY = 5  # consecutive frames with a correct prediction that make a motion st
 VISITED = 64  # poses that a lost camera tries, one per frame
 VISITED_SEPARATION = 0.1  # m and rad between them
 RECOVERY_INFORMATION = 2.0  # times min_information that a lost camera needs
+
+
+class ResidualWeights(Enum):
+    """The weights of residuals (framework/tracking/alignment.py)."""
+
+    TUKEY = "of residuals over their expected noise, for a larger noise at coarse levels; exposure is compensated"
+    LINEAR = "of VoxelHashing's code: the same at all levels, without noise model and compensation of exposure"
 
 
 class Alignment(NamedTuple):
@@ -55,8 +63,13 @@ class VoxelHashingIcp(PoseTracker):
 
     A pose needs agreement with the map: less at the prediction of a steady motion, more elsewhere. Agreement alone does
     not separate right from wrong poses (docs/guides/trackers.md), so a pose elsewhere needs confirmation by features.
+
+    A frame is always lost if too few points match, the step is not plausible, or the points do not determine it. All
+    other checks are ours: min_agreement=0 and max_occluded=1 turn off those of agreement, also after a loss, and
+    relocalize=false those by features.
     """
 
+    residual_weights: ResidualWeights = ResidualWeights.TUKEY
     finest_scale: float = 0.5  # of the image's size, a power of 1/2: resolution of the view and of the finest level
     iterations_coarse: int = 8  # >= 0, at 1/4 of the finest resolution
     iterations_middle: int = 6  # >= 0, at 1/2
@@ -64,18 +77,20 @@ class VoxelHashingIcp(PoseTracker):
     max_distance: float = 0.1  # m, > 0, of a point from its model point
     close_distance: float = 0.05  # m, > 0, at least a voxel: a reading this near to the map's surface agrees with it
     min_normal_dot: float = 0.7  # in [-1, 1], cosine between the normals of a point and its model point
-    geometric_scale: float = 4.0  # standard deviations, > 0, Tukey's cut-off of a distance
-    photometric_scale: float = 4.0  # standard deviations, > 0, Tukey's cut-off of an intensity difference
-    intensity_noise: float = 0.05  # of [0, 1], > 0, standard deviation of an intensity difference
+    geometric_scale: float = 4.0  # standard deviations, > 0, cut-off of a distance (TUKEY)
+    photometric_scale: float = 4.0  # standard deviations, > 0, cut-off of an intensity difference (TUKEY)
+    intensity_noise: float = 0.05  # of [0, 1], > 0, standard deviation of an intensity difference (TUKEY)
+    max_intensity_difference: float = 0.1  # of [0, 1], > 0, where the weight of an intensity is 0 (LINEAR)
     color_weight: float = 0.1  # lambda, >= 0; 0 = ICP alone
+    color_levels: int = 3  # in [1, 3], levels that use color, from the coarsest
     depth_weight: float = 1.0  # 1, or 0 = color alone
     max_translation: float = 0.3  # m, > 0, between frames; a larger step is lost
     max_rotation: float = 0.35  # rad, > 0, between frames; a larger turn is lost
     min_visible: float = 0.05  # in [0, 1], ratio of the frame's points that fall on the map
     min_matched: float = 0.4  # in [0, 1], ratio of the points in view with a weight
     min_information: float = 1e-3  # in [0, 1], smallest eigenvalue of A over the mean; less leaves a motion open
-    min_agreement: float = 0.92  # in [0, 1], ratio of the points in view that agree with the map ...
-    max_occluded: float = 0.015  # in [0, 1], ... and that lie behind it; other poses need confirmation
+    min_agreement: float = 0.92  # in [0, 1], ratio of the points in view that agree with the map, 0 = unchecked ...
+    max_occluded: float = 0.015  # in [0, 1], ... and that lie behind it, 1 = unchecked; others need confirmation
     relocalize: bool = True  # by features, when lost, in doubt or jumping, and from visited poses, when lost
     seed: int = 0  # of the relocalization's random samples
 
@@ -84,13 +99,18 @@ class VoxelHashingIcp(PoseTracker):
             self, finest_scale=(1 / 64, 1.0), iterations_coarse=(0, 1000), iterations_middle=(0, 1000),
             iterations_fine=(1, 1000), max_distance=(1e-4, 10.0), close_distance=(1e-4, 10.0),
             min_normal_dot=(-1.0, 1.0), geometric_scale=(1e-3, 1e3), photometric_scale=(1e-3, 1e3),
-            intensity_noise=(1e-3, 1.0), color_weight=(0.0, 1e3), depth_weight=(0.0, 1.0),
+            intensity_noise=(1e-3, 1.0), max_intensity_difference=(1e-3, 1.0), color_weight=(0.0, 1e3),
+            color_levels=(1, LEVELS), depth_weight=(0.0, 1.0),
             max_translation=(1e-3, 100.0), max_rotation=(1e-3, 3.15), min_visible=(0.0, 1.0),
             min_matched=(0.0, 1.0), min_information=(0.0, 1.0), min_agreement=(0.0, 1.0), max_occluded=(0.0, 1.0),
         )  # fmt: skip
         require(
             np.log2(self.finest_scale) % 1 == 0, "VoxelHashingIcp.finest_scale", self.finest_scale, "1, 1/2, 1/4, ..."
         )
+        require(
+            self.depth_weight > 0 or self.color_levels == LEVELS,
+            "VoxelHashingIcp.color_levels", self.color_levels, f"{LEVELS} without depth",
+        )  # fmt: skip
         self._weights = Weights(*(np.float32(getattr(self, name)) for name in Weights._fields))
         self._T_world_last: Float64 | None = None  # the last trusted pose
         self._T_last_next = np.eye(4)  # motion to the next frame under constant velocity
@@ -255,7 +275,7 @@ class VoxelHashingIcp(PoseTracker):
     def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
         """Align from a pose, and again to the view from the result: agreement shows that the frame determines it."""
         alignment = self._align(levels, scene, T_world_from, T_world_from)
-        if not alignment.trusted:
+        if not alignment.trusted or self.min_agreement == 0:
             return alignment
         again = self._align(levels, scene, alignment.T_world_camera, T_world_from)
         if not _near(alignment.T_world_camera, again.T_world_camera, SAME_POSE / 2):
@@ -269,19 +289,22 @@ class VoxelHashingIcp(PoseTracker):
         view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth)
         model, intensities = model_view(view), model_intensities(view, LEVELS)
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
+        linear = self._linear_weights(scene)
         T_view_camera = np.eye(4)
         brightness = 0.0
         for level in reversed(range(LEVELS)):
             weights, smooth = self._weights_at(level), smoothed(model, level)
             for _ in range(iterations[level]):
-                equations = linearize(levels[level], smooth, intensities[level], T_view_camera, weights, brightness)
-                brightness = equations.brightness
+                equations = linearize(
+                    levels[level], smooth, intensities[level], T_view_camera, weights, brightness, linear
+                )
+                brightness = equations.brightness if linear is None else 0.0
                 xi = _solved(equations)
                 T_view_camera = exp_se3(xi) @ T_view_camera
                 if np.abs(xi).max() < CONVERGED * 4**level:
                     break
         if np.abs(xi).max() >= CONVERGED:  # the counts before such a step do not describe its result
-            equations = linearize(levels[0], smooth, intensities[0], T_view_camera, weights, brightness)
+            equations = linearize(levels[0], smooth, intensities[0], T_view_camera, weights, brightness, linear)
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially
         T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
@@ -297,10 +320,24 @@ class VoxelHashingIcp(PoseTracker):
             doubt = f"{agreement:.0%} of the points in view agree with the map, but {matched:.0%} in their normals, too"
         return Alignment(T_world_camera, matched, agreement, behind, agreement_in_front, reason, doubt)
 
+    def _linear_weights(self, scene: SceneMap) -> LinearWeights | None:
+        """Return the maxima of linear weights, None for Tukey's."""
+        if self.residual_weights is ResidualWeights.TUKEY:
+            return None
+        return LinearWeights(np.float32(scene.depth_range[1]), np.float32(self.max_intensity_difference))
+
     def _weights_at(self, level: int) -> Weights:
-        """Return the weights of a level: coarse levels start from less accurate poses and tolerate larger residuals."""
-        return self._weights._replace(
+        """Return the weights of a level.
+
+        Coarse levels start from less accurate poses, and Tukey's weights tolerate larger residuals there.
+        """
+        weights = self._weights._replace(
             min_normal_dot=np.float32(-1) if self._coarse_depth else self._weights.min_normal_dot,
+            color_weight=self._weights.color_weight if level >= LEVELS - self.color_levels else np.float32(0),
+        )
+        if self.residual_weights is ResidualWeights.LINEAR:
+            return weights
+        return weights._replace(
             max_distance=self._weights.max_distance * np.float32(1 + level),
             geometric_scale=self._weights.geometric_scale * np.float32(2**level),
             photometric_scale=self._weights.photometric_scale * np.float32(2**level),
@@ -314,7 +351,7 @@ class VoxelHashingIcp(PoseTracker):
         if equations.visible < self.min_visible * points:
             return f"{equations.visible / points:.0%} of the frame's points fall on the map"
         few_match = equations.matched < self.min_matched * equations.visible
-        if few_match and equations.close < self.min_agreement * equations.visible:
+        if few_match and (self.min_agreement == 0 or equations.close < self.min_agreement * equations.visible):
             return f"{equations.matched / equations.visible:.0%} of the points in view agree with the map"
         if self._is_jump(T_from_camera):
             step, turn = np.linalg.norm(T_from_camera[:3, 3]), rotation_angle(T_from_camera[:3, :3])

@@ -8,8 +8,8 @@ import pytest
 
 from framework.data import Frame
 from framework.geometry import exp_se3, inverse
-from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearize, smoothed
-from framework.tracking.pyramid import build_pyramid, intrinsics, model_intensities
+from framework.tracking.alignment import LinearWeights, ModelView, NormalEquations, Weights, linearize, smoothed
+from framework.tracking.pyramid import PyramidLevel, build_pyramid, intrinsics, model_intensities
 from plugins.trackers.voxel_hashing_icp import _solved
 from tests.support.scenes.analytic_scene import CAMERA, Scene, pose
 
@@ -32,6 +32,14 @@ def step(
 
     The model is seen from T_VIEW, as `seen` has it.
     """
+    model, intensities = model_of(scene)
+    pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
+    equations = linearize(pyramid[level], seen(model), intensities[level], T_view_camera, weights, brightness)
+    return _solved(equations), equations
+
+
+def model_of(scene: Scene) -> tuple[ModelView, list[np.ndarray]]:
+    """Return the scene's planes as seen from T_VIEW, and their intensities at three levels."""
     view_frame = scene.frame(T_VIEW)
     depth = view_frame.depth
     gap = inverse(T_VIEW)[:3, :3]
@@ -41,12 +49,8 @@ def step(
         normals[surface == k] = gap @ n
     depth = np.where(surface <= len(scene.planes), depth, 0).astype(np.float32)
     model = ModelView(depth, np.ascontiguousarray(normals.transpose(2, 0, 1)), *intrinsics(CAMERA))
-    model = seen(model)
     view = dataclasses.make_dataclass("Seen", ["color", "depth"])(view_frame.color, depth)
-    intensity = model_intensities(view, 3)[level]
-    pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
-    equations = linearize(pyramid[level], model, intensity, T_view_camera, weights, brightness)
-    return _solved(equations), equations
+    return model, model_intensities(view, 3)
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
@@ -146,3 +150,107 @@ def test_smoothed_normals_are_means_of_squares_without_what_is_not_mapped() -> N
             for u in range(reach, 17 - reach):
                 total = normals[:, v - reach : v + reach + 1, u - reach : u + reach + 1].sum(axis=(1, 2))
                 np.testing.assert_allclose(found.normals[:, v, u], total / np.linalg.norm(total), atol=1e-4)
+
+
+CORNER = Scene(
+    planes=[(np.array([0, 0, -1.0]), -1.8), (np.array([0, -0.8, -0.6]), -1.2), (np.array([0.8, 0, -0.6]), -1.4)],
+    contrast=1.0,
+)
+VOXEL_HASHING = Weights(*map(np.float32, (0.15, 0.05, 0.97, 4.0, 4.0, 0.05, 0.7, 0.5)))
+MAXIMA = LinearWeights(np.float32(4.0), np.float32(0.1))
+
+
+def slow_equations(
+    level: PyramidLevel, model: ModelView, intensity: np.ndarray, T: np.ndarray, weights: Weights, linear: LinearWeights
+) -> NormalEquations:
+    """Return the equations with linear weights in double precision, with derivatives by finite differences."""
+    height, width = model.depth.shape
+    v, u = np.nonzero(level.depth)
+    z = level.depth[v, u].astype(np.float64)
+    rays = np.stack([(u - level.camera.cx) / level.camera.fx, (v - level.camera.cy) / level.camera.fy, np.ones(len(u))])
+    p = T[:3, :3] @ (rays * z) + T[:3, 3:]
+    mu, mv = model.fx * p[0] / p[2] + model.cx + 0.5, model.fy * p[1] / p[2] + model.cy + 0.5
+    column, row = np.floor(mu).astype(int), np.floor(mv).astype(int)
+    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    depth = np.where(inside, model.depth[row, column], 0).astype(np.float64)
+    q = depth * np.stack([(column - model.cx) / model.fx, (row - model.cy) / model.fy, np.ones(len(u))])
+    n = model.normals[:, row, column].astype(np.float64)
+    distance = np.linalg.norm(p - q, axis=0)
+    same = (n * (T[:3, :3] @ level.normals[:, v, u])).sum(0) > weights.min_normal_dot
+    matched = (depth > 0) & (distance <= weights.max_distance) & same
+    w = matched * np.maximum(0, ((1 - distance / weights.max_distance) + (1 - z / linear.max_depth)) / 2)
+
+    scale = width / intensity.shape[1]
+    left, top = (np.floor(m / scale - 0.5).astype(int) for m in (mu, mv))
+    compared = matched & (left >= 1) & (top >= 1) & (left < intensity.shape[1] - 2) & (top < intensity.shape[0] - 2)
+    left, top = np.where(compared, left, 0), np.where(compared, top, 0)
+    corners = [intensity[top + j, left + i].astype(np.float64) for j in (0, 1) for i in (0, 1)]
+    compared &= np.min(corners, axis=0) >= 0
+
+    def errors(xi: np.ndarray) -> np.ndarray:
+        """Return (2, P) the distances from the planes and the intensity differences after a twist."""
+        moved = exp_se3(xi)[:3, :3] @ p + exp_se3(xi)[:3, 3:]
+        a = (model.fx * moved[0] / moved[2] + model.cx + 0.5) / scale - 0.5 - left
+        b = (model.fy * moved[1] / moved[2] + model.cy + 0.5) / scale - 0.5 - top
+        i00, i10, i01, i11 = corners
+        seen = (1 - b) * ((1 - a) * i00 + a * i10) + b * ((1 - a) * i01 + a * i11)
+        return np.stack([(n * (moved - q)).sum(0), seen - level.intensity[v, u]])
+
+    r = errors(np.zeros(6))
+    J = np.stack([(errors(h) - errors(-h)) / 2e-6 for h in 1e-6 * np.eye(6)])
+    x = compared * np.maximum(0, 1 - np.abs(r[1]) / linear.max_intensity_difference)
+    weight = np.stack([w * weights.depth_weight, x * weights.color_weight])
+    A = np.einsum("iep,jep,ep->ij", J, J, weight)
+    return NormalEquations(
+        A, np.einsum("iep,ep->i", J, weight * r), int((depth > 0).sum()), int((w > 0).sum()), 0, 0, 0
+    )
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("dropped", [{}, {"color_weight": 0}, {"depth_weight": 0}], ids=["both", "depth", "color"])
+def test_linear_weights_match_slow_reference(level: int, dropped: dict[str, int]) -> None:
+    """Weights of all sizes, and points beyond each of the maxima; at a pose where no projection is on a pixel's border."""
+    weights = VOXEL_HASHING._replace(**{name: np.float32(value) for name, value in dropped.items()})
+    T = exp_se3(np.array([0.011, -0.007, 0.004, 0.003, -0.005, 0.002]))
+    frame = CORNER.frame(T_VIEW @ exp_se3(np.array([0.05, -0.03, 0.02, 0.02, -0.03, 0.01])))
+    model, intensities = model_of(CORNER)
+    pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
+    arguments = pyramid[level], model, intensities[level], T, weights
+    found = linearize(*arguments, 0.0, MAXIMA)
+    expected = slow_equations(*arguments, MAXIMA)
+    assert found.visible == pytest.approx(expected.visible, rel=1e-3)
+    if weights.depth_weight > 0:
+        assert found.matched == pytest.approx(expected.matched, rel=1e-3)
+        assert 100 / 4**level < expected.matched < 0.95 * expected.visible
+    np.testing.assert_allclose(found.A, expected.A, rtol=2e-3, atol=2e-3 * np.abs(expected.A).max())
+    np.testing.assert_allclose(found.b, expected.b, rtol=2e-3, atol=2e-3 * np.abs(expected.b).max())
+
+
+def test_linear_weight_is_zero_at_its_maxima() -> None:
+    """On a wall 1.5 m away, seen from its true pose, the distance is 0 and all depths are nearly equal."""
+    frame = WALL.frame(T_VIEW)
+    model, intensities = model_of(WALL)
+    level = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)[0]
+    weights = VOXEL_HASHING._replace(color_weight=np.float32(0))
+    sums = {}
+    for max_depth in (0.7, 1.5, 3.0, np.inf):
+        linear = LinearWeights(np.float32(max_depth), np.float32(0.1))
+        sums[max_depth] = linearize(level, model, intensities[0], np.eye(4), weights, 0.0, linear).A[2, 2]
+    ratios = [sums[max_depth] / sums[np.inf] for max_depth in (3.0, 1.5)]
+    assert ratios == pytest.approx([0.75, 0.5], rel=0.03)
+    assert sums[0.7] == 0
+
+
+def test_linear_weights_compare_colors_of_matching_normals_only() -> None:
+    n = np.array([np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)])
+    frame = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.5]))]).frame(T_VIEW)
+    model, intensities = model_of(WALL)
+    level = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)[0]
+    weights = COLOR._replace(max_distance=np.float32(1))
+    by_color = [
+        linearize(level, model, intensities[0], np.eye(4), weights, 0.0, linear)
+        for linear in (None, LinearWeights(np.float32(4), np.float32(1)))
+    ]
+    assert by_color[0].matched > 100
+    assert by_color[1].matched == 0
