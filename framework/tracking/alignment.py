@@ -8,7 +8,7 @@ count standard deviations. Beyond `FAR` a depth's standard deviation is its nois
 structured-light cameras at that range cover whole image regions and do not average out. Gauss-Newton steps are twists
 in the view's frame: T <- exp(xi) T.
 
-`LinearWeights` replaces Tukey's weights by those of VoxelHashing's published code. Residuals are then in m and in [0, 1].
+`LinearWeights` replaces Tukey's weights by those of VoxelHashing's published code, for residuals in m and in [0, 1].
 With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
 
     w_i = max(0, ((1 - d / max_distance) + (1 - z / max_depth)) / 2)
