@@ -46,6 +46,7 @@ LONGEST_FOCAL_LENGTH = 1e6  # px
 UNIT_TOLERANCE = 1e-3  # largest | |v| - 1 | of a unit vector
 LONGEST_EMBEDDING = 65_536  # dimensions; published networks have 500 to 4,000
 LONGEST_SPACE = 300  # characters of the name of an embedding space
+SAME_TIME = 1e-5  # s, between two readings of one frame's time: trajectory.txt has 1e-9, a double of a Unix time 1e-6
 PROBABILITY_TOLERANCE = 1e-3  # a row of probabilities sums to 1 within this: softmax in half precision
 
 
@@ -357,6 +358,28 @@ class InstanceMesh:
 
 
 @dataclass(frozen=True)
+class ReferenceTrajectory:
+    """The camera poses in the world of a ground truth. Maps in another world are aligned to them."""
+
+    timestamps: Float64  # (F,) s, increasing
+    T_world_camera: Float64  # (F, 4, 4)
+    given: bool  # the poses given to the run: a map that begins with one of them is in their world already
+
+    def __post_init__(self) -> None:
+        f = len(self.timestamps)
+        check_array("ReferenceTrajectory.timestamps", self.timestamps, (f,), np.float64)
+        check_array("ReferenceTrajectory.T_world_camera", self.T_world_camera, (f, 4, 4), np.float64)
+
+    def at(self, timestamps: Float64) -> Int64:
+        """Return the index (N,) of the pose at each time (N,), -1 = none."""
+        if not len(self.timestamps):
+            return np.full(len(timestamps), -1)
+        last = len(self.timestamps) - 1
+        nearest = np.clip(np.searchsorted(self.timestamps, timestamps - SAME_TIME), 0, last)
+        return np.where(np.abs(self.timestamps[nearest] - timestamps) <= SAME_TIME, nearest, -1)
+
+
+@dataclass(frozen=True)
 class SceneTruth:
     """The true instances of a sequence as labeled surface points, for evaluation."""
 
@@ -364,6 +387,7 @@ class SceneTruth:
     instance_ids: Int32  # (V,), 0 = no instance
     class_names: Mapping[int, str | None] = field(default_factory=dict)  # as in FrameTruth; None = not evaluated
     classes: tuple[str, ...] | None = None  # all annotated classes; None = unknown
+    trajectory: ReferenceTrajectory | None = None  # None = all maps are in the world of the points
 
     def __post_init__(self) -> None:
         v = len(self.points_world)

@@ -19,26 +19,24 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from framework.data import Float64, FrameTruth, Int32, SceneTruth
-from framework.datasets.calibration.camera_json import read_camera, read_json_object
+from framework.datasets.calibration.camera_json import read_camera
 from framework.datasets.frames.numbered_images import numbered_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording, StoredImages
+from framework.datasets.ground_truth.named_truth import read_class_names
 from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import is_there
 from framework.files.image_files import read_uint16
-from framework.files.number_lines import SHOWN, read_gravity
+from framework.files.number_lines import read_gravity
 from framework.files.tum_trajectory import TumLine, read_tum_lines
-from framework.vocabulary.label_spaces import COCO
 
 LARGEST_ID = 2**16 - 1  # of an instance: its image holds uint16
-MOST_DIGITS = 10  # of an id, with leading zeros
 
 Entry = TypeVar("Entry")
 log = logging.getLogger(__name__)
@@ -83,7 +81,7 @@ class RgbdFolder(Recording):
             raise FrameError(f"{path}: instance {unknown[0]} is not in {self.folder / 'instances.json'}")
         return FrameTruth(ids, self._class_names)
 
-    def scene_truth(self) -> SceneTruth | None:
+    def own_scene_truth(self) -> SceneTruth | None:
         """Return the fused depth and instance ids of the selected frames, None without instances or poses.
 
         Frames that cannot be read are skipped. The points are as exact as the depth images.
@@ -108,11 +106,11 @@ class RgbdFolder(Recording):
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
         """The class of each instance, and each frame's image of instances; empty without labels."""
         folder, names = self.folder / "instance", self.folder / "instances.json"
-        if not is_there(folder) and not is_there(names):
+        if self.named_truth is not None or (not is_there(folder) and not is_there(names)):
             return {}, []
         if not is_there(names):
             raise DataError(f"{folder} is there, but {names} is missing: it names the class of each instance")
-        class_names = _read_class_names(names)
+        class_names = read_class_names(names, LARGEST_ID)
         images = numbered_images(folder, (".png",))
         _check_same_frames(color, images)
         return class_names, list(images.values())
@@ -147,26 +145,3 @@ def _read_optional(path: Path, read: Callable[[Path], list[Entry]], name: str, f
         found = f"{path} holds {len(entries)} {name}, but color/ holds {frames} frames"
         raise DataError(f"{found}: one line a frame is needed")
     return entries
-
-
-def _read_class_names(path: Path) -> dict[int, str | None]:
-    class_names: dict[int, str | None] = {}
-    for key, entry in read_json_object(path).items():
-        if not (key.isascii() and key.isdigit() and len(key) <= MOST_DIGITS and 0 < int(key) <= LARGEST_ID):
-            raise DataError(f"{path}: an instance id is a whole number from 1 to {LARGEST_ID}, found {key!r:.60}")
-        if int(key) in class_names:
-            raise DataError(f"{path}: instance {int(key)} is there twice, the second time as {key!r}")
-        class_names[int(key)] = _class_of(f"{path}: instance {key}", entry)
-    return class_names
-
-
-def _class_of(where: str, entry: Any) -> str | None:
-    if not isinstance(entry, dict) or "class" not in entry:
-        expected = '{"name": ..., "class": name or null}, where null means not known'
-        raise DataError(f"{where} must be {expected}, found {entry!r:.60}")
-    name = entry["class"]
-    if name is None or (isinstance(name, str) and name in COCO):
-        return name
-    close = get_close_matches(str(name)[:SHOWN].strip().lower(), COCO, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise DataError(f"{where}: class must be one of COCO's names, or null for not known, found {name!r:.60}{hint}")

@@ -32,7 +32,7 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
         raise DataError(
             f"frame {frame.index} has no instance ground truth, which this detector needs:"
             " set dataset.frame_ground_truth=true where the dataset has a labeled mesh (scenenn, scannet),"
-            " or choose another dataset or detector"
+            " name one with dataset.ground_truth=PATH, or choose another dataset or detector"
         )
     index = {name: k for k, name in enumerate(classes)}
     names = {i: name for i, name in frame.truth.class_names.items() if i != 0 and name is not None}

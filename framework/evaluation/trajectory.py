@@ -83,6 +83,24 @@ def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
     return R, mu_y - R @ mu_x
 
 
+def align(P: Float64, Q: Float64) -> Float64:
+    """Return the rigid T (4, 4) that moves the poses P (n, 4, 4) nearest to Q (n, 4, 4), n >= 1.
+
+    As in `umeyama`, for the positions and the points 1 m along each camera's axes. The points determine the rotation
+    for a camera that only turns, too.
+    """
+    R, t = umeyama(_axis_points(P), _axis_points(Q))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
+def _axis_points(P: Float64) -> Float64:
+    """Return (4n, 3) the positions of poses (n, 4, 4) and the points 1 m along their axes."""
+    positions = P[:, None, :3, 3]
+    return np.concatenate([positions, positions + P[:, :3, :3].transpose(0, 2, 1)], axis=1).reshape(-1, 3)
+
+
 def _inverse(T: Float64) -> Float64:
     """Invert rigid transforms (n, 4, 4)."""
     inverse = np.zeros_like(T)

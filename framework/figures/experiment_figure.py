@@ -166,7 +166,7 @@ DRAWN: Mapping[str, Callable[[Pictured], Page]] = {"stage_times": _stage_times, 
 
 
 def _truth(record: Record) -> SceneTruth | None:
-    return Truth.of(record.config).scene
+    return Truth.of(record.dataset).in_world_of(record)
 
 
 def _caption(stored: StoredMap | None) -> str:

@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 from omegaconf import OmegaConf
 
-from framework.data import Camera, Float64, Frame, SceneTruth, UInt8
+from framework.data import SAME_TIME, Camera, Float64, Frame, SceneTruth, UInt8
 from framework.errors import DataError, FrameError, InstanceMapError
 from framework.evaluation.trajectory import umeyama
+from framework.evaluation.truth_alignment import in_map_world
 from framework.interfaces import RGBDSequence, RGBDVideo
 from framework.registry import build
 from framework.reporting.run_contents import RunContents
 from framework.runs.metrics import TRUTH, truth_sha256
 from framework.runs.provenance import leaves
 
-SAME_TIME_S = 1e-5  # tolerance of timestamps: a double of a Unix time has a precision of about 1e-6 s
 MAX_WIDTH = 640  # px, of stored images
 MIN_CLARITY = 0.3  # a blurred image of an object is better than a distant view
 
@@ -34,11 +34,11 @@ class RunSource:
     @classmethod
     def of(cls, contents: RunContents) -> RunSource:
         """Open the sequence from the run's config. A sequence that cannot be read is None."""
-        config = contents.record.config
-        if any("${" in str(value) for _, value in leaves({"dataset": config.get("dataset")})):
+        dataset = contents.record.dataset
+        if any("${" in str(value) for _, value in leaves({"dataset": dataset})):
             return cls(contents, None, "its config is not resolved")
         try:
-            video = build(RGBDVideo, OmegaConf.create(dict(config)).get("dataset"))
+            video = build(RGBDVideo, OmegaConf.create(dataset))
         except (InstanceMapError, OSError) as error:
             return cls(contents, None, str(error))
         if not isinstance(video, RGBDSequence):
@@ -64,14 +64,17 @@ class RunSource:
                 frame = self.video[position]
             except FrameError:
                 continue
-            if frame.index == numbers[k] and abs(frame.timestamp - self.contents.timestamps[k]) < SAME_TIME_S:
+            if frame.index == numbers[k] and abs(frame.timestamp - self.contents.timestamps[k]) < SAME_TIME:
                 return frame
             if frame.index > numbers[k]:
                 return None
         return None
 
     def scene_truth(self) -> tuple[SceneTruth | None, str]:
-        """Return the true instances of the run's evaluation, or None and the reason ("" for a run without them)."""
+        """Return the true instances of the run's evaluation in the world of its map, or None and the reason.
+
+        The reason is "" for a run without them.
+        """
         expected = self.contents.record.metrics.get(TRUTH)
         if self.video is None:
             return None, self.why_not if expected else ""
@@ -83,7 +86,10 @@ class RunSource:
             return None, "the dataset has no true instances any more" if expected else ""
         if expected is not None and truth_sha256(truth) != expected:
             return None, "the true instances are no longer those that the run was compared with"
-        return truth, ""
+        try:
+            return in_map_world(truth, self.contents.timestamps, self.contents.poses), ""
+        except DataError as error:
+            return None, str(error)
 
 
 @dataclass(frozen=True)

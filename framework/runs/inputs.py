@@ -9,6 +9,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
+from framework.datasets.ground_truth.named_truth import KEY, truth_files
 from framework.datasets.scannet.scannet_annotation import FIRST_LABEL_TABLE, LABEL_TABLE
 from framework.detection.stored.fingerprint import content_hash
 from framework.errors import ConfigError, DataError
@@ -28,13 +29,23 @@ def inputs_sha256(config: Mapping[str, Any]) -> str:
     """
     digest = hashlib.sha256()
     for key, value in leaves(relevant(config)):
-        if isinstance(value, str) and key not in ("dataset.root", "dataset.scene"):
+        if isinstance(value, str) and key == KEY:
+            digest.update("".join(map(_content, _truth_files(value))).encode())
+        elif isinstance(value, str) and key not in ("dataset.root", "dataset.scene"):
             digest.update(f"{key} {_content(value)};".encode())
     dataset = config.get("dataset") or {}
     if root := dataset.get("root"):
         for entry in islice(_listed(folder_of(Path(root)), str(dataset.get("scene") or "")), MOST_FILES):
             digest.update(f"{entry};".encode())
     return digest.hexdigest()
+
+
+def _truth_files(value: str) -> list[str]:
+    """Return the files of a named ground truth; none if one is missing, which is an error of the run."""
+    try:
+        return [str(path) for path in truth_files(Path(value))]
+    except (ConfigError, DataError):
+        return []
 
 
 def _content(value: str) -> str:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Mapping
 from dataclasses import asdict
 
 import numpy as np
 
 from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
+from framework.errors import DataError
 from framework.evaluation import instances, trajectory
 from framework.evaluation.instances import PredictedInstances, Transfer
+from framework.evaluation.truth_alignment import in_map_world
 from framework.files.hashing import add_values
 from framework.interfaces import RGBDVideo, SceneMap
 from framework.mapping.gravity import floor_height
 from framework.runtime.run_log import STAGES, RunResult
+
+log = logging.getLogger(__name__)
 
 Metrics = dict[str, float | int | str | bool | None]
 
@@ -66,23 +71,38 @@ def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
 
 
 def instance_metrics(
-    video: RGBDVideo, mesh: InstanceMesh, found: Mapping[int, Instance], classes: tuple[str, ...]
+    video: RGBDVideo,
+    mesh: InstanceMesh,
+    found: Mapping[int, Instance],
+    classes: tuple[str, ...],
+    trajectory: tuple[Float64, Float64],
 ) -> Metrics:
-    """Return the number of instances and, with ground truth, their metrics."""
+    """Return the number of instances and, with ground truth in a known world, their metrics.
+
+    `trajectory` has the times (F,) s and poses (F, 4, 4) of the map.
+    """
     count: Metrics = {"instances.count": len(found)}
     truth = video.scene_truth()
     if truth is None:
         return count
-    return count | evaluation_metrics(PredictedInstances.of_map(mesh, found, classes), truth, video.annotation)
+    try:
+        aligned = in_map_world(truth, *trajectory)
+    except DataError as error:
+        log.warning("instances are not evaluated: %s", error)
+        return count
+    return count | evaluation_metrics(PredictedInstances.of_map(mesh, found, classes), truth, aligned, video.annotation)
 
 
-def evaluation_metrics(predictions: PredictedInstances, truth: SceneTruth, annotation: str) -> Metrics:
+def evaluation_metrics(
+    predictions: PredictedInstances, truth: SceneTruth, aligned: SceneTruth, annotation: str
+) -> Metrics:
     """Return `InstanceEvaluation.metrics`, and the main ones of the other label transfer as `instances.to_map.`...
 
-    `annotation_release` is the release of the ground truth, None = only one exists; `truth_sha256` its hash.
+    `aligned` is the ground truth in the world of the map. `annotation_release` is the release of the ground truth, None
+    = only one exists; `truth_sha256` its hash.
     """
-    figures = instances.evaluate(predictions, truth).metrics()
-    to_map = instances.evaluate(predictions, truth, transfer=Transfer.TO_MAP).metrics()
+    figures = instances.evaluate(predictions, aligned).metrics()
+    to_map = instances.evaluate(predictions, aligned, transfer=Transfer.TO_MAP).metrics()
     of_map = {f"instances.to_map.{name}": to_map[f"instances.{name}"] for name in MAIN_FIGURES if to_map}
     return {**figures, **of_map, "annotation_release": annotation or None, TRUTH: truth_sha256(truth)}
 

@@ -12,14 +12,16 @@ from omegaconf import OmegaConf
 from framework.data import SceneTruth
 from framework.errors import DataError
 from framework.evaluation.instances import PredictedInstances
+from framework.evaluation.truth_alignment import in_map_world
 from framework.files.directory_lock import locked
 from framework.files.json_file import write_json
+from framework.files.tum_trajectory import read_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import build
 from framework.runs.metrics import TRUTH, evaluation_metrics, is_evaluation
 from framework.runs.provenance import code_version, leaves
 from framework.runs.stored_map import read_objects
-from framework.runs.stored_runs import EVALUATION, METRICS, Record
+from framework.runs.stored_runs import EVALUATION, GROUND_TRUTH, METRICS, TRAJECTORY, Record
 
 
 @dataclass(frozen=True)
@@ -28,16 +30,21 @@ class Truth:
 
     scene: SceneTruth | None  # None = not labeled
     annotation: str  # RGBDVideo.annotation
+    named: str | None = None  # dataset.ground_truth, None = the dataset's own
 
     @classmethod
-    def of(cls, config: Mapping[str, Any]) -> Truth:
-        """Read the ground truth of a run's resolved config. Raises InstanceMapError."""
-        node = OmegaConf.create(dict(config)).get("dataset")
-        for key, value in leaves({"dataset": config.get("dataset")}):
+    def of(cls, dataset: Mapping[str, Any]) -> Truth:
+        """Read the ground truth of a dataset's resolved config. Raises InstanceMapError."""
+        for key, value in leaves({"dataset": dataset}):
             if "${" in str(value):
                 raise DataError(f"a run's config is stored resolved, and this one is not: {key}={value}")
-        video = build(RGBDVideo, node)
-        return cls(video.scene_truth(), video.annotation)
+        video = build(RGBDVideo, OmegaConf.create(dict(dataset)))
+        named = dataset.get("ground_truth")
+        return cls(video.scene_truth(), video.annotation, None if named is None else str(named))
+
+    def in_world_of(self, record: Record) -> SceneTruth | None:
+        """Return the ground truth in the world of a run's map. Raises DataError."""
+        return self.scene and in_map_world(self.scene, *read_tum(record.directory / TRAJECTORY))
 
 
 @dataclass(frozen=True)
@@ -58,10 +65,12 @@ class Reevaluation:
             if any(map(is_evaluation, record.metrics)):
                 raise DataError(f"{record.directory}: its figures are of true instances that the dataset has no longer")
             return cls(record, record.metrics)
-        found = evaluation_metrics(read_predictions(record), truth.scene, truth.annotation)
+        aligned = truth.in_world_of(record)
+        assert aligned is not None
+        found = evaluation_metrics(read_predictions(record), truth.scene, aligned, truth.annotation)
         if not other_truth and record.metrics.get(TRUTH) not in (None, found[TRUTH]):
             raise DataError(
-                f"{record.directory}: the true instances of {record.config['dataset']['_target_']} are not those that "
+                f"{record.directory}: the true instances of {record.dataset['_target_']} are not those that "
                 "the run was compared with: its dataset has changed, or a relative dataset.root means another folder "
                 "here; --other-truth compares with them all the same"
             )
@@ -71,6 +80,8 @@ class Reevaluation:
                 metrics[key] = value
             if key == "instances.count":
                 metrics |= found | {EVALUATION + name: value for name, value in code_version().items()}
+        if truth.named != record.config["dataset"].get("ground_truth"):
+            metrics[GROUND_TRUTH] = truth.named
         return cls(record, metrics)
 
     @property
@@ -114,6 +125,6 @@ def read_predictions(record: Record) -> PredictedInstances:
     )
 
 
-def dataset_of(record: Record) -> str:
-    """Return a key that is equal for runs with the same ground truth."""
-    return str(record.config.get("dataset"))
+def dataset_of(record: Record, ground_truth: str | None = None) -> dict[str, Any]:
+    """Return the dataset's config of a run, with another ground truth; "" = the dataset's own, None = unchanged."""
+    return record.dataset | ({} if ground_truth is None else {"ground_truth": ground_truth or None})

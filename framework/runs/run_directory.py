@@ -20,7 +20,7 @@ from framework.data import Instance
 from framework.errors import InstanceMapError
 from framework.files.atomic_write import remove_left_over, written_whole
 from framework.files.json_file import write_json
-from framework.files.tum_trajectory import write_tum
+from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import RGBDVideo
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
@@ -118,7 +118,8 @@ class RunRecord:
         if result.keyframes:
             attempt(write_keyframes, self.directory / KEYFRAMES, result.keyframes)
         if found is not None:
-            figures |= attempt(instance_metrics, video, *found, scene.classes) or {}
+            stored = attempt(read_tum, self.directory / TRAJECTORY)  # as written: a re-evaluation gets the same metrics
+            figures |= (stored and attempt(instance_metrics, video, *found, scene.classes, stored)) or {}
         figures |= attempt(trajectory_metrics, result) or {}
         title = headline({"sequence": video.name, **figures})
         if found is not None:

@@ -36,6 +36,7 @@ MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
 """Files of a map in the order of writing, small ones first in case the disk is full."""
 
 EVALUATION = "evaluation."  # prefix of the code version of a re-evaluation
+GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the dataset.ground_truth of a re-evaluation, if it had one
 
 FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # prefixes of numeric metrics
 
@@ -64,6 +65,12 @@ class Record:
         later = {key[prefix:]: value for key, value in self.metrics.items() if key.startswith(EVALUATION)}
         evaluator = commit_of(later) if later else self.commit
         return self.commit if evaluator == self.commit else f"{self.commit}, evaluated by {evaluator}"
+
+    @property
+    def dataset(self) -> dict[str, Any]:
+        """Return the config of the dataset, with the ground truth of the last evaluation."""
+        config = dict(self.config.get("dataset") or {})
+        return config | ({"ground_truth": self.metrics[GROUND_TRUTH]} if GROUND_TRUTH in self.metrics else {})
 
     @property
     def annotation(self) -> str:

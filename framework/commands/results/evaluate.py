@@ -34,29 +34,48 @@ def main() -> None:
         default=Transfer.TO_TRUTH.value,
         help="label transfer of the printed metrics; both are evaluated",
     )
+    parser.add_argument(
+        "--ground-truth",
+        metavar="PATH",
+        help="labeled mesh or run directory to compare with, as dataset.ground_truth; '' = the dataset's own",
+    )
     parser.add_argument("--other-truth", action="store_true", help="accept a changed ground truth")
     parser.add_argument("--dry-run", action="store_true", help="print only, write nothing")
     parsed = arguments(parser)
     with one_line_errors():
-        failed = evaluate_runs(parsed.run, Transfer(parsed.transfer), not parsed.dry_run, parsed.other_truth)
+        transfer, write = Transfer(parsed.transfer), not parsed.dry_run
+        failed = evaluate_runs(parsed.run, transfer, write, parsed.other_truth, parsed.ground_truth)
     if failed:
         sys.exit(EXIT_FAILED)
 
 
-def evaluate_runs(roots: Sequence[Path], transfer: Transfer, write: bool, other_truth: bool = False) -> int:
-    """Evaluate all runs at and below `roots`, print a line for each, and return the number of failures."""
+def evaluate_runs(
+    roots: Sequence[Path],
+    transfer: Transfer,
+    write: bool,
+    other_truth: bool = False,
+    ground_truth: str | None = None,
+) -> int:
+    """Evaluate all runs at and below `roots`, print a line for each, and return the number of failures.
+
+    `ground_truth` is as in `dataset_of`.
+    """
     records, failures = _find(roots)
     for failure in failures:
         print_error(failure, REFUSED)
     failed = len(failures)
+
+    def key(record: Record) -> str:
+        return str(dataset_of(record, ground_truth))
+
     with tqdm(total=len(records), unit=" runs", disable=None, dynamic_ncols=True) as bar:
         # by dataset, so that only one ground truth is in memory
-        for _, group in groupby(sorted(records, key=dataset_of), dataset_of):
+        for _, group in groupby(sorted(records, key=key), key):
             truth: Truth | None = None
             for record in group:
                 try:
-                    truth = truth or Truth.of(record.config)
-                    found = Reevaluation.of(record, truth, other_truth)
+                    truth = truth or Truth.of(dataset_of(record, ground_truth))
+                    found = Reevaluation.of(record, truth, other_truth or ground_truth is not None)
                     if write:
                         found.write()
                     tqdm.write(f"{record.directory}: {summary(found, transfer)}")

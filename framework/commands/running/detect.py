@@ -102,11 +102,16 @@ def _written(
                 log.warning("frame skipped: %s", error)
                 continue
             results.write(frame.index, found)
-            if frame.truth is not None:
+            try:
+                true_ids = None if frame.truth is None else frame.truth.instance_ids
+            except FrameError as error:
+                log.warning("frame not compared with the ground truth: %s", error)
+                continue
+            if frame.truth is not None and true_ids is not None:
                 faults.add(frame.truth, found)
                 names = frame.truth.class_names
-                ids = np.array([i for i in np.unique(frame.truth.instance_ids).tolist() if i and i in names], np.int32)
-                yield frame.truth.instance_ids == ids[:, None, None], [names[i] for i in ids.tolist()], found
+                ids = np.array([i for i in np.unique(true_ids).tolist() if i and i in names], np.int32)
+                yield true_ids == ids[:, None, None], [names[i] for i in ids.tolist()], found
     if results.frames == 0:
         raise DataError(f"{sequence.name}: none of the {len(sequence)} frames can be used")
 

@@ -15,10 +15,22 @@ from pathlib import Path
 import numpy as np
 
 from framework.config.validation import require
-from framework.data import Camera, Float32, Float64, Frame, FrameTruth, UInt8, UInt16
+from framework.data import (
+    Camera,
+    Float32,
+    Float64,
+    Frame,
+    FrameTruth,
+    ReferenceTrajectory,
+    SceneTruth,
+    UInt8,
+    UInt16,
+)
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import DepthReading, PoseReading
+from framework.datasets.ground_truth.labeled_mesh import unseen
+from framework.datasets.ground_truth.named_truth import KEY, NamedTruth, read_named_truth
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.search_paths import folder_of
@@ -80,7 +92,10 @@ class Contents:
 
 @dataclass
 class Recording(RGBDSequence):
-    """An RGB-D video on disk. A subclass lists what is stored (`open`), and knows the ground truth.
+    """An RGB-D video on disk. A subclass lists what is stored (`open`), and knows the recording's own ground truth.
+
+    The ground truth that the user names replaces the recording's own. It is the whole mesh, whatever frames are
+    selected; the instances in a frame are rendered from it.
 
     Errors of the whole recording raise DataError when it is opened. Errors of one frame raise FrameError when it is
     read, so that the pipeline counts and skips it.
@@ -94,6 +109,7 @@ class Recording(RGBDSequence):
     frame_fraction: float = 1.0  # in (0, 1], fraction of these frames, selected at random with `seed`
     seed: int = 0  # of the random selection
     max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
+    ground_truth: Path | None = None  # labeled mesh or run directory; None = the recording's own
     pose_reading: PoseReading = field(default_factory=PoseReading)
     depth_reading: DepthReading = field(default_factory=DepthReading)
 
@@ -106,6 +122,7 @@ class Recording(RGBDSequence):
             project = "" if self.root.is_absolute() else ", neither here nor in a checkout of the project"
             raise DataError(f"dataset.root: the folder {self.folder} does not exist{project}")
         self.name = self.folder.resolve().name
+        self.named_truth = None if self.ground_truth is None else read_named_truth(Path(self.ground_truth))
         stored = self.open()
         depth_scale = self.depth_reading.depth_scale or stored.depth_scale
         posed = [_posed(frame, self.pose_reading) for frame in delay_poses(stored.frames, self.pose_reading.pose_delay)]
@@ -117,14 +134,33 @@ class Recording(RGBDSequence):
         )
         self.chosen = choose_frames(len(frames), self.start, self.stop, self.stride, self.frame_fraction, self.seed)
         self._check_first_image()
+        if self.named_truth is not None:
+            self.annotation = self.named_truth.name
+            self._check_truth_poses(self.named_truth)
 
     @abstractmethod
     def open(self) -> Contents:
         """Return what `self.folder` stores. Raises DataError, with the file, if this is no such recording."""
 
     def truth_in(self, index: int) -> FrameTruth | None:
-        """Return the true instances in stored frame `index`, or None if they are not known."""
+        """Return the recording's own true instances in stored frame `index`, or None if they are not known."""
         return None
+
+    def own_scene_truth(self) -> SceneTruth | None:
+        """Return the recording's own true instances, in the world of its poses, or None without annotation."""
+        return None
+
+    def scene_truth(self) -> SceneTruth | None:
+        """Return the true instances, with the poses that show their world; None without annotation or poses."""
+        named = self.named_truth
+        truth = self.own_scene_truth() if named is None else named.mesh.scene_truth()
+        if truth is None:
+            return None
+        trajectory = self._given_trajectory() if named is None or named.trajectory is None else named.trajectory
+        if not len(trajectory.timestamps):
+            log.warning("%s: instances are not evaluated: no given pose shows the world of the ground truth", self.name)
+            return None
+        return replace(truth, trajectory=trajectory)
 
     def __len__(self) -> int:
         return len(self.chosen)
@@ -146,7 +182,7 @@ class Recording(RGBDSequence):
             depth=self.metric_depth(index),
             camera=self.camera,
             T_world_camera=recorded.T_world_camera,
-            truth=self.truth_in(index),
+            truth=self._frame_truth(index),
             up=recorded.up,
         )
 
@@ -154,6 +190,31 @@ class Recording(RGBDSequence):
         """Return depth (H, W) in m, 0 = no reading. Raises FrameError."""
         images = self.contents.frames[index].images
         return self.calibration.depth(images.depth(), images.depth_name)
+
+    def _frame_truth(self, index: int) -> FrameTruth | None:
+        if self.named_truth is None:
+            return self.truth_in(index)
+        recorded = self.contents.frames[index]
+        T_world_camera = self.named_truth.pose(recorded.timestamp, recorded.T_world_camera)
+        if T_world_camera is None:
+            return unseen(self.camera, f"frame {index} has no pose from which its true instances can be rendered")
+        return self.named_truth.mesh.seen_by(self.camera, T_world_camera)
+
+    def _given_trajectory(self) -> ReferenceTrajectory:
+        posed = [one for one in self.contents.frames if one.T_world_camera is not None and not one.error]
+        times = np.array([one.timestamp for one in posed], np.float64)
+        return ReferenceTrajectory(times, np.array([one.T_world_camera for one in posed]).reshape(-1, 4, 4), given=True)
+
+    def _check_truth_poses(self, named: NamedTruth) -> None:
+        """Raise ConfigError if no selected frame has a pose in the world of the named ground truth."""
+        frames = [self.contents.frames[index] for index in self.chosen]
+        if any(named.pose(one.timestamp, one.T_world_camera) is not None for one in frames):
+            return
+        if named.trajectory is None:
+            expected = "expected given poses, whose world the mesh is in, got a recording without poses"
+            raise ConfigError(f"{KEY}: {expected}; add them, or name the directory of a run of it")
+        expected = "expected a run of this recording, got one without a pose at the time of any selected frame"
+        raise ConfigError(f"{KEY}: {expected}; name another run, or select other frames")
 
     def _check_first_image(self) -> None:
         """Raise FrameError for a first image of the wrong size: all others would be skipped one by one."""

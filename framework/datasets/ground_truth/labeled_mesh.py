@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
-from framework.datasets.frames.sequence_reader import Recording
-from framework.errors import DataError
-from framework.files.atomic_write import is_there
+from framework.errors import NoPoseError
 from framework.files.hashing import add_array, path_hash
 from framework.rendering import rasterizer
 from framework.rendering.rasterizer import Rasterizer
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -58,37 +53,10 @@ class LabeledMesh:
         return digest.hexdigest()
 
 
-@dataclass
-class LabeledRecording(Recording):
-    """A recording of a scene that may have a labeled mesh, which the subclass loads in `open`.
+def unseen(camera: Camera, why: str) -> FrameTruth:
+    """Return the instances of a frame that cannot be rendered: they raise NoPoseError with the reason on access."""
 
-    The ground truth is the whole mesh, whatever frames are selected.
-    """
+    def render() -> Int32:
+        raise NoPoseError(why)
 
-    frame_ground_truth: bool = False  # frames have the true instances: the mesh is rendered for detectors that need it
-
-    def __post_init__(self) -> None:
-        self.mesh: LabeledMesh | None = None
-        super().__post_init__()
-
-    def load_mesh(self, files: Sequence[Path], read: Callable[..., LabeledMesh]) -> None:
-        """Load the mesh from its files, if all of them exist.
-
-        Raises DataError if one is missing and `frame_ground_truth` needs it.
-        """
-        missing = [path for path in files if not is_there(path)]
-        if not missing:
-            self.mesh = read(*files)
-        elif self.frame_ground_truth:
-            raise DataError(f"dataset.frame_ground_truth: expected the labeled mesh, found no {missing[0]}")
-        elif len(missing) < len(files):
-            log.warning("no true instances: %s is missing", missing[0])
-
-    def truth_in(self, index: int) -> FrameTruth | None:
-        T_world_camera = self.contents.frames[index].T_world_camera
-        if self.mesh is None or not self.frame_ground_truth or T_world_camera is None:
-            return None
-        return self.mesh.seen_by(self.camera, T_world_camera)
-
-    def scene_truth(self) -> SceneTruth | None:
-        return self.mesh.scene_truth() if self.mesh else None
+    return DeferredTruth(render, camera.shape, class_names={}, origin=why)

@@ -26,7 +26,8 @@ from framework.data import Camera
 from framework.datasets.calibration.color_registration import ColorRegistration, registered_images
 from framework.datasets.frames.numbered_images import first_size, numbered_images, paired_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, StoredImages
-from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
+from framework.datasets.ground_truth.labeled_recording import LabeledRecording
 from framework.datasets.scannet.scannet_annotation import (
     FIRST_LABEL_TABLE,
     LABEL_TABLE,

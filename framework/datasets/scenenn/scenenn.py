@@ -25,7 +25,8 @@ import numpy as np
 from framework.data import Camera
 from framework.datasets.frames.numbered_images import first_size, numbered_images, paired_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, StoredImages
-from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
+from framework.datasets.ground_truth.labeled_recording import LabeledRecording
 from framework.datasets.scenenn.scene_files import TrajectoryLog, read_intrinsics, read_timestamps, read_trajectory_log
 from framework.datasets.scenenn.scenenn_annotation import LARGEST_ID, Annotated, read_annotation
 from framework.detection.domain import RENDERED_ROOMS

@@ -108,7 +108,7 @@ def test_metrics_have_the_keys_of_the_design(record: RunRecord, room: CornerRoom
 def test_both_transfers_and_the_release_of_the_truth_are_told(room: CornerRoom, annotation: str, release: str) -> None:
     scene = mapped(room).scene
     room.annotation = annotation
-    metrics = instance_metrics(room, scene.mesh(), scene.instances(), CLASSES)
+    metrics = instance_metrics(room, scene.mesh(), scene.instances(), CLASSES, (np.zeros(0), np.zeros((0, 4, 4))))
     predictions = PredictedInstances.of_map(scene.mesh(), scene.instances(), CLASSES)
     to_truth, to_map = (evaluate(predictions, room.scene_truth(), transfer=way).metrics() for way in Transfer)
     assert to_map["instances.mean_iou"] != to_truth["instances.mean_iou"]

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
 from framework.commands.running.detect import write_detections
+from framework.data import Frame
+from framework.datasets.ground_truth.labeled_mesh import unseen
 from framework.errors import DataError
+from plugins.detectors.none import NoDetections
 from plugins.detectors.precomputed import Precomputed
 from tests.support.forked_commands import FAKE_CONF, completed
 from tests.support.scenes.corner_room import CornerRoom, SphereDetector
@@ -95,3 +99,19 @@ def test_a_file_without_detections_is_valid(tmp_path: Path) -> None:
 
     write_detections(tmp_path / "found.json", Nothing(), CornerRoom())
     assert json.loads((tmp_path / "found.json").read_text()) == []
+
+
+@dataclass
+class PartlyTrueRoom(CornerRoom):
+    """A room whose frame 2 has no pose from which its true instances can be rendered."""
+
+    def __getitem__(self, k: int) -> Frame:
+        frame = super().__getitem__(k)
+        return replace(frame, truth=unseen(self.camera, "frame 2 has no pose")) if frame.index == 2 else frame
+
+
+def test_frame_without_rendered_truth_is_detected(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_detections(tmp_path / "found.json", NoDetections(), PartlyTrueRoom())
+    assert "frame not compared with the ground truth: frame 2 has no pose" in caplog.text
+    with pytest.raises(DataError, match="none of the 1 frames can be used"):
+        write_detections(tmp_path / "found.json", SphereDetector(), PartlyTrueRoom(start=2, stop=3))

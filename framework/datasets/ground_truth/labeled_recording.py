@@ -1,0 +1,54 @@
+"""Recordings with a labeled mesh of their own."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from framework.data import FrameTruth, SceneTruth
+from framework.datasets.frames.sequence_reader import Recording
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
+from framework.errors import DataError
+from framework.files.atomic_write import is_there
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class LabeledRecording(Recording):
+    """A recording of a scene that may have a labeled mesh of its own, which the subclass loads in `open`.
+
+    The ground truth is the whole mesh, whatever frames are selected.
+    """
+
+    frame_ground_truth: bool = False  # frames have the true instances: the mesh is rendered for detectors that need it
+
+    def __post_init__(self) -> None:
+        self.mesh: LabeledMesh | None = None
+        super().__post_init__()
+
+    def load_mesh(self, files: Sequence[Path], read: Callable[..., LabeledMesh]) -> None:
+        """Load the mesh from its files, if all of them exist and the user names no other ground truth.
+
+        Raises DataError if one is missing and `frame_ground_truth` needs it.
+        """
+        if self.named_truth is not None:
+            return
+        missing = [path for path in files if not is_there(path)]
+        if not missing:
+            self.mesh = read(*files)
+        elif self.frame_ground_truth:
+            raise DataError(f"dataset.frame_ground_truth: expected the labeled mesh, found no {missing[0]}")
+        elif len(missing) < len(files):
+            log.warning("no true instances: %s is missing", missing[0])
+
+    def truth_in(self, index: int) -> FrameTruth | None:
+        T_world_camera = self.contents.frames[index].T_world_camera
+        if self.mesh is None or not self.frame_ground_truth or T_world_camera is None:
+            return None
+        return self.mesh.seen_by(self.camera, T_world_camera)
+
+    def own_scene_truth(self) -> SceneTruth | None:
+        return self.mesh.scene_truth() if self.mesh else None

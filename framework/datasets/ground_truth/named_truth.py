@@ -1,0 +1,160 @@
+"""The ground truth that the user names: a labeled mesh, or the map of a run.
+
+    DIR/mesh.ply            a PLY file of any name: vertex x y z [m], integer property `instance`, 0 = none; faces
+    DIR/instances.json      next to it, or in the folder above: {"<id>": {"name", "class"}}, class = a name of COCO, or
+                            null = not known
+
+    RUN/                    a run directory: mesh.ply, instances.json (a list) and trajectory.txt
+
+An annotated mesh is in the world of the recording's given poses. The world of a run is known by its trajectory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from framework.data import Float64, Int32, ReferenceTrajectory
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
+from framework.errors import ConfigError, DataError
+from framework.files.atomic_write import is_there
+from framework.files.json_file import read_json
+from framework.files.number_lines import SHOWN
+from framework.files.ply import PlyMesh, read_ply
+from framework.files.search_paths import candidates
+from framework.files.tum_trajectory import read_tum
+from framework.vocabulary.label_spaces import COCO
+
+KEY = "dataset.ground_truth"
+MESH, INSTANCES, TRAJECTORY, METRICS = "mesh.ply", "instances.json", "trajectory.txt", "metrics.json"  # of a run
+LABELS = "instance"  # the property of a vertex
+LARGEST_ID = np.iinfo(np.int32).max
+MOST_DIGITS = 10  # of an id, with leading zeros
+
+
+@dataclass(frozen=True)
+class NamedTruth:
+    """A labeled mesh, and the poses of the run that made it."""
+
+    mesh: LabeledMesh
+    name: str  # for tables: the file and its folder
+    trajectory: ReferenceTrajectory | None  # None = the mesh is in the world of the recording's given poses
+
+    def pose(self, timestamp: float, given: Float64 | None) -> Float64 | None:
+        """Return T_world_camera (4, 4) in the world of the mesh of a frame with this time and given pose.
+
+        None = not known.
+        """
+        if self.trajectory is None:
+            return given
+        k = int(self.trajectory.at(np.array([timestamp]))[0])
+        return self.trajectory.T_world_camera[k] if k >= 0 else None
+
+
+def read_named_truth(path: Path) -> NamedTruth:
+    """Return the ground truth at a path, a run directory or a labeled mesh.
+
+    Raises ConfigError for a path that does not exist, and DataError, with the file, for an invalid one.
+    """
+    files = truth_files(path)
+    mesh, names = files[0], files[1]
+    ply, content = read_ply(mesh), read_json(names)
+    ids = _labels_of(mesh, ply)
+    label = f"{mesh.parent.name}/{mesh.name}"
+    if isinstance(content, list):
+        class_names = _classes_of_run(names, content)
+        ids = np.where(np.isin(ids, list(class_names)), ids, 0).astype(np.int32)  # tentative instances have no entry
+        return NamedTruth(_labeled(mesh, ply, ids, class_names), label, _trajectory_of_run(mesh.parent))
+    class_names = read_class_names(names, LARGEST_ID)
+    unlisted = set(np.unique(ids).tolist()) - class_names.keys() - {0}
+    if unlisted:
+        raise DataError(f"{mesh}: expected an entry of {names} for each instance, got none for {min(unlisted)}; add it")
+    return NamedTruth(_labeled(mesh, ply, ids, class_names), label, None)
+
+
+def truth_files(path: Path) -> list[Path]:
+    """Return the mesh at a path, its instances.json and, for a run, its trajectory.
+
+    Raises ConfigError or DataError, naming the file, if one is missing.
+    """
+    found = next((place for place in candidates(path) if place.exists()), None)
+    if found is None:
+        raise ConfigError(f"{KEY}: expected a labeled mesh (PLY) or a run directory, got {path}, which does not exist")
+    mesh = found / MESH if found.is_dir() else found
+    if not is_there(mesh):
+        raise DataError(f"{KEY}: expected {MESH} in the directory {found}, found none; name the labeled mesh")
+    places = [mesh.with_name(INSTANCES), mesh.absolute().parents[1] / INSTANCES]
+    names = next((place for place in places if is_there(place)), None)
+    if names is None:
+        raise DataError(f"{KEY}: expected {places[0]} with the class of each instance of {mesh.name}, found none")
+    trajectory = mesh.with_name(TRAJECTORY)
+    return [mesh, names, trajectory] if is_there(trajectory) else [mesh, names]
+
+
+def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
+    """Return the class of each instance of an annotation, None = not known. Raises DataError, with the file."""
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
+    class_names: dict[int, str | None] = {}
+    for key, entry in content.items():
+        if not (key.isascii() and key.isdigit() and len(key) <= MOST_DIGITS and 0 < int(key) <= largest_id):
+            raise DataError(f"{path}: an instance id is a whole number from 1 to {largest_id}, found {key!r:.60}")
+        if int(key) in class_names:
+            raise DataError(f"{path}: instance {int(key)} is there twice, the second time as {key!r}")
+        class_names[int(key)] = _class_of(f"{path}: instance {key}", entry)
+    return class_names
+
+
+def _class_of(where: str, entry: Any) -> str | None:
+    if not isinstance(entry, dict) or "class" not in entry:
+        expected = '{"name": ..., "class": name or null}, where null means not known'
+        raise DataError(f"{where} must be {expected}, found {entry!r:.60}")
+    name = entry["class"]
+    if name is None or (isinstance(name, str) and name in COCO):
+        return name
+    close = get_close_matches(str(name)[:SHOWN].strip().lower(), COCO, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    raise DataError(f"{where}: class must be one of COCO's names, or null for not known, found {name!r:.60}{hint}")
+
+
+def _labels_of(path: Path, ply: PlyMesh) -> Int32:
+    """The instance (V,) of each vertex of a mesh with triangles."""
+    labels = ply.properties.get(LABELS)
+    if labels is None or labels.dtype.kind not in "iu":
+        found = f"got {', '.join(sorted(ply.properties)) or 'none'}"
+        raise DataError(f"{path}: expected a vertex property {LABELS!r} of integers, {found}; label the mesh")
+    if not len(ply.triangles):
+        raise DataError(f"{path}: expected faces, from which masks are rendered, got none; name a mesh")
+    if labels.min() < 0 or labels.max() > LARGEST_ID:
+        raise DataError(f"{path}: expected instances from 0 to {LARGEST_ID}, got {labels.min()} to {labels.max()}")
+    return labels.astype(np.int32)
+
+
+def _labeled(path: Path, ply: PlyMesh, ids: Int32, class_names: Mapping[int, str | None]) -> LabeledMesh:
+    if not ids.any():
+        raise DataError(f"{path}: expected vertices with an instance, got only instance 0; label the mesh")
+    return LabeledMesh(ply.vertices, ply.triangles, ids, class_names)
+
+
+def _classes_of_run(path: Path, entries: Sequence[Any]) -> dict[int, str | None]:
+    """The class of each instance of a run, None in a map without classes."""
+    class_names: dict[int, str | None] = {}
+    for number, entry in enumerate(entries, start=1):
+        key, name = (entry.get("id"), entry.get("class", ...)) if isinstance(entry, dict) else (None, None)
+        if type(key) is not int or not 0 < key <= LARGEST_ID or not (name is None or isinstance(name, str)):
+            raise DataError(f"{path}, entry {number}: expected an id and a class, got {entry!r:.60}; run it again")
+        class_names[key] = name
+    return class_names
+
+
+def _trajectory_of_run(directory: Path) -> ReferenceTrajectory:
+    timestamps, poses = read_tum(directory / TRAJECTORY)
+    metrics = read_json(directory / METRICS) if is_there(directory / METRICS) else {}
+    given = isinstance(metrics, dict) and metrics.get("pose_source") == "ground_truth"
+    return ReferenceTrajectory(timestamps, poses, given)
