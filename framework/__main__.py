@@ -15,6 +15,7 @@ import framework
 COMMANDS = {
     "tables": "write the tables of an experiment: Markdown, LaTeX, CSV",
     "figures": "draw the figures of an experiment",
+    "raycast": "draw the ray-cast view of a map: depth, normals, vertices, RGB, object indices",
     "report": "write an HTML report of a run, or a comparison of several",
     "import": "convert a recording of a phone or sensor to a folder for dataset=rgbd_folder",
     "check": "validate a recording and suggest parameter fixes",
@@ -37,7 +38,7 @@ COMMANDS = {
 
 FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
-    "results": ("tables", "figures", "report", "diff", "export", "query", "evaluate"),
+    "results": ("tables", "figures", "raycast", "report", "diff", "export", "query", "evaluate"),
     "recordings": ("import", "check", "synthesize", "convert-oni"),
     "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "convert-weights"),
 }

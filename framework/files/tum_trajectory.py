@@ -35,18 +35,27 @@ class TumLine:
 
     def pose(self) -> Float64:
         """Return T_world_camera (4, 4), rigid. Raises DataError for an invalid pose."""
-        norm = math.hypot(*self.quat_xyzw)
-        if not all(map(math.isfinite, (*self.position, norm))):
-            raise self.fault("the pose is not finite")
-        if abs(norm - 1) > QUATERNION_TOLERANCE:
-            raise self.fault(f"the quaternion qx qy qz qw has length {norm:.4g}, expected 1")
-        T_world_camera = np.eye(4)
-        T_world_camera[:3, :3] = Rotation.from_quat(self.quat_xyzw).as_matrix()
-        T_world_camera[:3, 3] = self.position
-        return T_world_camera
+        return rigid_pose(self._place, self.position, self.quat_xyzw)
 
     def fault(self, message: str) -> DataError:
-        return DataError(f"{self.path}, line {self.number}: {message}")
+        return DataError(f"{self._place}: {message}")
+
+    @property
+    def _place(self) -> str:
+        return f"{self.path}, line {self.number}"
+
+
+def rigid_pose(place: str, position: Sequence[float], quat_xyzw: Sequence[float]) -> Float64:
+    """Return T_world_camera (4, 4) of a position (3,) m and a quaternion. Raises DataError that begins with `place`."""
+    norm = math.hypot(*quat_xyzw)
+    if not all(map(math.isfinite, (*position, norm))):
+        raise DataError(f"{place}: the pose is not finite")
+    if abs(norm - 1) > QUATERNION_TOLERANCE:
+        raise DataError(f"{place}: the quaternion qx qy qz qw has length {norm:.4g}, expected 1")
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
+    T_world_camera[:3, 3] = position
+    return T_world_camera
 
 
 def read_tum(path: Path) -> tuple[Float64, Float64]:

@@ -167,6 +167,7 @@ FAULTY = {
     "figures": ["nowhere"],
     "import": ["old", "new"],
     "check": ["out=check.jpg"],
+    "raycast": ["nowhere"],
     "report": ["nowhere"],
     "diff": ["old", "old"],
     "export": ["nowhere", "--to", "glb"],

@@ -1,0 +1,85 @@
+"""`instancemap raycast RUN`: draw the view of a run's map from a frame's pose (the paper's Figure 2)."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from framework.commands.command_line import arguments, one_line_errors
+from framework.config.validation import checked_file
+from framework.errors import DataError
+from framework.files.tum_trajectory import rigid_pose
+
+if TYPE_CHECKING:
+    from framework.reporting.run_contents import RunContents
+
+log = logging.getLogger(__name__)
+
+PICTURE = "raycast.png"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description="Draws the ray-cast view of a run's map in five panels: depth, normals, vertices, RGB and object "
+        "indices."
+    )
+    parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
+    view = parser.add_mutually_exclusive_group()
+    view.add_argument("--frame", metavar="N", type=int, help="number of a mapped frame, default: the middle one")
+    pose = ("TX", "TY", "TZ", "QX", "QY", "QZ", "QW")
+    view.add_argument("--pose", metavar=pose, nargs=7, type=float, help="another pose, T_world_camera, in m as in TUM")
+    parser.add_argument("--out", metavar="FILE", type=Path, help=f"PNG file, default: {PICTURE} in the run directory")
+    parsed = arguments(parser)
+    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    with one_line_errors():
+        out = parsed.run / PICTURE if parsed.out is None else checked_file("--out", str(parsed.out), ".png")
+        draw(parsed.run, parsed.frame, parsed.pose, out)
+        print(out)
+
+
+def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> None:
+    """Write the picture of a run's map from a pose, by default that of a frame. Raises DataError."""
+    from framework.api import scene_of  # slow: after the arguments are checked
+    from framework.figures.raycast_figure import write_raycast
+    from framework.reporting.run_contents import RunContents
+    from framework.reporting.run_source import RunSource
+    from framework.reporting.visibility import NOT_CAMERA
+
+    scene = scene_of("raycast", run)
+    contents = RunContents.read(run)
+    if pose is None:
+        k = pose_of_frame(contents, frame)
+        T_world_camera, place = contents.poses[k], f"frame {contents.frame_numbers[k]}"
+    else:
+        T_world_camera = rigid_pose("--pose", pose[:3], pose[3:])
+        place = f"pose {' '.join(f'{value:g}' for value in pose)}"
+    source = RunSource.of(contents)
+    if source.camera is None:
+        log.warning("the camera of the run is unknown (%s); the view is that of a Kinect", source.why_not)
+    objects = scene.instances()
+    names = {key: scene.classes[int(one.class_probabilities.argmax())] for key, one in objects.items()}
+    view = scene.render(source.camera or NOT_CAMERA, T_world_camera)
+    if not (view.depth > 0).any():
+        raise DataError(f"raycast: expected a pose that sees the map, got {place}")
+    centers = {key: one.aabb.center for key, one in objects.items()}
+    note = f"{contents.name}, {place}, ray-cast from the final map. Commit {contents.record.commit}."
+    write_raycast(out, view, names, centers, note)
+
+
+def pose_of_frame(contents: RunContents, frame: int | None) -> int:
+    """Return the index of a frame's pose in the trajectory, None = the middle one. Raises DataError without a pose."""
+    numbers, lost = contents.frame_numbers, contents.lost_frames
+    if not numbers:
+        raise DataError(f"{contents.record.directory}: expected mapped frames, got none")
+    if frame is None:
+        return len(numbers) // 2
+    if frame in numbers:
+        return numbers.index(frame)
+    known = (*numbers, *lost)
+    if not min(known) <= frame <= max(known):
+        raise DataError(f"--frame: expected {min(known)} to {max(known)}, got {frame}")
+    nearest = min(numbers, key=lambda number: abs(number - frame))
+    what = "is lost" if frame in lost else "was not mapped"
+    raise DataError(f"--frame: expected a mapped frame, got {frame}, which {what}; the nearest is {nearest}")

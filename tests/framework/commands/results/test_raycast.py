@@ -1,0 +1,143 @@
+"""`python -m framework raycast`: the ray-cast view of a run."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.commands.results import raycast
+from framework.data import View
+from framework.figures import raycast_figure
+from framework.files.tum_trajectory import read_tum, write_tum
+from framework.reporting.run_source import RunSource
+from framework.reporting.visibility import NOT_CAMERA
+from tests.support.reported_run import write_run
+
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture
+def stored(mapped: Path, tmp_path: Path) -> Path:
+    """A run whose third frame is lost."""
+    run = Path(shutil.copytree(mapped, tmp_path / "run"))
+    timestamps, poses = read_tum(run / "trajectory.txt")
+    write_tum(run / "trajectory.txt", np.delete(timestamps, 2), np.delete(poses, 2, axis=0))
+    lines = (run / "timings.csv").read_text().splitlines(keepends=True)
+    of_tracking = ("2,reading", "2,detection", "2,tracking")
+    kept = [line for line in lines if not line.startswith("2,") or line.startswith(of_tracking)]
+    (run / "timings.csv").write_text("".join(kept))
+    return run
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Run the command here; return its status and what it wrote to stdout and stderr."""
+
+    def start(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["raycast", *map(str, arguments)])
+        status = 0
+        try:
+            raycast.main()
+        except SystemExit as ended:
+            status = int(ended.code or 0)
+        written = capsys.readouterr()
+        return status, written.out, written.err
+
+    return start
+
+
+@pytest.fixture
+def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[View, str]]:
+    """The drawn views with their notes."""
+    drawn: list[tuple[View, str]] = []
+    write = raycast_figure.write_raycast
+
+    def noted(path: Path, view: View, names: dict[int, str], centers: dict[int, np.ndarray], note: str) -> None:
+        drawn.append((view, note))
+        write(path, view, names, centers, note)
+
+    monkeypatch.setattr(raycast_figure, "write_raycast", noted)
+    return drawn
+
+
+def test_raycast_draws_the_middle_frame(stored: Path, command: Command, views: list[tuple[View, str]]) -> None:
+    status, out, err = command(stored)
+    assert (status, err) == (0, "")
+    assert out == f"{stored / 'raycast.png'}\n"
+    assert (stored / "raycast.png").read_bytes()[1:4] == b"PNG"
+    [(view, note)] = views
+    assert "frame 3," in note, "of 0, 1, 3, 4, 5"
+    np.testing.assert_allclose(view.T_world_camera, read_tum(stored / "trajectory.txt")[1][2])
+    assert (view.depth > 0).mean() > 0.5
+    assert view.instance_ids.any()
+
+
+def test_raycast_draws_a_chosen_frame_and_pose(
+    stored: Path, command: Command, views: list[tuple[View, str]], tmp_path: Path
+) -> None:
+    assert command(stored, "--frame", 4, "--out", tmp_path / "frame.png")[0] == 0
+    line = (stored / "trajectory.txt").read_text().splitlines()[3].split()
+    assert command(stored, "--pose", *line[1:], "--out", tmp_path / "pose.png")[0] == 0
+    assert "frame 4," in views[0][1]
+    assert "pose " in views[1][1]
+    np.testing.assert_allclose(views[0][0].T_world_camera, views[1][0].T_world_camera, atol=1e-9)
+    np.testing.assert_array_equal(views[0][0].instance_ids, views[1][0].instance_ids)
+    assert not (stored / "raycast.png").exists()
+
+
+def test_raycast_without_the_sequence_uses_another_camera(
+    stored: Path,
+    command: Command,
+    views: list[tuple[View, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(RunSource, "of", classmethod(lambda cls, contents: cls(contents, None, "its folder is gone")))
+    assert command(stored)[0] == 0
+    assert "the camera of the run is unknown (its folder is gone); the view is that of a Kinect" in caplog.text
+    assert views[0][0].camera == NOT_CAMERA
+
+
+FAR = ("--pose", 0, 0, -50, 0, 1, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--frame", 2], "--frame: expected a mapped frame, got 2, which is lost; the nearest is 1"),
+        (["--frame", 6], "--frame: expected 0 to 5, got 6"),
+        (["--frame", -1], "--frame: expected 0 to 5, got -1"),
+        (["--pose", 0, 0, 0, 0, 0, 0, 2], "--pose: the quaternion qx qy qz qw has length 2, expected 1"),
+        (["--pose", "nan", 0, 0, 0, 0, 0, 1], "--pose: the pose is not finite"),
+        (FAR, "raycast: expected a pose that sees the map, got pose 0 0 -50 0 1 0 0"),
+        (["--out", "view.jpg"], "--out must end in .png, found view.jpg"),
+    ],
+)
+def test_raycast_error_is_one_line(stored: Path, command: Command, arguments: list[object], message: str) -> None:
+    assert command(stored, *arguments) == (1, "", f"error: {message}\n")
+
+
+def test_raycast_without_map_is_one_line(stored: Path, command: Command, tmp_path: Path) -> None:
+    (stored / "map.npz").unlink()
+    for run in (stored, tmp_path / "nowhere"):
+        message = f"error: raycast: there is no {run / 'map.npz'}: expected the directory of a run\n"
+        assert command(run) == (1, "", message)
+
+
+def test_raycast_without_mapped_frames_is_one_line(stored: Path, command: Command) -> None:
+    (stored / "trajectory.txt").write_text("")
+    status, _, err = command(stored)
+    assert status == 1
+    assert err == f"error: {stored}: expected mapped frames, got none\n"
