@@ -21,6 +21,7 @@ from framework.files.ply import read_ply, write_ply
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.geometry import exp_se3, inverse, transform
 from plugins.detectors.ground_truth import GroundTruthDetector
+from tests.support.recordings.recordings import opened
 
 CAMERA = Camera(48, 32, 40.0, 41.0, 23.5, 15.5)
 FRAMES = 4
@@ -265,3 +266,34 @@ def test_rendered_masks_agree_with_annotated_images(shared_data: Path, name: str
         annotated = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
         labeled = annotated > 0
         assert (truth.instance_ids == annotated)[labeled].mean() > 0.85
+
+
+@pytest.mark.parametrize(
+    ("option", "root", "scene"),
+    [
+        ("replica_nice_slam", "originals/replica_nice_slam", "office0"),
+        ("rgbd_folder", "redkitchen", ""),
+        ("scannet", "scannet_scene0000", "scene0000_00"),
+        ("seven_scenes", "originals/seven_scenes/redkitchen", "seq-01"),
+        ("tum_rgbd", "tum_fr1_rpy_a", "rgbd_dataset_freiburg1_rpy"),
+    ],
+)
+def test_named_mesh_is_the_truth_of_every_dataset(
+    shared_data: Path, mesh: Path, option: str, root: str, scene: str
+) -> None:
+    """The mesh is a wall in front of the first camera with a pose."""
+    place = (f"dataset.root={shared_data / root}", f"dataset.scene={scene}")
+    first = next(frame for frame in opened(option, *place) if frame.T_world_camera is not None)
+    write_wall(mesh, first.T_world_camera)
+    named = opened(option, *place, f"dataset.ground_truth={mesh}", f"dataset.start={first.index}")
+    scene_truth, truth = named.scene_truth(), named[0].truth
+    assert scene_truth is not None
+    assert scene_truth.class_names == {CHAIR: "chair", UNKNOWN: None}
+    np.testing.assert_array_equal(scene_truth.points_world, read_ply(mesh).vertices)
+    camera = named.camera
+    x = (np.arange(camera.width) - camera.cx) / camera.fx * WALL
+    clear = (np.minimum(np.abs(x + 0.3), np.abs(x - 0.4)) > CELL) & (np.abs(x) < 1.9)
+    assert truth is not None
+    assert set(label_at(x[clear]).tolist()) == {0, CHAIR, UNKNOWN}
+    middle = truth.instance_ids[camera.height // 2]
+    np.testing.assert_array_equal(middle[clear], label_at(x[clear]))
