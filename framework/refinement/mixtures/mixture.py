@@ -19,6 +19,7 @@ from framework.refinement.mixtures.mixture_kernels import (
     claim,
     coefficients,
     fit_all,
+    improve_all,
 )
 
 BATCH = 16 * BLOCK  # points that a thread takes at once
@@ -45,6 +46,11 @@ def fit(
     )  # fmt: skip
     fit_all(points, starts, labels, odds, own_components, settings, mixtures)
     return mixtures
+
+
+def improve(points: Float32, starts: Int64, mixtures: Mixtures, settings: EmSettings) -> None:
+    """Run EM on each point set `points[starts[k]:starts[k + 1]]` from the present components of mixture k, in place."""
+    improve_all(points, starts, np.zeros(len(points), np.float32), settings, mixtures)
 
 
 def likely_members(

@@ -70,19 +70,40 @@ def fit_all(
             _fit_one(points[own], labels[own], odds[own], own_components, settings, mixtures, k)
 
 
+@njit(cache=True, nogil=True, parallel=True)
+def improve_all(points: Float32, starts: Int64, odds: Float32, settings: EmSettings, mixtures: Mixtures) -> None:
+    for k in prange(len(starts) - 1):
+        if starts[k + 1] > starts[k]:
+            own = slice(starts[k], starts[k + 1])
+            center, volume = _center_and_volume(points[own], settings.variance_floor)
+            mixtures.outlier_weights[k], mixtures.outlier_densities[k] = settings.outlier_fraction, 1.0 / volume
+            _iterate(points[own], odds[own], 0, center, settings, mixtures, k)
+
+
 @njit(cache=True, nogil=True)
 def _fit_one(
     points: Float32, labels: Int32, odds: Float32, own_components: int, settings: EmSettings, mixtures: Mixtures, k: int
 ) -> None:
     weights, means, covariances = mixtures.weights[k], mixtures.means[k], mixtures.covariances[k]
+    center, volume = _center_and_volume(points, settings.variance_floor)
+    mixtures.outlier_weights[k], mixtures.outlier_densities[k] = settings.outlier_fraction, 1.0 / volume
+    moments = np.zeros((len(weights), 10))
+    for i in range(len(points)):
+        add_point(moments[labels[i]], points[i], center, 1.0 - settings.outlier_fraction)
+    _maximize(moments, center, len(points), settings.variance_floor, weights, means, covariances)
+    _iterate(points, odds, own_components, center, settings, mixtures, k)
+
+
+@njit(cache=True, nogil=True)
+def _iterate(
+    points: Float32, odds: Float32, own_components: int, center: Float64, settings: EmSettings, mixtures: Mixtures,
+    k: int,
+) -> None:  # fmt: skip
+    """Run EM on mixture k from its present components."""
+    weights, means, covariances = mixtures.weights[k], mixtures.means[k], mixtures.covariances[k]
     outlier_weights, log_likelihoods = mixtures.outlier_weights, mixtures.log_likelihoods
     variance_floor, count, components = settings.variance_floor, len(points), len(weights)
-    center, volume = _center_and_volume(points, variance_floor)
-    outlier_weights[k], mixtures.outlier_densities[k] = settings.outlier_fraction, 1.0 / volume
     moments = np.zeros((components, 10))
-    for i in range(count):
-        add_point(moments[labels[i]], points[i], center, 1.0 - settings.outlier_fraction)
-    _maximize(moments, center, count, variance_floor, weights, means, covariances)
     xyz = np.empty((3, count), np.float32)  # centered, so that single precision suffices
     for i in range(count):
         for a in range(3):

@@ -99,9 +99,9 @@ def fit(
         chosen = np.nonzero(np.diff(starts) >= max(min_points, 1))[0]
         if grown and len(chosen) == 0:
             break
-        own, own_starts = _ranges(points, starts, chosen)
+        own, own_starts = ranges(points, starts, chosen)
         fitted = mixture.fit(own, own_starts, cut(own, own_starts, children), children, settings)
-        level = _level(fitted, bounding_boxes(own, own_starts, least_side), chosen, above, min_support)
+        level = level_below(fitted, bounding_boxes(own, own_starts, least_side), chosen, above, min_support)
         if grown and len(level) == 0:
             break
         grown.append(level)
@@ -167,7 +167,7 @@ def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: 
     return claimed
 
 
-def _level(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
+def level_below(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
     """Return the level below nodes with the weights `above` (Q,), of which the `chosen` ones got children."""
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
     survivors = np.count_nonzero(kept, axis=1)
@@ -185,7 +185,7 @@ def _level(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_
     return Level(*nodes, firsts, outlier_weights, outlier_boxes)
 
 
-def _ranges(points: Float32, starts: Int64, chosen: Int64) -> tuple[Float32, Int64]:
+def ranges(points: Float32, starts: Int64, chosen: Int64) -> tuple[Float32, Int64]:
     """Return the points of the chosen sets and where each of them begins."""
     counts = np.diff(starts)
     if len(chosen) == len(counts):

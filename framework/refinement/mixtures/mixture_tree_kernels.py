@@ -118,7 +118,7 @@ def _pass_block(
     largest, best = np.full(n, log_outlier), np.full(n, -1, np.int32)
     for j in range(children):
         log_densities(xyz[0], xyz[1], xyz[2], rows[j], densities[j])
-        _take_better(densities[j], np.int32(j), largest, best)
+        take_better(densities[j], np.int32(j), largest, best)
     for i in range(n):
         child[i] = first_child + best[i] if best[i] >= 0 else -1
     evidence = np.empty(n, np.float32)
@@ -134,7 +134,7 @@ def _pass_block(
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
-def _take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
+def take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
     for i in range(len(largest)):
         better = densities[i] > largest[i]
         best[i] = j if better else best[i]

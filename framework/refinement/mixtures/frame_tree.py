@@ -1,0 +1,133 @@
+"""One tree of Gaussian mixtures over all masks of a frame: our first reading of section 3.2.2 of the paper.
+
+Level 1 has a Gaussian for each mask, whose pixels are its first responsibilities. Every further level splits each node
+into children, fitted to the node's own points. A point belongs to the mask above its most probable leaf. The split and
+the number of levels are our choice: the paper names a hierarchical EM algorithm without them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from framework.data import Float32, Float64, Int32, Int64
+from framework.refinement.mixtures import mixture
+from framework.refinement.mixtures.frame_tree_kernels import find_most_probable
+from framework.refinement.mixtures.lloyd_iterations import cluster
+from framework.refinement.mixtures.mixture_kernels import EmSettings, Mixtures, coefficients
+from framework.refinement.mixtures.mixture_tree import Level, MixtureTree, cut, level_below, ranges
+from framework.refinement.neighborhood_kernels import grouped
+
+NOWHERE = 1e6  # m, the center of a mask without points
+MIN_NODE = 32  # points of a node with children
+
+
+class Initialization(Enum):
+    """The first responsibilities of the Gaussians of level 1."""
+
+    MASKS = "the masks, as in the paper"
+    K_MEANS = "k-means over the frame's points from the masks' means, which the paper argues against"
+
+
+@dataclass(frozen=True)
+class FrameTree:
+    """A tree over the points of N masks."""
+
+    levels: tuple[Level, ...]
+    masks: tuple[Int64, ...]  # (M,) of each level: the mask of each node
+
+    def leaves(self) -> tuple[Float64, Float64, Float64, Int64]:
+        """Return weights (L,), means (L, 3), covariances (L, 3, 3) and masks (L,) of the nodes without children."""
+        parts = []
+        for k, (level, masks) in enumerate(zip(self.levels, self.masks, strict=True)):
+            below = self.levels[k + 1].firsts if k + 1 < len(self.levels) else np.zeros(len(level) + 1, np.int64)
+            leaf = np.diff(below) == 0
+            parts.append((level.weights[leaf], level.means[leaf], level.covariances[leaf], masks[leaf]))
+        weights, means, covariances, masks = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return weights, means, covariances, masks
+
+    def masks_of(self, points: Float32) -> Int32:
+        """Return (S,) the mask of the most probable leaf for each point (S, 3), -1 if the tree has no leaf."""
+        weights, means, covariances, masks = self.leaves()
+        best = np.empty(len(points), np.int32)
+        find_most_probable(points, coefficients(weights, means, covariances), best)
+        return np.append(masks, -1)[best].astype(np.int32)
+
+
+def grow(
+    points: Float32, masks: Int32, count: int, settings: EmSettings, *, levels: int, children: int,
+    gaussians_per_mask: int, initialization: Initialization, min_support: float,
+) -> FrameTree:  # fmt: skip
+    """Grow a tree of at most `levels` levels over points (S, 3) with masks (S,) in [0, `count`), ascending.
+
+    A node with at least MIN_NODE points gets `children`. A node with a weight below `min_support`, or with fewer points
+    than a covariance takes, is dropped in favor of its siblings.
+    """
+    labels = _start(points, masks, count, gaussians_per_mask, initialization, settings.max_iterations)
+    components = count * gaussians_per_mask
+    starts, all_points = np.array([0, len(points)]), np.zeros(1, np.int64)
+    fitted = mixture.fit(points, starts, labels, components, settings)
+    level, kept = _level(fitted, all_points, np.ones(1), min_support)
+    grown, roots = [level], [kept // gaussians_per_mask]
+    for _ in range(1, levels):
+        child = MixtureTree((level,)).passed(0, points, starts)
+        order, starts = grouped(child.astype(np.int32), len(level))
+        points = points[order]
+        chosen = np.flatnonzero(np.diff(starts) >= MIN_NODE)
+        if not len(chosen):
+            break
+        own, own_starts = ranges(points, starts, chosen)
+        fitted = corners(level.means[chosen], level.covariances[chosen], children)
+        mixture.improve(own, own_starts, fitted, settings)
+        parents = roots[-1]
+        level, _ = _level(fitted, chosen, level.weights, min_support)
+        grown.append(level)
+        roots.append(parents[level.parents])
+    return FrameTree(tuple(grown), tuple(roots))
+
+
+def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
+    """Return the first children of M Gaussians: at one standard deviation along the longest axes, both ways.
+
+    2, 4 or 8 children are along one, two or three axes. They have equal weights and a quarter of the covariance.
+    """
+    count, axes = len(means), children.bit_length() - 1
+    values, vectors = np.linalg.eigh(covariances)  # ascending
+    signs = 1 - 2 * (np.arange(children)[:, None] >> np.arange(axes) & 1)  # (J, axes)
+    steps = (np.sqrt(values)[:, None, :] * vectors)[:, :, 3 - axes :]  # (M, 3, axes)
+    shape = (count, children)
+    return Mixtures(
+        weights=np.full(shape, 1 / children),
+        means=np.ascontiguousarray(means[:, None] + np.einsum("mxa,ja->mjx", steps, signs)),
+        covariances=np.repeat(covariances[:, None] / 4, children, axis=1),
+        outlier_weights=np.zeros(count),
+        outlier_densities=np.zeros(count),
+        log_likelihoods=np.zeros(count),
+        iterations=np.zeros(count, np.int64),
+    )
+
+
+def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) -> tuple[Level, Int64]:
+    """Return the level below nodes with the weights `above`, and the components that became its nodes."""
+    boxes = np.zeros((len(chosen), 2, 3))  # no uniform component
+    level = level_below(fitted, boxes, chosen, above, min_support)
+    kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
+    return level, np.nonzero(kept)[1]
+
+
+def _start(
+    points: Float32, masks: Int32, count: int, gaussians: int, initialization: Initialization, max_iterations: int
+) -> Int32:
+    """Return (S,) the first Gaussian of each point; those of mask k are k * `gaussians` and the following ones."""
+    starts = np.searchsorted(masks, np.arange(count + 1))
+    labels = np.asarray(masks * np.int32(gaussians), np.int32)
+    if gaussians > 1:
+        labels += cut(points, starts, gaussians)
+    if initialization is Initialization.MASKS:
+        return labels
+    sizes = np.bincount(labels, minlength=count * gaussians)
+    sums = np.stack([np.bincount(labels, points[:, a], count * gaussians) for a in range(3)], axis=1)
+    centers = np.where(sizes[:, None] > 0, sums / np.maximum(sizes, 1)[:, None], NOWHERE)
+    return cluster(points, np.array([0, len(points)]), centers[None], max_iterations)[0]

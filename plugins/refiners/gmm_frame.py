@@ -1,0 +1,90 @@
+"""Cluster refinement by one Gaussian mixture over all masks of a frame: our first reading of the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from framework.config.validation import check_bounds
+from framework.data import Bool, Frame, PointClusters
+from framework.errors import ConfigError
+from framework.interfaces import ClusterRefiner
+from framework.refinement.mixtures.frame_tree import Initialization, grow
+from framework.refinement.mixtures.frame_tree_kernels import keep_best_cluster
+from framework.refinement.mixtures.mixture_kernels import EmSettings
+from framework.refinement.neighborhood import members
+from framework.refinement.neighborhood_kernels import grouped
+from framework.refinement.refine import keep_points
+
+
+class ForeignPoints(Enum):
+    """The treatment of points whose most probable Gaussian is of another mask."""
+
+    MOVE = "they move to that mask's cluster"
+    DROP = "they are dropped"
+    STAY = "they stay"
+
+
+@dataclass
+class GmmFrame(ClusterRefiner):
+    """Assigns the points of a frame's masks to the most probable mask, by hierarchical EM.
+
+    Eqs. (1) to (4) over the points of all masks, section 3.2.2. A pixel in several masks is one point, of the mask with
+    the best score. There is no background and no evidence of the masks beyond the start, so clusters lose points to
+    other clusters only. The paper leaves the hierarchy open: levels, children and their start are our choice (J = 8
+    after Eckart et al., CVPR 2016).
+    """
+
+    levels: int = 2  # from 1; 1 = flat
+    children: int = 8  # of a node: 2, 4 or 8
+    gaussians_per_mask: int = 1  # from 1, of level 1
+    initialization: Initialization = Initialization.MASKS  # of level 1
+    foreign_points: ForeignPoints = ForeignPoints.MOVE  # points of another mask's Gaussian
+    max_iterations: int = 10  # from 1, of EM in a node
+    tolerance: float = 1e-3  # nats per point; EM ends when the mean log-likelihood increases by less
+    std_floor: float = 0.005  # m, smallest standard deviation of a Gaussian along any axis
+    min_support: float = 1e-4  # in [0, 1), of the frame's points; a Gaussian with less is dropped
+    min_points: int = 30  # from 1, of a cluster; one left with fewer is dropped
+    max_points: int = 20_000  # from 100, of a frame for the fit; all points are assigned
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self, levels=(1, 8), gaussians_per_mask=(1, 64), max_iterations=(1, 1000), tolerance=(0.0, np.inf),
+            std_floor=(1e-4, 1.0), min_support=(0.0, 0.99), min_points=(1, 10**9), max_points=(100, 10**9),
+        )  # fmt: skip
+        if self.children not in (2, 4, 8):
+            raise ConfigError(f"children: expected 2, 4 or 8, got {self.children}; set refiner.children=8")
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        single = keep_points(clusters, best_of_pixels(clusters, frame.depth.shape))
+        order, _ = members(single)
+        points, masks = np.ascontiguousarray(single.points_world[order]), single.cluster[order]
+        if not len(points):
+            return single
+        nth = -(-len(points) // self.max_points)
+        tree = grow(
+            np.ascontiguousarray(points[::nth]), masks[::nth], len(clusters),
+            EmSettings(self.max_iterations, self.tolerance, self.std_floor**2, outlier_fraction=0.0),
+            levels=self.levels, children=self.children, gaussians_per_mask=self.gaussians_per_mask,
+            initialization=self.initialization, min_support=self.min_support,
+        )  # fmt: skip
+        assigned = masks if self.foreign_points is ForeignPoints.STAY else tree.masks_of(points)
+        if self.foreign_points is ForeignPoints.DROP:
+            assigned = np.where(assigned == masks, masks, np.int32(-1))
+        sizes = np.bincount(assigned[assigned >= 0], minlength=len(clusters))
+        too_small = np.append(sizes < self.min_points, False)  # False for -1
+        assigned = np.where(too_small[assigned], np.int32(-1), assigned)
+        kept, _ = grouped(assigned, len(clusters))
+        pixels = single.pixels[order]
+        return replace(clusters, points_world=points[kept], pixels=pixels[kept], cluster=assigned[kept])
+
+
+def best_of_pixels(clusters: PointClusters, shape: tuple[int, int]) -> Bool:
+    """Return (P,) which points are of the cluster with the best score at their pixel; ties: the first cluster."""
+    rank = np.empty(len(clusters), np.int32)
+    rank[np.argsort(-clusters.scores, kind="stable")] = np.arange(len(clusters), dtype=np.int32)
+    kept = np.empty(len(clusters.cluster), np.bool_)
+    keep_best_cluster(clusters.pixels, clusters.cluster, rank, np.full(shape, -1, np.int32), kept)
+    return kept
