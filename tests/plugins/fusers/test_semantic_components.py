@@ -11,6 +11,7 @@ import pytest
 from framework.baselines.semantic_map import SemanticMap
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, DataError
+from framework.mapping.instance_map import FORMAT
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
@@ -260,7 +261,7 @@ def test_mapping_goes_on_after_loading(frames: list[Frame], tmp_path: Path) -> N
 
 def test_a_map_of_instances_is_refused(tmp_path: Path) -> None:
     BayesianTsdf().scene.save(tmp_path / "map.npz")
-    with pytest.raises(DataError, match="map format 7, this version reads semantic 3"):
+    with pytest.raises(DataError, match=f"map format {FORMAT}, this version reads semantic 3"):
         SemanticMap.load(tmp_path / "map.npz")
 
 
