@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import json
 import math
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 from scipy.stats import spearmanr
 
 from framework.errors import DataError
-from framework.runs.provenance import config_hash
 from framework.tables.comparison import ComparisonTable
 from tests.support.doc_pages import CHECKOUT, LINES
+from tests.support.stored_experiments import AP50, IOU, experiment, run
 
 pytestmark = pytest.mark.integration
 
@@ -32,41 +30,6 @@ script = sys.modules["ranks_script"] = importlib.util.module_from_spec(
 )
 script.__spec__.loader.exec_module(script)
 Ranking, ranks, spearman, write_ranks = script.Ranking, script.ranks, script.spearman, script.write_ranks
-
-AP50, IOU = "instances.ap50", "instances.mean_iou"
-Figures = Mapping[str, Sequence[float | None]]  # by row, one for each seed; None = not defined
-
-
-def experiment(root: Path, figures: Figures, iou: float = 0.5, scenes: Sequence[str] = ()) -> Path:
-    """The records of a folder; with `scenes`, a figure is that of a scene, and all are of seed 0."""
-    root.mkdir(parents=True)
-    rows = {row: [f"refiner={row}"] for row in figures}
-    over = ["seed", "dataset.scene"] if scenes else ["seed"]
-    table = {"average_over": over, "columns": [AP50]}
-    (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": rows})))
-    for row, values in figures.items():
-        for k, value in enumerate(values):
-            run(root, row, 0 if scenes else k, value, iou, scenes[k] if scenes else "")
-    return root
-
-
-def run(root: Path, row: str, seed: int, value: float | None, iou: float = 0.5, scene: str = "") -> None:
-    directory = root / f"row={row},seed={seed},{scene}"
-    directory.mkdir()
-    config = {"row": row, "seed": seed, "dataset": {"scene": scene}, "refiner": {"kind": row}}
-    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
-    metrics = {
-        **{
-            AP50: value,
-            "instances.ap": value,
-            IOU: iou,
-            "pose_source": "ground_truth",
-            "choice.dataset": "d",
-            "choice.detector": "seen",
-        },
-        **{"config_hash": config_hash(config), "git_commit": "1234567890", "git_dirty": False},
-    }
-    (directory / "metrics.json").write_text(json.dumps(metrics))
 
 
 @pytest.fixture
