@@ -2,7 +2,7 @@
 
 Labels are transferred between map vertices and true surface points by nearest neighbor. Predictions are matched to true
 instances greedily in order of confidence. AP is the area under a class's precision-recall curve with all-point
-interpolation (Pascal VOC from 2010 on), averaged over the classes with a true instance. The paper has it at IoU 0.5.
+interpolation (Pascal VOC from 2010 on), averaged over the classes with a true instance.
 
 A true instance is evaluated if its class is known and it has at least `min_points` points. The others are *ignored*
 instances. A prediction without a match is ignored, neither right nor wrong, if

@@ -33,7 +33,7 @@ COCO_BY_ID = tuple(COCO[_COCO_IDS.index(k)] if k in _COCO_IDS else NO_CLASS for 
 """COCO's classes by the ids of its annotation files, 0 to 90, as in DETR and RF-DETR; unused ids are NO_CLASS."""
 
 SCENENN_TO_COCO = {name: coco for name, coco in _SECTIONS["scenenn"].items() if coco is not None}
-"""The nine SceneNN classes of the paper's evaluation, with their COCO names."""
+"""Nine SceneNN classes with their COCO names: our choice, as the paper does not name its nine."""
 
 MEANINGS: Mapping[str, str | None] = {name: coco for names in _SECTIONS.values() for name, coco in names.items()}
 """The COCO name of any name of any space, in lower case; None = no object class of COCO."""

@@ -1,4 +1,4 @@
-"""Cluster refinement by a Gaussian mixture: the paper's step, with components for the object's surroundings."""
+"""Cluster refinement by a Gaussian mixture: for each mask, with components for its surroundings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from framework.refinement.refine import keep_points
 class GmmEm(ClusterRefiner):
     """Drops the points that a Gaussian mixture of object, background and outliers assigns to the last two.
 
-    Eqs. [1] to [4] of the paper, for each mask: object components start from groups of the mask's points, background
+    Eqs. (1) to (4) for each mask: object components start from groups of the mask's points, background
     components from groups of the points in a ring around it; a uniform component takes outliers. The mask also enters
     as evidence (our choice: without it, object and background can swap): log-odds for the object fall linearly from
     `mask_log_odds` inside of the mask to as much against it in the ring. The `structure` of an earlier refiner is
@@ -34,7 +34,7 @@ class GmmEm(ClusterRefiner):
     std_floor: float = 0.01  # m, smallest standard deviation of a component along any axis
     outlier_fraction: float = 0.02  # in [0, 1), of the points, at the start
     min_posterior: float = 0.5  # in (0, 1), of the object; points at or below it are dropped
-    mask_log_odds: float = 4.0  # nats, from 0; 0 = the mask is the start only, as in the paper
+    mask_log_odds: float = 4.0  # nats, from 0; 0 = the mask is the start only
     expected_bleed: float = 0.4  # in [0, 1), distance inside of the mask where its log-odds are 0, in ring widths
     ring: Ring = field(default_factory=Ring)
 

@@ -28,7 +28,7 @@ class GmmTree(ClusterRefiner):
     """
 
     levels: int = 2  # from 1, of a tree
-    children: int = 8  # from 2, of a node: the paper's J
+    children: int = 8  # from 2, of a node; J of Eckart et al. 2016
     max_iterations: int = 8  # from 1, of EM in a node
     tolerance: float = 1e-3  # nats per point; EM ends when the mean log-likelihood increases by less
     std_floor: float = 0.01  # m, smallest standard deviation of a node along any axis

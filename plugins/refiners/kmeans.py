@@ -1,4 +1,4 @@
-"""Cluster refinement by k-means: the paper's conventional alternative to its mixture."""
+"""Cluster refinement by k-means. In the paper, k-means is the usual start of a mixture, not a refiner."""
 
 from __future__ import annotations
 

@@ -17,9 +17,9 @@ from framework.refinement.refine import keep_points
 class RankOrder(ClusterRefiner):
     """Keeps of each cluster its largest group under the rank-order distance, of equal ones the first in the image.
 
-    The paper names an "ROC algorithm" without a citation. We read it as rank-order clustering (Zhu, Wen and Sun, "A
-    Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR 2011): points belong together if they have
-    the same neighbors. The distance is the approximation of Otto, Wang and Jain ("Clustering Millions of Faces by
+    The paper names an alternative, "ROC algorithm [12]"; its reference list is not available. We read it as rank-order
+    clustering (Zhu, Wen and Sun, "A Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR 2011): points
+    belong together if they have the same neighbors. The distance is the approximation of Otto, Wang and Jain ("Clustering Millions of Faces by
     Identity", PAMI 2018), eqs. 4 and 5, with O_a(b) the rank of b among the neighbors of a, nearest first, and f_a(i)
     the neighbor with rank i:
 

@@ -1,6 +1,6 @@
 """Gaussian mixtures with a uniform outlier component, fitted to many point sets in parallel.
 
-Equation numbers are the paper's: [1] the mixture, [2] the E-step, [3, 4] the M-step. The uniform component is from
+Equations of docs/method.md: (1) the mixture, (2) the E-step, (3, 4) the M-step. The uniform component is from
 Eckart et al., "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016. scikit-learn's mixture has no uniform
 component and no evidence for single points, and is slower (tests/benchmarks/test_refiners.py).
 """

@@ -191,7 +191,7 @@ def test_published_run_times_stand_below_those_on_scenenn(sweep: Path, annotatio
     assert "- Published, the paper: DDNS 2020, article 2528954; all components on every frame of 640x480" in text
     unknown = [line for line in lines if "nobody has looked the numbers up" in line]
     assert unknown == [
-        "- Published, but nobody has looked the numbers up: Voxblox++ (Grinvald et al., RA-L 2019); Pham et al. (3DV "
+        "- Published, but nobody has looked the numbers up: Voxblox++ (Grinvald et al., RA-L 2019); Pham et al. (WACV "
         "2019); MaskFusion (Rünz et al., ISMAR 2018); Fusion++ (McCormac et al., 3DV 2018)."
     ]
 
