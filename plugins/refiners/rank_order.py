@@ -18,10 +18,10 @@ class RankOrder(ClusterRefiner):
     """Keeps of each cluster its largest group under the rank-order distance, of equal ones the first in the image.
 
     The paper names an alternative, "ROC algorithm [12]"; its reference list is not available. We read it as rank-order
-    clustering (Zhu, Wen and Sun, "A Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR 2011): points
-    belong together if they have the same neighbors. The distance is the approximation of Otto, Wang and Jain ("Clustering Millions of Faces by
-    Identity", PAMI 2018), eqs. 4 and 5, with O_a(b) the rank of b among the neighbors of a, nearest first, and f_a(i)
-    the neighbor with rank i:
+    clustering (Zhu, Wen and Sun, "A Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR 2011):
+    points belong together if they have the same neighbors. The distance is the approximation of Otto, Wang and Jain
+    ("Clustering Millions of Faces by Identity", PAMI 2018), eqs. 4 and 5, with O_a(b) the rank of b among the neighbors
+    of a, nearest first, and f_a(i) the neighbor with rank i:
 
         d(a, b) = number of i in 1 .. min(O_a(b), k) for which f_a(i) is not among the k nearest of b (or b itself),
         D(a, b) = (d(a, b) + d(b, a)) / min(O_a(b), O_b(a)).
