@@ -6,7 +6,7 @@ the inside and the outside.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -87,8 +87,10 @@ class Surroundings:
         return np.diff(self.windows.firsts)
 
     def of_at_least(self, min_points: int) -> Bool:
-        """Return (N,) which clusters have at least `min_points` points, and as many in their ring."""
-        return np.asarray((self.mask_counts >= min_points) & (self.ring_counts >= min_points))
+        """Return (N,) which clusters have at least `min_points` points, and as many in their ring if there is one."""
+        return np.asarray(
+            (self.mask_counts >= min_points) & ((self.ring_counts >= min_points) | (self.ring_widths == 0))
+        )
 
     def sampled(self, max_points: int) -> Neighborhoods:
         """Return every n-th point of each neighborhood, n chosen to leave at most `max_points`."""
@@ -123,8 +125,8 @@ class Surroundings:
 class Ring:
     """The band around a mask, and the points of both that a refiner uses."""
 
-    ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area
-    min_ring: int = 4  # px, smallest width
+    ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area; 0 = no ring
+    min_ring: int = 4  # px, from 1, smallest width of a ring
     max_ring: int = 12  # px, largest width
     max_points: int = 1000  # from 100, of a mask and its ring for the fit; all points of the mask are judged
     min_points: int = 30  # from 10, of a mask and of its ring; smaller ones are not judged
@@ -135,20 +137,26 @@ class Ring:
             max_points=(100, 10**9), min_points=(10, 10**9),
         )  # fmt: skip
 
+    def without_ring(self) -> Ring:
+        return replace(self, ring_fraction=0.0)
+
 
 def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundings:
     """Return the N clusters of one frame with their rings.
 
     A ring contains the pixels with a depth reading, outside of the cluster, within `ring_fraction` * sqrt(points in the
-    cluster) px of it, bounded to [`min_ring`, `max_ring`] px. It may contain pixels of other clusters. Pixels of known
-    structure count as pixels without a reading: they need no separation from the object.
+    cluster) px of it, bounded to [`min_ring`, `max_ring`] px; with `ring_fraction=0` it is empty. It may contain pixels
+    of other clusters. Pixels of known structure count as pixels without a reading: they need no separation from the
+    object.
     """
     order, firsts = members(clusters)
     pixels, areas = clusters.pixels[order], np.diff(firsts)
     readings = frame.depth if clusters.structure is None else np.where(clusters.structure, np.float32(0), frame.depth)
     widths = np.clip(np.rint(ring.ring_fraction * np.sqrt(areas)), ring.min_ring, ring.max_ring).astype(np.int64)
+    if ring.ring_fraction == 0:
+        widths[:] = 0
     bounds = np.zeros((len(clusters), 4), np.int64)
-    bound(pixels, firsts, widths, *frame.camera.shape, bounds)
+    bound(pixels, firsts, np.maximum(widths, 1), *frame.camera.shape, bounds)  # the mask's border needs a neighbor
     cells = np.concatenate([[0], np.cumsum((bounds[:, 2] - bounds[:, 0]) * (bounds[:, 3] - bounds[:, 1]))])
     windows, steps = Windows(pixels, firsts, bounds, cells), np.empty(cells[-1], np.int16)
     ring_counts, radii = np.zeros(len(widths), np.int64), np.zeros(len(widths), np.float32)

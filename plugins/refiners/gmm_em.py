@@ -25,10 +25,12 @@ class GmmEm(ClusterRefiner):
     as evidence (our choice: without it, object and background can swap): log-odds for the object fall linearly from
     `mask_log_odds` inside of the mask to as much against it in the ring. The `structure` of an earlier refiner is
     neither border nor ring. Clusters with fewer than `min_points` points in the mask or the ring stay unchanged.
+    Without background components, only the outliers compete with the object.
     """
 
     object_components: int = 3  # from 1; the visible faces of an object, which one Gaussian covers badly
-    background_components: int = 6  # from 1; occluders, supporting surface, neighbors, walls
+    background_components: int = 6  # from 0; occluders, supporting surface, neighbors, walls; 0 = no ring either
+    start_iterations: int = 5  # from 1, of k-means at the start; 1 = groups of equal size by depth alone
     max_iterations: int = 8  # from 1
     tolerance: float = 1e-3  # nats per point; EM ends when the mean log-likelihood increases by less
     std_floor: float = 0.01  # m, smallest standard deviation of a component along any axis
@@ -40,16 +42,18 @@ class GmmEm(ClusterRefiner):
 
     def __post_init__(self) -> None:
         check_bounds(
-            self, object_components=(1, 64), background_components=(1, 64), max_iterations=(1, 1000),
-            tolerance=(0.0, np.inf), std_floor=(1e-4, 1.0), outlier_fraction=(0.0, 0.99),
+            self, object_components=(1, 64), background_components=(0, 64), start_iterations=(1, 1000),
+            max_iterations=(1, 1000), tolerance=(0.0, np.inf), std_floor=(1e-4, 1.0), outlier_fraction=(0.0, 0.99),
             min_posterior=(1e-6, 1 - 1e-6), mask_log_odds=(0.0, 20.0), expected_bleed=(0.0, 0.99),
         )  # fmt: skip
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        around = surroundings(clusters, frame, self.ring)
+        around = surroundings(clusters, frame, self.ring if self.background_components else self.ring.without_ring())
         sample = around.sampled(self.ring.max_points)
         log_odds = sample.mask_log_odds(self.mask_log_odds, self.expected_bleed)
-        labels = start_labels(sample, log_odds, self.object_components, self.background_components)
+        labels = start_labels(
+            sample, log_odds, self.object_components, self.background_components, self.start_iterations
+        )
         mixtures = mixture.fit(
             sample.points_camera, sample.starts, labels, self.object_components + self.background_components,
             EmSettings(self.max_iterations, self.tolerance, self.std_floor**2, self.outlier_fraction),

@@ -24,15 +24,15 @@ class KMeans(ClusterRefiner):
     """
 
     object_centers: int = 5  # from 1
-    background_centers: int = 5  # from 1
+    background_centers: int = 5  # from 0; 0 = no ring either: every point stays
     max_iterations: int = 20  # from 1; it ends earlier if no label changes
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:
-        check_bounds(self, object_centers=(1, 64), background_centers=(1, 64), max_iterations=(1, 1000))
+        check_bounds(self, object_centers=(1, 64), background_centers=(0, 64), max_iterations=(1, 1000))
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        around = surroundings(clusters, frame, self.ring)
+        around = surroundings(clusters, frame, self.ring if self.background_centers else self.ring.without_ring())
         sample = around.sampled(self.ring.max_points)
         start = start_centers(sample, self.object_centers, self.background_centers)
         _, centers = cluster(sample.points_camera, sample.starts, start, self.max_iterations)

@@ -48,15 +48,18 @@ def start_centers(around: Neighborhoods, object_centers: int, background_centers
     return np.concatenate([objects, background], axis=1)
 
 
-def start_labels(around: Neighborhoods, log_odds: Float32, object_components: int, background_components: int) -> Int32:
+def start_labels(
+    around: Neighborhoods, log_odds: Float32, object_components: int, background_components: int, iterations: int
+) -> Int32:
     """Return (S,) the start component of each point for EM: the object's come first, then the background's.
 
-    Lloyd's iterations group the mask's points with `log_odds` (S,) from 0, and the ring's points. The mask's other
-    points start in the nearest group of the ring.
+    Up to `iterations` of Lloyd's algorithm group the mask's points with `log_odds` (S,) from 0, and the ring's points,
+    from groups of equal size by depth. The mask's other points start in the nearest group of the ring; without
+    background components they start in the object.
     """
     labels = np.empty(len(around.points_camera), np.int32)
     start_all(
         around.points_camera, log_odds, around.starts, around.mask_counts, object_components, background_components,
-        labels,
+        iterations, labels,
     )  # fmt: skip
     return labels

@@ -7,8 +7,6 @@ from numba import njit, prange
 
 from framework.data import Bool, Float32, Float64, Int32, Int64
 
-START_ITERATIONS = 5  # of Lloyd's algorithm, which need not converge for a start
-
 
 @njit(cache=True, nogil=True, parallel=True)
 def lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: int, labels: Int32) -> None:
@@ -112,31 +110,39 @@ def _by_depth(points: Float32) -> Int64:
 @njit(cache=True, nogil=True, parallel=True)
 def start_all(
     points: Float32, log_odds: Float32, starts: Int64, mask_counts: Int64, object_components: int,
-    background_components: int, labels: Int32,
+    background_components: int, iterations: int, labels: Int32,
 ) -> None:  # fmt: skip
     for k in prange(len(starts) - 1):
         own = slice(starts[k], starts[k + 1])
-        _start_one(points[own], log_odds[own], mask_counts[k], object_components, background_components, labels[own])
+        _start_one(
+            points[own],
+            log_odds[own],
+            mask_counts[k],
+            object_components,
+            background_components,
+            iterations,
+            labels[own],
+        )
 
 
 @njit(cache=True, nogil=True)
 def _start_one(
     points: Float32, log_odds: Float32, mask_count: int, object_components: int, background_components: int,
-    labels: Int32,
+    iterations: int, labels: Int32,
 ) -> None:  # fmt: skip
     of_ring, in_core = np.empty(len(points), np.bool_), np.empty(len(points), np.bool_)
     for i in range(len(points)):
         of_ring[i] = i >= mask_count
-        in_core[i] = i < mask_count and log_odds[i] >= 0
-    _group(points, in_core, object_components, 0, labels)
-    centers = _group(points, of_ring, background_components, object_components, labels)
+        in_core[i] = i < mask_count and (log_odds[i] >= 0 or background_components == 0)
+    _group(points, in_core, object_components, 0, iterations, labels)
+    centers = _group(points, of_ring, background_components, object_components, iterations, labels)
     for i in range(mask_count):
         if not in_core[i]:
             labels[i] = object_components + nearest(points[i], centers)
 
 
 @njit(cache=True, nogil=True)
-def _group(points: Float32, chosen: Bool, groups: int, first_label: int, labels: Int32) -> Float64:
+def _group(points: Float32, chosen: Bool, groups: int, first_label: int, iterations: int, labels: Int32) -> Float64:
     """Set the labels of the chosen points; return their groups' centers."""
     own, own_labels, count = np.empty_like(points), np.empty(len(points), np.int32), 0
     for i in range(len(points)):
@@ -145,7 +151,7 @@ def _group(points: Float32, chosen: Bool, groups: int, first_label: int, labels:
             own_labels[count] = -1
             count += 1
     centers: Float64 = depth_groups_of(own[:count], groups)
-    lloyd(own[:count], centers, START_ITERATIONS, own_labels[:count])
+    lloyd(own[:count], centers, iterations, own_labels[:count])
     count = 0
     for i in range(len(points)):
         if chosen[i]:

@@ -113,6 +113,17 @@ def test_depth_in_mask_is_the_chamfer_distance():
             assert around.mask_radii[k] == found.max(initial=0)
 
 
+def test_without_ring_only_the_mask_has_points():
+    masks, frame = random_scene(0)
+    clusters = clusters_of(masks, frame)
+    around = neighborhoods(clusters, frame, ring_fraction=0.0, min_ring=6, max_ring=8)
+    with_ring = neighborhoods(clusters, frame, ring_fraction=0.25, min_ring=6, max_ring=8)
+    assert not around.of_ring.any()
+    assert not around.ring_widths.any()
+    np.testing.assert_array_equal(around.points_camera, with_ring.points_camera[~with_ring.of_ring])
+    np.testing.assert_array_equal(around.depth_in_mask, with_ring.depth_in_mask[~with_ring.of_ring])
+
+
 def test_points_are_those_of_back_project_and_rings_those_of_a_distance_transform():
     for seed in range(5):
         masks, frame = random_scene(seed)

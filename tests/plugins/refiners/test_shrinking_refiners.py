@@ -10,11 +10,13 @@ import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError
-from framework.geometry import exp_se3
+from framework.geometry import back_project, exp_se3
 from framework.interfaces import ClusterRefiner
 from framework.refinement.lifting import lift
+from framework.refinement.neighborhood import Ring
 from plugins.refiners.connected import Connected
 from plugins.refiners.gmm_em import GmmEm
+from plugins.refiners.gmm_tree import GmmTree
 from plugins.refiners.identity import Identity
 from plugins.refiners.kmeans import KMeans
 from plugins.refiners.largest_component import LargestComponent
@@ -239,10 +241,64 @@ def test_largest_component_is_that_of_all_pairs(reach, density):
         (GmmEm, {"object_components": 0}, "GmmEm.object_components must be in"),
         (GmmEm, {"std_floor": float("nan")}, "std_floor .* found nan"),
         (GmmEm, {"min_posterior": 1.0}, "min_posterior"),
-        (KMeans, {"background_centers": 0}, "KMeans.background_centers"),
+        (KMeans, {"background_centers": -1}, "KMeans.background_centers"),
         (LargestComponent, {"connection_radius": 0}, "LargestComponent.connection_radius"),
     ],
 )
 def test_parameters_are_checked(make, parameters, message):
     with pytest.raises(ConfigError, match=message):
         make(**parameters)
+
+
+def slow_posterior(points: np.ndarray, iterations: int, std_floor: float, outliers: float) -> np.ndarray:
+    """Return (P,) the posterior of one Gaussian against a uniform density after float64 EM from all points."""
+    x = points.astype(np.float64)
+    density = 1 / np.prod(np.maximum(x.max(axis=0) - x.min(axis=0), 4 * std_floor))
+    weight, responsibilities, uniform = 0.0, np.full(len(x), 1 - outliers), outliers
+    for k in range(iterations + 1):
+        total = responsibilities.sum()
+        weight, mean = total / len(x), responsibilities @ x / total
+        values, vectors = np.linalg.eigh((x - mean).T * responsibilities @ (x - mean) / total)
+        values = np.maximum(values, std_floor**2)
+        squares = ((x - mean) @ vectors) ** 2 @ (1 / values)
+        own = weight * np.exp(-0.5 * squares) / np.sqrt((2 * np.pi) ** 3 * values.prod())
+        responsibilities = own / (own + uniform * density)
+        if k < iterations:
+            uniform = 1 - responsibilities.mean()
+    return responsibilities
+
+
+def test_gmm_em_without_ring_and_background_agrees_with_slow_reference():
+    depth, ids = room()
+    frame = frame_of(depth)
+    before = lifted(bleeding(ids == 1, 8)[None], frame)
+    refiner = GmmEm(
+        object_components=1, background_components=0, tolerance=0.0, outlier_fraction=0.1, mask_log_odds=0.0,
+        ring=Ring(max_points=10**6),
+    )  # fmt: skip
+    after = refiner.refine(before, frame)
+    cv, cu = before.pixels[:, 1], before.pixels[:, 0]
+    points = back_project(CAMERA, before.pixels, depth[cv, cu])
+    posterior = slow_posterior(points, refiner.max_iterations, refiner.std_floor, 0.1)
+    kept = np.zeros(depth.shape, bool)
+    kept[after.pixels[:, 1], after.pixels[:, 0]] = True
+    clear = np.abs(posterior - 0.5) > 1e-3
+    np.testing.assert_array_equal(kept[cv, cu][clear], posterior[clear] > 0.5)
+    assert 0 < len(after.pixels) < len(before.pixels)
+
+
+@pytest.mark.parametrize(
+    "refiner",
+    [
+        GmmEm(background_components=0, outlier_fraction=0.0),
+        KMeans(background_centers=0),
+        GmmEm(outlier_fraction=0.0, ring=Ring(ring_fraction=0.0)),
+        GmmTree(ring=Ring(ring_fraction=0.0)),
+        KMeans(ring=Ring(ring_fraction=0.0)),
+    ],
+)
+def test_all_points_stay_without_a_competitor(refiner):
+    depth, ids = room()
+    frame = frame_of(depth)
+    before = lifted(bleeding(ids == 1, 8)[None], frame)
+    assert len(refiner.refine(before, frame).pixels) == len(before.pixels)

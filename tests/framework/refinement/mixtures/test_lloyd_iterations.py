@@ -10,7 +10,6 @@ from sklearn.cluster import KMeans
 
 from framework.refinement.mixtures import lloyd_iterations
 from framework.refinement.mixtures.lloyd_iterations import start_labels
-from framework.refinement.mixtures.lloyd_iterations_kernels import START_ITERATIONS
 from framework.refinement.neighborhood import Neighborhoods
 
 
@@ -71,12 +70,12 @@ def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:
     return sets, log_odds
 
 
-def groups_of(points: np.ndarray, groups: int) -> tuple[np.ndarray, np.ndarray]:
+def groups_of(points: np.ndarray, groups: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
     """Labels and centers of Lloyd's algorithm from the means of equal parts by depth."""
     by_depth = points[np.argsort(points[:, 2], kind="stable")]
     cuts = np.arange(groups + 1) * len(points) // groups
     centers = np.array([by_depth[a:b].mean(axis=0) for a, b in pairwise(cuts)])
-    for _ in range(START_ITERATIONS):
+    for _ in range(iterations):
         labels = nearest(points, centers)
         centers = np.array([points[labels == j].mean(axis=0) for j in range(groups)])
     return labels, centers
@@ -87,16 +86,17 @@ def nearest(points: np.ndarray, centers: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.integration
-def test_core_and_ring_are_cut_by_place_and_the_border_starts_in_the_ring():
+@pytest.mark.parametrize("iterations", [1, 5])
+def test_core_and_ring_are_cut_by_place_and_the_border_starts_in_the_ring(iterations):
     sets, log_odds = around([(400, 300), (150, 600)])
-    labels = start_labels(sets, log_odds, 2, 5)
+    labels = start_labels(sets, log_odds, 2, 5, iterations)
     for k in range(2):
         own = slice(sets.starts[k], sets.starts[k + 1])
         points, found = sets.points_camera[own].astype(np.float64), labels[own]
         ring = sets.of_ring[own]
         core = ~ring & (log_odds[own] >= 0)
-        np.testing.assert_array_equal(found[core], groups_of(points[core], 2)[0])
-        background, centers = groups_of(points[ring], 5)
+        np.testing.assert_array_equal(found[core], groups_of(points[core], 2, iterations)[0])
+        background, centers = groups_of(points[ring], 5, iterations)
         np.testing.assert_array_equal(found[ring], 2 + background)
         border = ~ring & ~core
         assert border.any()
@@ -106,6 +106,15 @@ def test_core_and_ring_are_cut_by_place_and_the_border_starts_in_the_ring():
 @pytest.mark.integration
 def test_sets_without_mask_ring_or_anything():
     sets, log_odds = around([(0, 50), (50, 0), (0, 0), (1, 1)])
-    labels = start_labels(sets, log_odds, 2, 6)
+    labels = start_labels(sets, log_odds, 2, 6, 5)
     assert ((labels >= 0) & (labels < 8)).all()
     assert (labels[:50] >= 2).all()
+
+
+def test_without_background_components_every_point_of_a_mask_starts_in_the_object():
+    sets, log_odds = around([(400, 0), (150, 0)])
+    labels = start_labels(sets, log_odds, 3, 0, 5)
+    for k in range(2):
+        own = slice(sets.starts[k], sets.starts[k + 1])
+        points = sets.points_camera[own].astype(np.float64)
+        np.testing.assert_array_equal(labels[own], groups_of(points, 3, 5)[0])
