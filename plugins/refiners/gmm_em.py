@@ -20,12 +20,12 @@ from framework.refinement.refine import keep_points
 class GmmEm(ClusterRefiner):
     """Drops the points that a Gaussian mixture of object, background and outliers assigns to the last two.
 
-    Eqs. (1) to (4) for each mask: object components start from groups of the mask's points, background
-    components from groups of the points in a ring around it; a uniform component takes outliers. The mask also enters
-    as evidence (our choice: without it, object and background can swap): log-odds for the object fall linearly from
-    `mask_log_odds` inside of the mask to as much against it in the ring. The `structure` of an earlier refiner is
-    neither border nor ring. Clusters with fewer than `min_points` points in the mask or the ring stay unchanged.
-    Without background components, only the outliers compete with the object.
+    Eqs. (1) to (4) for each mask: object components start from groups of the mask's points, background components from
+    groups of the points in a ring around it; a uniform component can take outliers. The mask also enters as evidence
+    (our choice: without it, object and background can swap): log-odds for the object fall linearly from `mask_log_odds`
+    inside of the mask to as much against it in the ring. The `structure` of an earlier refiner is neither border nor
+    ring. Clusters with fewer than `min_points` points in the mask or the ring stay unchanged. Without background
+    components, only outliers compete with the object.
     """
 
     object_components: int = 3  # from 1; the visible faces of an object, which one Gaussian covers badly
@@ -34,7 +34,7 @@ class GmmEm(ClusterRefiner):
     max_iterations: int = 8  # from 1
     tolerance: float = 1e-3  # nats per point; EM ends when the mean log-likelihood increases by less
     std_floor: float = 0.01  # m, smallest standard deviation of a component along any axis
-    outlier_fraction: float = 0.02  # in [0, 1), of the points, at the start
+    outlier_fraction: float = 0.0  # in [0, 1), of the points, at the start; 0 = no uniform component
     min_posterior: float = 0.5  # in (0, 1), of the object; points at or below it are dropped
     mask_log_odds: float = 4.0  # nats, from 0; 0 = the mask is the start only
     expected_bleed: float = 0.4  # in [0, 1), distance inside of the mask where its log-odds are 0, in ring widths

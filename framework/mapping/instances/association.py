@@ -25,7 +25,7 @@ from framework.errors import DataError
 from framework.mapping.instances.association_kernels import count_votes, find_seen
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
-from framework.mapping.labels.pixel_lists import PixelLists, find_duplicates, list_points_by_pixel
+from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
 VOTES_ACROSS = 320  # pixels of an image row that vote; more take time without a benefit
@@ -192,14 +192,13 @@ class Association:
     )
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one
     create_points: int = 50  # pixels, >= 1: and this many; overlaps with less of an instance are counted over this many
-    duplicate_overlap: float = 0.6  # in [0, 1]: a cluster that shares this with a better one creates nothing
     split_instances: bool = (
         True  # whether two clusters on one instance split it: the better one keeps it, the other is new
     )
     match_hidden: bool = (
         True  # whether an unmatched cluster may match a second most likely instance; SURFACE_LOOKUP only
     )
-    merge_overlap: float = 0.5  # in [0, 1]: two instances under one cluster above this are one object ...
+    merge_overlap: float = 1.0  # in [0, 1]: two instances under one cluster above this are one object; 1 = off ...
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart ...
     merge_agreement: float = 0.1  # in [0, 1]: ... and if their classes agree so much (as in class_gate); so must those
     # of a cluster and of an instance that another one hides
@@ -211,7 +210,6 @@ class Association:
             min_class_agreement=(0.0, 1.0),
             create_score=(0.0, 1.0),
             create_points=(1, 2**31),
-            duplicate_overlap=(0.0, 1.0),
             merge_overlap=(0.0, 1.0),
             merge_frames=(1, 2**31),
             merge_agreement=(0.0, 1.0),
@@ -248,8 +246,6 @@ class Association:
         )
         if not self.split_instances:
             may_create &= ~allowed.any(axis=1)
-        if may_create.any():
-            may_create &= ~find_duplicates(points, clusters.scores, self.duplicate_overlap)
         if overlaps.hidden is not None and may_create.any():
             hidden = count_overlaps(points, overlaps.hidden, overlaps.stride)
             self._find_hidden(table, hidden, clusters, may_create, instance_ids)

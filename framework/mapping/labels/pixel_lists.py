@@ -18,11 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.data import Bool, Float32, Int32, PointClusters
+from framework.data import Bool, Int32, PointClusters
 from framework.geometry import require_pixels_inside
 from framework.mapping.labels.pixel_lists_kernels import (
     CHUNKS,
-    count_shared,
     keep_smallest,
     link_points,
     lists_without,
@@ -69,21 +68,6 @@ def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> Pix
     listed = np.empty(offsets[-1], np.int32)
     write_lists(tree.head, tree.parent, offsets, listed)
     return PixelLists(list_ids, pixel_counts, offsets, listed, len(clusters))
-
-
-def find_duplicates(points: PixelLists, scores: Float32, threshold: float) -> Bool:
-    """Return (N,) whether a cluster shares more than `threshold` of the smaller one's pixels with one of better score.
-
-    It is most likely the same object detected twice, and must not create an instance.
-    """
-    n = points.cluster_count
-    shared = np.zeros((n, n), np.int32)
-    count_shared(points.pixel_counts, points.offsets, points.clusters, shared)
-    sizes = shared.diagonal()
-    over_smaller = shared / np.maximum(np.minimum(sizes[:, None], sizes[None, :]), 1)
-    rank = np.lexsort((np.arange(n), -scores)).argsort()
-    better = rank[None, :] < rank[:, None]
-    return np.asarray((better & (over_smaller > threshold)).any(axis=1))
 
 
 def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> PixelLists:

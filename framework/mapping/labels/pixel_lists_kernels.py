@@ -74,15 +74,6 @@ def write_lists(head, parent, offsets, clusters):
 
 
 @njit(cache=True, nogil=True)
-def count_shared(pixel_counts, offsets, clusters, shared):
-    """Add to shared (N, N) the pixels that each two clusters have in common, with their sizes on the diagonal."""
-    for i in range(pixel_counts.shape[0]):
-        for a in range(offsets[i], offsets[i + 1]):
-            for b in range(offsets[i], offsets[i + 1]):
-                shared[clusters[a], clusters[b]] += pixel_counts[i]
-
-
-@njit(cache=True, nogil=True)
 def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kept_offsets, kept):
     """Fill kept_offsets (L + 1,) and the first kept_offsets[L] entries of `kept`, which has the length of clusters."""
     sizes = np.zeros(instance_ids.shape[0], np.float64)

@@ -248,7 +248,7 @@ def test_each_sphere_is_one_instance_on_its_surface(mapped: Open3DMap) -> None:
 
 
 def test_merging_moves_every_voxel(frames: list[Frame]) -> None:
-    fuser = new_fuser(merge_frames=1)
+    fuser = new_fuser(merge_overlap=0.5, merge_frames=1)
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
     left = whole & (np.arange(CAMERA.width) < (u[0] + u[-1]) // 2)

@@ -19,7 +19,6 @@ from framework.mapping.instances.association import (
 )
 from framework.mapping.labels.pixel_lists import (
     PixelLists,
-    find_duplicates,
     keep_on_top,
     list_points_by_pixel,
     remove_supports,
@@ -94,7 +93,6 @@ def test_nothing_seen_and_nothing_detected() -> None:
     )
     assert overlaps_of(empty, seen).votes.shape == (0, 0)
     assert len(best_first(overlaps_of(empty, seen + 1).over_smaller(min_pixels=1), 0.3)) == 0
-    assert len(find_duplicates(list_points_by_pixel(empty, SHAPE), empty.scores, 0.5)) == 0
 
 
 def test_every_second_pixel_stands_for_four() -> None:
@@ -152,11 +150,6 @@ def test_the_order_of_detections_does_not_matter(seed: int) -> None:
     assert (best_first(overlap, 0.4)[order] == best_first(overlap[order], 0.4)).all()
 
 
-def test_a_second_detection_of_an_object_is_told_by_its_overlap() -> None:
-    clusters = clusters_of([columns(0, 3), columns(0, 2), columns(3, 5)], [0.5, 0.9, 0.4])
-    assert find_duplicates(list_points_by_pixel(clusters, SHAPE), clusters.scores, 0.6).tolist() == [True, False, False]
-
-
 @pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
 def test_a_pixel_outside_the_image_is_refused(pixel: tuple[int, int]) -> None:
     clusters = clusters_of([columns(0, 2)], [1])
@@ -174,9 +167,6 @@ def test_points_of_no_cluster_have_no_say() -> None:
     assert overlaps.votes.tolist() == [[8], [8]]
     points = list_points_by_pixel(clusters, SHAPE)
     assert (points.list_ids > 0).any(axis=0).tolist() == [True, False, True, True, False]
-    # 4 of the 8 pixels of each are shared: columns 0, 2 against 2, 3
-    assert find_duplicates(points, clusters.scores, 0.49).tolist() == [False, True]
-    assert find_duplicates(points, clusters.scores, 0.5).tolist() == [False, False]
 
 
 def clusters_at(points: PixelLists) -> list[list[int]]:
