@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import numpy as np
 import pytest
 
@@ -22,6 +23,8 @@ from framework.config import composition  # noqa: E402
 from tests.support.scenes.corner_room import CornerRoom  # noqa: E402
 
 os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # no test downloads 180 MB because the machine could
+hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)  # a busy machine fails no test
+hypothesis.settings.load_profile("tests")
 CHECKOUT = Path(__file__).resolve().parent.parent
 
 # who starts the tests in the background has them, and all that they start, ignore Ctrl-C; nohup, a closed terminal
