@@ -1,20 +1,28 @@
-"""Whether two folders of run records hold the same results, byte for byte, for changes that must not change any.
+"""Compare the results of two folders of run directories, byte for byte, for changes that must not change any result.
 
-    python tests/same_results.py BEFORE AFTER
+    python -m tests.same_results BEFORE AFTER
 
-Compares the runs below both, by their place: the files of the map, of map.npz the arrays, and metrics.json but for what
-measures the machine or names the code. Prints what differs; the exit status is 1 where anything does.
+Runs are paired by their path below BEFORE and AFTER. Each pair is compared by its files, the arrays of its NPZ files,
+its metrics and its config. Metrics of the machine and of the code are left out. Old config keys are translated to their
+new names. Keys that only one of the two configs has are listed and not compared. The exit status is 1 if a run differs.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from omegaconf import OmegaConf
+
+from framework.config.renamed_keys import new_name
+from framework.runs.provenance import WITHOUT_EFFECT, leaves
 
 FILES = ("mesh.ply", "trajectory.txt", "instances.json")
+ARRAY_FILES = ("map.npz", "keyframes.npz")
 NOT_RESULTS = (
     "fps",
     "stage_ms.",
@@ -27,15 +35,37 @@ NOT_RESULTS = (
     "time.",
     "code",
 )
+RENAMED = {  # old keys that have several new names in framework/config/renamed_keys.py
+    "refiner.links.plane_removal.min_share": "refiner.links.plane_removal.min_frame_fraction",
+    "refiner.links.connected.min_share": "refiner.links.connected.min_piece_ratio",
+}
 
 
 def results(directory: Path) -> dict[str, object]:
-    """What a run found, by name of the file or key of metrics.json."""
+    """Return the results of a run by file, array or metric."""
     found: dict[str, object] = {name: (directory / name).read_bytes() for name in FILES if (directory / name).exists()}
-    with np.load(directory / "map.npz") as arrays:
-        found |= {f"map.npz: {name}": arrays[name].tobytes() for name in arrays.files}
+    for name in ARRAY_FILES:
+        if (directory / name).exists():
+            with np.load(directory / name) as arrays:
+                found |= {
+                    f"{name}: {key}": (str(arrays[key].dtype), arrays[key].shape, arrays[key].tobytes())
+                    for key in arrays.files
+                }
     metrics = json.loads((directory / "metrics.json").read_text())
     return found | {key: value for key, value in metrics.items() if not key.startswith(NOT_RESULTS)}
+
+
+def settings(directory: Path, names: Collection[str] = ()) -> dict[str, object]:
+    """Return the values of a run's config by dotted key; keys that are not in `names` get their new name."""
+    config: Any = OmegaConf.to_container(OmegaConf.load(directory / "config.yaml"))
+    named = {key if key in names else translated(key): value for key, value in leaves(config)}
+    return {key: value for key, value in named.items() if key.partition(".")[0] not in WITHOUT_EFFECT}
+
+
+def translated(key: str) -> str:
+    """Return the new name of a config key, or the key itself if it was not renamed."""
+    group, dot, name = key.rpartition(".")
+    return RENAMED.get(key) or group + dot + (new_name(key) or name).rpartition(".")[2]
 
 
 def main() -> None:
@@ -44,14 +74,21 @@ def main() -> None:
     differing = 0
     for run in runs:
         if not (after / run / "metrics.json").exists():
-            print(f"{run}: not there after")
+            print(f"{run}: missing in {after}")
             differing += 1
             continue
         old, new = results(before / run), results(after / run)
+        print(f"{run}: {len(old.keys() | new.keys())} files, arrays and metrics")
+        new_settings = settings(after / run)
+        old_settings = settings(before / run, new_settings)
+        if one_sided := sorted(old_settings.keys() ^ new_settings.keys()):
+            print(f"{run}: not compared, only in one config: {', '.join(one_sided)}")
+        for key in old_settings.keys() & new_settings.keys():
+            old[f"config.yaml: {key}"], new[f"config.yaml: {key}"] = old_settings[key], new_settings[key]
         changed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key)]
         for key in changed:
             values = [found.get(key) for found in (old, new)]
-            shown = ["bytes" if isinstance(value, bytes) else repr(value) for value in values]
+            shown = ["bytes" if isinstance(value, (bytes, tuple)) else repr(value) for value in values]
             print(f"{run}: {key}: {shown[0]} -> {shown[1]}")
         differing += bool(changed)
     print(f"{len(runs) - differing} of {len(runs)} runs are the same")
