@@ -7,9 +7,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
 
 from framework.baselines.class_evidence import ClassEvidence, ClassRows
-from framework.baselines.semantic_map_kernels import connect_vertices, label_classes, label_view, sum_components
+from framework.baselines.semantic_map_kernels import (
+    connect_vertices,
+    label_classes,
+    label_view,
+    smooth_classes,
+    sum_components,
+)
 from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.interfaces import Gravity, MapStatistics, SceneMap
 from framework.mapping.instances.association import agreed_classes
@@ -19,8 +26,17 @@ from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 
-MISSED, AREA = (1e-6, 1.0), (0.0, 1000.0)  # bounds of the parameters; AREA in m^2
-FORMAT = "semantic 3"  # of the map file; increment it when the meaning of the contents changes
+MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the parameters; AREA in m^2
+SWEEPS = 20  # of the regularization, at most
+FORMAT = "semantic 4"  # of the map file; increment it when the meaning of the contents changes
+
+
+class Elections(NamedTuple):
+    """How classes and instances follow from the evidence."""
+
+    missed: float  # P(no mask | a surface of any class) over that of the background
+    min_area: float  # m^2, of an instance
+    smoothness: float  # log-odds for each neighboring vertex of the same class
 
 
 class ComponentStatistics(NamedTuple):
@@ -35,15 +51,13 @@ class ComponentStatistics(NamedTuple):
 class SemanticMap(SceneMap):
     """A TSDF whose voxels store a distribution over the classes and the background.
 
-    `missed` is the probability that a surface of any class is under no mask in a frame that sees it. Instance ids hold
-    for the current mesh only: after more frames, an object may have another id.
+    Instance ids hold for the current mesh only: after more frames, an object may have another id.
     """
 
-    def __init__(self, volume: TsdfVolume, missed: float, min_area: float) -> None:
+    def __init__(self, volume: TsdfVolume, elections: Elections) -> None:
         self.classes: tuple[str, ...] = ()
         self.volume = volume
-        self.missed = missed
-        self.min_area = min_area
+        self.elections = elections
         self.labels = ClassRows(volume.voxels)
 
     def begin(self, classes: tuple[str, ...]) -> None:
@@ -66,7 +80,7 @@ class SemanticMap(SceneMap):
 
     @property
     def _log_missed(self) -> np.float32:
-        return np.float32(np.log(self.missed))
+        return np.float32(np.log(self.elections.missed))
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """Return surface and classes; voxels know no instances."""
@@ -86,10 +100,27 @@ class SemanticMap(SceneMap):
         """Return the surface with instances and classes, elected as in an InstanceMap."""
         colors, class_ids = np.empty((len(surface.voxels), 3), np.uint8), np.empty(len(surface.voxels), np.int32)
         label_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface, colors, class_ids)
-        min_vertices = vertices_of_area(self.min_area, self.volume.voxel_size)
+        if self.elections.smoothness > 0:
+            self._smooth(surface, class_ids)
+        min_vertices = vertices_of_area(self.elections.min_area, self.volume.voxel_size)
         instance_ids = connected_components(surface.triangles, class_ids, min_vertices)
         class_ids[instance_ids == 0] = -1
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
+
+    def _smooth(self, surface: UnlabeledMesh, class_ids: Int32) -> None:
+        """Regularize the classes (V,) in place: a Potts model over the edges of the mesh.
+
+        The unary term is the class evidence of the voxel nearest to the vertex. Iterated conditional modes (Besag 1986)
+        minimize the energy.
+        """
+        starts, neighbors = vertex_neighbors(surface.triangles, len(class_ids))
+        grid, evidence = self.volume.voxels.grid, self.labels.evidence
+        smoothness = np.float32(self.elections.smoothness)
+        for _ in range(SWEEPS):
+            if not smooth_classes(
+                grid, evidence, self._log_missed, surface.voxels, starts, neighbors, smoothness, class_ids
+            ):
+                break
 
     def instances(self) -> Mapping[int, Instance]:
         """Return the components of the mesh.
@@ -130,8 +161,7 @@ class SemanticMap(SceneMap):
         header, arrays = self.volume.saved()
         header |= {
             "format": FORMAT,
-            "missed": self.missed,
-            "min_area": self.min_area,
+            **self.elections._asdict(),
             "classes": self.classes,
             "evicted": self.labels.evicted,
         }
@@ -142,7 +172,8 @@ class SemanticMap(SceneMap):
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
         with faults_of(path):
             volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))
-            scene = cls(volume, header.number("missed", MISSED), header.number("min_area", AREA))
+            bounds = {"missed": MISSED, "min_area": AREA, "smoothness": SMOOTHNESS}
+            scene = cls(volume, Elections(**{name: header.number(name, limits) for name, limits in bounds.items()}))
             classes = header.classes()
             scene.begin(classes)
             scene.labels.fill(arrays, len(classes))
@@ -160,3 +191,11 @@ def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) 
     connect_vertices(triangles, class_ids, components)
     counts = np.bincount(components[class_ids >= 0], minlength=len(components)) >= min_vertices
     return np.where((class_ids >= 0) & counts[components], np.cumsum(counts)[components], 0).astype(np.int32)
+
+
+def vertex_neighbors(triangles: Int32, count: int) -> tuple[Int32, Int32]:
+    """Return the neighbors of V = `count` vertices along the edges of triangles (F, 3): starts (V + 1,) and indices."""
+    a, b = (triangles[:, sides].ravel() for sides in ([0, 1, 2], [1, 2, 0]))
+    both = np.concatenate([a, b]), np.concatenate([b, a])
+    edges = coo_array((np.ones(len(both[0]), np.bool_), both), (count, count)).tocsr()
+    return edges.indptr.astype(np.int32), edges.indices.astype(np.int32)

@@ -50,6 +50,52 @@ def label_classes(grid, evidence, log_missed, surface, colors, class_ids):
                 class_ids[v] = _elect(grid, evidence, log_missed, blocks, voxels, weights, labels)
 
 
+@device
+def _log_ratio(grid, evidence, log_missed, block, n, label):
+    """Return the log ratio of a class of a voxel to the background; -1 = the background itself."""
+    if label < 0:
+        return np.float32(0)
+    absent = log_missed * np.float32(evidence.unmasked[block, n])
+    row = grid.label_row[block]
+    if row < 0:
+        return absent
+    for s in range(evidence.class_ids.shape[2]):
+        if evidence.class_ids[row, n, s] == label:
+            return evidence.log_ratio[row, n, s] + absent
+    return evidence.rest[row, n] + absent
+
+
+@njit(cache=True, nogil=True)
+def smooth_classes(grid, evidence, log_missed, voxels, starts, neighbors, smoothness, class_ids):
+    """Give each vertex, in order, the class with the best sum of evidence and agreeing neighbors. Returns the changes.
+
+    Candidates are the background, the best class of the nearest voxel and the classes of the neighbors. The current
+    class wins ties.
+    """
+    changes = 0
+    for v in range(len(class_ids)):
+        block, n = voxels[v] // BLOCK_VOXELS, voxels[v] % BLOCK_VOXELS
+        around = neighbors[starts[v] : starts[v + 1]]
+        best, largest = class_ids[v], np.float32(-np.inf)
+        for candidate in range(-3, len(around)):
+            label = class_ids[v]
+            if candidate == -2:
+                label = np.int32(-1)
+            elif candidate == -1:
+                label = best_class(grid, evidence, log_missed, block, n)
+            elif candidate >= 0:
+                label = class_ids[around[candidate]]
+            value = _log_ratio(grid, evidence, log_missed, block, n, label)
+            for w in around:
+                if class_ids[w] == label:
+                    value += smoothness
+            if value > largest:
+                best, largest = label, value
+        changes += best != class_ids[v]
+        class_ids[v] = best
+    return changes
+
+
 @njit(cache=True, nogil=True)
 def connect_vertices(triangles, class_ids, components):
     """Fill components (V,) with the first vertex of the connected component of each vertex."""

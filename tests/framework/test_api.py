@@ -71,7 +71,7 @@ def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) 
     assert not mapper.add(room[2]).lost
 
 
-@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "open3d_vbg", "object_volumes", "semantic_components"])
+@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "open3d_vbg", "object_volumes", "class_only_fusion"])
 def test_what_a_sensor_tells_is_up_in_the_map_and_in_its_file(fuser: str, tmp_path: Path) -> None:
     """A camera over a slanted table alone, which surfaces take for level; the tracker's world is the first frame."""
     tilt = np.radians(20)
@@ -124,7 +124,7 @@ def test_several_threads_share_a_mapper(room: CornerRoom) -> None:
     np.testing.assert_array_equal(mapper.scene.mesh().vertices, alone.scene.mesh().vertices)
 
 
-@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "object_volumes", "semantic_components"])
+@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "object_volumes", "class_only_fusion"])
 def test_a_mapper_is_pickled(room: CornerRoom, fuser: str) -> None:
     mapper = Mapper(*STAGES, f"fuser={fuser}")
     mapper.add(room[0])

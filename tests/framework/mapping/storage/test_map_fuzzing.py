@@ -28,7 +28,7 @@ pytestmark = pytest.mark.integration
 
 SLOWEST = 5.0  # s of this process: others may keep the machine busy
 CAMERA = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
-KINDS = ("bayesian_tsdf", "words", "exact", "last_write", "object_volumes", "open3d_vbg", "semantic_components")
+KINDS = ("bayesian_tsdf", "words", "exact", "last_write", "object_volumes", "open3d_vbg", "class_only_fusion")
 
 
 @dataclass(frozen=True)

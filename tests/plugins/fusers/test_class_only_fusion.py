@@ -1,4 +1,4 @@
-"""The semantic rival on scenes of a few boxes and spheres, and beside the recursion written out voxel by voxel."""
+"""Class-only fusion on analytic scenes, and compared with the recursion of each voxel in float64."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.baselines.semantic_map import SemanticMap
-from framework.data import Detections, Frame, Pose
+from framework.baselines.semantic_map import SemanticMap, connected_components
+from framework.data import Detections, Frame, Int32, Pose
 from framework.errors import ConfigError, DataError
 from framework.mapping.instance_map import FORMAT
+from framework.mapping.instances.instance_list import LEAST_VERTICES
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from plugins.fusers.semantic_components import SemanticComponents
+from plugins.fusers.class_only_fusion import ClassOnlyFusion
 from tests.support.scenes import box_scene
 from tests.support.scenes.analytic_scene import CAMERA, room, walk
 from tests.support.scenes.box_scene import BoxScene, look_from
@@ -28,8 +29,8 @@ SECOND_FOUND = (1, 3, 5)  # frames
 TOUCHING = (-0.1, 0.8, 0.0, 0.4, 1.2, 0.5)  # the left box's side
 
 
-def new_fuser(**parameters: object) -> SemanticComponents:
-    return assemble(SemanticComponents, voxel_size=0.03, max_depth=4.0, **parameters)
+def new_fuser(**parameters: object) -> ClassOnlyFusion:
+    return assemble(ClassOnlyFusion, voxel_size=0.03, max_depth=4.0, **parameters)
 
 
 def mapped_boxes(boxes: list[box_scene.Box], class_ids: list[int]) -> SemanticMap:
@@ -175,7 +176,7 @@ def test_an_instances_numbers_are_those_of_its_voxels(mapped: SemanticMap) -> No
             for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
                 if label < 2:
                     log[label] = ratio
-            log[:2] += np.log(mapped.missed) * evidence.unmasked[block, n]
+            log[:2] += np.log(mapped.elections.missed) * evidence.unmasked[block, n]
             posteriors.append((np.exp(log) / np.exp(log).sum())[:2])
             counts.append(evidence.masked[row, n])
             firsts += [evidence.first_frame[row, n]] if counts[-1] else []
@@ -237,11 +238,7 @@ def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: Sema
             theirs.observations,
             theirs.last_frame,
         )
-    assert (loaded.missed, loaded.min_area, loaded.statistics.bytes) == (
-        mapped.missed,
-        mapped.min_area,
-        mapped.statistics.bytes,
-    )
+    assert (loaded.elections, loaded.statistics.bytes) == (mapped.elections, mapped.statistics.bytes)
     loaded.save(tmp_path / "again.npz")
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
 
@@ -261,7 +258,7 @@ def test_mapping_goes_on_after_loading(frames: list[Frame], tmp_path: Path) -> N
 
 def test_a_map_of_instances_is_refused(tmp_path: Path) -> None:
     BayesianTsdf().scene.save(tmp_path / "map.npz")
-    with pytest.raises(DataError, match=f"map format {FORMAT}, this version reads semantic 3"):
+    with pytest.raises(DataError, match=f"map format {FORMAT}, this version reads semantic 4"):
         SemanticMap.load(tmp_path / "map.npz")
 
 
@@ -275,6 +272,65 @@ def test_another_label_space_is_refused(frames: list[Frame]) -> None:
 
 
 def test_parameters_are_checked() -> None:
-    for wrong in ({"missed": 0.0}, {"class_floor": 1.0}, {"max_weight": 256.0}, {"voxel_size": float("nan")}):
+    for wrong in (
+        {"missed": 0.0},
+        {"class_floor": 1.0},
+        {"smoothness": -1.0},
+        {"max_weight": 256.0},
+        {"voxel_size": float("nan")},
+    ):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
-            assemble(SemanticComponents, **wrong)
+            assemble(ClassOnlyFusion, **wrong)
+
+
+def with_smoothness(mapped: SemanticMap, tmp_path: Path, smoothness: float) -> SemanticMap:
+    """Return the map with all components, however small."""
+    mapped.save(tmp_path / "map.npz")
+    scene = SemanticMap.load(tmp_path / "map.npz")
+    scene.elections = scene.elections._replace(min_area=0.0, smoothness=smoothness)
+    return scene
+
+
+def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
+    """Iterated conditional modes vertex by vertex, in float64 and with sets."""
+    surface, grid, evidence = scene.volume.surface(), scene.volume.voxels.grid, scene.labels.evidence
+    class_ids = scene.mesh().class_ids.tolist()
+    neighbors: list[set[int]] = [set() for _ in class_ids]
+    for corners in surface.triangles.tolist():
+        for one, other in itertools.permutations(corners, 2):
+            neighbors[one].add(other)
+    before = None
+    while class_ids != before:
+        before = list(class_ids)
+        for v, (block, n) in enumerate(divmod(int(voxel), 512) for voxel in surface.voxels):
+            row, absent = grid.label_row[block], np.log(scene.elections.missed) * evidence.unmasked[block, n]
+            log = [absent + (evidence.rest[row, n] if row >= 0 else 0)] * 2 + [0.0]  # two classes, background
+            for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
+                if row >= 0 and label < 2:
+                    log[label] = ratio + absent
+            values = [
+                value + smoothness * sum(class_ids[w] == c for w in neighbors[v])
+                for c, value in zip((0, 1, -1), log, strict=True)
+            ]
+            if max(values) > values[class_ids[v]] + 1e-5:
+                class_ids[v] = (0, 1, -1)[int(np.argmax(values))]
+    result = np.array(class_ids, np.int32)
+    return np.where(connected_components(surface.triangles, result, LEAST_VERTICES) > 0, result, -1)
+
+
+@pytest.mark.parametrize("smoothness", [0.5, 3.0])
+def test_smoothness_equals_iterated_conditional_modes(mapped: SemanticMap, smoothness: float, tmp_path: Path) -> None:
+    plain = with_smoothness(mapped, tmp_path, 0.0)
+    expected = slowly_smoothed(plain, smoothness)
+    smooth = with_smoothness(mapped, tmp_path, smoothness).mesh().class_ids
+    assert (smooth != expected).sum() <= 2, "float32 may break a tie differently"
+    assert (expected != plain.mesh().class_ids).sum() > 2
+
+
+def test_smoothness_shortens_borders(mapped: SemanticMap, tmp_path: Path) -> None:
+    borders = []
+    for smoothness in (0.0, 0.3, 3.0):
+        mesh = with_smoothness(mapped, tmp_path, smoothness).mesh()
+        corners = mesh.class_ids[mesh.triangles]
+        borders.append(int((corners != corners[:, :1]).any(axis=1).sum()))
+    assert borders[0] > borders[1] > borders[2]
