@@ -22,8 +22,8 @@ class ResNetShape:
     """The parameters of a residual network."""
 
     name: str = "resnet50"  # a key of DEPTHS
-    width: int = 64  # channels of the stem; 64 in the paper
-    stride_in_1x1: bool = False  # convolution of a bottleneck with the stride: True = the first (the paper, Detectron's
+    width: int = 64  # channels of the stem; 64 in He et al. 2016
+    stride_in_1x1: bool = False  # convolution of a bottleneck with the stride: True = the first (He et al., Detectron's
     # networks), False = the second (torchvision, "v1.5")
     norm_eps: float = 1e-5  # of the batch normalization
 
