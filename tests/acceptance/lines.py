@@ -16,7 +16,6 @@ from tests.acceptance.runner import CHECKOUT, Measured, line
 
 SHARED = CHECKOUT.parent / "shared" / "data"
 PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
-MOST_LINES = 49_000
 
 
 @functools.cache
