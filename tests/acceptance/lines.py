@@ -145,10 +145,3 @@ def wheel() -> Measured:
         ]
     failed = sum(status != 0 for status in statuses)
     return failed, failed == 0
-
-
-@line("<= 49,000 lines of framework/ and plugins/", "framework", "plugins")
-def line_count() -> Measured:
-    files = [path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py")]
-    count = sum(len(path.read_bytes().splitlines()) for path in files)
-    return count, count <= MOST_LINES
