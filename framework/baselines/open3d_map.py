@@ -89,8 +89,8 @@ class Open3DMap(InstanceTableMap):
         v, u = np.nonzero(frame.depth[::stride, ::stride])
         pixels = np.stack([u * stride, v * stride], axis=1).astype(np.int32)
         points_camera = back_project(frame.camera, pixels, frame.depth[pixels[:, 1], pixels[:, 0]])
-        instance_ids = np.zeros((1, *(-(-side // stride) for side in frame.depth.shape)), np.int32)
-        instance_ids[0, v, u] = self.instances_at(np.asarray(transform(T_world_camera, points_camera), np.float32))
+        instance_ids = np.zeros(tuple(-(-side // stride) for side in frame.depth.shape), np.int32)
+        instance_ids[v, u] = self.instances_at(np.asarray(transform(T_world_camera, points_camera), np.float32))
         return instance_ids
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:

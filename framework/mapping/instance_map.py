@@ -71,7 +71,7 @@ class InstanceMap(InstanceTableMap):
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """See LabeledMap."""
-        instance_ids = np.empty((2, *(-(-side // stride) for side in frame.depth.shape)), np.int32)
+        instance_ids = np.empty(tuple(-(-side // stride) for side in frame.depth.shape), np.int32)
         view = pinhole(frame.camera, T_world_camera)
         look_up_instances(self.volume.voxels.grid, self.labels.evidence, frame.depth, view, stride, instance_ids)
         return instance_ids

@@ -30,7 +30,7 @@ class GmmEm(ClusterRefiner):
 
     object_components: int = 3  # from 1; the visible faces of an object, which one Gaussian covers badly
     background_components: int = 6  # from 0; occluders, supporting surface, neighbors, walls; 0 = no ring either
-    start_iterations: int = 5  # from 1, of k-means at the start; 1 = groups of equal size by depth alone
+    start_iterations: int = 1  # from 1, of k-means at the start; 1 = groups of equal size by depth alone
     max_iterations: int = 8  # from 1
     tolerance: float = 1e-3  # nats per point; EM ends when the mean log-likelihood increases by less
     std_floor: float = 0.01  # m, smallest standard deviation of a component along any axis

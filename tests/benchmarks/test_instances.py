@@ -36,7 +36,7 @@ def test_associate_ten_masks(benchmark, mapped) -> None:
     def associate() -> None:
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = fuser.association.look_up(fuser.scene, frame, pose, points)
-        matches = fuser.association.associate(fuser.scene.table, overlaps, clusters, points, frame.index)
+        matches = fuser.association.associate(fuser.scene.table, overlaps, clusters, frame.index)
         fuser.association.merge(fuser.scene, matches)
 
     benchmark(associate)
@@ -47,7 +47,7 @@ def test_write_the_labels_of_ten_masks(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
     points = list_points_by_pixel(clusters, frame.depth.shape)
     overlaps = fuser.association.look_up(fuser.scene, frame, pose, points)
-    matches = fuser.association.associate(fuser.scene.table, overlaps, clusters, points, frame.index)
+    matches = fuser.association.associate(fuser.scene.table, overlaps, clusters, frame.index)
     seen = fuser.voxels.integrate(fuser.scene, frame, pose)
 
     def write_labels() -> None:

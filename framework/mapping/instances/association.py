@@ -3,15 +3,14 @@
 The pixels of a cluster vote for the instances of the map at their positions, which are those of the voxels at the
 measured surface, or those of the ray-cast view, as in section 3.3 of the paper. Pairs may match if their overlap is
 large enough, by default over the smaller of the two, so that a part of an object matches the whole. Matching is one to
-one, best IoU first, so that a table does not match the book on it. An unmatched cluster is compared with the second
-most likely instances of the voxels before it creates a new one.
+one, best IoU first, so that a table does not match the book on it. An unmatched cluster creates a new instance.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from itertools import combinations
 from typing import Protocol
@@ -56,7 +55,6 @@ class Overlaps:
     votes: Int32  # (N, M) pixels of both
     seen: Int32  # (h, w) the instance at every `stride`-th pixel of every `stride`-th row, 0 = none
     stride: int
-    hidden: Int32 | None = None  # (h, w) the second most likely instances; None = the map does not know them
 
     def by(self, rule: OverlapRule, min_pixels: int) -> npt.NDArray[np.float64]:
         """Return the overlaps (N, M) in [0, 1] by a rule; `min_pixels` as in `over_smaller`."""
@@ -130,7 +128,7 @@ class LabeledMap(Protocol):
     table: InstanceTable
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """Return the L most likely instances (L, ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
+        """Return the most likely instance (ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
 
         Samples every stride-th reading of every stride-th row of `frame.depth`. Unlike a ray-cast, this cannot see an
         instance behind a new object.
@@ -195,13 +193,9 @@ class Association:
     split_instances: bool = (
         True  # whether two clusters on one instance split it: the better one keeps it, the other is new
     )
-    match_hidden: bool = (
-        True  # whether an unmatched cluster may match a second most likely instance; SURFACE_LOOKUP only
-    )
     merge_overlap: float = 1.0  # in [0, 1]: two instances under one cluster above this are one object; 1 = off ...
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart ...
-    merge_agreement: float = 0.1  # in [0, 1]: ... and if their classes agree so much (as in class_gate); so must those
-    # of a cluster and of an instance that another one hides
+    merge_agreement: float = 0.1  # in [0, 1]: ... and if their classes agree so much (Bhattacharyya coefficient)
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -220,7 +214,7 @@ class Association:
         """Return the clusters over each pixel, and their matches with old and new instances of the map."""
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self.look_up(scene, frame, pose, points)
-        return points, self.associate(scene.table, overlaps, clusters, points, frame.index)
+        return points, self.associate(scene.table, overlaps, clusters, frame.index)
 
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, points: PixelLists) -> Overlaps:
         """Return the overlaps of the clusters with the instances of the map at their pixels."""
@@ -228,13 +222,9 @@ class Association:
         if self.association is InstanceSource.RAYCAST:
             view = scene.render(frame.camera, pose.T_world_camera)
             return count_overlaps(points, np.ascontiguousarray(view.instance_ids[::stride, ::stride]), stride)
-        seen, *hidden = scene.instances_seen(frame, pose.T_world_camera, stride)
-        overlaps = count_overlaps(points, seen, stride)
-        return replace(overlaps, hidden=hidden[0]) if hidden and self.match_hidden else overlaps
+        return count_overlaps(points, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
 
-    def associate(
-        self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame_index: int
-    ) -> Matches:
+    def associate(self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> Matches:
         """Match each cluster with an instance that overlaps enough, or create one if its score and size suffice."""
         frame_index = table.number_of(frame_index)
         allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
@@ -246,31 +236,9 @@ class Association:
         )
         if not self.split_instances:
             may_create &= ~allowed.any(axis=1)
-        if overlaps.hidden is not None and may_create.any():
-            hidden = count_overlaps(points, overlaps.hidden, overlaps.stride)
-            self._find_hidden(table, hidden, clusters, may_create, instance_ids)
-        for k in np.flatnonzero(may_create & (instance_ids == 0)):
+        for k in np.flatnonzero(may_create):
             instance_ids[k] = table.create(len(clusters.classes), frame_index).id
         return Matches(frame_index, clusters, overlaps, instance_ids)
-
-    def _find_hidden(
-        self, table: InstanceTable, hidden: Overlaps, clusters: PointClusters, may_create: Bool, instance_ids: Int32
-    ) -> None:
-        """Fill instance_ids (N,) with second most likely instances of clusters that would create a new one.
-
-        A keyboard on a desk that was mapped earlier is such an instance, until it has enough evidence. If each frame
-        created a new instance, none would ever get enough.
-        """
-        free = ~np.isin(hidden.instance_ids, instance_ids)
-        allowed = may_create[:, None] & free & (hidden.by(self.overlap_rule, self.create_points) > self.min_overlap)
-        if not allowed.any():
-            return
-        known = np.stack([table.class_probabilities(table.records[int(k)]) for k in hidden.instance_ids])
-        allowed &= class_agreement(clusters.class_probabilities, known) >= max(
-            self.min_class_agreement, self.merge_agreement
-        )
-        match = match_one_to_one(allowed, hidden.over_union(self.create_points))
-        instance_ids[match >= 0] = hidden.instance_ids[match[match >= 0]]
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
         """Return (N, M) whether the classes of a cluster and an instance allow a match."""

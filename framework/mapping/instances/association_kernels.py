@@ -7,7 +7,7 @@ from numba import njit, prange
 
 from framework.data import Float32, Int32
 from framework.mapping.labels.label_evidence import Evidence
-from framework.mapping.labels.label_evidence_kernels import best_instance, label_row, next_instance
+from framework.mapping.labels.label_evidence_kernels import best_instance, label_row
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 from framework.mapping.voxels.integration_parameters import Pinhole
 from framework.mapping.voxels.raycasting_kernels import voxel_seen
@@ -20,11 +20,13 @@ from framework.mapping.voxels.voxel_walk import prefetch_element
 def look_up_instances(
     grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, stride: int, instance_ids: Int32
 ) -> None:
-    """Fill instance_ids (2, ceil(H / stride), ceil(W / stride)) with the two most likely instances of the voxel nearest
-    to every stride-th reading of every stride-th row of `depth` (H, W), 0 = none. `view` holds T_world_camera.
+    """Fill instance_ids (ceil(H / stride), ceil(W / stride)) with the most likely instances of voxels; 0 = none.
+
+    The voxels are the nearest to every stride-th reading of every stride-th row of `depth` (H, W). `view` holds
+    T_world_camera.
     """
-    columns = instance_ids.shape[2]
-    for row in prange(instance_ids.shape[1]):
+    columns = instance_ids.shape[1]
+    for row in prange(instance_ids.shape[0]):
         key, region = NO_LOOK_UP
         rows, voxels = np.empty(columns, np.int32), np.empty(columns, np.int32)
         for column in range(columns):
@@ -43,8 +45,7 @@ def look_up_instances(
                 prefetch_element(evidence.instance_ids, voxel, 0)
         for column in range(columns):
             voxel = voxels[column]
-            instance_ids[0, row, column] = best_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
-            instance_ids[1, row, column] = next_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
+            instance_ids[row, column] = best_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
 
 
 @njit(cache=True, nogil=True)

@@ -50,19 +50,6 @@ def best_instance(evidence, voxel):
 
 
 @device
-def next_instance(evidence, voxel):
-    """Return the second most likely instance of a labeled voxel, 0 if the unnamed ones are more likely."""
-    best = np.int32(0)
-    best_value = np.float32(0.0)
-    for s in range(1, evidence.instance_ids.shape[1]):
-        label, value = evidence.instance_ids[voxel, s], evidence.instance_value[voxel, s]
-        if label > 0 and (value > best_value or (value == best_value and label < best)):
-            best = label
-            best_value = value
-    return best
-
-
-@device
 def best_counted_instance(evidence, voxel, counts):
     """Return the most likely instance of a labeled voxel with counts[id], 0 if the unnamed ones are more likely."""
     best = np.int32(0)

@@ -83,6 +83,6 @@ def test_a_book_stays_on_a_couch_that_is_seen_better(frames: list[Frame], on_top
         fuse_masks(fuser, frame, [couch, book] if k % 2 else [couch], [0.6, 0.5][: 1 + k % 2])
     frame = frames[0]
     assert frame.T_world_camera is not None
-    seen = fuser.scene.instances_seen(frame, frame.T_world_camera, 1)[0]
+    seen = fuser.scene.instances_seen(frame, frame.T_world_camera, 1)
     assert (np.median(seen[book]) == 2) == of_the_book
     assert (seen[book] == 2).any() == of_the_book
