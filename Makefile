@@ -9,7 +9,6 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed # its time says for which pyproject.toml the environment was made
 INSTALLED_DEV := $(VENV)/.installed-dev # likewise with what tests, linter and type checker need
 DEMO := outputs/demo
-TESTED_EXTRAS := joblib,onnx,phone,ray,ros,slurm,transformers,usd,viewer
 
 IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 
@@ -31,9 +30,10 @@ demo: $(INSTALLED) ## map a real desk, leave the record in outputs/demo
 PYTEST = $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --quiet
 
 .PHONY: check
-check: $(INSTALLED_DEV) ## lint, check types, run the unit tests
+check: $(INSTALLED_DEV) ## run linters, type checks and unit tests
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/codespell
 	$(BIN)/mypy
 	$(BIN)/python -m framework compile --all
 	$(PYTEST) -m unit
@@ -83,7 +83,7 @@ $(INSTALLED): pyproject.toml
 $(INSTALLED_DEV): $(INSTALLED)
 	@$(MAKE) --no-print-directory browser
 	@echo "installing what the tests need"
-	@$(PIP_INSTALL) --group dev --editable '.[$(TESTED_EXTRAS)]'
+	@$(PIP_INSTALL) --group dev --editable '.[all]'
 	@touch $(INSTALLED_DEV)
 
 # What is missing of: Python with venv, git (for the commit in the run records), Open3D's shared libraries.

@@ -1,20 +1,19 @@
-"""InstanceMap: a map of object instances from RGB-D video, frame by frame.
+"""InstanceMap builds object-level 3D maps from RGB-D video.
 
     from instancemap import Camera, Mapper
 
-    mapper = Mapper("fuser.voxel_size=0.02")  # what `instancemap ...` takes, with its defaults
+    mapper = Mapper("fuser.voxel_size=0.02")  # overrides, as on the command line
     camera = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
     for color, depth in video:  # uint8 (480, 640, 3) RGB; float32 (480, 640) m, 0 = no reading
-        added = mapper.add(color, depth, camera=camera)
-        if added.lost:
-            print(f"the frame is not in the map: {added.reason}")
+        result = mapper.add(color, depth, camera=camera)
+        if result.lost:
+            print(f"frame not mapped: {result.reason}")
 
     for instance in mapper.instances().values():
         print(instance.id, mapper.name(instance), instance.obb.center, "m", instance.confidence)
     mapper.save("map.npz")
 
-`Mapper("resume_from=outputs/demo")` goes on with the map of a run. What else a map does, also one that a run left
-behind:
+`Mapper("resume_from=outputs/demo")` resumes the map of a run. Stored maps answer queries:
 
     scene = load_map("outputs/demo/map.npz")
     chairs = scene.instances("chair")
@@ -22,17 +21,17 @@ behind:
     mesh = scene.mesh()  # vertices, triangles, color, instance and class of each vertex; scene.mesh(it) of one object
     view = scene.view(camera, T_world_camera)  # depth, normals, color and instances, as the camera would see them
 
-`export("outputs/demo", "glb", "usd")` writes a run for other programs; `query("outputs/demo", "a red chair").objects`
-are what these words mean, best first.
+`export("outputs/demo", "glb", "usd")` writes files for other programs. `query("outputs/demo", "a red chair").objects`
+are the objects that match the text, best first.
 
-Several threads may ask one Mapper, while it maps, too: questions wait for the frame in work.
+A Mapper is thread-safe; queries wait until the current frame is mapped.
 
 Meters, seconds, radians; camera axes x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a;
-pixel centers at integers; instance 0 = none. Every fault that is yours to mend is an InstanceMapError of one line.
+pixel centers at integers; instance 0 = none. User errors are InstanceMapErrors with a one-line message.
 
-Stages of your own are dataclasses that implement Detector, PoseTracker, ClusterRefiner or MapFuser. They go together
-as `Pipeline(detector, tracker, refiner, fuser).run(sequence)`, or are chosen by name once a YAML registers them
-(CONTRIBUTING.md says how). Plugins import only `instancemap`, and their tests `instancemap.testing`.
+Your own stages are dataclasses that implement Detector, PoseTracker, ClusterRefiner or MapFuser. Combine them with
+`Pipeline(detector, tracker, refiner, fuser).run(sequence)`, or register them with a YAML file (CONTRIBUTING.md).
+Plugins import only `instancemap`, and their tests `instancemap.testing`.
 """
 
 from importlib import import_module

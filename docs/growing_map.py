@@ -31,11 +31,12 @@ MILLISECONDS, LAST = 100, 2500  # that a picture stays, and the last one
 
 
 def only(instance_ids: Int32, shown: list[int]) -> Int32:
-    """The ids, 0 for those that are not to be shown."""
+    """Return the instance IDs, 0 for those that are not shown."""
     return np.where(np.isin(instance_ids, shown), instance_ids, 0).astype(np.int32)
 
 
 def main() -> None:
+    """Run `python docs/growing_map.py`."""
     if len(sys.argv) < 2:
         sys.exit(__doc__)
     out, config = Path(sys.argv[1]), composed(*sys.argv[2:])

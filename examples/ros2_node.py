@@ -1,6 +1,6 @@
-"""A ROS 2 node that maps what a depth camera publishes, and publishes the objects as markers.
+r"""ROS 2 node that maps the images of a depth camera and publishes the objects as markers.
 
-    python examples/ros2_node.py --ros-args -r color:=/camera/color/image_raw \\
+    python examples/ros2_node.py --ros-args -r color:=/camera/color/image_raw \
         -r depth:=/camera/aligned_depth_to_color/image_raw -r camera_info:=/camera/color/camera_info
 
 Depth must be registered to color. Each marker is the box around one object in the map's world; its text is the class.
@@ -20,6 +20,8 @@ from instancemap import Camera, FrameError, Mapper
 
 
 class InstanceMapNode(Node):
+    """Node with one map."""
+
     def __init__(self, *overrides: str) -> None:
         super().__init__("instancemap")
         self.mapper = Mapper(*overrides)
@@ -27,19 +29,19 @@ class InstanceMapNode(Node):
         topics = (("color", Image), ("depth", Image), ("camera_info", CameraInfo))
         subscribers = [message_filters.Subscriber(self, kind, name) for name, kind in topics]
         synchronizer = message_filters.ApproximateTimeSynchronizer(subscribers, queue_size=2, slop=0.02)
-        synchronizer.registerCallback(self.map)  # what comes while a frame is mapped is dropped but for two
+        synchronizer.registerCallback(self.map)  # while a frame is mapped, the queue keeps the two newest
 
     def map(self, color: Image, depth: Image, info: CameraInfo) -> None:
         camera = Camera(info.width, info.height, info.k[0], info.k[4], info.k[2], info.k[5])
         stamp = color.header.stamp.sec + 1e-9 * color.header.stamp.nanosec
         try:
-            added = self.mapper.add(rgb(color), meters(depth), camera=camera, timestamp=stamp)
+            result = self.mapper.add(rgb(color), meters(depth), camera=camera, timestamp=stamp)
         except FrameError as error:
             self.get_logger().warning(str(error))
             return
-        if added.lost:
-            self.get_logger().warning(f"lost: {added.reason}", throttle_duration_sec=1.0)
-        elif added.new or added.removed:
+        if result.lost:
+            self.get_logger().warning(f"lost: {result.reason}", throttle_duration_sec=1.0)
+        elif result.new or result.removed:
             self.markers.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL), *self.boxes()]))
 
     def boxes(self) -> list[Marker]:
@@ -55,18 +57,21 @@ class InstanceMapNode(Node):
 
 
 def rgb(image: Image) -> np.ndarray:
+    """Return the RGB image (H, W, 3) uint8 of a message."""
     pixels = np.frombuffer(bytes(image.data), np.uint8).reshape(image.height, image.step)[:, : 3 * image.width]
     pixels = pixels.reshape(image.height, image.width, 3)
     return pixels[..., ::-1] if image.encoding == "bgr8" else pixels
 
 
 def meters(image: Image) -> np.ndarray:
+    """Return the depth (H, W) float32 in m of a message, 0 = no reading."""
     kind, unit = (np.float32, 1.0) if image.encoding == "32FC1" else (np.uint16, 0.001)
     values = np.frombuffer(bytes(image.data), kind).reshape(image.height, -1)[:, : image.width] * np.float32(unit)
     return np.nan_to_num(values, nan=0.0, posinf=0.0).astype(np.float32)
 
 
 def main() -> None:
+    """Run the node."""
     rclpy.init()
     rclpy.spin(InstanceMapNode("fuser.voxel_size=0.02"))
 

@@ -115,7 +115,7 @@ class FrameTruth:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(height, width)"""
+        """Shape (height, width) in px."""
         return self.instance_ids.shape
 
 

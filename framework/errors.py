@@ -66,6 +66,7 @@ def in_one_line(message: object) -> str:
 
 
 def first_line(error: BaseException) -> str:
+    """Return the first line of an error message."""
     return str(error).partition("\n")[0] or type(error).__name__
 
 

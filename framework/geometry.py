@@ -30,7 +30,7 @@ def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray
 
 
 def skew(v: Float64) -> Float64:
-    """Return the (3, 3) matrix with skew(v) @ w = v x w."""
+    """Return the skew-symmetric (3, 3) matrix S of v, with S @ w = v x w."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 

@@ -19,7 +19,7 @@ from sphinx.util.rst import escape
 
 
 def comments(source: str) -> dict[str, str]:
-    """The comment on the lines of each annotated name in a class's source."""
+    """Return the comments of the annotated names in the source of a class."""
     said = {
         token.start[0]: token.string.lstrip("#: ").strip()
         for token in tokenize.generate_tokens(io.StringIO(source).readline)
@@ -35,7 +35,7 @@ def comments(source: str) -> dict[str, str]:
 
 
 def add_fields(app: Sphinx, what: str, name: str, of: Any, options: Any, lines: list[str]) -> None:
-    """Appends a dataclass's fields to its docstring."""
+    """Append the fields of a dataclass to its docstring."""
     if not isinstance(of, type) or not dataclasses.is_dataclass(of):
         return
     said: dict[str, str] = {}
@@ -59,6 +59,7 @@ def name_arrays(
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the extension with Sphinx."""
     app.connect("autodoc-process-docstring", add_fields)
     app.connect("autodoc-process-signature", name_arrays)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -16,11 +16,13 @@ log = logging.getLogger(__name__)
 
 
 def visit_inline(writer: HTML5Translator, node: nodes.math) -> None:
+    """Write an inline formula as MathML."""
     writer.body.append(_translated(node))
     raise nodes.SkipNode
 
 
 def visit_block(writer: HTML5Translator, node: nodes.math_block) -> None:
+    """Write a display formula as MathML."""
     writer.body.append(f'<div class="math">\n{_translated(node, as_block=True)}\n</div>\n')
     raise nodes.SkipNode
 
@@ -34,5 +36,6 @@ def _translated(node: nodes.math | nodes.math_block, as_block: bool = False) -> 
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the extension with Sphinx."""
     app.add_html_math_renderer("mathml", (visit_inline, None), (visit_block, None))
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -81,7 +81,7 @@ class Commands(SphinxDirective):
 
 
 def _head(text: str) -> str:
-    """The comment at the top of a YAML; `# @package` is Hydra's."""
+    """Return the comment at the top of a YAML; `# @package` is Hydra's."""
     lines = [line for line in text.splitlines() if not line.startswith("# @")]
     head = []
     for line in lines:
@@ -101,6 +101,7 @@ def yaml_value(value: object) -> str:
 
 
 def paragraph(text: str) -> nodes.paragraph:
+    """Return a paragraph of parsed Markdown."""
     return nodes.paragraph("", "", *inline(text))
 
 
@@ -112,6 +113,7 @@ def inline(text: str) -> Iterator[nodes.Node]:
 
 
 def definitions(items: Iterable[tuple[str, str]]) -> nodes.definition_list:
+    """Return a definition list."""
     found = nodes.definition_list()
     for term, meaning in items:
         found += nodes.definition_list_item(
@@ -121,7 +123,7 @@ def definitions(items: Iterable[tuple[str, str]]) -> nodes.definition_list:
 
 
 def table(rows: Iterable[Row]) -> nodes.table:
-    """A row for each parameter: its name, its type and default below, and beside that what it means."""
+    """Return a row for each parameter: name, type and default on the left, description on the right."""
     group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in (45, 55)), cols=2)
     head = nodes.row("", *(nodes.entry("", paragraph(word)) for word in ("Parameter", "Meaning")))
     group += nodes.thead("", head)
@@ -136,6 +138,7 @@ def _row(row: Row) -> nodes.row:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the extension with Sphinx."""
     app.add_directive("options", Options)
     app.add_directive("settings", Settings)
     app.add_directive("files", Files)

@@ -30,7 +30,7 @@ _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)(?P<path>[^)#\s]+)(?P<anchor>#[^)\s]*)?(
 
 
 def show(app: Sphinx, name: str, source: list[str]) -> None:
-    """The text of a page, or of the file that it shows, with its links as seen from the page."""
+    """Return the text of a page or of the file that it shows, with links relative to the page."""
     page = DOCS / f"{name}.md"
     shown = {DOCS / place: PROJECT / path for path, place in PAGES.items()}.get(page, page)
     text = source[0] if shown == page else shown.read_text()
@@ -48,5 +48,6 @@ def show(app: Sphinx, name: str, source: list[str]) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the extension with Sphinx."""
     app.connect("source-read", show)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

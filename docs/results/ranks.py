@@ -51,7 +51,7 @@ class Place:
         return np.asarray(self.values.mean(axis=1), np.float64)
 
     def drawn_means(self, rng: np.random.Generator) -> Float64:
-        """(SAMPLES, R) means of as many sequences, drawn with replacement, the same ones for all rows."""
+        """Return (SAMPLES, R) means of bootstrap samples of the sequences, the same samples for all rows."""
         drawn = rng.integers(self.values.shape[1], size=(SAMPLES, self.values.shape[1]))
         return np.asarray(self.values[:, drawn].mean(axis=2).T, np.float64)
 
@@ -88,7 +88,7 @@ class Ranking:
 
     @classmethod
     def of(cls, key: str, comparisons: Sequence[ComparisonTable]) -> Ranking:
-        """Raises DataError where a folder has no such figure, or where there is too little in common."""
+        """Raise DataError if a folder lacks this metric, or if the folders have too few rows or sequences in common."""
         names = _names(comparisons)
         found = [{row.name: row for row in one.rows if row.values(key)} for one in comparisons]
         for comparison, rows in zip(comparisons, found, strict=True):
@@ -131,6 +131,7 @@ class Ranking:
 
 
 def main() -> None:
+    """Run `python docs/results/ranks.py`."""
     parser = argparse.ArgumentParser(
         description="Compare an experiment's rows across datasets: the mean and rank of each row on each dataset, and "
         "Spearman's rho between datasets with bootstrap intervals.",
@@ -153,7 +154,7 @@ def main() -> None:
 
 
 def write_ranks(directories: Sequence[Path], keys: Sequence[str], out: Path | None) -> str:
-    """Compares the experiments in `directories` by each of the figures, and returns the Markdown.
+    """Compare the experiments in `directories` by each metric and return the Markdown.
 
     Where `out` is a folder, ranks.md and ranks.csv are written into it. Raises DataError when there is nothing to
     compare.
@@ -174,6 +175,7 @@ def write_ranks(directories: Sequence[Path], keys: Sequence[str], out: Path | No
 
 
 def markdown(rankings: Sequence[Ranking]) -> str:
+    """Return the tables as Markdown."""
     parts = ["# Ranks"]
     for ranking in rankings:
         parts += [f"## {head(ranking.key)}", markdown_grid(rank_grid(ranking)), markdown_grid(agreement_grid(ranking))]
@@ -183,7 +185,7 @@ def markdown(rankings: Sequence[Ranking]) -> str:
 
 
 def rank_grid(ranking: Ranking) -> TextTable:
-    """A line a row: its mean and its rank in each place."""
+    """Return a line for each row: its mean and rank in each folder."""
     columns = [(means, ranks(means)) for means in ranking.columns.values()]
     digits = decimals(float(value) for means, _ in columns for value in means)
     body = [
@@ -197,7 +199,7 @@ def rank_grid(ranking: Ranking) -> TextTable:
 
 
 def agreement_grid(ranking: Ranking) -> TextTable:
-    """A line a pair of places."""
+    """Return a line for each pair of folders."""
     share = f"{CONFIDENCE:.0%}"
     body = [
         [pair, str(len(ranking.rows)), _signed(one.rho), _between(one.over_rows), _between(one.over_runs)]
@@ -239,7 +241,7 @@ def spearman(ours: Float64, theirs: Float64) -> Float64:
 
 
 def _interval(samples: Float64) -> tuple[float, float]:
-    """The middle of what the samples are, in which CONFIDENCE of them lie; those that are not defined do not count."""
+    """Return the interval that contains the fraction CONFIDENCE of the finite samples."""
     defined = samples[~np.isnan(samples)]
     if not len(defined):
         return math.nan, math.nan
@@ -264,7 +266,7 @@ def _place(name: str, comparison: ComparisonTable, rows: Sequence[RunRow], key: 
 
 
 def _names(comparisons: Sequence[ComparisonTable]) -> list[str]:
-    """What the folders are called; by their path where two have the same name."""
+    """Return the titles of the folders, or their paths if titles are equal."""
     titles = [one.title for one in comparisons]
     return [one.title if titles.count(one.title) == 1 else str(one.root) for one in comparisons]
 
@@ -289,7 +291,7 @@ def _between(interval: tuple[float, float]) -> str:
 
 
 def _notes_of(ranking: Ranking) -> Iterator[str]:
-    """What is true of one figure alone."""
+    """Return the notes on one metric."""
     counts = ", ".join(f"{place.name} {place.runs}" for place in ranking.places)
     yield f"Runs of each row: {counts}."
     if ranking.absent:

@@ -73,6 +73,7 @@ class Difference:
 
 
 def main() -> None:
+    """Run `python docs/results/steps.py`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "directory", metavar="DIR", nargs="+", type=Path, help="folder of the runs with one dataset and detector"
@@ -143,6 +144,7 @@ def bases_of(rows: Sequence[str]) -> dict[str, str | None]:
 
 
 def difference(scenes: Sequence[Scene], row: str, base: str, metric: str, *, synthetic: bool) -> Difference:
+    """Return the paired differences of two rows over the scenes."""
     pairs = [(one.values[row][metric], one.values[base][metric]) for one in scenes if one.synthetic == synthetic]
     return Difference(np.array([value - other for value, other in pairs if not math.isnan(value - other)], np.float64))
 
@@ -153,6 +155,7 @@ def markdown(
     metrics: Sequence[str],
     comparisons: Sequence[ComparisonTable],
 ) -> str:
+    """Return the tables as Markdown."""
     parts = []
     for metric in metrics:
         header, body = ["row", "compared with"], []

@@ -121,8 +121,10 @@ class ObjectMap(InstanceTableMap):
         return boxes_in_view(camera, T_world_camera, low, high, float(self.background.sensor.min_depth))
 
     def instances_seen(self, camera: Camera, T_world_camera: Float64, depth: Float32, stride: int) -> Int32:
-        """Return the object (ceil(H / stride), ceil(W / stride)) at every stride-th reading of every stride-th row of
-        `depth` (H, W) m, 0 = none: of the volumes that contain it, the one with the highest foreground probability.
+        """Return the object (ceil(H / stride), ceil(W / stride)) at each reading of the subsampled depth, 0 = none.
+
+        `depth` is (H, W) m. If several volumes contain a reading, it belongs to the one with the highest foreground
+        probability.
         """
         shape = tuple(-(-side // stride) for side in depth.shape)
         instance_ids, best = np.zeros(shape, np.int32), np.full(shape, np.float32(FOREGROUND))

@@ -103,7 +103,10 @@ def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: F
     The windows are never too small. A box out of view has u1 <= u0 or v1 <= v0.
 
     Args:
-        low: (N, 3) m, with `high` the corners of the boxes.
+        T_world_camera: (4, 4) pose.
+        camera: The camera.
+        low: (N, 3) m, lower corners of the boxes.
+        high: (N, 3) m, upper corners of the boxes.
         near: The least visible depth, m.
     """
     T_camera_world = inverse(T_world_camera)

@@ -57,9 +57,9 @@ def look_up_object(
     instance_ids: Int32,
     best: Float32,
 ) -> None:
-    """Set instance_ids (h, w) to `instance_id`, and `best` (h, w) to its probability, where the object is more probable
-    than `best` in the voxel of the reading: every stride-th one of every stride-th row of `depth` (H, W) m.
+    """Set instance_ids (h, w) and `best` (h, w) where the object is more probable than `best` at the reading's voxel.
 
+    Readings are every stride-th one of every stride-th row of `depth` (H, W) m.
     `window` holds the first row and column of (h, w) and the last ones, exclusive; `view` T_world_camera.
     """
     top, left, bottom, right = window

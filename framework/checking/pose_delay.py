@@ -95,6 +95,6 @@ def delayed(pair: MatchedPair, poses: Sequence[Float64 | None], delay: int) -> M
 
 
 def _error(pair: MatchedPair, poses: Mapping[int, Float64], fit: PoseFit, delay: int) -> float:
-    """The error of a pair in px with the poses of the frames `delay` later."""
+    """Return the error of a pair in px with the poses of the frames `delay` later."""
     T_second_first = motion_between(poses[pair.first.index + delay], poses[pair.second.index + delay], fit.reading)
     return error_of(pair, T_second_first, fit.depth_factor)

@@ -71,7 +71,7 @@ def motion_between(T_world_first: Float64, T_world_second: Float64, reading: Pos
 
 
 def _depth_factor(pairs: Sequence[MatchedPair], motions: Sequence[Float64]) -> tuple[float, float]:
-    """The ratio of the poses' translations to those of the images, and its uncertainty; 1 and 1 if not known."""
+    """Return the ratio of the poses' translations to those of the images, and its uncertainty; 1 and 1 if not known."""
     ratios = []
     for pair, T_second_first in zip(pairs, motions, strict=True):
         seen, moved = np.linalg.norm(pair.T_second_first[:3, 3]), np.linalg.norm(T_second_first[:3, 3])
@@ -94,7 +94,7 @@ def error_of(pair: MatchedPair, T_second_first: Float64, factor: float) -> float
 
 
 @dataclass(frozen=True)
-class PoseJudgement:
+class PoseJudgment:
     """Findings about a recording's poses and units."""
 
     findings: tuple[Finding, ...]
@@ -103,7 +103,7 @@ class PoseJudgement:
     others: tuple[PoseFit, ...] = ()  # all readings, without a depth factor
 
 
-def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, median_depth: float) -> PoseJudgement:
+def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, median_depth: float) -> PoseJudgment:
     """Check stored poses against the images, and find the reading that fits.
 
     `given` is the reading that is set, `depth_scale` the units per meter of depth, `median_depth` the result in m.
@@ -111,7 +111,7 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     informative = [pair for pair in pairs if pair.motion > SHORTEST_MOTION * pair.first.camera.width]
     if len(informative) < FEWEST_PAIRS:
         text = f"too few pairs of frames move enough to check the poses ({len(informative)})"
-        return PoseJudgement((Finding(Verdict.UNKNOWN, "poses", text),), None, None)
+        return PoseJudgment((Finding(Verdict.UNKNOWN, "poses", text),), None, None)
     motion = float(np.median([pair.motion for pair in informative]))
     as_given = fit(informative, given, 1.0)
     others = tuple(fit(informative, reading, 1.0) for reading in readings(given.pose_unit))
@@ -123,11 +123,11 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     chosen = _with_plain_factor(informative, reading)
     measured = f"in {len(informative)} pairs of frames that move {motion:.0f} px, points are off by {now:.1f} px"
     if reading == given and now <= POOR * motion and chosen.depth_factor == 1.0:
-        return PoseJudgement((Finding(Verdict.FINE, "poses", f"they fit: {measured}"),), as_given, as_given, others)
+        return PoseJudgment((Finding(Verdict.FINE, "poses", f"they fit: {measured}"),), as_given, as_given, others)
     if chosen.error > POOR * motion:
         text = f"they do not fit the images, in any axes: {measured}"
         finding = Finding(Verdict.FAULT, "poses", text, "tracker=voxel_hashing_icp, which needs none")
-        return PoseJudgement((finding,), as_given, best, others)
+        return PoseJudgment((finding,), as_given, best, others)
     findings = []
     if reading != given:
         text = f"they are {_named(reading)}: {measured}, and {chosen.error:.1f} px when they are read so"
@@ -140,11 +140,11 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
         findings.append(Finding(Verdict.FINE, "poses", text))
     if chosen.depth_factor != 1.0:
         findings.append(_scale_finding(chosen, depth_scale, median_depth))
-    return PoseJudgement(tuple(findings), as_given, chosen, others)
+    return PoseJudgment(tuple(findings), as_given, chosen, others)
 
 
 def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:
-    """The fit with depth as stored, unless another factor is clearly better."""
+    """Return the fit with depth as stored, unless another factor is clearly better."""
     as_stored, scaled = fit(pairs, reading, 1.0), fit(pairs, reading)
     far = not 1 / WRONG_SCALE < scaled.depth_factor < WRONG_SCALE
     needed = NOT_WORSE if far else CLEARLY
@@ -175,13 +175,13 @@ def _named(reading: PoseReading) -> str:
 
 
 def _equal_to_best(fits: Sequence[PoseFit]) -> list[PoseFit]:
-    """The best fit and those equal to it: for a camera that only pans, some axes are the same."""
+    """Return the best fit and those equal to it: for a camera that only pans, some axes are the same."""
     least = min(one.error for one in fits)
     return [one for one in fits if one.error <= ALIKE * least + ALIKE_PX]
 
 
 def _settings(reading: PoseReading, given: PoseReading) -> tuple[str, ...]:
-    """The parameters in which the readings differ."""
+    """Return the parameters in which the readings differ."""
     names = ("pose_kind", "camera_axes", "quaternion_order")
     changed = [name for name in names if getattr(reading, name) != getattr(given, name)]
     return tuple(f"dataset.{name}={getattr(reading, name).name}" for name in changed)

@@ -12,7 +12,7 @@ import numpy as np
 from framework.checking import Finding, Verdict, pose_fit, registration
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_delay import delayed, find_delay
-from framework.checking.pose_fit import PLAUSIBLE, USUAL_SCALES, PoseJudgement
+from framework.checking.pose_fit import PLAUSIBLE, USUAL_SCALES, PoseJudgment
 from framework.checking.registration import EdgeAlignment, EdgeComparison, color_gradient
 from framework.data import Camera, Float64, Frame
 from framework.datasets.frames.conventions import PoseReading
@@ -42,7 +42,7 @@ class RecordingCheck:
     summary: str
     frames: tuple[Frame, ...]  # the checked ones
     by_delay: tuple[EdgeAlignment, ...]
-    poses: PoseJudgement
+    poses: PoseJudgment
     pair: MatchedPair | None  # in the figure, with the stored poses
     meant: MatchedPair | None  # the pair with the delay of the poses removed
 
@@ -86,14 +86,14 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     pairs = list(matcher.pairs(starts))
     posed = [pair for pair in pairs if _is_posed(pair)]
     if any(frame.T_world_camera is not None for frame in frames):
-        judgement, pose_delay = _judge_poses(sequence, posed, given, median_depth)
+        judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
     else:
         no_poses = Finding(Verdict.FINE, "poses", "the recording has none: the camera is tracked")
-        judgement, pose_delay = PoseJudgement((no_poses,), None, None), 0
-    if not any(finding.subject == "depth" for finding in judgement.findings):  # poses measure it more exactly
+        judgment, pose_delay = PoseJudgment((no_poses,), None, None), 0
+    if not any(finding.subject == "depth" for finding in judgment.findings):  # poses measure it more exactly
         findings.append(depth_finding)
     motion_finding = _check_motion(steps, len(neighbors), sequence.camera.width)
-    findings += [*judgement.findings, registration_finding, motion_finding, _check_sharpness(frames)]
+    findings += [*judgment.findings, registration_finding, motion_finding, _check_sharpness(frames)]
     findings += _check_times(sequence)
     camera = sequence.camera
     summary = (
@@ -102,33 +102,33 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     )
     shown = min(posed or pairs, key=lambda pair: abs(pair.motion - SHOWN_MOTION * camera.width), default=None)
     meant = delayed(shown, _stored_poses(sequence), pose_delay) if shown is not None and pose_delay else shown
-    return RecordingCheck(tuple(findings), summary, tuple(frames), tuple(by_delay), judgement, shown, meant)
+    return RecordingCheck(tuple(findings), summary, tuple(frames), tuple(by_delay), judgment, shown, meant)
 
 
 def _judge_poses(
     sequence: RGBDSequence, pairs: Sequence[MatchedPair], asked: PoseReading, median_depth: float
-) -> tuple[PoseJudgement, int]:
-    """The findings about the poses, and their delay in frames."""
+) -> tuple[PoseJudgment, int]:
+    """Return the findings about the poses, and their delay in frames."""
     given, scale = replace(asked, pose_delay=0), _scale_of(sequence)
-    judgement = pose_fit.judge(pairs, given, scale, median_depth)
-    if judgement.given is None or judgement.best is None:
-        return judgement, 0
+    judgment = pose_fit.judge(pairs, given, scale, median_depth)
+    if judgment.given is None or judgment.best is None:
+        return judgment, 0
     poses = _stored_poses(sequence)
-    fits = [judgement.given, judgement.best, replace(judgement.given, depth_factor=judgement.best.depth_factor)]
+    fits = [judgment.given, judgment.best, replace(judgment.given, depth_factor=judgment.best.depth_factor)]
     late = find_delay(pairs, poses, fits)
     if late is None:
-        return judgement, 0
+        return judgment, 0
     meant = [delayed(pair, poses, late.frames) for pair in pairs]
     then = pose_fit.judge([pair for pair in meant if _is_posed(pair)], given, scale, median_depth)
     others = [finding for finding in then.findings if finding.verdict is not Verdict.FINE]
     assert isinstance(sequence, Recording)  # only recordings have stored poses
     step = float(np.median(np.diff([recorded.timestamp for recorded in sequence.contents.frames])))
     findings = (late.finding(asked.pose_delay, step), *others)
-    return replace(then, findings=findings, given=judgement.given), late.frames
+    return replace(then, findings=findings, given=judgment.given), late.frames
 
 
 def _stored_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
-    """The poses of all frames of a recording, selected or not."""
+    """Return the poses of all frames of a recording, selected or not."""
     return [recorded.T_world_camera for recorded in sequence.contents.frames] if isinstance(sequence, Recording) else []
 
 
@@ -188,7 +188,7 @@ def _read(sequence: RGBDSequence, chosen: Sequence[int]) -> tuple[list[Frame], l
 
 
 def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tuple[Finding, float]:
-    """The finding, and the median depth in m."""
+    """Return the finding, and the median depth in m."""
     readings = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
     if not len(readings):
         return Finding(Verdict.FAULT, "depth", "there is not a single reading"), 0.0
@@ -210,7 +210,7 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
 
 
 def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
-    """The finding about the motion from frame to frame, `steps` in fractions of the width."""
+    """Return the finding about the motion from frame to frame, `steps` in fractions of the width."""
     if not neighbors:
         return Finding(Verdict.UNKNOWN, "motion", "there is only one frame")
     lost = neighbors - len(steps)
@@ -225,7 +225,7 @@ def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
 
 
 def _check_sharpness(frames: Sequence[Frame]) -> Finding:
-    """The finding about the width of color edges: contrast by gradient, at the strongest ones."""
+    """Return the finding about the width of color edges: contrast by gradient, at the strongest ones."""
     widths = [_edge_width(frame) for frame in frames]
     text = f"edges are {np.median(widths):.1f} px wide, and {max(widths):.1f} px in the worst of {len(frames)} frames"
     blurred = sum(width > WIDEST_EDGE * frames[0].camera.width for width in widths)
@@ -235,7 +235,7 @@ def _check_sharpness(frames: Sequence[Frame]) -> Finding:
 
 
 def _edge_width(frame: Frame) -> float:
-    """The median width in px."""
+    """Return the median width in px."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     window = np.ones((max(3, round(EDGE_WINDOW * frame.camera.width)),) * 2, np.uint8)
     contrast = cv2.subtract(cv2.dilate(gray, window), cv2.erode(gray, window)).astype(np.float32)
@@ -245,7 +245,7 @@ def _edge_width(frame: Frame) -> float:
 
 
 def _check_times(sequence: RGBDSequence) -> list[Finding]:
-    """The finding about the timestamps of a recording."""
+    """Return the finding about the timestamps of a recording."""
     if not isinstance(sequence, Recording) or len(sequence) < 3:
         return []
     times: Float64 = np.array([sequence.contents.frames[k].timestamp for k in sequence.chosen])

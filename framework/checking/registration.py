@@ -69,7 +69,7 @@ class EdgeComparison:
         return found
 
     def _correlation(self, of_color: int, of_depth: int, zoom: float) -> Float32 | None:
-        """The mean gradient (2 L + 1, 2 L + 1) at the depth edges, for each shift of up to L px."""
+        """Return the mean gradient (2 L + 1, 2 L + 1) at the depth edges, for each shift of up to L px."""
         color, depth = self._edges(of_color), self._edges(of_depth)
         if color is None or depth is None:
             return None
@@ -85,7 +85,7 @@ class EdgeComparison:
         return np.asarray(cv2.matchTemplate(padded, edges, cv2.TM_CCORR) / edges.sum(), np.float32)
 
     def _find_edges(self, k: int) -> tuple[Float32, Float32] | None:
-        """The gradient of color, with mean 0 and deviation 1, and the depth edges, both (h, WIDTH)."""
+        """Return the gradient of color, with mean 0 and deviation 1, and the depth edges, both (h, WIDTH)."""
         try:
             frame = self.sequence[k]
         except FrameError:

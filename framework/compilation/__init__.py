@@ -1,0 +1,1 @@
+"""Compilation and caching of numba kernels."""

@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 def composed(*overrides: str) -> DictConfig:
-    """The main config with these overrides. Raises ConfigError for a name or a value that there is not."""
+    """Compose the main config with these overrides. Raises ConfigError for an unknown name or value."""
     try:
         with config_loader() as loader:
             return loader.compose([*overrides])
@@ -45,7 +45,7 @@ _added: list[Path] = []
 
 
 def add_config_dir(folder: Path) -> None:
-    """Takes the options of another folder for registered in this process, as a run does those of --config-dir.
+    """Register the options of another folder in this process, like --config-dir.
 
     Raises ConfigError when there is no such folder.
     """
@@ -157,13 +157,13 @@ class ConfigLoader(hydra_api.ConfigLoaderImpl):
 
 @contextmanager
 def config_loader() -> Iterator[ConfigLoader]:
-    """The loader of our configs; while the body runs, Hydra has the version base that they are written for."""
+    """Return the loader of our configs; Hydra uses their version base inside the context."""
     with hydra_api.version_base("1.3"):
         yield ConfigLoader()
 
 
 def running_loader() -> Any | None:
-    """The loader of the Hydra application that runs in this process, if our configs are on its search path."""
+    """Return the loader of the running Hydra application if our configs are on its search path."""
     hydra = hydra_api.running()
     if hydra is None:
         return None
@@ -172,7 +172,7 @@ def running_loader() -> Any | None:
 
 
 def one_line(error: BaseException) -> str:
-    """What is wrong, in one line; Hydra's messages are made to say what the user can do."""
+    """Return the error in one line, with the fix."""
     return printable(_said(error))
 
 
@@ -212,7 +212,7 @@ def _no_such_option(error: MissingConfigException) -> str:
 
 
 def _known_keys(error: OmegaConfBaseException) -> str:
-    """The keys that there are in place of the one that is not."""
+    """Return the existing keys at the position of an unknown key."""
     keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
     close = get_close_matches(str(error.key), keys, n=1)
     path = str(error.full_key or error.key)

@@ -55,12 +55,12 @@ def version_base(version: str) -> Iterator[None]:
 
 
 def running() -> Any | None:
-    """The Hydra application that runs in this process; unlike GlobalHydra.instance(), this creates nothing."""
+    """Return the Hydra application of this process; unlike GlobalHydra.instance(), this creates nothing."""
     return getattr(Singleton._instances.get(GlobalHydra), "hydra", None)
 
 
 def search_path_plugins() -> list[Any]:
-    """The search path plugins that Hydra has found, in a process that has had it look for plugins."""
+    """Return the search path plugins that Hydra has loaded in this process."""
     plugins: Any = Singleton._instances.get(Plugins)
     return [] if plugins is None else list(plugins.discover(SearchPathPlugin))
 

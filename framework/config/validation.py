@@ -17,7 +17,7 @@ LONGEST_SIDE = 2**13  # px, of the image that a network takes
 
 
 def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
-    """Raises ConfigError unless each named parameter lies in its closed interval (low, high). NaN never does."""
+    """Raise ConfigError unless each named parameter is in its closed interval (low, high); NaN never is."""
     for name, (low, high) in bounds.items():
         value = getattr(plugin, name)
         require(low <= value <= high, f"{type(plugin).__name__}.{name}", value, f"in [{low:g}, {high:g}]")
@@ -39,13 +39,13 @@ def require(holds: bool, name: str, value: object, allowed: str) -> None:
 
 
 def checked_path(name: str, value: object) -> Path:
-    """The place that a key of the config names, absolute. Raises ConfigError for what YAML takes for no text."""
+    """Return the absolute path in a config key. Raises ConfigError for a value that YAML does not read as text."""
     require(isinstance(value, str) and value != "", name, repr(value), "a path; quote what looks like a number")
     return Path(str(value)).expanduser().absolute()
 
 
 def checked_file(name: str, value: object, suffix: str = "") -> Path:
-    """The file that a key of the config names to be written, absolute. Raises ConfigError where that cannot be."""
+    """Return the absolute path of an output file in a config key. Raises ConfigError if it cannot be written."""
     path = checked_path(name, value)
     if suffix and path.suffix.lower() != suffix:
         raise ConfigError(f"{name} must end in {suffix}, found {path.name}")
@@ -55,12 +55,12 @@ def checked_file(name: str, value: object, suffix: str = "") -> Path:
 
 
 def check_count(name: str, value: int, most: int) -> None:
-    """Raises ConfigError unless a number of things is from 1 to `most`, which memory has room for."""
+    """Raise ConfigError unless a count is from 1 to `most`, the limit of memory."""
     require(1 <= value <= most, name, value, f"at least 1 and at most {most}")
 
 
 def checked_rows(node: Any) -> dict[str, list[str]]:
-    """The overrides of each of an experiment's rows, by name; none without `rows`.
+    """Return the overrides of each row of an experiment by name; empty without `rows`.
 
     Raises ConfigError when those of a row are no list of texts.
     """
@@ -75,7 +75,7 @@ def checked_rows(node: Any) -> dict[str, list[str]]:
 
 
 def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
-    """The keyword arguments that the config's block `name` gives to the dataclass `kind`, its defaults included.
+    """Return the keyword arguments of the dataclass `kind` from the config block `name`, with defaults.
 
     Raises ConfigError for keys and types that it does not have.
     """

@@ -104,7 +104,7 @@ class RgbdFolder(Recording):
                 yield LabeledDepth(depth, truth.instance_ids, self.camera, recorded.T_world_camera)
 
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
-        """The class of each instance, and each frame's image of instances; empty without labels."""
+        """Return the class of each instance, and each frame's image of instances; empty without labels."""
         folder, names = self.folder / "instance", self.folder / "instances.json"
         if self.named_truth is not None or (not is_there(folder) and not is_there(names)):
             return {}, []
@@ -137,7 +137,7 @@ def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
 
 
 def _read_optional(path: Path, read: Callable[[Path], list[Entry]], name: str, frames: int) -> list[Entry] | None:
-    """The entry of each frame, None without the file."""
+    """Return the entry of each frame, None without the file."""
     if not is_there(path):
         return None
     entries = read(path)

@@ -101,7 +101,7 @@ class TumRgbd(Recording):
         return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None)
 
     def _stored_camera(self) -> tuple[StoredCamera, Path | str]:
-        """The camera, and the file or parameter that selects it."""
+        """Return the camera, and the file or parameter that selects it."""
         intrinsics, own = self.intrinsics, self.folder / "camera.json"
         if intrinsics is Intrinsics.AUTO:
             named = re.search(r"freiburg[123]", self.name)
@@ -177,7 +177,7 @@ def associate(first: Sequence[float], second: Sequence[float], max_difference: f
 
 
 def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]:
-    """The items without those that repeat a timestamp: association is quadratic in their number."""
+    """Return the items without those that repeat a timestamp: association is quadratic in their number."""
     at: dict[float, Timed] = {}
     for item in items:
         at.setdefault(item.timestamp, item)
@@ -188,7 +188,7 @@ def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]
 
 
 def _read_list(path: Path) -> list[ListedImage]:
-    """The images in a list. Raises DataError, with the file and the line, for one that is not `timestamp filename`."""
+    """Return the images of a list. Raises DataError for a line that is not `timestamp filename`."""
     lines = read_lines(path, missing="is missing: it lists the images' times, a line each: timestamp filename")
     numbered = [(n, line.strip()) for n, line in enumerate(lines, start=1)]
     images = [_listed(path, n, line) for n, line in numbered if line and not line.startswith("#")]

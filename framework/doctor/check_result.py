@@ -46,6 +46,7 @@ def run_checks(*checks: Callable[[], Iterable[Check]]) -> list[Check]:
 
 
 def one_line(error: BaseException) -> str:
+    """Return an error message as one line."""
     return anonymous(f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": "))[:300]
 
 

@@ -27,6 +27,7 @@ PREFIXES = ("HF_", "INSTANCEMAP_", "NUMBA_", "OMP_", "TRANSFORMERS_", "CUDA_VISI
 
 
 def hardware() -> Iterator[Check]:
+    """Check the GPU and the CPU."""
     from framework.runs.provenance import processor
     from framework.runtime.process_settings import available_cores
 
@@ -39,6 +40,7 @@ def hardware() -> Iterator[Check]:
 
 
 def disk() -> Iterator[Check]:
+    """Check free disk space."""
     import platformdirs
 
     for name, folder, fix in (
@@ -59,6 +61,7 @@ def writable_parent(folder: Path) -> tuple[Path, bool]:
 
 
 def system_libraries() -> Iterator[Check]:
+    """Check the shared libraries of the system."""
     for file, (package, user) in SYSTEM_LIBRARIES.items() if platform.system() == "Linux" else ():
         try:
             found = bool(ctypes.CDLL(file))
@@ -69,5 +72,6 @@ def system_libraries() -> Iterator[Check]:
 
 
 def environment() -> Iterator[Check]:
+    """Check the Python environment."""
     for name in sorted(name for name in os.environ if name.startswith(PREFIXES)):
         yield Check(name, Status.OK, anonymous(os.environ[name]) or '""')

@@ -40,6 +40,7 @@ def included_and_hub() -> Iterator[Check]:
 
 
 def published() -> Iterator[Check]:
+    """Check the networks of the options."""
     from framework.detection.mask_rcnn.published_weights import OFFLINE, PUBLISHED
 
     offline = f", but {OFFLINE} is set" if os.environ.get(OFFLINE) else ""

@@ -43,6 +43,7 @@ def declared() -> tuple[str, list[Requirement], dict[str, list[Requirement]]]:
 
 
 def import_statement(package: str) -> str:
+    """Return the statement that imports a package."""
     return f"import {MODULES.get(package, package.replace('-', '_'))}"
 
 

@@ -116,7 +116,7 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Judgment:
     """One prediction compared with the truth."""
 
     id: int
@@ -207,7 +207,7 @@ def evaluate(
 
 def judge(
     predictions: PredictedInstances, truth: SceneTruth, threshold: float = 0.5
-) -> tuple[list[Judgement], dict[int, str]]:
+) -> tuple[list[Judgment], dict[int, str]]:
     """Return the outcome of each prediction, best first, and the class of each missed true instance.
 
     The matching is that of `InstanceEvaluation.overall`.
@@ -216,7 +216,7 @@ def judge(
     everything = np.ones(len(overlaps.predicted_ids), np.bool_)
     same_class = overlaps.evaluated & (overlaps.predicted_classes[:, None] == overlaps.truth_classes[None, :])
     matches = overlaps.matches(threshold, everything, same_class)
-    judged = [overlaps.judgement(k, match, threshold) for k, match in matches]
+    judged = [overlaps.judgment(k, match, threshold) for k, match in matches]
     found = {one.truth_id for one in judged if one.outcome is Outcome.RIGHT}
     counted = zip(overlaps.truth_ids.tolist(), overlaps.truth_classes, overlaps.evaluated, strict=True)
     return judged, {key: name for key, name, counts in counted if counts and key not in found}
@@ -298,15 +298,15 @@ class _Overlaps:
                 found.append((k, IGNORED if unknown[k] else NO_MATCH))
         return found
 
-    def judgement(self, k: int, match: int, threshold: float) -> Judgement:
-        """Return the judgement of prediction k with this result of `matches`."""
+    def judgment(self, k: int, match: int, threshold: float) -> Judgment:
+        """Return the judgment of prediction k with this result of `matches`."""
         t = match if match >= 0 else int(self.iou[k].argmax()) if len(self.truth_ids) else -1
         iou = float(self.iou[k, t]) if t >= 0 else 0.0
         truth_id, truth_class = (int(self.truth_ids[t]), self.truth_classes[t]) if iou > 0 else (0, None)
         outcome = Outcome.RIGHT if match >= 0 else Outcome.IGNORED if match == IGNORED else Outcome.FALSE
         if match == NO_MATCH and iou >= threshold and truth_class != self.predicted_classes[k]:
             outcome = Outcome.WRONG_CLASS
-        return Judgement(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
+        return Judgment(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
 
     def best(self) -> tuple[dict[int, float], dict[int, int]]:
         """Return the best overlap of each evaluated true instance, and the prediction with it, of any class."""

@@ -47,7 +47,7 @@ DIGITS = 4  # decimal places, of meters
 
 
 def write_floor_plan(path: Path, room: UprightRoom, plan: Plan, robot_height: float) -> None:
-    """Draw the plan as a PNG file; the same room gives the same bytes."""
+    """Draw the plan as a PNG file; output is deterministic."""
     with warnings.catch_warnings(), written_whole(path) as temporary:
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)  # drawn as boxes
         _drawn(room, plan, robot_height).savefig(temporary, dpi=DPI)

@@ -38,7 +38,7 @@ class Node:
 
 
 def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> bytes:
-    """Return parts of a room as a GLB file. The same parts give the same bytes."""
+    """Return parts of a room as a GLB file; output is deterministic."""
     return glb_of(
         [_node(part, colors) for part, colors in zip(shown, part_colors(shown, coloring), strict=True)],
         lit=coloring is not Coloring.APPEARANCE,
@@ -46,7 +46,7 @@ def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> byte
 
 
 def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
-    """Return nodes, lit or unlit, as a GLB file. The same nodes give the same bytes."""
+    """Return nodes, lit or unlit, as a GLB file; output is deterministic."""
     scene: Any = trimesh.Scene(base_frame="world")
     for node in nodes:
         extras = dict(node.extras)

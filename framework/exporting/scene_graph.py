@@ -22,6 +22,7 @@ def write_scene_graph(path: Path, room: UprightRoom, plan: Plan | None) -> None:
 
 
 def scene_graph(room: UprightRoom, plan: Plan | None) -> dict[str, Any]:
+    """Return the scene graph of a room, as for JSON."""
     divided = rooms(plan) if plan is not None else None
     nodes = [_object_node(one) for one in room.objects]
     edges = _edges(room, relations(room, plan))

@@ -49,7 +49,7 @@ def check_usd() -> None:
 def write_usd(
     path: Path, parts: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE, collision: Collision = Collision.HULL
 ) -> None:
-    """Write parts as one stage, in the room frame; the same parts give the same bytes. Raises DataError."""
+    """Write parts as one stage, in the room frame; output is deterministic. Raises DataError."""
     check_usd()
     from pxr import Gf, Kind, Tf, Usd, UsdGeom, UsdPhysics
 

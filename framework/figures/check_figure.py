@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from framework.checking import Verdict
 from framework.checking.matched_pairs import MatchedPair
-from framework.checking.pose_fit import PoseFit, PoseJudgement, motion_of
+from framework.checking.pose_fit import PoseFit, PoseJudgment, motion_of
 from framework.checking.recording_check import RecordingCheck
 from framework.checking.registration import depth_edges
 from framework.data import Float64, Frame, UInt8
@@ -101,7 +101,7 @@ def _moved(pair: MatchedPair, T_second_first: Float64, factor: float) -> UInt8:
     return np.stack([own, other, other], axis=2).astype(np.uint8)
 
 
-def _readings(axes: Axes, poses: PoseJudgement) -> None:
+def _readings(axes: Axes, poses: PoseJudgment) -> None:
     """Draw the reprojection error of each pose convention."""
     if poses.best is None or not poses.others:
         _say(axes, f"poses: {poses.findings[0].text}")

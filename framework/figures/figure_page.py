@@ -87,6 +87,7 @@ def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, wi
     """Write names on the objects of a picture, or next to them with a line.
 
     Args:
+        axes: Axes of the picture.
         ids: (H, W) object of each pixel, 0 = none; the axes have these pixels as unit.
         names: by object; one without space is omitted.
         size: of the letters, pt.

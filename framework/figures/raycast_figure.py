@@ -24,6 +24,8 @@ def write_raycast(path: Path, view: View, names: Mapping[int, str], centers: Map
     """Write the five panels of a ray-cast view as a PNG.
 
     Args:
+        path: PNG file.
+        view: Ray-cast view.
         names: class of each object, by id; other ids are shown without color.
         centers: (3,) m of the same objects, which choose their colors.
         note: at the bottom of the page.

@@ -41,6 +41,7 @@ def refinement_figure(refinement: Refinement, title: str, refiner: str) -> Figur
     """Draw the clusters of one frame before and after refinement.
 
     Args:
+        refinement: Clusters before and after refinement.
         title: frame and detector.
         refiner: name of the refiner.
     """

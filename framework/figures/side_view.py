@@ -47,7 +47,10 @@ class SideView:
         """Return the view from the left or right that shows more changed points, None without depth readings.
 
         Args:
-            aspect: width of the view by its height.
+            frame: Frame with depth.
+            before: Clusters before refinement.
+            after: Clusters after refinement.
+            aspect: width of the view divided by its height.
         """
         rows, columns = np.nonzero(frame.depth)
         if len(rows) == 0:

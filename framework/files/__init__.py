@@ -1,1 +1,1 @@
-"""File formats, and files that are written whole or not at all."""
+"""File formats and atomic writing."""

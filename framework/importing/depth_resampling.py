@@ -51,6 +51,6 @@ def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, targ
 
 
 def _coordinates(size: int, f_target: float, c_target: float, f: float, c: float, scale: float) -> Float64:
-    """The positions (size,) in the depth image of the pixels of a target's row or column."""
+    """Return the positions (size,) in the depth image of the pixels of a target's row or column."""
     in_color = (np.arange(size) - c_target) * (f / f_target) + c
     return np.asarray((in_color + 0.5) * scale - 0.5, np.float64)

@@ -13,6 +13,7 @@ COLOR_SIGMA = 15.0  # of 255, root of the summed squares of R, G, B: noise and s
 
 @njit(cache=True, nogil=True)
 def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, registered: Float32) -> None:
+    """Fill `registered` with depth moved to the target camera; the nearest reading wins."""
     height, width = registered.shape
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -36,7 +37,7 @@ def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, reg
 
 @njit(cache=True, nogil=True)
 def upsample(depth: Float32, guide: UInt8, u: Float64, v: Float64, color: UInt8, found: Float32) -> None:
-    """Fills `found` (H, W) at the coordinates u (W,), v (H,) of depth (h, w), whose colors are guide (h, w, 3)."""
+    """Fill `found` (H, W) at the coordinates u (W,), v (H,) of depth (h, w), whose colors are guide (h, w, 3)."""
     height, width = depth.shape
     for row in range(len(v)):
         if not -0.5 <= v[row] <= height - 0.5:

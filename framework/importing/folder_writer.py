@@ -118,7 +118,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
 
 
 def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int, DeviceFrame]]:
-    """The number and content of each usable frame; the errors of the others go to `written`."""
+    """Return the number and content of each usable frame; the errors of the others go to `written`."""
     chosen = islice(enumerate(source.frames), 0, None, stride)
     for number, stored in tqdm(chosen, total=-(-source.count // stride), unit=" frames", disable=None):
         try:

@@ -48,7 +48,7 @@ class SealedPage:
                     self.close_connection = True
 
             def log_message(self, format: str, *args: object) -> None:
-                """Requests are not logged."""
+                """Suppress the request log."""
 
         self._server = ThreadingHTTPServer((HERE, port), Handler)  # before the download, because the port may be in use
         try:

@@ -57,6 +57,7 @@ def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
 
 @njit(cache=True, nogil=True)
 def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tuple[Int64, Int64]:
+    """Assign clusters to threads by cost; return them in the order of threads, and each thread's start."""
     loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
     for k in longest_first:
         least = 0

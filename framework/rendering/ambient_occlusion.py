@@ -20,6 +20,7 @@ def openness(camera: Camera, depth: Float32, normals_camera: Float32) -> Float32
     """Return the fraction (H, W) of the ambient light, in (0, 1].
 
     Args:
+        camera: Camera of the depth image.
         depth: (H, W) m along z, 0 = none.
         normals_camera: (H, W, 3) unit vectors, camera frame.
     """

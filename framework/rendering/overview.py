@@ -32,6 +32,8 @@ def write_overview(
     """Write the overview as a PNG.
 
     Args:
+        path: PNG file.
+        mesh: Mesh of the map.
         instances: class name and confidence by id; other ids are background.
         poses: (F, 4, 4) T_world_camera of the frames that were mapped.
         title: above the pictures.

@@ -122,6 +122,7 @@ def draw_triangles(
 
 @njit(cache=True, nogil=True)
 def nearest(triangle: Int32, uv: Float32, triangles: Int32, labels: Int32, image: Int32) -> None:
+    """Set each covered pixel to the label of the nearest vertex of its triangle."""
     for v in range(triangle.shape[0]):
         for u in range(triangle.shape[1]):
             f = triangle[v, u]
@@ -133,6 +134,7 @@ def nearest(triangle: Int32, uv: Float32, triangles: Int32, labels: Int32, image
 
 @njit(cache=True, nogil=True)
 def interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32, image: Float32) -> None:
+    """Set each covered pixel to the interpolated values of its triangle's vertices."""
     for v in range(triangle.shape[0]):
         for u in range(triangle.shape[1]):
             f = triangle[v, u]

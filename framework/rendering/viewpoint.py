@@ -35,8 +35,11 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
     """Return the camera of width x height px and its T_world_camera with the best view.
 
     Args:
+        surface: Surface in view.
         instance_ids: (V,) of the surface's vertices, 0 = no instance.
         poses: (F, 4, 4) of the cameras that mapped the surface.
+        width: Width of the image in px.
+        height: Height of the image in px.
     """
     up = upward(poses, surface)
     forward = poses[:, :3, 2].mean(axis=0)

@@ -174,7 +174,8 @@ def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int]
     """Draw the fraction of the final surface and the number of the final objects that each frame had reached.
 
     Args:
-        frames: of `fraction` (n,).
+        frames: Frames of `fraction`.
+        fraction: (n,) fraction of the final surface.
         first_frames: of the objects.
         last_frame: of the sequence.
     """

@@ -25,6 +25,8 @@ def page(template: str, title: str, context: Mapping[str, Any], data: Mapping[st
 
     Args:
         template: a file of templates/ that extends page.html.
+        title: Title of the page.
+        context: Variables of the template.
         data: for the scripts, as JSON.
         maps: GLB, gzip, base64.
     """

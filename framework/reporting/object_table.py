@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import Float64
-from framework.evaluation.instances import Judgement, Outcome
+from framework.evaluation.instances import Judgment, Outcome
 from framework.reporting.map_scene import colors_by_id, hex_color
 from framework.reporting.pictures import Picture
 from framework.reporting.run_contents import RunContents
@@ -35,13 +35,13 @@ class ObjectRow:
 
 
 def object_rows(
-    contents: RunContents, pictures: Mapping[int, Picture], judgements: Mapping[int, Judgement]
+    contents: RunContents, pictures: Mapping[int, Picture], judgments: Mapping[int, Judgment]
 ) -> list[ObjectRow]:
     """Return the rows of the table, the most confident object first."""
     colors = colors_by_id(contents.objects)
     rows = []
     for one in sorted(contents.objects, key=lambda one: (-one.confidence, one.id)):
-        judgement = judgements.get(one.id)
+        judgment = judgments.get(one.id)
         rows.append(
             ObjectRow(
                 one,
@@ -50,16 +50,16 @@ def object_rows(
                 _size(one, contents.up),
                 100 * float(one.obb.extent.max()),
                 _position(one),
-                _truth(judgement),
-                css_class(judgement.outcome) if judgement else "faint",
-                f"{judgement.iou:.2f}" if judgement and judgement.iou else "",
+                _truth(judgment),
+                css_class(judgment.outcome) if judgment else "faint",
+                f"{judgment.iou:.2f}" if judgment and judgment.iou else "",
             )
         )
     return rows
 
 
 def object_data(
-    one: StoredInstance, contents: RunContents, picture: Picture | None, judgement: Judgement | None
+    one: StoredInstance, contents: RunContents, picture: Picture | None, judgment: Judgment | None
 ) -> dict[str, Any]:
     """Return the data of an object in the panel."""
     likeliest = sorted(one.class_probabilities.items(), key=lambda entry: (-entry[1], entry[0]))[:SHOWN_CLASSES]
@@ -76,7 +76,7 @@ def object_data(
         "frames": f"{one.first_frame} to {one.last_frame}",
         "vertices": one.vertices,
         "source": picture.source if picture else "",
-        "truth": _truth(judgement) + (f", IoU {judgement.iou:.2f}" if judgement and judgement.iou else ""),
+        "truth": _truth(judgment) + (f", IoU {judgment.iou:.2f}" if judgment and judgment.iou else ""),
     }
 
 
@@ -99,12 +99,12 @@ def _height_above_floor(one: StoredInstance, contents: RunContents) -> float | N
     return float(one.obb.center @ up) - half - floor
 
 
-def _truth(judgement: Judgement | None) -> str:
-    if judgement is None:
+def _truth(judgment: Judgment | None) -> str:
+    if judgment is None:
         return ""
-    if judgement.outcome is Outcome.WRONG_CLASS:
-        return f"truth: {judgement.truth_class}"
-    return str(judgement.outcome.value)
+    if judgment.outcome is Outcome.WRONG_CLASS:
+        return f"truth: {judgment.truth_class}"
+    return str(judgment.outcome.value)
 
 
 def _position(one: StoredInstance) -> str:

@@ -47,6 +47,7 @@ class Photographer:
         Args:
             labels: (V,) of the mesh's vertices, 0 = none.
             best: index of the pose, by label.
+            colors: (3,) color by label.
         """
         taken: dict[int, Picture] = {}
         scale = 1.0 if len(best) <= MANY else 0.6

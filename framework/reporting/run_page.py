@@ -76,13 +76,12 @@ class RunReport:
     def html(self) -> str:
         """Return the page, identical for the same run and sequence."""
         contents, metrics = self.contents, self.contents.record.metrics
-        judgements = self.check.judgements if self.check else {}
+        judgments = self.check.judgments if self.check else {}
         data: dict[str, Any] = {
             "likely": LIKELY,
             "maps": [] if self.scene is None else [{"name": contents.name, **self.scene.data()}],
             "objects": [
-                object_data(one, contents, self.pictures.get(one.id), judgements.get(one.id))
-                for one in contents.objects
+                object_data(one, contents, self.pictures.get(one.id), judgments.get(one.id)) for one in contents.objects
             ],
         }
         context = {
@@ -94,7 +93,7 @@ class RunReport:
             "mapped": self.scene is not None,
             "still": overview_url(contents.record.directory / "overview.png") if self.scene is not None else "",
             "checked": self.check is not None,
-            "objects": object_rows(contents, self.pictures, judgements),
+            "objects": object_rows(contents, self.pictures, judgments),
             "truth": truth_section(self.check, self.why_unchecked, contents, self.pictures),
             "trajectory": self._trajectory(),
             "progress": self._progress(),

@@ -26,6 +26,7 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
     the class. A mesh of `light_enough` results in at most MOST_BYTES.
 
     Args:
+        mesh: Mesh of the map.
         first_seen: (V,) in [0, 1], part of the sequence before the first view of each vertex.
         names: class by id, of the objects with a node.
         up: (3,) unit vector, world.

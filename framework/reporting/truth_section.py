@@ -11,7 +11,7 @@ import numpy as np
 from framework.data import SceneTruth, UInt8
 from framework.evaluation.instances import (
     MAX_DISTANCE,
-    Judgement,
+    Judgment,
     Outcome,
     PredictedInstances,
     judge,
@@ -70,7 +70,7 @@ class Gallery:
 class TruthCheck:
     """The outcome of every object, and the missed true objects."""
 
-    judgements: Mapping[int, Judgement]  # by object
+    judgments: Mapping[int, Judgment]  # by object
     missed: list[Card]
 
     @classmethod
@@ -112,8 +112,8 @@ class TruthCheck:
     def galleries(self, contents: RunContents, pictures: Mapping[int, Picture]) -> list[Gallery]:
         cards = {outcome: list[Card]() for outcome in GROUPS}
         for one in contents.objects:
-            if judgement := self.judgements.get(one.id):
-                cards[judgement.outcome].append(_card(one, judgement, pictures.get(one.id)))
+            if judgment := self.judgments.get(one.id):
+                cards[judgment.outcome].append(_card(one, judgment, pictures.get(one.id)))
         note = "true objects without a match of their class"
         galleries = [Gallery("missed", "Missed", note, self.missed, bool(self.missed))]
         for outcome, (name, note) in GROUPS.items():
@@ -144,15 +144,16 @@ def truth_section(
 
 
 def css_class(outcome: Outcome) -> str:
+    """Return the CSS class of an outcome."""
     return outcome.name.lower().replace("_", "-")
 
 
-def _card(one: StoredInstance, judgement: Judgement, picture: Picture | None) -> Card:
-    near = judgement.truth_class or "an unlabeled object"
+def _card(one: StoredInstance, judgment: Judgment, picture: Picture | None) -> Card:
+    near = judgment.truth_class or "an unlabeled object"
     notes = {
-        Outcome.RIGHT: f"IoU {judgement.iou:.2f}",
-        Outcome.WRONG_CLASS: f"truth: {near}, IoU {judgement.iou:.2f}",
-        Outcome.FALSE: f"nearest: {near}, IoU {judgement.iou:.2f}" if judgement.iou else "no overlap",
+        Outcome.RIGHT: f"IoU {judgment.iou:.2f}",
+        Outcome.WRONG_CLASS: f"truth: {near}, IoU {judgment.iou:.2f}",
+        Outcome.FALSE: f"nearest: {near}, IoU {judgment.iou:.2f}" if judgment.iou else "no overlap",
         Outcome.IGNORED: f"on {near}",
     }
-    return Card(one.class_name, f"{one.confidence:.2f}", notes[judgement.outcome], picture, one.id)
+    return Card(one.class_name, f"{one.confidence:.2f}", notes[judgment.outcome], picture, one.id)

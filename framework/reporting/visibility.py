@@ -44,7 +44,9 @@ def sightings(
     """Return the views of a mesh from the poses (P, 4, 4), by rendering it from some of them.
 
     Args:
+        mesh: Mesh of the map.
         labels: (V,) of the vertices, 0 = none.
+        poses: (P, 4, 4) T_world_camera.
         camera: of the sequence.
         clarity: sharpness of the image, by pose, in [0, 1]; 1 if missing.
     """

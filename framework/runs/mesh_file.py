@@ -28,7 +28,7 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
         "class": mesh.class_ids,
     }
     comments = (
-        "InstanceMap; metres; instance 0 = none; class -1 = none, else an index into:",
+        "InstanceMap; meters; instance 0 = none; class -1 = none, else an index into:",
         f"{CLASSES}{','.join(mesh.classes)}",
     )
     write_ply(path, mesh.vertices, mesh.triangles, properties, comments)

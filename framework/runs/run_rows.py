@@ -169,7 +169,7 @@ class _Variant:
     def of(cls, record: Record, over: Sequence[str]) -> _Variant:
         parameters = dict(leaves(relevant(record.config)))
         choices = {k.removeprefix(CHOICE): v for k, v in record.metrics.items() if k.startswith(CHOICE)}
-        choices["annotation"] = record.annotation or "not told"
+        choices["annotation"] = record.annotation or "unknown"
         run = tuple(str(parameters.get(key)) for key in over)
         row = record.config.get("row")
         return cls(record, "" if row is None else str(row), run, choices, parameters)

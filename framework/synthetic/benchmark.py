@@ -1,8 +1,8 @@
-"""The ten rooms of the synthetic benchmark, named after what they are for. None is a copy of a real place.
+"""The ten scenes of the synthetic benchmark.
 
-`bedroom`, `couches`, `student` and `one_room` have things lying on beds and couches, `living_chairs`, `meeting` and
-`kitchen` rows of equal chairs, `books` and `office` many books. Each of the nine classes is in several rooms, and
-clutter of no class stands on and against the furniture of all.
+`bedroom`, `couches`, `student` and `one_room` have objects on beds and couches; `living_chairs`, `meeting` and
+`kitchen` have rows of equal chairs; `books` and `office` have many books. Each of the nine classes is in several
+scenes, and clutter without class is on and next to the furniture of all.
 """
 
 from __future__ import annotations
@@ -54,10 +54,12 @@ class SceneSpec:
 
 
 def bag(rng: Rng) -> Group:
+    """Return a random bag."""
     return single("bag", fixtures.backpack(rng))
 
 
 def cupboard(rng: Rng) -> Group:
+    """Return a random cupboard."""
     return laden("cupboard", clutter.cupboard(rng), rng)
 
 
@@ -70,6 +72,7 @@ def kitchen(rng: Rng) -> Group:
 
 
 def shelf(rng: Rng) -> Group:
+    """Return a random shelf."""
     return single("shelf", small_things.shelf(rng))
 
 
@@ -138,7 +141,7 @@ class Scene:
 
 
 def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: float) -> Scene:
-    """The scene of this spec that a walk of `frames` frames shows most of, among several drawn from `stream`.
+    """Return the candidate scene of this spec whose walk of `frames` frames shows the most of it.
 
     `stride` is the walk's, see walk.plan_path.
 
@@ -162,7 +165,7 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: floa
 
 
 def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
-    """A scene, and the shares of its classes and of its objects of a class that its walk shows well."""
+    """Return a scene and the fractions of its classes and same-class objects that its walk shows well."""
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
@@ -179,7 +182,7 @@ def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[
 
 
 def furnish_scene(spec: SceneSpec, rng: Rng) -> Room:
-    """A room of this spec, drawn at random. Raises DataError when its furniture does not fit."""
+    """Return a random room of this spec. Raises DataError if its furniture does not fit."""
     contents = [make(rng) for make in spec.groups]
     contents += [
         single("door", clutter.door(rng)),

@@ -43,7 +43,7 @@ class Layout:
 
 
 def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout:
-    """The groups in the smallest room, from `width` x `depth` m upwards, in which they leave room to walk.
+    """Return the groups in the smallest room, at least `width` x `depth` m, that leaves space to walk.
 
     Raises DataError when even a room half as long again is too small.
     """
@@ -106,7 +106,7 @@ def _try_layout(
 
 
 def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
-    """The place (x, y, angle) of a group `along` a wall: 0 at -y, 1 at +x, 2 at +y, 3 at -x."""
+    """Return the pose (x, y, angle) of a group `along` a wall: 0 at -y, 1 at +x, 2 at +y, 3 at -x."""
     if wall == 0:
         return along, -depth / 2, 0.0
     if wall == 1:
@@ -148,7 +148,7 @@ def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
 
 
 def strew(layout: Layout, things: Sequence[Furniture], rng: Rng) -> Layout:
-    """The layout with the things in it, each against some furniture, but for what finds no place or bars the walk.
+    """Return the layout with things next to furniture, without those that do not fit or block the walk.
 
     The things turn by quarters, so that their boxes stay as tight as they are.
     """

@@ -36,6 +36,8 @@ EMISSION, DARK, SHINY = 11, 12, 13  # columns of material_table
 
 
 class Texture(IntEnum):
+    """Procedural textures."""
+
     PAINT = 0
     WOOD = 1
     FABRIC = 2
@@ -90,6 +92,7 @@ def absorbed(color: Color) -> float:
 
 
 def pick(rng: np.random.Generator, choices: tuple[Color, ...]) -> Color:
+    """Return a random choice."""
     return choices[int(rng.integers(len(choices)))]
 
 
@@ -105,6 +108,7 @@ def vivid(rng: np.random.Generator) -> Color:
 
 
 def wood(rng: np.random.Generator) -> Material:
+    """Return a random wood material."""
     first, second = WOODS[int(rng.integers(len(WOODS)))]
     tone = rng.uniform(0.9, 1.08)
     light, veins = shade(first, tone), shade(second, tone)
@@ -133,6 +137,7 @@ def patterned_cloth(rng: np.random.Generator) -> Material:
 
 
 def paint(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
+    """Return a painted material."""
     return Material(Texture.PAINT, color, shade(color, contrast), scale, seed=new_seed(rng), dark=absorbed(color))
 
 
@@ -142,6 +147,7 @@ def glaze(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale:
 
 
 def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Material:
+    """Return a metal material."""
     dark = absorbed(color)
     return Material(Texture.METAL, color, shade(color, 0.91), seed=new_seed(rng), dark=dark, shiny=POLISHED)
 

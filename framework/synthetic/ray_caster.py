@@ -39,7 +39,7 @@ class RayCaster:
         )
 
     def cast(self, rays: Float32) -> RayHits:
-        """The first hits of rays (..., 6), origin and direction."""
+        """Return the first hits of rays (..., 6), origin and direction."""
         answer = self._scene.cast_rays(_tensor(np.ascontiguousarray(rays)), get_num_threads())
         triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's "nothing" is 2^32 - 1, which is -1
         return RayHits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
@@ -70,5 +70,5 @@ def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) 
 
 
 def image_rays(camera: Camera, T_world_camera: Float64) -> Float32:
-    """The rays (H, W, 6) through all pixel centers."""
+    """Return the rays (H, W, 6) through all pixel centers."""
     return pixel_rays(camera, T_world_camera, np.arange(camera.width)[None, :], np.arange(camera.height)[:, None])

@@ -53,12 +53,12 @@ class Room:
 
 
 def furnish(kind: RoomKind, rng: Rng) -> Room:
-    """A room of this kind, drawn at random."""
+    """Return a random room of this kind."""
     return furnish_with(_groups(kind, rng), *SMALLEST[kind], rng)
 
 
 def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, strewn: Sequence[Furniture] = ()) -> Room:
-    """A room of at least `width` x `depth` m with these contents, the largest first: they find a place most easily.
+    """Return a room of at least `width` x `depth` m with these contents, placed largest first.
 
     As much of what is `strewn` stands on the floor as finds a place against the furniture.
     """
@@ -70,7 +70,7 @@ def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, st
 
 
 def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
-    """What the room holds, largest first: the first ones find a place most easily."""
+    """Return the contents of the room, largest first, which is easiest to place."""
     door, window = single("door", clutter.door(rng)), single("window", clutter.window(rng), z=0.95, hung=True)
     bag = single("backpack", fixtures.backpack(rng))
     extras = [
@@ -132,7 +132,7 @@ def _floor(rng: Rng) -> Material:
 
 
 def _lamps(pieces: list[Furniture]) -> list[Lamp]:
-    """The light of everything that glows."""
+    """Return the light of all emitters."""
     lamps: list[Lamp] = []
     for piece in pieces:
         low, high = piece.bounds()
@@ -151,7 +151,7 @@ def _lamps(pieces: list[Furniture]) -> list[Lamp]:
 
 
 def _daylight(low: Float64, high: Float64) -> Lamp:
-    """A window's light, sent from between its curtains; the window lies against the wall nearest to it."""
+    """Return the light of a window, emitted between its curtains; the window is at the nearest wall."""
     thin = int(np.argmin((high - low)[:2]))
     wide = 1 - thin
     normal = np.zeros(3)

@@ -24,7 +24,7 @@ class RoomMesh:
     instance_ids: Int32  # (V,), 0 = floor, wall or ceiling
 
     def only(self, kept: Bool) -> RoomMesh:
-        """The vertices `kept` (V,), in their order, and the triangles between them."""
+        """Return the vertices `kept` (V,) in order, and the triangles between them."""
         number = np.cumsum(kept, dtype=np.int32) - 1
         triangles = self.triangles[kept[self.triangles].all(axis=1)]
         return RoomMesh(self.vertices[kept], number[triangles], self.instance_ids[kept])
@@ -38,7 +38,7 @@ def visible_mesh(
     reach: tuple[float, float],
     longest_edge: float = LONGEST_EDGE,
 ) -> RoomMesh:
-    """The surfaces, as far as they are seen from one of the poses T_world_camera at a depth within `reach` (m, m).
+    """Return the surfaces visible from the poses T_world_camera at a depth within `reach` (m, m).
 
     `caster` has the triangles of `surfaces`. What no depth camera reads is not seen, nor what lies behind it.
     """
@@ -47,7 +47,7 @@ def visible_mesh(
 
 
 def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
-    """The surfaces in triangles whose edges are at most `longest_edge` m long.
+    """Return the surfaces in triangles whose edges are at most `longest_edge` m long.
 
     A longer edge is halved until it is short enough, in all triangles that have it, so that no gaps come about.
     """
@@ -117,7 +117,7 @@ def seen_from(
 def _in_view(
     vertices: Float32, skip: Bool, camera: Camera, T_world_camera: Float64, reach: tuple[float, float]
 ) -> Int64:
-    """The indices of the vertices, but for those to `skip`, that the picture would show if nothing stood before."""
+    """Return the indices of the vertices in view regardless of occlusion, except those to `skip`."""
     index = np.flatnonzero(~skip)
     dx, dy, dz = vertices[index].T - T_world_camera[:3, 3:]
     x, y, z = (R[0] * dx + R[1] * dy + R[2] * dz for R in T_world_camera[:3, :3].T)

@@ -39,7 +39,7 @@ Piece = Callable[[SceneNNScene], int]  # writes some files, returns how many of 
 
 
 def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: BenchmarkSettings, jobs: int) -> None:
-    """Writes the scenes into `root`, by `jobs` processes; what is there of the same recording is kept.
+    """Write the scenes into `root` with `jobs` processes; files of the same scenes are kept.
 
     Raises ConfigError when `root` holds something else, DataError when a file or a process fails.
     """
@@ -73,7 +73,7 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Benchmar
 
 
 def _begin(root: Path, recording: BenchmarkSettings) -> None:
-    """The files that all scenes share; refuses a folder that holds anything else."""
+    """Write the files that all scenes share; refuse a folder with other content."""
     made_by = root / MADE_BY
     wanted = {"generation": GENERATION, **asdict(recording)}
     if made_by.exists():
@@ -129,7 +129,7 @@ class _Scene:
 
 
 def _choose(scenes: list[_Scene], last: _Scene | None) -> _Scene | None:
-    """The scene that a process goes on with, given its `last`: that one, else an untouched one, else the longest."""
+    """Return the next scene of a process: its `last` one, else one not started, else the longest."""
     if last is not None and last.ready:
         return last
     ready = [scene for scene in scenes if scene.ready]
@@ -167,7 +167,7 @@ _in_memory: list[SceneNNScene] = []  # of this process: the scene that it wrote 
 
 
 def _write(folder: Path, spec: SceneSpec, recording: BenchmarkSettings, piece: Piece) -> int:
-    """Writes a piece of the scene, in one of the processes."""
+    """Write a part of the scene, in one of the processes."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         if not _in_memory or _in_memory[0].folder != folder:

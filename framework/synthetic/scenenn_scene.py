@@ -141,7 +141,7 @@ class SceneNNScene:
         _write_png(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
 
     def write_truth(self) -> int:
-        """The labeled mesh and what its labels mean, and no frame; what is never read is not in it."""
+        """Write the labeled mesh and its labels, but no frames."""
         frames, name = self.recording.frames, self.folder.name
         every = -(-frames // TRUTH_VIEWS)
         views = (self.path.pose(index) for index in range(0, frames, every))
@@ -153,7 +153,7 @@ class SceneNNScene:
         return 0
 
     def _annotated(self, vertices: Float32, instance_ids: Int32) -> list[Annotated]:
-        """The objects of which the mesh shows something, by label; `vertices` (V, 3) m are y-up."""
+        """Return the objects in the mesh by label; `vertices` (V, 3) m are y-up."""
         annotated = []
         for instance, piece in self.room.objects[1:]:
             points = vertices[instance_ids == instance].astype(np.float64)
@@ -175,7 +175,7 @@ class SceneNNScene:
         return sorted(annotated, key=lambda one: one.id)
 
     def write_walk(self) -> int:
-        """The timestamps and the trajectory, which come last: where the trajectory is, the scene is complete."""
+        """Write the timestamps and the trajectory last: a scene with a trajectory is complete."""
         frames = range(self.recording.frames)
         with written_whole(self.folder / "timestamp.txt") as temporary:
             times = [round(1e6 * index / self.recording.rate) for index in frames]
@@ -191,6 +191,7 @@ def frame_files(folder: Path, index: int) -> tuple[Path, Path]:
 
 
 def trajectory_file(folder: Path) -> Path:
+    """Return the path of the trajectory."""
     return folder / "trajectory.log"
 
 

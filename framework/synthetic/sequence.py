@@ -106,7 +106,7 @@ class Synthetic(RGBDSequence):
         return self._renderer.depth_and_ids(self.camera, T_world_camera)
 
     def scene_truth(self) -> SceneTruth:
-        """The labeled surface within the sensor's range in the chosen frames, from their exact depth."""
+        """Return the labeled surface within the sensor's range in the chosen frames, from their exact depth."""
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
         chosen = sorted({*self._chosen[::every], self._chosen[-1]})
         return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)

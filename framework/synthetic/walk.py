@@ -65,7 +65,7 @@ class LabelView(Protocol):
 def plan_path(
     layout: Layout, frames: int, labels: LabelView, wanted: set[int], rng: np.random.Generator, stride: float = 1.0
 ) -> CameraPath:
-    """The walk whose `frames` frames see most of the `wanted` instances, with only every `stride`-th frame.
+    """Return the walk whose `frames` frames show the most of the `wanted` instances, with every `stride`-th frame.
 
     Raises DataError without room to walk.
     """
@@ -103,7 +103,7 @@ def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
 
 
 def _allowed_phase_speed(path: CameraPath) -> float:
-    """The phase speed (rad/s) at which neither MAX_SPEED nor MAX_TURN is exceeded anywhere."""
+    """Return the phase speed (rad/s) at which neither MAX_SPEED nor MAX_TURN is exceeded anywhere."""
     phase = np.linspace(0, 2 * np.pi, 721)
     step = phase[1]
     position, yaw, pitch, roll = path._state(phase)
@@ -114,7 +114,7 @@ def _allowed_phase_speed(path: CameraPath) -> float:
 
 
 def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[int]) -> float:
-    """The phase from which a walk over `sweep` rad sees most wanted instances, and of these most pixels."""
+    """Return the start phase of a walk over `sweep` rad that shows the most wanted instances, then pixels."""
     phases = 2 * np.pi * np.arange(PHASES) / PHASES
     ids = sorted(wanted)
     pixels = np.array(

@@ -43,7 +43,7 @@ def markdown_grid(grid: TextTable) -> str:
 
 
 def latex_grid(grid: TextTable) -> list[str]:
-    """Return the lines of a tabular for `\\usepackage{booktabs}`."""
+    """Return the lines of a LaTeX tabular for the package booktabs."""
     alignment = "l" * grid.label_columns + "r" * (len(grid.heads) - grid.label_columns)
     lines = [f"\\begin{{tabular}}{{{alignment}}}", "\\toprule", _latex_line(map(_escaped, grid.heads)), "\\midrule"]
     for k, cells in enumerate(grid.body):

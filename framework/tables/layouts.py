@@ -244,6 +244,7 @@ def _published_line(comparison: ComparisonTable, one: PublishedRow, keys: Iterab
 
 
 def published_name(published: PublishedRow) -> str:
+    """Return the name of a published row."""
     return f"{published.system} (published)"
 
 

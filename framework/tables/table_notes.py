@@ -112,7 +112,7 @@ def _published(comparison: ComparisonTable) -> Iterator[str]:
     for row in comparison.published_rows:
         yield f"Published, {row.system}: {row.source}{f'; {row.remark}' if row.remark else ''}."
     if unknown := [f"{row.system} ({row.source})" for row in comparison.published_unknown]:
-        yield f"Published, but nobody has looked the numbers up: {'; '.join(unknown)}."
+        yield f"Published results whose numbers we do not have: {'; '.join(unknown)}."
 
 
 def _missing(comparison: ComparisonTable) -> Iterator[str]:

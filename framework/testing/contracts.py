@@ -137,6 +137,7 @@ class DetectorContract:
 
 
 def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
+    """Assert that detections fulfill the detector contract."""
     assert found.classes == detector.classes
     assert found.masks.shape == (len(found), *frame.camera.shape)
     assert found.class_probabilities.shape == (len(found), len(detector.classes))
@@ -393,6 +394,7 @@ def fused(fuser: MapFuser, frames: int = 5) -> MapFuser:
 
 
 def nothing_in(frame: Frame, pose: Pose) -> PointClusters:
+    """Return empty point clusters of a frame."""
     return lift(Detections.none(CAMERA.shape, CLASSES), frame, pose)
 
 

@@ -69,6 +69,7 @@ def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: in
 
 
 def room_folder(folder: Path, number: int) -> Path:
+    """Return the folder of a training room."""
     return folder / f"room_{number:06d}"
 
 

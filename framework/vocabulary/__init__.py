@@ -1,0 +1,1 @@
+"""Label spaces, color names and text queries."""

@@ -125,7 +125,9 @@ class Precomputed(Detector):
         if index > last:
             raise DataError(f"{has}, and for none of those asked for so far, up to {index}: is it this sequence's?")
         if len(self._asked) == FRAMES_IN_DOUBT:
-            log.warning("%s, but for none of the first %d frames: is it this sequence's?", has, FRAMES_IN_DOUBT)
+            log.warning(
+                "%s, but none of the first %d frames; check that the file is of this sequence", has, FRAMES_IN_DOUBT
+            )
 
 
 def _mask(stored: StoredDetection, frame: Frame) -> Bool:

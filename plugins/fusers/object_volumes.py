@@ -40,7 +40,7 @@ class ObjectVolumes(MapFuser):
     create_points: int = 50  # pixels, >= 1: and this many; an object is seen, or missed, with this many in view
     min_existence: float = 0.1  # in [0, 1]: an object that exists with less probability is forgotten
     min_observations: int = 3  # frames, >= 1: before that an object is tentative, as in our own map
-    min_area: float = 0.01  # m^2 of surface in the mesh, >= 0: likewise
+    min_area: float = 0.01  # m^2 of surface in the mesh, >= 0: smaller objects are tentative
 
     def __post_init__(self) -> None:
         check_bounds(

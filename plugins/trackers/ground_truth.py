@@ -17,7 +17,7 @@ class GroundTruth(PoseTracker):
     pose_source = "ground_truth"
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """Raises NoPoseError for a frame without a pose."""
+        """Return the given pose. Raises NoPoseError for a frame without a pose."""
         if frame.T_world_camera is None:
             raise NoPoseError(f"frame {frame.index} has no true pose at {frame.timestamp:.3f} s")
         return Pose(frame.T_world_camera)

@@ -48,7 +48,7 @@ class TrajectoryFile(PoseTracker):
         self._T_world_file: Float64 | None = np.eye(4) if self.world_frame is World.FILE else None
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """Raises NoPoseError for a frame without a pose in the file."""
+        """Return the pose of the file. Raises NoPoseError for a frame without a pose in the file."""
         nearest = int(np.abs(self._timestamps - frame.timestamp).argmin())
         difference = abs(float(self._timestamps[nearest]) - frame.timestamp)
         if difference > self.max_time_difference:

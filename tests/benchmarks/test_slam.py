@@ -252,8 +252,9 @@ def test_slam_trajectory(benchmark, walks, trajectories, video: str, tracker: st
 
 
 class Duel:
-    """Ours and Open3D's on the same frames, TURN frames each in turns: whatever else the machine does hits both alike,
-    and each mostly finds the caches as it left them, as it would where it runs alone.
+    """Run both systems on the same frames, alternating every TURN frames.
+
+    Other load on the machine affects both equally, and each mostly finds its caches as when it runs alone.
     """
 
     def __init__(self, recording: Recording, ours: SlamLoop, theirs: Open3DSlam) -> None:
@@ -299,5 +300,5 @@ class Duel:
         return {row: np.quantile(pairs[FIRST:], q, axis=0) for row, pairs in self._measured.items()}
 
     def lifting(self) -> float:
-        """s"""
+        """Return the median time of lifting in s."""
         return float(np.median(self._lifting[FIRST:]))

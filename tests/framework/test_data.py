@@ -77,7 +77,7 @@ def test_a_camera_is_made_of_numbers(name: str, value: object) -> None:
 
 
 def test_read_only_images_are_copied_and_others_are_not() -> None:
-    """numba compiles its kernels anew for arrays that it must not write to."""
+    """Read-only arrays would compile the kernels again."""
     depth = np.ones((3, 4), np.float32)
     assert frame(depth=depth).depth is depth
     depth.flags.writeable = False

@@ -1,4 +1,4 @@
-"""Private parts of Hydra and numba are used in few places, which CONTRIBUTING.md lists with the tested versions."""
+"""Private parts of Hydra and numba are used in few places, which docs/development.md lists with the tested versions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from framework.config import hydra_api
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SECTION = (
-    (CHECKOUT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Private APIs")[2].partition("\n## ")[0]
+    (CHECKOUT / "docs" / "development.md")
+    .read_text(encoding="utf-8")
+    .partition("## Private APIs")[2]
+    .partition("\n## ")[0]
 )
 PRIVATE = re.compile(r"(hydra\._internal|hydra\.core\.singleton|hydra\.version|numba\.core)(\.|$)|(hydra|numba)\..*\b_")
 
@@ -36,7 +39,7 @@ def private_imports() -> dict[tuple[str, str], set[str]]:
     return found
 
 
-def test_private_imports_are_listed_in_contributing() -> None:
+def test_private_imports_are_listed_in_development_notes() -> None:
     rows = re.findall(r"(?m)^\| `([\w.]+)` \| ([^|]+) \|", SECTION)
     listed = {(module, name) for module, names in rows for name in re.findall(r"`(\w+)`", names)}
     assert listed == set(private_imports())

@@ -142,7 +142,7 @@ def test_seeds_of_a_scene_are_drawn_together(tmp_path: Path) -> None:
 
 
 def test_only_runs_that_all_rows_have_are_compared(tmp_path: Path) -> None:
-    """c has no figure with the hard seed, in which all others are worse: it is no better for that."""
+    """A row without the hard seed does not gain rank by the missing run."""
     one = experiment(tmp_path / "one", {"a": (0.9, 0.3), "b": (0.8, 0.2), "c": (0.7, None), "d": (0.6, 0.1)})
     other = experiment(tmp_path / "other", {"a": (0.9,), "b": (0.8,), "c": (0.7,), "d": (0.6,)})
     lines = lines_of(write_ranks([one, other], [AP50], None))

@@ -29,8 +29,9 @@ def fuse_masks(
     embeddings: np.ndarray | None = None,
     space: str = "words@1",
 ) -> None:
-    """Fuses the frame at its true pose, with these masks detected, each with its distribution over the classes, and
-    with an embedding (n, D) of this space where there are some.
+    """Fuse the frame at its true pose with these masks and their class distributions.
+
+    `embeddings` (n, D) are optional.
     """
     assert frame.T_world_camera is not None
     pose = Pose(frame.T_world_camera)

@@ -1,0 +1,1 @@
+"""Commands that inspect and extend the installation."""

@@ -13,6 +13,7 @@ from framework.errors import ConfigError
 
 
 def main() -> None:
+    """Run the command `instancemap compile`."""
     parser = argparse.ArgumentParser(
         description="Compiles the kernels of a run with the default stages, which numba stores for later runs of this "
         "installation. Compiled kernels are skipped."

@@ -13,6 +13,7 @@ from framework.errors import ConfigError
 
 
 def main() -> None:
+    """Run the command `instancemap convert-weights`."""
     parser = argparse.ArgumentParser(
         description="Converts a Mask R-CNN of torchvision or detectron2 for detector=mask_rcnn."
     )
@@ -29,6 +30,7 @@ def main() -> None:
 
 
 def convert(source: Path, target: Path, kind: str | None, classes: str | None, norm_eps: float, half: bool) -> None:
+    """Convert a checkpoint to safetensors."""
     if target.suffix != ".safetensors":
         raise ConfigError(f"{target}: expected a file name that ends in .safetensors")
     from framework.detection.mask_rcnn.checkpoint import CheckpointKind, read_network

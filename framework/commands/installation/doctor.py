@@ -22,6 +22,7 @@ LEGEND = "ok: available   --: missing, optional   !!: missing or broken, require
 
 
 def main() -> None:
+    """Run the command `instancemap doctor`."""
     parser = argparse.ArgumentParser(
         description="Checks the installation and prints the fix for each problem. Paste the output into an issue: it"
         " does not contain your user name or home folder. Exits with 1 if a run with the default stages cannot work."

@@ -1,6 +1,6 @@
-"""`python -m framework new-plugin STAGE NAME`: a repository of one's own with a plugin that works, to begin from.
+"""`instancemap new-plugin STAGE NAME` creates a package with a working plugin.
 
-What it writes stands in framework/templates: a folder for each stage and for viewers, and what all have in common.
+framework/templates has a folder for each stage, one for viewers and one for common files.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from framework.errors import ConfigError, DataError
 from framework.registry import GROUPS
 
 TEMPLATES = Path(framework.__file__).with_name("templates")
-PLACES = {  # of each template in the new repository; the first ones are those of the stage
+PLACES = {  # path of each template in the new package; those of the stage come first
     "plugin.py": "$package/$name.py",
     "option.yaml": "$package/conf/$stage/$name.yaml",
     "test.py": "tests/test_$name.py",
@@ -37,10 +37,10 @@ PLACES = {  # of each template in the new repository; the first ones are those o
     "test.yml": ".github/workflows/test.yml",
 }
 LONGEST_NAME = 30  # characters; lines of the templates stay within 120
-FOLDERS = ("conf", "tests")  # of the repository and the package, that a module would stand in the way of
+FOLDERS = ("conf", "tests")  # names that a module of the package must not have
 SMALL = "dataset=synthetic dataset.frames=30 dataset.width=320 dataset.height=240"
 FIRST = "hydra.sweep.dir=outputs/first_sweep"
-TRIES = {  # by stage: how a new plugin is compared with ours; a viewer changes no result, and is looked at
+TRIES = {  # by stage: command that compares a new plugin with ours; a viewer is only inspected
     "detector": f"instancemap -m detector=mask_rcnn_rooms,$name {SMALL} {FIRST}",
     "tracker": f"instancemap -m tracker=voxel_hashing_icp,$name detector=simulated {SMALL} {FIRST}",
     "refiner": f"instancemap -m refiner=gmm_em,$name detector=simulated {SMALL} {FIRST}",
@@ -49,12 +49,12 @@ TRIES = {  # by stage: how a new plugin is compared with ours; a viewer changes 
     "viewer": f"instancemap viewer=$name detector=simulated {SMALL} hydra.run.dir=outputs/first_run",
 }
 SWEPT = """\
-sweeps, and ends with a table, which is also in `outputs/first_sweep/table.md`; each run's `overview.png` is its map.
-Without `dataset.frames` and the like it takes longer, and is enough to compare."""
+runs a sweep and prints `outputs/first_sweep/table.md`; `overview.png` of each run shows its map. For a comparison, omit
+`dataset.frames`, `dataset.width` and `dataset.height`."""
 WATCHED = """\
-maps thirty frames of a made-up room with it: `outputs/first_run/frames.jsonl` has a line for each of them.
-`instancemap dataset=desk viewer=$name` maps a real video."""
-DATA: dict[str, tuple[type, ...]] = {  # by stage: what its methods get and give
+maps thirty frames of a synthetic scene with it: `outputs/first_run/frames.jsonl` has a line for each frame.
+`instancemap dataset=desk viewer=$name` maps a real sequence."""
+DATA: dict[str, tuple[type, ...]] = {  # by stage: types of its arguments and results
     "detector": (Frame, Camera, Detections),
     "tracker": (Frame, Camera, SurfaceView, Pose),
     "refiner": (PointClusters, Frame, Camera),
@@ -62,7 +62,7 @@ DATA: dict[str, tuple[type, ...]] = {  # by stage: what its methods get and give
     "dataset": (Frame, Camera),
     "viewer": (Frame, Camera, Detections, Pose, Instance),
 }
-VARIANTS = {  # by stage: a parameter for an option that inherits
+VARIANTS = {  # by stage: parameter of a variant
     "detector": "tolerance: 30",
     "tracker": "max_distance: 0.2",
     "refiner": "reach: 0.6",
@@ -73,6 +73,7 @@ VARIANTS = {  # by stage: a parameter for an option that inherits
 
 
 def main() -> None:
+    """Run the command `instancemap new-plugin`."""
     parser = argparse.ArgumentParser(
         description="Writes a repository with a plugin of your own, which works at once: package, option, tests, CI."
     )
@@ -91,7 +92,7 @@ def main() -> None:
 
 
 def write_repository(stage: str, name: str, folder: Path) -> Path:
-    """The new folder in `folder`, written whole or not at all.
+    """Create the new folder in `folder` atomically and return it.
 
     Raises ConfigError for a name that cannot be one or is taken, DataError where the folder cannot be written.
     """
@@ -114,7 +115,7 @@ def write_repository(stage: str, name: str, folder: Path) -> Path:
 
 
 def check_name(stage: str, name: str) -> None:
-    """Raises ConfigError for a name that cannot be that of a module and of a new option of the stage."""
+    """Raise ConfigError unless the name is valid for a module and a new option of the stage."""
     if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > LONGEST_NAME:
         raise ConfigError(
             f"NAME must be words of a-z and 0-9 with _ between them, like my_{stage}, at most {LONGEST_NAME} "
@@ -138,7 +139,7 @@ def is_value(name: str) -> bool:
 
 
 def names_of(stage: str, name: str) -> dict[str, str]:
-    """What the templates' placeholders stand for."""
+    """Return the values of the placeholders in the templates."""
     own = {
         "stage": stage,
         "name": name,
@@ -155,13 +156,13 @@ def names_of(stage: str, name: str) -> dict[str, str]:
 
 
 def fields_of(data: type) -> str:
-    """The fields of a dataclass with their shapes, units and meanings, as its source has them."""
+    """Return the fields of a dataclass with the comments of its source."""
     body = inspect.getsource(data).partition("\n    def ")[0]
     return "\n".join([f"class {data.__name__}:", *re.findall(r"^    \w+: .*", body, re.MULTILINE)])
 
 
 def files_of(stage: str, name: str) -> dict[str, str]:
-    """The texts of the new repository's files, by path."""
+    """Return the contents of the new repository's files by path."""
     names = names_of(stage, name)
     return {
         Template(place).substitute(names): Template(_template(stage, template)).substitute(names)

@@ -54,7 +54,7 @@ class Option:
 
 
 def registered(*stages: str, only: str | None = None) -> list[Option]:
-    """The options of these config groups, by stage and name, or those with the name that is asked for."""
+    """Return the options of these config groups by stage and name, or only those with the requested name."""
     with config_loader() as loader:
         files = CachingConfigRepository(loader.repository)  # of all options: they share most of what they are made of
         return [
@@ -66,7 +66,7 @@ def registered(*stages: str, only: str | None = None) -> list[Option]:
 
 
 def options_of(stage: str) -> list[str]:
-    """The names of the stage's options, whether they can be used or not."""
+    """Return the names of the stage's options, usable or not."""
     with config_loader() as loader:
         return list(loader.get_group_options(stage))
 
@@ -109,7 +109,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
 
 
 def _nested(made_of: Mapping[str, str], place: str, plugin_class: type) -> str:
-    """The options that a field at `place` (detector.detector) holds: one, or several by name."""
+    """Return the options in the field at `place` (detector.detector): one, or several by name."""
     if holds_one(plugin_class, place.rpartition(".")[2]):
         own = [path for path, package in made_of.items() if package == place]
         return own[-1].rpartition("/")[2] if own else ""  # after those that it inherits from
@@ -124,13 +124,13 @@ def _default(field: dataclasses.Field[Any]) -> object:
 
 
 def _text(source: str, name: str) -> str:
-    """The YAML as it was written: Hydra's configs have lost the comments."""
+    """Return the text of the YAML file; Hydra's configs have no comments."""
     scheme, _, root = source.partition("://")
     return Path(root, name).read_text() if scheme == "file" else ""
 
 
 def describe(option: Option) -> str:
-    """An option as indented text: name and documentation, then a line for each parameter."""
+    """Return an option as indented text: name, description and a line for each parameter."""
     origin = "" if option.provider == "main" else f"  [from {option.provider}]"
     lines = [
         f"  {option.name}{origin}",
@@ -144,6 +144,7 @@ def describe(option: Option) -> str:
 
 
 def main() -> None:
+    """Run the command `instancemap plugins`."""
     parser = argparse.ArgumentParser(description="Lists the registered plugins.")
     parser.add_argument("stage", nargs="?", choices=GROUPS, help="only this stage")
     parser.add_argument("name", nargs="?", help="only this option")

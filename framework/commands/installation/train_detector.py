@@ -14,11 +14,13 @@ from framework.files.search_paths import CONF
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train_detector")
 def job(config: DictConfig) -> None:
+    """Train the detector of a composed config."""
     from framework.training.train import train  # slow: after Hydra has checked the keys
 
     train(config, Path(HydraConfig.get().runtime.output_dir))
 
 
 def main() -> None:
+    """Run the command `instancemap train-detector`."""
     with one_line_errors():
         job()

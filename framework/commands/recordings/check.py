@@ -43,4 +43,5 @@ def job(config: DictConfig) -> None:
 
 
 def main() -> None:
+    """Run the command `instancemap check`."""
     jobs.run(job)

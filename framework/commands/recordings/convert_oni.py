@@ -25,6 +25,7 @@ PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # a higher level takes longer than playi
 
 
 def main() -> None:
+    """Run the command `instancemap convert-oni`."""
     parser = argparse.ArgumentParser(
         description="Converts an OpenNI recording to SceneNN's images. Needs OpenNI 2: apt-get install libopenni2-0."
     )

@@ -13,6 +13,7 @@ from framework.importing.phones.image_rotation import QUARTER, upright
 
 
 def main() -> None:
+    """Run the command `instancemap import`."""
     default = Writing()
     listed = "\n".join(f"  {kind.name:<15} {kind.needs}" for kind in FORMATS)
     parser = argparse.ArgumentParser(

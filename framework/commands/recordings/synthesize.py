@@ -14,10 +14,11 @@ from framework.synthetic.scenenn_scene import BenchmarkSettings
 
 
 def main() -> None:
+    """Run the command `instancemap synthesize`."""
     default = BenchmarkSettings()
     parser = argparse.ArgumentParser(
         description="Writes synthetic rooms to DIR in SceneNN's format: images, depth, trajectory, labeled mesh. The "
-        "same parameters give the same bytes. Existing rooms are kept."
+        "the same parameters give byte-identical files. Existing rooms are kept."
     )
     add = parser.add_argument
     add("directory", metavar="DIR", type=Path, help="new folder, or one that this command began")

@@ -22,6 +22,7 @@ UNCHANGED = (Kind.STAYED, Kind.NOT_SEEN)
 
 
 def main() -> None:
+    """Run the command `instancemap diff`."""
     parser = argparse.ArgumentParser(
         description="Lists the objects that appeared, vanished or moved between two runs, with probabilities. Both "
         "need the same world frame: run the second with localize_in=FIRST, or both with given poses."
@@ -63,6 +64,7 @@ def in_world(run: Path, world: Path) -> bool:
 
 
 def line(change: Change) -> str:
+    """Return one line of text about a change."""
     x, y, z = change.place
     where = f"at ({x:.2f}, {y:.2f}, {z:.2f}) m"
     if change.kind is Kind.MOVED:
@@ -72,6 +74,7 @@ def line(change: Change) -> str:
 
 
 def entry(change: Change) -> dict[str, object]:
+    """Return a change for JSON."""
     return {
         "kind": change.kind.value,
         "class": change.name,

@@ -23,6 +23,7 @@ REFUSED = "refused: "  # prefix of an error
 
 
 def main() -> None:
+    """Run the command `instancemap evaluate`."""
     parser = argparse.ArgumentParser(
         description="Re-evaluates the instances of stored runs from mesh.ply and instances.json, updates these metrics "
         "in metrics.json and prints the changes. Other metrics, such as those of the trajectory, are not changed."

@@ -10,6 +10,7 @@ from framework.commands.command_line import arguments, one_line_errors
 
 
 def main() -> None:
+    """Run the command `instancemap export`."""
     parser = argparse.ArgumentParser(
         description="Exports the scene of a run, its separate objects (upright, at the origin, in meters), a floor "
         "plan or a scene graph to the formats of other programs."

@@ -7,6 +7,7 @@ from framework.figures.experiment_figure import write_figure
 
 
 def main() -> None:
+    """Run the command `instancemap figures`."""
     print_for_directories(
         "Writes figure.png and figure.pdf of the experiment in DIR.",
         "folder of an experiment",

@@ -12,6 +12,7 @@ from framework.queries.text_search import BY, WITH_EMBEDDINGS, Match, QueryResul
 
 
 def main() -> None:
+    """Run the command `instancemap query`."""
     parser = argparse.ArgumentParser(
         description="Ranks the objects of a stored run by a text query: by image embeddings if the run has any "
         f"({WITH_EMBEDDINGS}), else by class names and surface colors."

@@ -21,6 +21,7 @@ PICTURE = "raycast.png"
 
 
 def main() -> None:
+    """Run the command `instancemap raycast`."""
     parser = argparse.ArgumentParser(
         description="Draws the ray-cast view of a run's map in five panels: depth, normals, vertices, RGB and object "
         "indices."

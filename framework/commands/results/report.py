@@ -19,6 +19,7 @@ COMPARISON = "comparison.html"
 
 
 def main() -> None:
+    """Run the command `instancemap report`."""
     parser = argparse.ArgumentParser(
         description="Writes an interactive HTML report of a run: map, objects, trajectory, times, and errors if ground "
         "truth is known. For several runs, it writes a report of each and a comparison. A report is a single file."

@@ -7,6 +7,7 @@ from framework.tables.experiment_tables import write_tables
 
 
 def main() -> None:
+    """Run the command `instancemap tables`."""
     print_for_directories(
         "Writes table.md, table.tex and table.csv of the runs below DIR.",
         "folder of a sweep or of several runs",

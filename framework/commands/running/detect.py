@@ -1,6 +1,6 @@
-"""`python -m framework detect detector=X dataset=D out=FILE`: writes a sequence's detections as a COCO result file.
+"""`instancemap detect detector=X dataset=D out=FILE` writes the detections of a sequence as a COCO result file.
 
-Where the frames come with their true instances, it also says how good the masks are, and what goes wrong how often.
+With ground truth, it also reports mask AP and the rates of detection errors.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from framework.errors import ConfigError, DataError, FrameError
 from framework.files.search_paths import CONF
 from framework.interfaces import Detector, RGBDSequence
 
-if TYPE_CHECKING:  # what is imported where it is used loads heavy libraries
+if TYPE_CHECKING:  # heavy imports are local
     from framework.data import Bool, Detections
     from framework.detection.stored.coco_results import ResultWriter
     from framework.evaluation.detection_faults import DetectionFaults
@@ -31,19 +31,19 @@ if TYPE_CHECKING:  # what is imported where it is used loads heavy libraries
 log = logging.getLogger(__name__)
 jobs = Jobs()
 
-SMALLEST = 100  # px, of a true object that counts
+SMALLEST = 100  # px, minimum size of evaluated objects
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="detect")
 @jobs.reported
 def job(config: DictConfig) -> None:
-    """Builds the dataset and the detector that the config names, and writes what the one finds in the other."""
+    """Build the dataset and the detector of the config and write the detections of all frames."""
     if config.out is None:
-        raise ConfigError("out must be given: out=detections.json")
+        raise ConfigError("out: expected a file name, got none; set out=detections.json")
     out = checked_file("out", config.out)
 
     from framework.detection.stored.cache import with_cache
-    from framework.registry import build  # here, so that such faults are answered before the heavy libraries load
+    from framework.registry import build  # local: config errors are reported before heavy imports
     from framework.runtime.process_settings import Settings
     from framework.vocabulary.label_spaces import COCO
 
@@ -56,13 +56,13 @@ def job(config: DictConfig) -> None:
     how = f"detector=precomputed detector.path={out}"
     if detector.classes != COCO:
         how += f" detector.label_space={write_labels(out, detector.classes)}"
-    log.info("read it with: %s", how)
+    log.info("use it with: %s", how)
 
 
 def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> int:
-    """Writes a result file that `detector=precomputed` reads back to the same detections; returns their number.
+    """Write a result file that `detector=precomputed` reads, and return the number of detections.
 
-    Frames that cannot be used are told and left out. Raises DataError when none can.
+    Unusable frames are logged and skipped. Raises DataError if no frame is usable.
     """
     from framework.detection.domain import warn_outside_domain
     from framework.detection.stored.coco_results import results_file
@@ -91,7 +91,7 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
 def _written(
     results: ResultWriter, detector: Detector, sequence: RGBDSequence, faults: DetectionFaults
 ) -> Iterator[tuple[Bool, list[str | None], Detections]]:
-    """Detects and writes, frame by frame; where there is truth, counts faults and yields what `mask_ap` compares."""
+    """Write the detections frame by frame; with ground truth, count errors and yield the input of `mask_ap`."""
     with logging_redirect_tqdm(), tqdm(total=len(sequence), unit=" frames", disable=None, dynamic_ncols=True) as bar:
         for k in range(len(sequence)):
             bar.update()
@@ -113,11 +113,11 @@ def _written(
                 ids = np.array([i for i in np.unique(true_ids).tolist() if i and i in names], np.int32)
                 yield true_ids == ids[:, None, None], [names[i] for i in ids.tolist()], found
     if results.frames == 0:
-        raise DataError(f"{sequence.name}: none of the {len(sequence)} frames can be used")
+        raise DataError(f"{sequence.name}: expected usable frames, got none of {len(sequence)}")
 
 
 def write_labels(path: Path, classes: tuple[str, ...]) -> Path:
-    """Writes the classes beside a result file, one a line: what its probabilities are over."""
+    """Write the class names next to a result file, one per line."""
     from framework.files.atomic_write import written_whole
 
     labels = path.with_suffix(".labels.txt")
@@ -127,4 +127,5 @@ def write_labels(path: Path, classes: tuple[str, ...]) -> Path:
 
 
 def main() -> None:
+    """Run the command `instancemap detect`."""
     jobs.run(job)

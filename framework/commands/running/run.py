@@ -96,11 +96,13 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
 
 def main() -> None:
+    """Run the pipeline or a sweep from the command line."""
     raise_on_signals()
     jobs.run(job_or_sweep)
 
 
 def job_or_sweep() -> None:
+    """Execute one run or, with -m, a sweep."""
     with ending:
         try:
             job()

@@ -1,6 +1,6 @@
-"""`python -m framework show-refinement dataset=D detector=X refiner=R out=FILE`: one frame before and after refinement.
+"""`instancemap show-refinement dataset=D detector=X refiner=R out=FILE` draws a frame before and after refinement.
 
-Draws the masks in the image and their points in 3D from the side (the paper's Figure 5), with the figures below.
+The figure shows the masks in the image, their points from the side, and metrics.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from framework.errors import ConfigError, DataError, FrameError
 from framework.files.search_paths import CONF
 from framework.interfaces import ClusterRefiner, Detector, RGBDSequence
 
-if TYPE_CHECKING:  # what is imported where it is used loads heavy libraries
+if TYPE_CHECKING:  # heavy imports are local
     from framework.data import Detections, Frame
 
 log = logging.getLogger(__name__)
 jobs = Jobs()
 
-TRIED = 6  # frames, evenly spaced, from which one is chosen where none is named
+TRIED = 6  # evenly spaced frames, candidates of the default frame
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="show_refinement")
 @jobs.reported
 def job(config: DictConfig) -> None:
-    """Builds dataset, detector and refiner, and draws what the last one does to one frame."""
+    """Build dataset, detector and refiner, and draw the refinement of one frame."""
     if config.out is None:
-        raise ConfigError("out must be given: out=refinement.png")
+        raise ConfigError("out: expected a file name, got none; set out=refinement.png")
     out = checked_file("out", config.out, ".png")
 
     from framework.detection.stored.cache import with_cache
     from framework.evaluation.refined_points import Refinement
     from framework.figures.refinement_figure import write_refinement
-    from framework.registry import build  # here, so that such faults are answered before the heavy libraries load
+    from framework.registry import build  # local: config errors are reported before heavy imports
     from framework.runtime.process_settings import Settings
 
     settings = Settings.of(config)
@@ -60,10 +60,9 @@ def job(config: DictConfig) -> None:
 
 
 def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tuple[int, Frame, Detections]:
-    """The frame at `position` with its detections, and its position; None = the one of a few with most detections.
+    """Return the frame at `position`, its detections and position; None = the frame with the most detections of a few.
 
-    Raises ConfigError for a position that there is not, FrameError when that frame cannot be used, and DataError when
-    none of the few can.
+    Raises ConfigError for an invalid position, FrameError for an unusable frame, DataError if no candidate is usable.
     """
     from framework.detection.domain import warn_outside_domain
 
@@ -93,11 +92,12 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
 
 
 def called(refiner: str, overrides: Iterable[str]) -> str:
-    """How the refiner is chosen on the command line, with the parameters that are not the config's."""
+    """Return the overrides that choose the refiner and its parameters."""
     return " ".join(
         [f"refiner={refiner}", *(item for item in overrides if item.lstrip("+~").startswith(("refiner.", "refiner@")))]
     )
 
 
 def main() -> None:
+    """Run the command `instancemap show-refinement`."""
     jobs.run(job)

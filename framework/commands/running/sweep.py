@@ -1,4 +1,4 @@
-"""What surrounds a run or a sweep, whoever runs its jobs: its place is its own, and its table is made in the end."""
+"""Directories, signals and tables of runs and sweeps, with any launcher."""
 
 from __future__ import annotations
 
@@ -30,35 +30,36 @@ from framework.runtime.process_settings import available_cores
 from framework.runtime.signals import signals_passed_on
 
 ending = ExitStack()
-"""What this process still has to do when the run or the sweep that it began has ended, in whatever way."""
+"""Cleanup of this process after its run or sweep."""
 
 
 def cores_of(threads: int) -> int:
-    """How many cores a job of so many threads (0 = all) takes of this machine."""
+    """Return the cores that a job with so many threads uses; 0 = all."""
     return threads or available_cores()
 
 
 def jobs_at_once(threads: int) -> int:
-    """How many such jobs the cores of this machine take."""
+    """Return the number of such jobs that fit on this machine."""
     return max(1, available_cores() // cores_of(threads))
 
 
 OmegaConf.register_new_resolver("cores_of", cores_of, replace=True)
 OmegaConf.register_new_resolver("jobs_at_once", jobs_at_once, replace=True)
-# once for a config: a sweep's workers, whose configs take over what this one's has resolved, get the same answer
+# cached: workers of a sweep use the directory that the main process resolved
 OmegaConf.register_new_resolver("new_directory", new_directory, use_cache=True, replace=True)
 
 
 @dataclass
 class PlaceCallback(Callback):
-    """How Hydra says that a run or a sweep begins, and where. It calls this in the process that was started, before it
-    writes anything, and not in workers.
+    """Hydra callback at the start of a run or sweep.
+
+    Hydra calls it in the main process before it writes anything, not in workers.
     """
 
-    of_run: bool = True  # whether a run has its place to itself; a command that writes one file has none
+    of_run: bool = True  # True if a run has its own directory; False for commands that write one file
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        HydraConfig.instance().set_config(config)  # as it does itself a moment later: the place names the dataset
+        HydraConfig.instance().set_config(config)  # as Hydra does later; the directory contains the name of the dataset
         if self.of_run:
             self.take(
                 lambda: run_in(place_of("hydra.run.dir", config.hydra.run.dir), wait=config.skip_completed is True)
@@ -70,12 +71,12 @@ class PlaceCallback(Callback):
     def take(self, place: Callable[[], AbstractContextManager[None]]) -> None:
         try:
             ending.enter_context(place())
-        except (InstanceMapError, OSError, OmegaConfBaseException) as error:  # Hydra would warn of it, and go on
+        except (InstanceMapError, OSError, OmegaConfBaseException) as error:  # Hydra would only warn
             sys.exit(f"error: {one_line(error)}")
 
 
 def place_of(key: str, chosen: str) -> Path:
-    """The directory that was chosen. Raises ConfigError for an empty name, which would be the working folder."""
+    """Return the chosen directory. Raises ConfigError for an empty name, which would be the working folder."""
     if not chosen.strip():
         raise ConfigError(f"{key} is empty; {key}=. is the working folder")
     return Path(chosen)
@@ -83,18 +84,17 @@ def place_of(key: str, chosen: str) -> Path:
 
 @contextmanager
 def run_in(directory: Path, wait: bool) -> Iterator[None]:
-    """Has `directory` to itself while the body runs. Raises DataError."""
+    """Lock `directory` inside the context. Raises DataError."""
     with locked(directory, wait):
         if (directory / LOG).exists():
-            check_regular(directory / LOG)  # Hydra opens it, and would wait for who reads a pipe
+            check_regular(directory / LOG)  # Hydra would block on a pipe
         yield
 
 
 def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[None]:
-    """The place of a sweep, once it is known that it has runs, with a table of them or not. Raises InstanceMapError.
+    """Return the directory of a sweep that has runs. Raises InstanceMapError.
 
-    Has joblib start no more workers than there are runs: the signals of a terminal reach all of them, and one that
-    never had a run would die of them, and all others with it.
+    joblib starts at most one worker per run: a terminal's signal would end an idle worker and then all others.
     """
     own = config.hydra
     swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
@@ -111,8 +111,10 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
 
 
 def _name_by(own: DictConfig, keys: Collection[str]) -> None:
-    """Has a job's directory be named by these keys, too, of those that change no result: jobs that differ in nothing
-    else would share one. Every job is composed anew, by workers, too, from the overrides that this adds to.
+    """Add these keys to the names of job directories, although they change no result.
+
+    Jobs that differ only in such keys would share a directory. Workers compose each job again from the overrides that
+    this function extends.
     """
     left_out = [*own.job.config.override_dirname.exclude_keys]
     still = [key for key in left_out if key not in keys]
@@ -122,12 +124,12 @@ def _name_by(own: DictConfig, keys: Collection[str]) -> None:
 
 
 def by_joblib(own: DictConfig | HydraConf) -> bool:
-    """Whether the jobs of a sweep are run by processes that this one has started, or a single one by itself."""
+    """Return True if joblib runs the jobs of the sweep."""
     return str(own.launcher._target_).endswith(".JoblibLauncher")
 
 
 def joblib_workers(asked: int | None) -> int:
-    """How many processes joblib makes of `n_jobs`; with 1 it starts none."""
+    """Return the number of processes that joblib uses for `n_jobs`; with 1 it starts none."""
     from joblib import effective_n_jobs  # type: ignore[import-untyped]
 
     return int(effective_n_jobs(asked))
@@ -135,13 +137,12 @@ def joblib_workers(asked: int | None) -> int:
 
 @contextmanager
 def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool = False) -> Iterator[None]:
-    """Has `directory` to itself while the body runs, and prints the table of the runs in it however the body ends.
+    """Lock `directory` inside the context, and print the table of its runs at the end, also after errors.
 
-    The picture of the runs is drawn, too, but for Ctrl-C, which shall end at once. Raises InstanceMapError, in place of
-    what the launchers raise when a worker is killed. Where it has `workers`, a signal is theirs, too: their runs leave
-    a partial record, and the sweep ends after them.
+    The figure is drawn, too, except after Ctrl-C. Raises InstanceMapError if a launcher fails because a worker was
+    killed. With `workers`, signals are forwarded to them: their runs store partial results before the sweep ends.
     """
-    # joblib ends its workers without their help, and Python's own clean-up warns of that
+    # joblib stops its workers, and Python's resource tracker warns about it
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker")))
     with locked(directory):
         remove_left_over(directory)
@@ -149,30 +150,30 @@ def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool
             with signals_passed_on(lambda: at_work_in(directory)) if workers else nullcontext():
                 yield
         except BaseException as error:
-            with suppress(InstanceMapError):  # more is to be said about how it ended than that nothing is there
+            with suppress(InstanceMapError):  # the first error matters more than a missing table
                 _report(directory, with_table, with_figure and isinstance(error, Exception))
             if _is_of_a_launcher(error):
                 reason = textwrap.shorten(one_line(error), 300)
                 raise InstanceMapError(
-                    f"the sweep ended early, and the same command goes on with it: {reason}"
+                    f"the sweep stopped early: {reason}; run the same command to continue it"
                 ) from error
             raise
         _report(directory, with_table, with_figure)
 
 
 def at_work_in(directory: Path) -> list[BaseProcess]:
-    """The processes that this one has started and that have a run in work in the place of a sweep."""
+    """Return the child processes that execute a run of this sweep."""
     busy = {holder(run) for run in directory.iterdir() if is_locked(run)}
     return [worker for worker in active_children() if holder_name(worker.pid) in busy]
 
 
 def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
-    """Makes of the runs in `directory` what is asked for, here and not where workers import this module."""
+    """Write tables and figures of the runs in `directory`, in the main process."""
     if with_table:
         from framework.tables.experiment_tables import write_tables
 
         print(write_tables(directory))
-        print(f"{os.path.relpath(directory / 'table.md')}, and beside it table.tex, table.csv")
+        print(f"{os.path.relpath(directory / 'table.md')}, table.tex, table.csv")
     if with_figure:
         from framework.figures.experiment_figure import write_figure
 
@@ -180,5 +181,5 @@ def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
 
 
 def _is_of_a_launcher(error: BaseException) -> bool:
-    """Whether not a job but what runs the jobs has failed: joblib and submitit raise RuntimeErrors, Ray its own."""
+    """Return True for errors of a launcher: RuntimeErrors of joblib and submitit, and those of Ray."""
     return isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] == "ray"

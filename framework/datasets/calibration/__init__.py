@@ -1,0 +1,1 @@
+"""Camera calibration of datasets."""

@@ -95,7 +95,7 @@ class DepthCamera(LiveVideo):
             self.stop()
 
     def _frame(self, images: Any, number: int, timestamp: float, calibration: Calibration) -> Frame:
-        """Raises FrameError if one of the two images is missing, or they cannot be registered."""
+        """Raise FrameError if one of the two images is missing or they cannot be registered."""
         try:
             color, depth = self.read(images)
         except self.errors as error:

@@ -77,7 +77,7 @@ class FolderWatch(LiveVideo):
             time.sleep(min(max(self.poll_interval, LEAST_REST * (time.monotonic() - began)), 0.1))
 
     def _calibration(self) -> Generator[None, None, Calibration]:
-        """The content of camera.json, once it is complete."""
+        """Return the content of camera.json, once it is complete."""
         path, deadline = self.folder / "camera.json", time.monotonic() + self.camera_timeout
         while True:
             try:
@@ -93,7 +93,7 @@ class FolderWatch(LiveVideo):
 
 
 def _read(number: int, images: StoredImages | str, timestamp: float, calibration: Calibration) -> Frame:
-    """The frame. Raises FrameError if it cannot be used."""
+    """Return the frame. Raises FrameError if it cannot be used."""
     if isinstance(images, str):
         raise FrameError(images)
     color = calibration.color(images.color(), images.color_name)

@@ -44,7 +44,7 @@ def paired_images(colors: dict[int, Path], depths: dict[int, Path]) -> dict[int,
 
 
 def _missing(files: dict[int, Path], number: int) -> Path:
-    """The path of a missing image, named like the others."""
+    """Return the path of a missing image, named like the others."""
     first = next(iter(files.values()))
     before = _before_number(first)
     return first.with_stem(before + str(number).zfill(len(first.stem) - len(before)))

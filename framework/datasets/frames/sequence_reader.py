@@ -254,7 +254,7 @@ def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[R
 
 
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
-    """The frame with its pose converted, or with a error if the pose is too far away to be mapped."""
+    """Return the frame with its pose converted, or with an error if the pose is too far away to be mapped."""
     if recorded.T_world_camera is None:
         return recorded
     T_world_camera = reading.pose(recorded.T_world_camera)
@@ -266,7 +266,7 @@ def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
 
 
 def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
-    """The frames, at 30 Hz if the times of the usable ones do not increase."""
+    """Return the frames, at 30 Hz if the times of the usable ones do not increase."""
     times = [recorded.timestamp for recorded in frames if not recorded.error]
     if all(a < b for a, b in pairwise(times)):
         return frames

@@ -1,0 +1,1 @@
+"""Ground-truth instances of datasets."""

@@ -124,7 +124,7 @@ def _class_of(where: str, entry: Any) -> str | None:
 
 
 def _labels_of(path: Path, ply: PlyMesh) -> Int32:
-    """The instance (V,) of each vertex of a mesh with triangles."""
+    """Return the instance (V,) of each vertex of a mesh with triangles."""
     labels = ply.properties.get(LABELS)
     if labels is None or labels.dtype.kind not in "iu":
         found = f"got {', '.join(sorted(ply.properties)) or 'none'}"
@@ -143,7 +143,7 @@ def _labeled(path: Path, ply: PlyMesh, ids: Int32, class_names: Mapping[int, str
 
 
 def _classes_of_run(path: Path, entries: Sequence[Any]) -> dict[int, str | None]:
-    """The class of each instance of a run, None in a map without classes."""
+    """Return the class of each instance of a run, None in a map without classes."""
     class_names: dict[int, str | None] = {}
     for number, entry in enumerate(entries, start=1):
         key, name = (entry.get("id"), entry.get("class", ...)) if isinstance(entry, dict) else (None, None)

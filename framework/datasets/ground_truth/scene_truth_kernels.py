@@ -30,7 +30,7 @@ class Slots(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
-    """The slot that holds (key, instance), or the empty one where it belongs."""
+    """Return the slot that holds (key, instance), or the empty one where it belongs."""
     keys, ids, votes, _, _ = slots
     mask = len(keys) - 1
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(instance) * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -46,7 +46,7 @@ def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
 def vote(
     depth: Float32, instance_ids: Int32, intrinsics: Float64, T: Float64, scale: float, slots: Slots, taken: int
 ) -> int:
-    """Adds one view's pixels; returns the number of slots taken, -1 when a point is too far away."""
+    """Add the pixels of a view; return the number of occupied slots, or -1 if a point is too far away."""
     keys, ids, votes, sums, first = slots
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     height, width = depth.shape
@@ -81,7 +81,7 @@ def vote(
 
 @njit(cache=True, nogil=True)
 def move_slots(slots: Slots, to: Slots) -> None:
-    """Puts all entries into a larger table."""
+    """Move all entries into a larger table."""
     for s in range(len(slots.keys)):
         if slots.votes[s] > 0:
             slot = _slot(to, slots.keys[s], slots.ids[s])

@@ -136,7 +136,7 @@ def _camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _color_camera(path: Path, width: int, height: int) -> Camera:
-    """The camera of exported color, which the SensReader may have made smaller without changing the intrinsics."""
+    """Return the camera of exported color, which SensReader may have resized without changing the intrinsics."""
     matrix = read_matrix(path)
     if _fits(matrix.camera(width, height)) or not _fits(camera := matrix.camera(*COLOR_SIZE)):
         return _camera(path, width, height)
@@ -146,7 +146,7 @@ def _color_camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _fits(camera: Camera) -> bool:
-    """True if the principal point is near the middle of the image."""
+    """Return True if the principal point is near the middle of the image."""
     u, v = camera.cx / camera.width, camera.cy / camera.height
     return max(abs(u - 0.5), abs(v - 0.5)) <= 1 / 8
 

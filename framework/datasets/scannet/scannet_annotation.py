@@ -126,13 +126,13 @@ def read_label_table(path: Path) -> Mapping[str, str]:
 
 
 def _spellings(nyu40: Mapping[str, str]) -> dict[str, str]:
-    """The known name for each known name and for its letters and digits alone."""
+    """Return the known name for each known name and for its letters and digits alone."""
     names = {**nyu40, **MEANINGS, **dict.fromkeys(UNNAMED)}
     return {_letters(name): name for name in names} | {name: name for name in names}
 
 
 def _spelled(label: str, spellings: Mapping[str, str]) -> str:
-    """The known name that an annotator meant, or what was written."""
+    """Return the known name that an annotator meant, or what was written."""
     own = label.strip().lower()
     return spellings.get(own) or spellings.get(_letters(own), own)
 

@@ -186,7 +186,7 @@ def _matrix(where: str, data: bytes) -> PrintedMatrix:
 
 
 def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) -> tuple[list[SensFrame], str]:
-    """The complete frames, and why there are no more; "" = these are all."""
+    """Yield the complete frames and the reason why there are no more; "" = all frames are complete."""
     most_color = 2 * 3 * prod(header.color_camera.shape) + OVERHEAD
     most_depth = 2 * 2 * prod(header.depth_camera.shape) + OVERHEAD
     frames: list[SensFrame] = []
@@ -210,7 +210,7 @@ def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) ->
 
 
 def _inflate(name: str, data: bytes, length: int) -> bytes:
-    """The unpacked `data`, of at most `length` bytes."""
+    """Return the unpacked `data`, of at most `length` bytes."""
     stream = zlib.decompressobj()
     try:
         unpacked = stream.decompress(data, length + 1)

@@ -174,7 +174,7 @@ def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
 
 
 def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """The images of `handles`, which are in the order of Stream."""
+    """Return the images of `handles`, which are in the order of Stream."""
     waited = (ctypes.c_void_p * len(handles))(*handles)
     last = dict.fromkeys(Stream, 0)
     while any(last[stream] < streams[stream].last for stream in Stream):
@@ -198,7 +198,7 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
 
 
 def _pixels(stream: Stream, frame: _Frame) -> npt.NDArray[Any] | None:
-    """A copy of the pixels; None if OpenNI delivers fewer than the image has."""
+    """Return a copy of the pixels; None if OpenNI delivers fewer than the image has."""
     pixel_format, shape = frame.mode.pixel_format, (frame.height, frame.width)
     if frame.data_size < frame.stride * frame.height:
         return None

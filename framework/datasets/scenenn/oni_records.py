@@ -145,7 +145,7 @@ def _read_contents(path: Path, file: BinaryIO) -> OniContents:
 
 
 def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
-    """The layouts of a position in the file, and of a record's start: magic, kind, node, two sizes, a position."""
+    """Return the layouts of a file position and of a record header: magic, kind, node, two sizes, a position."""
     position = "Q" if wide else "I"
     return struct.Struct(f"<{position}"), struct.Struct(f"<4s4I{position}")
 
@@ -165,7 +165,7 @@ def _read_version(path: Path, file: BinaryIO) -> tuple[int, ...]:
 
 
 def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
-    """The records up to the end record, or up to the first incomplete one."""
+    """Return the records up to the end record, or up to the first incomplete one."""
     size = file.seek(0, 2)
     position = FILE_HEADER.size
     while position + header.size <= size:
@@ -184,7 +184,7 @@ def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
 
 
 def _added_stream(path: Path, record: _Record) -> Stream | None:
-    """The stream of a node; None for a device, infrared or sound."""
+    """Return the stream of a node; None for a device, infrared or sound."""
     try:
         (name_size,) = struct.unpack_from("<I", record.fields)
         (node_type,) = struct.unpack_from("<I", record.fields, 4 + name_size)

@@ -107,7 +107,7 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
 
 
 def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
-    """The four rows (4, 4), finite or not; None if the end of the file cuts them off."""
+    """Return the four rows (4, 4), finite or not; None if the end of the file cuts them off."""
     matrix = np.empty((4, 4))
     for k, line in enumerate(rows):
         try:
@@ -125,7 +125,7 @@ def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
 
 
 def _is_frame(word: str) -> bool:
-    """True for a number that may be in a header."""
+    """Return True for a number that may be in a header."""
     return word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1
 
 

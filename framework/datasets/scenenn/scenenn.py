@@ -86,7 +86,7 @@ def _recorded(images: StoredImages, pose_id: int, poses: TrajectoryLog | None, t
 
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:
-    """The times of all of these images, or of none: two clocks do not mix."""
+    """Return the times of all images or of none: two clocks are not mixed."""
     if not is_there(path):
         return {}
     times = read_timestamps(path)
@@ -128,7 +128,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
 
 def _nyu_class(label: Annotated | None) -> str:
-    """The class of a label, "" = not known."""
+    """Return the class of a label, "" = not known."""
     if label is None or not label.text.strip():
         return ""
     name = label.nyu_class.strip().lower()

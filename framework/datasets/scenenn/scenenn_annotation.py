@@ -153,7 +153,7 @@ def _color(text: str) -> tuple[int, int, int]:
 
 
 def _aabb(text: str) -> Float64 | None:
-    """The box of `minx miny minz maxx maxy maxz`."""
+    """Return the box of `minx miny minz maxx maxy maxz`."""
     numbers = _numbers(text, 6)
     if numbers is None or (numbers[:3] > numbers[3:]).any():
         return None
@@ -161,7 +161,7 @@ def _aabb(text: str) -> Float64 | None:
 
 
 def _obb(text: str) -> Box | None:
-    """The box of a center, the dimensions and a quaternion xyzw (github.com/hkust-vgd/scenenn, issue 11)."""
+    """Return the box of a center, the dimensions and a quaternion xyzw (github.com/hkust-vgd/scenenn, issue 11)."""
     numbers = _numbers(text, 10)
     if numbers is None or (numbers[3:6] < 0).any():
         return None
@@ -171,7 +171,7 @@ def _obb(text: str) -> Box | None:
 
 
 def _numbers(text: str, count: int) -> Float64 | None:
-    """The `count` finite numbers of a text, None if it is something else."""
+    """Return the `count` finite numbers of a text, None if it is something else."""
     try:
         numbers = np.array([float(word) for word in text.split(maxsplit=count)])
     except ValueError:

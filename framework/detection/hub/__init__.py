@@ -1,0 +1,1 @@
+"""Detectors from the Hugging Face hub."""

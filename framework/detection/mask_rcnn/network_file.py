@@ -1,4 +1,4 @@
-"""Networks as safetensors files, with metadata:
+"""Networks as safetensors files with metadata.
 
 architecture     the Architecture as JSON
 card             the model card as JSON: data, steps, AP, limits, ...; `domain`: the only images the network is for

@@ -1,0 +1,1 @@
+"""Runtimes of networks: ONNX and Caffe2."""

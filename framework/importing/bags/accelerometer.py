@@ -66,7 +66,7 @@ def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> 
 
 
 def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
-    """The accelerometer of a topic, or why it is unusable."""
+    """Return the accelerometer of a topic, or why it is unusable."""
     times, measured, frame_id = _read(bag, topic)
     if not len(times):
         return f"{topic} has no message that can be read"
@@ -97,7 +97,7 @@ def _rotation(bag: RosBag, topic: str, frame_id: str, color: str) -> Float64 | N
 
 
 def _read(bag: RosBag, topic: str) -> tuple[Float64, Float64, str]:
-    """Times (N,) in s by the headers, measurements (N, 3) in m/s^2, and their frame, without damaged messages."""
+    """Return header times (N,) in s, measurements (N, 3) in m/s^2, and their frame, without damaged messages."""
     times, measured, frame_id, damaged = [], [], "", 0
     try:
         for message in bag.messages([topic]):

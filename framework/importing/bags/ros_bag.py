@@ -49,6 +49,7 @@ log = logging.getLogger(__name__)
 
 
 def recognized(path: Path) -> bool:
+    """Return True if this reader supports the path."""
     return path.suffix.lower() in (".bag", ".mcap", ".db3") if path.is_file() else (path / "metadata.yaml").is_file()
 
 
@@ -140,7 +141,7 @@ def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> l
 
 
 def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:
-    """The frames in the order of their second image."""
+    """Return the frames in the order of their second image."""
     topics = device.topics
     partner = {topics.color: {pair.color: pair for pair in pairs}, topics.depth: {pair.depth: pair for pair in pairs}}
     counts = {topics.color: 0, topics.depth: 0}
@@ -175,7 +176,7 @@ def _raise(error: DataError) -> DeviceFrame:
 
 
 def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading]:
-    """The poses of a topic, and their convention."""
+    """Return the poses of a topic, and their convention."""
     if not topic:
         return None, PoseReading()
     lines = []
@@ -200,7 +201,7 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
 
 
 def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistration | None:
-    """The registration of depth to the color camera. Raises DataError if it is needed and not known."""
+    """Return the registration of depth to the color camera. Raises DataError if it is needed and not known."""
     own = camera_info_of(bag, topics.depth)
     if topics.depth_is_registered or not own or own == topics.camera_info:
         return None
@@ -229,7 +230,7 @@ def _is_same(depth: Camera, color: Camera) -> bool:
 
 
 def _depth_unit(bag: RosBag, topics: Topics) -> float:
-    """The unit of whole numbers in depth images, in m."""
+    """Return the unit of whole numbers in depth images, in m."""
     if topics.depth.startswith(REALSENSE):
         sensor = topics.depth.partition(DEPTH_STREAM)[0]
         for name in ("Depth Units", "Depth_Units"):
@@ -240,7 +241,7 @@ def _depth_unit(bag: RosBag, topics: Topics) -> float:
 
 
 def _numbers(info: Any, name: str) -> list[float]:
-    """A field of a CameraInfo, which is upper case in ROS 1."""
+    """Return a field of a CameraInfo, which is upper case in ROS 1."""
     return [float(value) for value in getattr(info, name.upper() if hasattr(info, name.upper()) else name)]
 
 
@@ -250,7 +251,7 @@ def _camera(where: str, info: Any) -> Camera:
 
 
 def _distortion(topics: Topics, info: Any) -> Distortion | None:
-    """The lens distortion of color; None if there is none, or images are rectified."""
+    """Return the lens distortion of color; None if there is none, or images are rectified."""
     values = _numbers(info, "d")
     if "rect" in topics.color.rpartition("/")[2] or not any(values):
         return None

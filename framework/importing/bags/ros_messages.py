@@ -53,7 +53,7 @@ class RosBag:
     """A ROS 1 bag, or a ROS 2 bag: a folder, an .mcap or a .db3 file."""
 
     def __init__(self, path: Path) -> None:
-        """Raises DataError, with the bag, if it cannot be read."""
+        """Raise DataError, with the bag, if it cannot be read."""
         self.path = path
         import_optional("rosbags", "reads ROS bags", "ros")
         from rosbags import rosbag1, rosbag2, typesys
@@ -143,7 +143,7 @@ def _whole(stored: Array, unit: float) -> Float32:
 
 
 def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
-    """The depth of a PNG, after a header of 12 bytes in compressedDepth, which quantizes inverse depth of floats."""
+    """Return the depth of a PNG; compressedDepth has a header of 12 bytes that quantizes inverse float depth."""
     encoding, _, codec = message.format.partition(";")
     data = message.data.tobytes()
     if COMPRESSED_DEPTH not in codec:
@@ -161,7 +161,7 @@ def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
 
 
 def _pixels(where: str, message: Any, dtype: np.dtype[Any], channels: int) -> Array:
-    """The pixels (H, W, channels) of an Image."""
+    """Return the pixels (H, W, channels) of an Image."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     row = width * channels * dtype.itemsize
     if not 0 < row <= step or height < 1 or len(message.data) != height * step:

@@ -74,7 +74,7 @@ def camera_info_of(bag: RosBag, image: str) -> str:
 
 
 def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Pattern[str]) -> str:
-    """The one topic that fits, uncompressed if there are both."""
+    """Return the one topic that fits, uncompressed if there are both."""
     fitting = [topic for topic in candidates if preferred.search(topic)] or list(candidates)
     left = [topic for topic in fitting if bag.kinds[topic] == IMAGE] or fitting
     if len(left) == 1:

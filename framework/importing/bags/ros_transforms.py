@@ -55,7 +55,7 @@ def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
 
 
 def _rotation(quaternion: Any) -> Float64 | None:
-    """The rotation (3, 3), None if it is not valid."""
+    """Return the rotation (3, 3), None if it is not valid."""
     quat_xyzw = [getattr(quaternion, name) for name in "xyzw"]
     if not np.isfinite(quat_xyzw).all() or np.linalg.norm(quat_xyzw) < SMALLEST_QUATERNION:
         return None

@@ -1,0 +1,1 @@
+"""Import of recordings of phone apps."""

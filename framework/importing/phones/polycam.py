@@ -37,10 +37,12 @@ def keyframes(path: Path) -> Path:
 
 
 def recognized(path: Path) -> bool:
+    """Return True if this reader supports the path."""
     return (keyframes(path) / "cameras").is_dir() and (keyframes(path) / "images").is_dir()
 
 
 def open_source(path: Path) -> Source:
+    """Open a recording. Raises DataError if it is unusable."""
     folder = keyframes(path)
     stems = [entry.stem for entry in (folder / "cameras").glob("*.json")]
     stems = sorted((stem for stem in stems if re.fullmatch("[0-9]{1,18}", stem)), key=int)

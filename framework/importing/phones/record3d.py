@@ -46,11 +46,13 @@ _load_lzfse = partial(import_optional, "lzfse", "unpacks Record3D's .r3d files",
 
 
 def open_folder(path: Path) -> Source:
+    """Open an exported folder."""
     _load_openexr()
     return _source(path / "metadata.json", read_json_object(path / "metadata.json"), ExrFolder(path))
 
 
 def open_file(path: Path) -> Source:
+    """Open a file of the app."""
     _load_lzfse()
     files = R3dFile(path)
     where = f"{path}: metadata"
@@ -88,7 +90,7 @@ class R3dFile:
     """The images of an .r3d file, with the methods of `ExrFolder`."""
 
     def __init__(self, path: Path) -> None:
-        """Raises DataError, with the file, if it is no zip."""
+        """Raise DataError, with the file, if it is not a zip archive."""
         self.path = path
         try:
             self._zip = zipfile.ZipFile(path)
@@ -178,7 +180,7 @@ def _pose(where: str, values: Any) -> Float64:
 
 
 def _is_turned(pose: Any) -> bool:
-    """True for a valid stored pose with a rotation."""
+    """Return True for a valid stored pose with a rotation."""
     try:
         quat_xyzw = number_list("pose", pose, 7)[:4]
     except DataError:
@@ -187,7 +189,7 @@ def _is_turned(pose: Any) -> bool:
 
 
 def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> list[tuple[float, ...]]:
-    """The intrinsics fx, fy, cx, cy of each frame's color image."""
+    """Return the intrinsics fx, fy, cx, cy of each frame's color image."""
     own = content.get("perFrameIntrinsicCoeffs")
     if isinstance(own, list) and len(own) == count:
         return [tuple(number_list(f"{where}: perFrameIntrinsicCoeffs", values, 4)) for values in own]
@@ -196,7 +198,7 @@ def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> li
 
 
 def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[float]:
-    """The time of each frame in s, by the frame rate in older recordings."""
+    """Return the time of each frame in s, by the frame rate in older recordings."""
     if "frameTimestamps" in content:
         return number_list(f"{where}: frameTimestamps", content.get("frameTimestamps"), count)
     [rate] = numbers_of(where, content, "fps")
@@ -206,7 +208,7 @@ def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[fl
 
 
 def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
-    """The size (h, w) of depth in px. Older versions do not store it: depth has color's size there."""
+    """Return the size (h, w) of depth in px. Older versions do not store it: depth has color's size there."""
     if "dw" not in content:
         return camera.shape
     width, height = numbers_of(where, content, "dw", "dh")
@@ -214,7 +216,7 @@ def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) 
 
 
 def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDArray[np.floating]:
-    """The one channel (h, w). The header is checked first, as it determines how much memory the rest needs."""
+    """Return the one channel (h, w). The header is checked first, as it determines how much memory the rest needs."""
     OpenEXR = _load_openexr()
     try:
         header = OpenEXR.File(io.BytesIO(data), header_only=True).header()

@@ -25,10 +25,12 @@ _FRAME = re.compile(r"frame_([0-9]{5,9})\.json")
 
 
 def recognized(path: Path) -> bool:
+    """Return True if this reader supports the path."""
     return path.is_dir() and any(_FRAME.fullmatch(entry.name) for entry in path.iterdir())
 
 
 def open_source(path: Path) -> Source:
+    """Open a recording. Raises DataError if it is unusable."""
     digits = sorted(match[1] for entry in path.iterdir() if (match := _FRAME.fullmatch(entry.name)))
     complete = [n for n in digits if (path / f"frame_{n}.jpg").exists() and (path / f"depth_{n}.png").exists()]
     if not complete:

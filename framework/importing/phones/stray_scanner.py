@@ -46,10 +46,12 @@ class OdometryRow:
 
 
 def recognized(path: Path) -> bool:
+    """Return True if this reader supports the path."""
     return (path / "odometry.csv").is_file() and (path / "camera_matrix.csv").is_file()
 
 
 def open_source(path: Path) -> Source:
+    """Open a recording. Raises DataError if it is unusable."""
     video = Video(path / "rgb.mp4")
     rows = _read_odometry(path / "odometry.csv", _read_camera(path / "camera_matrix.csv", video))
     confident = (path / "confidence").is_dir()
@@ -114,7 +116,7 @@ class Video:
     """Reads frames in sensor orientation, as depth has it, without the rotation that a phone notes."""
 
     def __init__(self, path: Path) -> None:
-        """Raises DataError, with the file, if it cannot be decoded."""
+        """Raise DataError, with the file, if it cannot be decoded."""
         check_regular(path)
         with path.open("rb") as file:
             if not file.read(KIND_AT + len(KIND)).endswith(KIND):

@@ -1,0 +1,1 @@
+"""Instances of the map and their association."""

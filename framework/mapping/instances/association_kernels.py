@@ -66,9 +66,9 @@ def _add_run(count, list_id, label, offsets, clusters, column, votes):
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_votes(points, instance_ids, stride, column, votes):
-    """Add the pixels of each cluster, and in the last row all pixels, on the instance of each column to votes
-    (CHUNKS, N + 1, M + 1).
+    """Add the number of pixels of each cluster (row) on each instance (column) to votes (CHUNKS, N + 1, M + 1).
 
+    The last row counts all pixels.
     Counts runs of pixels, because a counter raised for each pixel would wait for its own memory.
     """
     list_ids, offsets, clusters = points.list_ids, points.offsets, points.clusters

@@ -1,0 +1,1 @@
+"""Class and instance evidence of voxels."""

@@ -99,8 +99,9 @@ def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evi
 
 @njit(cache=True, nogil=True)
 def number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
-    """Fill rows (A,) with the row of each block, a new one if it has none and new (A,) voxels, and first_new (A,) with
-    the index of its first new voxel. Returns the numbers of rows and voxels.
+    """Fill rows (A,) with the row of each block and first_new (A,) with the index of its first new voxel.
+
+    A block without row gets one if it has new (A,) voxels. Returns the numbers of rows and voxels.
     """
     for a in range(blocks.shape[0]):
         rows[a], first_new[a] = row_of[blocks[a]], voxel_count

@@ -82,11 +82,13 @@ def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> P
 
 
 def remove_supports(points: PixelLists, supported: Bool, seen: Int32, stride: int) -> PixelLists:
-    """Return the lists without clusters at pixels where the map has an instance that lies on the cluster's object.
+    """Return the lists without clusters at pixels where the map has an instance supported by the cluster's object.
 
     Args:
-        supported: (N, ids + 1) whether an instance lies on what a cluster is of.
+        points: Lists of clusters at the pixels.
+        supported: (N, ids + 1) True if the cluster's object supports the instance.
         seen: The map's instance at every stride-th pixel of every stride-th row.
+        stride: Stride of `seen` in px.
     """
     instances = np.flatnonzero(supported.any(axis=0))
     column = np.zeros(supported.shape[1], np.int32)

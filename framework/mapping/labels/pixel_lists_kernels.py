@@ -66,6 +66,7 @@ def link_points(coordinates, cluster, list_ids, tree):
 
 @njit(cache=True, nogil=True)
 def write_lists(head, parent, offsets, clusters):
+    """Write the clusters of each list into the flat array, from `offsets` on."""
     for i in range(offsets.shape[0] - 1):
         list_id = i
         for entry in range(offsets[i], offsets[i + 1]):

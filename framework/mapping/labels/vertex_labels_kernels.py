@@ -23,8 +23,9 @@ CHUNK = 1024  # vertices that share scratch arrays
 
 @device
 def corner_voxels(grid, vertex, blocks, voxels, weights):
-    """Fill the block, -1 = absent, the index in it and the trilinear weight, (8,) each, of the voxels around a vertex
-    (3,) m. Returns whether any of them has label evidence.
+    """Fill block (-1 = absent), index and trilinear weight, (8,) each, of the voxels around a vertex (3,) m.
+
+    Returns True if any of them has label evidence.
     """
     scale = np.float32(1.0) / grid.voxel_size
     x, y, z = vertex[0] * scale, vertex[1] * scale, vertex[2] * scale
@@ -54,8 +55,9 @@ def keep_near(grid, blocks, voxels, weights):
 
 @device
 def majority(labels, weights):
-    """Return the voxel with the largest weight among those of the label (8,) > 0 that has more than half of the total
-    weight; -1 if there is no such label.
+    """Return the voxel with the largest weight of the majority label; -1 without majority.
+
+    The majority label is the entry of `labels` (8,) > 0 with more than half of the total weight.
     """
     total = np.float32(0.0)
     for c in range(CORNERS):

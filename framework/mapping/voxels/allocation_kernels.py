@@ -87,6 +87,7 @@ def surface_blocks(depth, view, sensor, block_size, stride, samples, found, coun
 
 @njit(cache=True, nogil=True)
 def unpack(keys, coords):
+    """Write the integer coordinates of packed keys into `coords`."""
     for i in range(keys.shape[0]):
         coords[i, 0], coords[i, 1], coords[i, 2] = unpack_key(keys[i])
 

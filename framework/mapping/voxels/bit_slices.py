@@ -40,6 +40,7 @@ def ahead_x(word, beyond):
 
 @device
 def ahead_y(word, beyond):
+    """Return the bits (x, y + 1) of a slice; `beyond` is the slice of the next block along y."""
     return (word >> _EIGHT) | (beyond << _TO_LAST_ROW)
 
 
@@ -51,4 +52,5 @@ def behind_x(word, before):
 
 @device
 def behind_y(word, before):
+    """Return the bits (x, y - 1) of a slice; `before` is the slice of the previous block along y."""
     return (word << _EIGHT) | (before >> _TO_LAST_ROW)

@@ -121,8 +121,10 @@ def bound_tiles(depths, pixels, tile_near, tile_far):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
-    """Fill depth (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1) m of every stride-th pixel, and of the last
-    row and column, of an image (H, W) by a full search; 0 = no surface. `view` holds T_world_camera.
+    """Fill depth (m) of every stride-th pixel and of the last row and column of an image by a full search.
+
+    The image is (H, W), `depth` (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1), 0 = no surface. `view` holds
+    T_world_camera.
     """
     scale = np.float32(1.0) / grid.voxel_size
     for y in prange(depth.shape[0]):
@@ -179,8 +181,9 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
 
 @device
 def _start_row(corners, b, stride, limits, depth):
-    """Fill depth (W,) m by interpolation between the corners (4, X) of cells, at the fraction b from the upper row;
-    0 = unknown.
+    """Fill depth (W,) m by interpolation between the corners (4, X) of cells; 0 = unknown.
+
+    `b` is the vertical position between the upper (0) and lower (1) corners.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     width = depth.shape[0]
@@ -249,9 +252,9 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
-    """Fill depth as cast_coarse(), starting at the camera's readings (H, W) m. No pixel is searched beyond its limit
-    (H, W) m; at limit 0 its depth is -1, because its neighbors may be searched.
+    """Fill depth as cast_coarse(), starting at the camera's readings (H, W) m.
 
+    No pixel is searched beyond its limit (H, W) m; at limit 0 its depth is -1, because its neighbors may be searched.
     Readings are noisy, and a wrong pose displaces them. So the search starts at the extrapolation of the two previous
     rays if the reading agrees with it, otherwise at the reading plus the last displacement.
     """

@@ -43,7 +43,7 @@ class TsdfVolume:
 
     @property
     def voxel_size(self) -> float:
-        """m"""
+        """Side of a voxel in m."""
         return float(self.voxels.grid.voxel_size)
 
     @property

@@ -192,6 +192,7 @@ def find_solid_blocks(grid, block_count):
 
 @njit(cache=True, nogil=True)
 def rehash(old_keys, old_regions, keys, regions):
+    """Insert all entries of a hash table into a larger one."""
     size = keys.shape[0]
     for i in range(old_keys.shape[0]):
         if old_keys[i] != NO_KEY:

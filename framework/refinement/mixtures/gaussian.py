@@ -48,6 +48,7 @@ def raise_to_density(x: Float32, y: Float32, z: Float32, row: Float32, values: F
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def add_to(values: Float32, summands: Float32) -> None:
+    """Add `summands` to `values` in place."""
     for i in range(len(summands)):
         values[i] += summands[i]
 
@@ -79,6 +80,7 @@ def _exp(t: np.float32) -> np.float32:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def constant_exponential(log_density: np.float32, largest: Float32, evidence: Float32, n: int) -> None:
+    """Add exp(log_density - largest) to the first n values of `evidence`."""
     for i in range(n):
         evidence[i] = _exp(log_density - largest[i])
 

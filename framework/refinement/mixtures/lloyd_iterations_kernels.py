@@ -10,6 +10,7 @@ from framework.data import Bool, Float32, Float64, Int32, Int64
 
 @njit(cache=True, nogil=True, parallel=True)
 def lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: int, labels: Int32) -> None:
+    """Run Lloyd iterations on each set of points."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             lloyd(points[starts[k] : starts[k + 1]], centers[k], max_iterations, labels[starts[k] : starts[k + 1]])
@@ -17,6 +18,7 @@ def lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: 
 
 @njit(cache=True, nogil=True)
 def lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32) -> None:
+    """Run Lloyd iterations on one set; update `centers` and `labels`."""
     sums = np.zeros((len(centers), 4))
     for _ in range(max_iterations):
         changed = False
@@ -39,6 +41,7 @@ def lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32)
 
 @njit(cache=True, nogil=True)
 def nearest(point: Float32, centers: Float64) -> int:
+    """Return the index of the nearest center."""
     nearest, least = 0, np.inf
     for j in range(len(centers)):
         x, y, z = point[0] - centers[j, 0], point[1] - centers[j, 1], point[2] - centers[j, 2]
@@ -50,6 +53,7 @@ def nearest(point: Float32, centers: Float64) -> int:
 
 @njit(cache=True, nogil=True, parallel=True)
 def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
+    """Return the nearest center of each point."""
     labels = np.full(len(points), -1, np.int32)
     for k in range(len(begins)):
         for i in prange(begins[k], ends[k]):
@@ -59,6 +63,7 @@ def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -
 
 @njit(cache=True, nogil=True, parallel=True)
 def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
+    """Return the `depth_groups` of each set, (sets, groups, 3)."""
     means = np.zeros((len(starts) - 1, groups, 3))
     for k in prange(len(starts) - 1):
         means[k] = depth_groups_of(points[starts[k] : starts[k + 1]], groups)
@@ -112,6 +117,7 @@ def start_all(
     points: Float32, log_odds: Float32, starts: Int64, mask_counts: Int64, object_components: int,
     background_components: int, iterations: int, labels: Int32,
 ) -> None:  # fmt: skip
+    """Set the initial component of each point of each cluster."""
     for k in prange(len(starts) - 1):
         own = slice(starts[k], starts[k + 1])
         _start_one(

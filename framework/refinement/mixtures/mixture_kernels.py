@@ -64,6 +64,7 @@ def fit_all(
     points: Float32, starts: Int64, labels: Int32, odds: Float32, own_components: int, settings: EmSettings,
     mixtures: Mixtures,
 ) -> None:  # fmt: skip
+    """Fit the mixture of each cluster."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             own = slice(starts[k], starts[k + 1])
@@ -72,6 +73,7 @@ def fit_all(
 
 @njit(cache=True, nogil=True, parallel=True)
 def improve_all(points: Float32, starts: Int64, odds: Float32, settings: EmSettings, mixtures: Mixtures) -> None:
+    """Run EM on the mixture of each cluster, from its present parameters."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             own = slice(starts[k], starts[k + 1])

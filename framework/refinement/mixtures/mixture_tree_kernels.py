@@ -14,6 +14,7 @@ RATIO_ITERATIONS = 20  # of EM over a node's object ratio; where classes are cle
 
 @njit(cache=True, nogil=True, parallel=True)
 def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
+    """Split each set of points into groups, along the axes of largest variance."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             _cut_one(points[starts[k] : starts[k + 1]], groups, labels[starts[k] : starts[k + 1]])
@@ -92,6 +93,7 @@ def pass_down(
     points: Float32, log_odds: Float32, blocks: Blocks, rows: Float32, ratios: Float32, firsts: Int64,
     log_outliers: Float32, outlier_ratios: Float32, child: Int64, posterior: Float32,
 ) -> None:  # fmt: skip
+    """Set the child of each point's node with the largest density, and its posterior."""
     for b in prange(len(blocks.sets)):
         q, own = blocks.sets[b], slice(blocks.begins[b], blocks.ends[b])
         children = slice(firsts[q], firsts[q + 1])
@@ -135,6 +137,7 @@ def _pass_block(
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
+    """Replace `best` by j for points whose density is larger."""
     for i in range(len(largest)):
         better = densities[i] > largest[i]
         best[i] = j if better else best[i]

@@ -1,0 +1,1 @@
+"""Geometric segmentation of depth images."""

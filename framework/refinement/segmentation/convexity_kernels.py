@@ -211,8 +211,10 @@ def _set_surface(
     plane: Float32, y: np.float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float,
     surface: Float32,
 ) -> None:  # fmt: skip
-    """Set the surface (9, columns) of a row: unit normals (3) away from the camera, the planes' distances, points (3),
-    noise of the distance to a plane, and least cosine between the normals of a flat surface.
+    """Set the surface (9, columns) of a row.
+
+    Its entries are unit normals (3) away from the camera, distances of the planes, points (3), noise of the distance to
+    a plane, and the least cosine between normals of a flat surface.
 
     1 / z = A (u - cx) + B (v - cy) + C is the plane (A fx, B fy, C) . p = 1. Without a plane the point is 0.
     """

@@ -40,6 +40,7 @@ def low_board(rng: Rng) -> Furniture:
 
 
 def nightstand(rng: Rng) -> Furniture:
+    """Return a random nightstand."""
     size = rng.uniform(0.46, 0.52), rng.uniform(0.37, 0.42), rng.uniform(0.48, 0.56)
     return _drawers("nightstand", rng, *size, 1)
 
@@ -88,6 +89,7 @@ def counter(rng: Rng) -> Furniture:
 
 
 def floor_lamp(rng: Rng) -> Furniture:
+    """Return a random floor lamp."""
     piece = Furniture("floor lamp")
     stem = paints.metal(rng, (0.25, 0.24, 0.23))
     height = rng.uniform(1.5, 1.7)
@@ -98,6 +100,7 @@ def floor_lamp(rng: Rng) -> Furniture:
 
 
 def table_lamp(rng: Rng) -> Furniture:
+    """Return a random table lamp."""
     piece = Furniture("table lamp")
     foot = [(0.0, 0.06), (0.02, 0.065), (0.10, 0.05), (0.16, 0.015)]
     piece.add(lathe(foot, 20, 0.03), paints.paint(rng, paints.vivid(rng)))
@@ -140,6 +143,7 @@ def plant(rng: Rng) -> Furniture:
 
 
 def carton(rng: Rng) -> Furniture:
+    """Return a random carton."""
     piece = Furniture("cardboard box")
     x, y, z = rng.uniform(0.32, 0.5), rng.uniform(0.28, 0.4), rng.uniform(0.25, 0.4)
     board = Material(Texture.FABRIC, (0.72, 0.56, 0.38), (0.64, 0.48, 0.31), 0.15, seed=paints.new_seed(rng))
@@ -150,6 +154,7 @@ def carton(rng: Rng) -> Furniture:
 
 
 def pouf(rng: Rng) -> Furniture:
+    """Return a random pouf."""
     piece = Furniture("pouf")
     radius, height = rng.uniform(0.22, 0.27), rng.uniform(0.34, 0.4)
     profile = [(0.0, 0.9), (0.06, 1.0), (height - 0.07, 1.0), (height - 0.02, 0.92), (height, 0.6)]
@@ -158,6 +163,7 @@ def pouf(rng: Rng) -> Furniture:
 
 
 def mug(rng: Rng) -> Furniture:
+    """Return a random mug."""
     piece = Furniture("mug")
     glaze = paints.glaze(rng, paints.vivid(rng))
     piece.add(lathe([(0.0, 0.034), (0.008, 0.04), (0.095, 0.042)], 22), glaze)
@@ -166,6 +172,7 @@ def mug(rng: Rng) -> Furniture:
 
 
 def vase(rng: Rng) -> Furniture:
+    """Return a random vase."""
     piece = Furniture("vase")
     profile = ((0.0, 0.05), (0.02, 0.06), (0.12, 0.085), (0.20, 0.05), (0.26, 0.032), (0.29, 0.045))
     piece.add(lathe(profile, 26, 0.03), paints.glaze(rng, paints.vivid(rng), 0.7, 0.03))
@@ -245,6 +252,7 @@ def door(rng: Rng) -> Furniture:
 
 
 def rug(rng: Rng, width: float, depth: float) -> Furniture:
+    """Return a random rug of this size."""
     piece = Furniture("rug")
     base = paints.pick(rng, paints.CLOTHS)
     other = paints.shade(paints.pick(rng, paints.CLOTHS), 1.2)
@@ -273,6 +281,7 @@ def ceiling_lamp(rng: Rng) -> Furniture:
 
 
 def throw_cushion(rng: Rng) -> Furniture:
+    """Return a random throw cushion."""
     piece = Furniture("cushion")
     side = rng.uniform(0.38, 0.5)
     piece.add(cushion(side, rng.uniform(0.8, 1.0) * side, rng.uniform(0.13, 0.18)), paints.patterned_cloth(rng))

@@ -1,4 +1,4 @@
-"""Hard cases as groups: things lying on beds, couches and tables, rows of equal objects, and neighbors that touch."""
+"""Hard cases as groups: objects on beds, couches and tables, rows of equal objects, and neighbors that touch."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ APRON = 0.13  # m, from a table's top down to where the knees of a chair go unde
 
 
 def cluttered_bed_group(rng: Rng) -> Group:
-    """A bed that somebody lives on: a blanket, clothes, cushions, a bag, books."""
+    """Return a cluttered bed: a blanket, clothes, cushions, a bag, books."""
     group = bed_group(rng)
     bed, stand = group.pieces[:2]
     side = 1 if stand.bounds()[0][0] > 0 else -1
@@ -48,7 +48,7 @@ def cluttered_bed_group(rng: Rng) -> Group:
 
 
 def cluttered_couch_group(rng: Rng) -> Group:
-    """A couch on which cushions, a blanket, a bag and books lie, and a full low table that touches it."""
+    """Return a couch with cushions, a blanket, a bag and books, and a full coffee table that touches it."""
     group = cluttered_couch(rng)
     front = float(group.pieces[0].bounds()[1][1])
     table = tabletops.coffee_table(rng)
@@ -60,7 +60,7 @@ def cluttered_couch_group(rng: Rng) -> Group:
 
 
 def cluttered_couch(rng: Rng) -> Group:
-    """The same couch without a table."""
+    """Return the couch without a table."""
     group = Group("couch")
     couch = seating.bare_couch(rng)
     if rng.uniform() < LEATHER_COUCHES:
@@ -71,7 +71,7 @@ def cluttered_couch(rng: Rng) -> Group:
 
 
 def _in_leather(couch: Furniture, rng: Rng) -> Furniture:
-    """The couch with black leather for its cloth."""
+    """Return the couch with black leather."""
     hide = paints.leather(rng)
     parts = [(solid, hide if material.texture is Texture.FABRIC else material) for solid, material in couch.parts]
     return Furniture(couch.kind, couch.class_name, parts)
@@ -135,7 +135,7 @@ def _overlap(box: Float64, other: Float64) -> bool:
 
 
 def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
-    """The height (m) of what is uppermost between the corners `low` and `high` (2,)."""
+    """Return the height (m) of the top surface between the corners `low` and `high` (2,)."""
     vertices = np.concatenate([solid.vertices for piece in pieces for solid, _ in piece.parts])
     within = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
     return float(vertices[within, 2].max())
@@ -179,7 +179,7 @@ def desk_row(rng: Rng, count: int) -> Group:
 
 
 def laid_table_group(rng: Rng) -> Group:
-    """A long table full of things, two equal chairs side by side pushed under it, one or two more at its ends."""
+    """Return a long table with many things, two equal adjacent chairs pushed under it, one or two at its ends."""
     group = Group("dining")
     table = tabletops.long_table(rng)
     table = group.add(table, y=against_wall(table))
@@ -197,7 +197,7 @@ def laid_table_group(rng: Rng) -> Group:
 
 
 def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Furniture:
-    """A chair before a table that faces +y, at `x` m from its middle, pushed until its back or its arms touch."""
+    """Return a chair pushed under a table that faces +y, `x` m from its middle, until back or arms touch."""
     low, high = table.bounds()
     turned = chair.placed(0, 0, 0, np.pi)
     stopped = _between(turned, float(high[2]) - APRON, float(high[2]))
@@ -206,7 +206,7 @@ def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Fu
 
 
 def _between(piece: Furniture, bottom: float, top: float) -> Float64:
-    """The points (N, 3) of a piece's parts that reach into the heights from `bottom` to `top`, m."""
+    """Return the points (N, 3) of a piece's parts that reach into the heights from `bottom` to `top`, m."""
     solids = [solid.vertices for solid, _ in piece.parts]
     reaching = [v for v in solids if v[:, 2].max() > bottom and v[:, 2].min() < top]
     sections = [v[(v[:, 2] > bottom - SPACING) & (v[:, 2] < top + SPACING)] for v in reaching]
@@ -234,7 +234,7 @@ def _touch(rng: Rng) -> float:
 
 
 def board_group(rng: Rng) -> Group:
-    """A low board full of books in piles and rows, a bag leaning on it."""
+    """Return a low board with books in piles and rows and a bag against it."""
     group = Group("board")
     board = clutter.low_board(rng)
     board = group.add(board, y=against_wall(board))
@@ -247,7 +247,7 @@ def board_group(rng: Rng) -> Group:
 
 
 def laden(name: str, support: Furniture, rng: Rng) -> Group:
-    """A cupboard or another tall thing with others on its top."""
+    """Return a cupboard or another tall piece with things on top."""
     group = single(name, support)
     strew_on(group, group.pieces[0], rng, small_things.some(rng, small_things.ON_TOPS, 2))
     return group

@@ -13,6 +13,7 @@ from framework.synthetic.paints import Texture
 
 
 def refrigerator(rng: Rng) -> Furniture:
+    """Return a random refrigerator."""
     piece = Furniture("refrigerator", "refrigerator")
     width, depth, height = rng.uniform(0.60, 0.72), rng.uniform(0.60, 0.66), rng.uniform(1.60, 1.82)
     colors = ((0.90, 0.91, 0.91), (0.70, 0.72, 0.74), (0.62, 0.16, 0.14), (0.62, 0.78, 0.74))
@@ -59,6 +60,7 @@ def tv(rng: Rng) -> Furniture:
 
 
 def toilet(rng: Rng) -> Furniture:
+    """Return a random toilet."""
     piece = Furniture("toilet", "toilet")
     white = paints.glaze(rng, (0.93, 0.93, 0.91), 0.95, 0.05)
     seat_color = paints.paint(rng, (0.88, 0.88, 0.86), 0.93, 0.05) if rng.uniform() < 0.6 else paints.wood(rng)
@@ -106,6 +108,7 @@ def _ring(a: float, b: float, inner_a: float, inner_b: float, height: float, fro
 
 
 def backpack(rng: Rng) -> Furniture:
+    """Return a random backpack."""
     piece = Furniture("backpack", "backpack")
     color = paints.vivid(rng)
     bag, trim = paints.cloth(rng, color), paints.cloth(rng, paints.shade(color, 0.45))

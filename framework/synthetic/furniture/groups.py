@@ -46,27 +46,29 @@ class Group:
 
 
 def against_wall(piece: Furniture) -> float:
-    """The y at which the piece's back touches the plane y = 0."""
+    """Return the y at which the piece's back touches the plane y = 0."""
     return WALL_GAP - float(piece.bounds()[0][1])
 
 
 def on_top(piece: Furniture) -> float:
-    """The height of the piece's uppermost point, m."""
+    """Return the height of the piece's uppermost point, m."""
     return float(piece.bounds()[1][2]) + 0.001
 
 
 def size(piece: Furniture) -> Float64:
+    """Return the size (3,) of a piece in m."""
     low, high = piece.bounds()
     return high - low
 
 
 def beside(piece: Furniture, other: Furniture, side: int, gap: float) -> float:
-    """The x at which `piece` stands `gap` m to the right (side 1) or left (side -1) of `other`."""
+    """Return the x at which `piece` stands `gap` m to the right (side 1) or left (side -1) of `other`."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(other_high[0] + gap - low[0] if side > 0 else other_low[0] - gap - high[0])
 
 
 def bed_group(rng: Rng) -> Group:
+    """Return a random bed group."""
     group = Group("bed")
     bed = seating.bed(rng)
     bed = group.add(bed, y=against_wall(bed))
@@ -78,11 +80,12 @@ def bed_group(rng: Rng) -> Group:
 
 
 def couch_group(rng: Rng) -> Group:
+    """Return a random couch group."""
     return with_low_table(seating.couch(rng), rng)
 
 
 def with_low_table(couch: Furniture, rng: Rng) -> Group:
-    """A couch with a rug and a low table before it."""
+    """Return a couch with a rug and a coffee table."""
     group = Group("couch")
     couch = group.add(couch, y=against_wall(couch))
     front = couch.bounds()[1][1]
@@ -95,7 +98,7 @@ def with_low_table(couch: Furniture, rng: Rng) -> Group:
 
 
 def put_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
-    """Puts things on a table, side by side along its length."""
+    """Put things on a table, side by side along its length."""
     low, high = table.bounds()
     slots = np.linspace(low[0], high[0], len(things) + 1)
     for thing, left, right in zip(things, slots[:-1], slots[1:], strict=True):
@@ -107,6 +110,7 @@ def put_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) ->
 
 
 def tv_group(rng: Rng) -> Group:
+    """Return a random TV group."""
     group = Group("tv", opposite="couch")
     board = clutter.low_board(rng)
     board = group.add(board, y=against_wall(board))
@@ -118,7 +122,7 @@ def tv_group(rng: Rng) -> Group:
 
 
 def dining_group(rng: Rng) -> Group:
-    """A table with chairs on two or three sides, two of them side by side and nearly touching."""
+    """Return a table with chairs on two or three sides, two of them side by side and nearly touching."""
     group = Group("dining")
     table = tabletops.dining_table(rng)
     group.add(table, y=against_wall(table) + 0.03)
@@ -155,6 +159,7 @@ def dining_group(rng: Rng) -> Group:
 
 
 def kitchen_group(rng: Rng) -> Group:
+    """Return a random kitchen group."""
     group = Group("kitchen")
     fridge, row = fixtures.refrigerator(rng), clutter.counter(rng)
     side = 1 if rng.uniform() < 0.5 else -1
@@ -164,6 +169,7 @@ def kitchen_group(rng: Rng) -> Group:
 
 
 def toilet_group(rng: Rng) -> Group:
+    """Return a random toilet group."""
     group = Group("toilet")
     toilet, wall = fixtures.toilet(rng), clutter.partition(rng)
     group.add(toilet, y=against_wall(toilet))
@@ -173,6 +179,7 @@ def toilet_group(rng: Rng) -> Group:
 
 
 def desk_group(rng: Rng) -> Group:
+    """Return a random desk group."""
     group = Group("desk")
     desk = tabletops.desk(rng)
     desk = group.add(desk, y=against_wall(desk))
@@ -183,6 +190,7 @@ def desk_group(rng: Rng) -> Group:
 
 
 def single(name: str, piece: Furniture, z: float = 0.0, hung: bool = False) -> Group:
+    """Return a group of one piece."""
     group = Group(name)
     group.add(piece, y=0.002 if hung else against_wall(piece), z=z)
     return group

@@ -11,6 +11,7 @@ from framework.synthetic.furniture.solids import cushion, cylinder, leg, rounded
 
 
 def bed(rng: Rng) -> Furniture:
+    """Return a random bed."""
     piece = Furniture("bed", "bed")
     wide = rng.uniform() < 0.7
     width, length = (rng.uniform(1.4, 1.7) if wide else rng.uniform(0.9, 1.05)), rng.uniform(1.95, 2.08)
@@ -100,6 +101,7 @@ def chair(rng: Rng) -> Furniture:
 
 
 def office_chair(rng: Rng) -> Furniture:
+    """Return a random office chair."""
     piece = Furniture("office chair", "chair")
     dark, pad = paints.metal(rng, (0.16, 0.16, 0.17)), paints.cloth(rng)
     seat = rng.uniform(0.46, 0.52)
@@ -126,6 +128,7 @@ def office_chair(rng: Rng) -> Furniture:
 
 
 def couch(rng: Rng) -> Furniture:
+    """Return a random couch."""
     piece, width, depth, arm = _couch_body(rng)
     for x in (-1, 1):
         if rng.uniform() < 0.7:

@@ -30,6 +30,7 @@ def papers(rng: Rng) -> Furniture:
 
 
 def bottle(rng: Rng) -> Furniture:
+    """Return a random bottle."""
     piece = Furniture("bottle")
     r, height = rng.uniform(0.033, 0.042), rng.uniform(0.26, 0.32)
     profile = ((0.0, 0.95 * r), (0.01, r), (0.6 * height, r), (0.75 * height, 0.4 * r), (height, 0.38 * r))
@@ -64,6 +65,7 @@ def basket(rng: Rng) -> Furniture:
 
 
 def shoes(rng: Rng) -> Furniture:
+    """Return a random shoes."""
     piece = Furniture("shoes")
     color = paints.vivid(rng)
     upper, sole = paints.cloth(rng, color), paints.paint(rng, (0.85, 0.84, 0.80))

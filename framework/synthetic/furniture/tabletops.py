@@ -9,6 +9,7 @@ from framework.synthetic.paints import Material, Texture
 
 
 def dining_table(rng: Rng) -> Furniture:
+    """Return a random dining table."""
     round_top = rng.uniform() < 0.3
     top_material = paints.wood(rng)
     if round_top:
@@ -29,6 +30,7 @@ def long_table(rng: Rng) -> Furniture:
 
 
 def desk(rng: Rng) -> Furniture:
+    """Return a random desk."""
     return _table("desk", rng.uniform(1.2, 1.45), rng.uniform(0.62, 0.72), 0.73, paints.wood(rng), 0.05)
 
 

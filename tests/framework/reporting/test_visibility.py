@@ -14,7 +14,7 @@ CAMERA = Camera(200, 150, 150.0, 150.0, 99.5, 74.5)
 
 
 def wall(n: int = 41) -> InstanceMesh:
-    """x from -2 to 2 m, y from -0.5 to 0.5, 2 m before the world's origin; two objects at its ends, one cut by both."""
+    """Return a wall 2 m before the origin, 4 x 1 m, with an object at each end."""
     x, y = np.meshgrid(np.linspace(-2, 2, n), np.linspace(-0.5, 0.5, n), indexing="ij")
     vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()

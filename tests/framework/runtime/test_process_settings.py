@@ -26,7 +26,7 @@ CHECKOUT = Path(__file__).resolve().parents[3]
 
 
 def test_threads_limit_what_is_loaded_and_what_is_loaded_later() -> None:
-    """torch is not loaded for it, and obeys when it is."""
+    """The setting does not import torch and applies when torch is imported later."""
     code = """
 import sys
 from framework.runtime.process_settings import Settings

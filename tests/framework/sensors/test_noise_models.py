@@ -8,7 +8,7 @@ from framework.sensors.noise_models import axial_sigma, axial_sigma_at_angle, ax
 
 
 def test_rounding_does_not_depend_on_who_calls() -> None:
-    """numba would let it have the fast math of the kernel that calls it first."""
+    """Without its own setting, numba would inherit fast math from the first calling kernel."""
 
     @njit(fastmath=True)
     def fill(z, out):  # type: ignore[no-untyped-def]

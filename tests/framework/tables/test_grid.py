@@ -28,7 +28,7 @@ def test_markdown_is_padded_and_words_stand_left() -> None:
 
 @pytest.mark.parametrize("name", ["*star", "[optional]"])
 def test_latex_takes_no_cell_for_an_argument(name: str) -> None:
-    """A star or a bracket behind the \\\\ or the rule of the line above is an argument of that."""
+    """LaTeX reads a star or bracket after a line break or a rule as its argument."""
     assert f"{{}}{name} & 1 \\\\" in latex_grid(TextTable(["row", "x"], [[name, "1"]]))
 
 

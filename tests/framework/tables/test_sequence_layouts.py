@@ -132,7 +132,7 @@ def test_published_numbers_stand_below_with_their_source(sweep: Path) -> None:
         "| 0.655 | 0.033 | 0.676 | 0.269 | 0.517 | 0.325 | 0.299 | – | 0.190 | – | – |"
     )
     assert "- Published, Voxblox++ with Detectron2 panoptic: Han et al., ICRA 2021" in text
-    assert "nobody has looked the numbers up: the paper (DDNS 2020" in text
+    assert "numbers we do not have: the paper (DDNS 2020" in text
     assert "- Without a complete run of any row: dataset.scene=030,061,078,086,096,206,223,255." in text
     assert "seed=0 dataset.scene=255" not in text  # told once, not for each row and seed
 
@@ -182,7 +182,7 @@ def test_a_row_that_alone_is_tracked_is_not_compared_with_given_poses(sweep: Pat
     [
         ({"data": "/real"}, "dataset.root=/data", "dataset.root=/data/real", "made up"),
         ({"release": "2017"}, "annotation=made up", "annotation=2017", "2017"),
-        ({"release": None}, "annotation=made up", "annotation=not told", "–"),
+        ({"release": None}, "annotation=made up", "annotation=unknown", "–"),
     ],
 )
 def test_other_data_and_annotations_are_never_averaged_or_compared(

@@ -42,7 +42,7 @@ def test_the_example_is_what_new_plugin_writes() -> None:
 @pytest.mark.parametrize("name", ["x", "a" * LONGEST_NAME])
 @pytest.mark.parametrize("stage", GROUPS)
 def test_what_is_written_is_in_style(stage: str, name: str, tmp_path: Path) -> None:
-    """ruff also finds a name that is not defined, and a template that is no Python."""
+    """Undefined names and invalid Python in a template fail, too."""
     made = write_repository(stage, name, tmp_path)
     for line in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
         done = subprocess.run(

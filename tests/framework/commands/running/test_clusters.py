@@ -55,7 +55,7 @@ def test_a_slurm_job_that_is_preempted_is_run_again_and_one_that_is_killed_by_th
     done = end(first)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert "error: the sweep ended early, and the same command goes on with it: Job" in done.stderr
+    assert "error: the sweep stopped early: Job" in done.stderr
     logs = [path.read_text() for path in (tmp_path / PLACE).rglob("*_log.err")]
     assert sum("this job is preempted" in text for text in logs) == 1
 
@@ -103,7 +103,7 @@ def test_the_same_command_goes_on_where_ray_gave_up(tmp_path: Path, undisturbed:
     os.kill(worker, signal.SIGKILL)
     done = end(sweep)
     assert done.returncode == 1
-    assert "error: the sweep ended early, and the same command goes on with it: " in done.stderr
+    assert "error: the sweep stopped early: " in done.stderr
     kept = recorded(tmp_path)
     assert 0 < len(kept) < 3
 

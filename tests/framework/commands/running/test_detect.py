@@ -40,7 +40,7 @@ def test_writes_a_file_that_precomputed_reads(tmp_path: Path) -> None:
     assert (said["found"], said["mask IoU"], said["class right"], said["false detections an image"]) == (
         *("1.00", "1.00", "1.00", "0.00"),
     )
-    how = done.stderr.split("read it with: ")[1].split()
+    how = done.stderr.split("use it with: ")[1].split()
     path, labels = (argument.split("=")[1] for argument in how[1:])
     detector = Precomputed(Path(path), label_space=labels)
     assert [len(detector.detect(frame)) for frame in CornerRoom()] == [2, 0, 2, 2, 2, 2]
@@ -68,7 +68,7 @@ def test_what_it_writes_is_what_cocos_evaluation_reads(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        ([], "out must be given: out=detections.json"),
+        ([], "out: expected a file name, got none; set out=detections.json"),
         (["out=absent/found.json"], "there is no folder"),
         (["out=2024"], "out must be a path; quote what looks like a number, found 2024"),
         (["out=[a,b]"], "out must be a path; quote what looks like a number, found ['a', 'b']"),
@@ -86,7 +86,7 @@ def test_a_detector_that_fails_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "found.json").write_text("before")
     with pytest.raises(DataError, match="no true instances"):
         write_detections(tmp_path / "found.json", SphereDetector(), CornerRoom(truth=False))
-    with pytest.raises(DataError, match="none of the 1 frames can be used"):
+    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
         write_detections(tmp_path / "found.json", SphereDetector(broken_at=0), CornerRoom(frames=1))
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("found.json", "before")]
 
@@ -113,5 +113,5 @@ class PartlyTrueRoom(CornerRoom):
 def test_frame_without_rendered_truth_is_detected(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_detections(tmp_path / "found.json", NoDetections(), PartlyTrueRoom())
     assert "frame not compared with the ground truth: frame 2 has no pose" in caplog.text
-    with pytest.raises(DataError, match="none of the 1 frames can be used"):
+    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
         write_detections(tmp_path / "found.json", SphereDetector(), PartlyTrueRoom(start=2, stop=3))

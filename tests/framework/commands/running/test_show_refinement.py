@@ -42,7 +42,7 @@ def test_without_detections_it_says_so_and_draws(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        ([], "out must be given: out=refinement.png"),
+        ([], "out: expected a file name, got none; set out=refinement.png"),
         (["out=absent/refinement.png"], "there is no folder"),
         (["out=refinement.jpg"], "out must end in .png, found refinement.jpg"),
         (["out=r.png", "frame=6"], "frame must be in [0, 5], a position among the frames of corner_room"),

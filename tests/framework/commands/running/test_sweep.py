@@ -131,7 +131,7 @@ def test_a_killed_sweep_goes_on_to_the_same_table(
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     last = done.stderr.splitlines()[-1]
-    assert last.startswith("error: the sweep ended early, and the same command goes on with it: A worker process")
+    assert last.startswith("error: the sweep stopped early: A worker process")
     assert "SIGKILL" in last
     assert (tmp_path / PLACE / "table.md").read_text() in done.stdout
     kept = recorded(tmp_path)

@@ -107,7 +107,7 @@ LAST = {  # what leaves a network is computed in float from the integers before:
 
 
 def integer_network(kind, args, weight, weight_scale, bias):
-    """image -> x (uint8) -> y -> z = max(y, 0), and what the integers of y stand for."""
+    """Return the network image -> x (uint8) -> y -> z = max(y, 0), and the quantization of y."""
     tensors = {"w": dequantized_weights(weight, weight_scale), "b": torch.from_numpy(bias)}
     result = Quantization(0.05, 0 if kind == "Int8ConvRelu" else 128)
     operator = {
@@ -183,7 +183,7 @@ def test_weights_that_do_not_fit_into_int8_are_rounded_in_their_channel_alone():
 
 @in_integers
 def test_a_blob_between_blocks_is_rounded_for_a_convolution_and_not_for_a_sum():
-    """y = x + linear(relu(x)): the sum takes x as it is."""
+    """In y = x + linear(relu(x)), the sum uses x before the ReLU."""
     one = {"Y_scale": 0.02, "Y_zero_point": 100}
     convolution = {"kernel": 1, "stride": 1, "pad": 0, **one}
     rectified = convolution | {"Y_zero_point": 0}

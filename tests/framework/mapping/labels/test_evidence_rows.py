@@ -112,9 +112,7 @@ def test_only_voxels_that_are_named_have_slots() -> None:
 def test_many_blocks_are_updated_as_voxel_by_voxel(
     blocks: int, frames: int, max_blocks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pixels under no, one or several clusters, some without an instance; slots that have to grow, and some that need
-    not; whatever the order of the threads.
-    """
+    """Update pixels under no, one or several clusters, with and without instance, with and without new slots."""
     monkeypatch.setattr(evidence_rows, "RESERVED", 1 if max_blocks == 4 else 128)
     first, other = by_one_thread_and_two(lambda: _updated(blocks, frames, max_blocks))
     for one, two in zip(first, other, strict=True):

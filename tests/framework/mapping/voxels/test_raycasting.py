@@ -87,8 +87,9 @@ def test_views_from_outside_and_of_an_empty_map() -> None:
 
 @pytest.mark.parametrize("d", [0.0, -0.0, 1e-20, -1e-20])
 def test_a_ray_along_a_slab_leaves_it_by_another_side(d: float) -> None:
-    """Else it would crawl through unmapped space a thousandth of a voxel at a time, as the middle column of a camera
-    with cx at a pixel's center does.
+    """A ray on a block face must not advance in steps of a thousandth of a voxel.
+
+    The middle column of a camera with cx at a pixel center has such rays.
     """
     direction = tuple(np.float32([d, d, 1.0]))
     start = tuple(np.float32([0.03, -0.05, 0.01]))
