@@ -1,6 +1,6 @@
-"""Maps a video and writes a moving picture of the map as it grows.
+"""Write an animation of a growing map, which begins with the complete map.
 
-python docs/growing_map.py OUT.webp [key=value ...]     keys of a run
+`python docs/growing_map.py OUT.webp [key=value ...]` takes the overrides of a run.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from framework.runs.run_directory import LIKELY
 from framework.runtime.process_settings import Settings
 from framework.runtime.run_log import Journal
 
-EVERY = 2  # frames between two pictures
+FRAME_INTERVAL = 2  # frames from one picture to the next
 WIDTH, HEIGHT = 600, 500  # px of each of the two views
-MILLISECONDS, LAST = 100, 2500  # that a picture stays, and the last one
+MILLISECONDS, LAST = 100, 2500  # display time of a picture and of the complete map
 
 
 def only(instance_ids: Int32, shown: list[int]) -> Int32:
@@ -49,7 +49,7 @@ def main() -> None:
         pose = pipeline.map_frame(frame, pipeline.detector.detect(frame), journal)
         if not pose.lost:
             poses.append(pose.T_world_camera)
-        if k % EVERY == EVERY - 1 or k == len(sequence) - 1:
+        if k % FRAME_INTERVAL == FRAME_INTERVAL - 1 or k == len(sequence) - 1:
             likely = [key for key, found in scene.instances().items() if found.confidence >= LIKELY]
             maps.append((scene.mesh(), likely))
 
@@ -60,7 +60,7 @@ def main() -> None:
     surface = Surface.seen_from(last.vertices, last.triangles, path)
     camera, T_world_camera = best_view(surface, only(last.instance_ids, likely), path, WIDTH, HEIGHT)
     centroids = {}
-    for mesh, likely in maps:  # an instance has the color of where it was last
+    for mesh, likely in maps:  # color by the last position of an instance
         for key in likely:
             centroids[key] = mesh.vertices[mesh.instance_ids == key].mean(axis=0)
     colors = dict(
@@ -71,8 +71,8 @@ def main() -> None:
         view = LitView(Surface.seen_from(mesh.vertices, mesh.triangles, path), camera, T_world_camera)
         panels = view.in_colors(mesh.colors), view.in_instances(mesh.colors, only(mesh.instance_ids, likely), colors)
         pictures.append(Image.fromarray(np.concatenate(panels, axis=1)))
-    stays = [MILLISECONDS] * (len(pictures) - 1) + [LAST]
-    pictures[0].save(out, save_all=True, append_images=pictures[1:], duration=stays, loop=0, quality=70, method=6)
+    durations = [LAST] + [MILLISECONDS] * (len(pictures) - 1)
+    pictures[-1].save(out, save_all=True, append_images=pictures[:-1], duration=durations, loop=0, quality=70, method=6)
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
 
 

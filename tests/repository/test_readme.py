@@ -215,7 +215,7 @@ def test_commands_that_take_seconds_run(ran: Path) -> None:
     assert not [name for name in LEFT_BEHIND if not (ran / name).exists()]
     assert len(list((ran / "outputs" / "table3_map").glob("*/metrics.json"))) == 3
     assert list(ran.glob("instancemap/detections/*/*.detections"))
-    assert (ran / "check.png").exists()
+    assert (ran / "outputs" / "check.png").exists()
 
 
 def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:

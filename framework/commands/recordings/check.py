@@ -1,11 +1,12 @@
 """`instancemap check dataset=D [out=FILE]`: validate a recording and suggest parameter fixes.
 
-Exit status 1 = it will not map.
+Exit status 1: the recording is not usable.
 """
 
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
@@ -24,7 +25,7 @@ jobs = Jobs()
 @jobs.reported
 def job(config: DictConfig) -> None:
     """Check the dataset of the config, print the findings and draw them."""
-    out = checked_file("out", config.out, ".png")
+    out = checked_file("out", config.out, ".png") if config.out is not None else Path("outputs", "check.png").absolute()
 
     from framework.checking.recording_check import check
     from framework.figures.check_figure import write_check
@@ -35,6 +36,7 @@ def job(config: DictConfig) -> None:
     farthest = build(MapFuser, config.fuser).scene.depth_range[1]
     found = check(build(RGBDSequence, config.dataset), farthest)
     print(found.summary, *found.findings, sep="\n")
+    out.parent.mkdir(exist_ok=True)
     write_check(out, found)
     log.info("%s", out)
     if found.faults:
