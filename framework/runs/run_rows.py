@@ -15,6 +15,7 @@ from framework.runs.stored_runs import Record, is_number
 CHOICE = "choice."  # prefix of the chosen options in metrics.json
 DATA = "dataset.root"  # config key of the recording's folder
 CONFIDENCE = 0.95
+PRESET_STAGES = ("tracker", "refiner", "fuser")  # what preset=NAME chooses
 
 Run = tuple[str, ...]  # values of the keys that are averaged over: ("3",) is seed 3
 
@@ -109,7 +110,7 @@ def rows_of(
     overrides = overrides or {}
     variants = [_Variant.of(record, over) for record in sorted(records, key=lambda record: record.written)]
     own = _following(variants, over)
-    changed = {_changed(override) for changes in overrides.values() for override in changes}
+    changed = {key for changes in overrides.values() for override in changes for key in _changed(override)}
     stages = _differing(
         [(one.row, one.choices) for one in variants]
         + [("", {key: value for key, value in one.choices.items() if key not in changed}) for one in variants]
@@ -135,10 +136,10 @@ def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record]) -
     return RunRow(name, dict(sorted(records.items(), key=lambda item: natural(item[0]))), system, variant)
 
 
-def _changed(override: str) -> str:
-    """Return the key that an override changes: refiner.links.x for refiner@refiner.links.x=y."""
+def _changed(override: str) -> tuple[str, ...]:
+    """Return the keys that an override changes: refiner.links.x for refiner@refiner.links.x=y."""
     group, _, package = override.lstrip("+~").partition("=")[0].partition("@")
-    return package or group.replace("/", ".")
+    return PRESET_STAGES if group == "preset" else (package or group.replace("/", "."),)
 
 
 def _kept(one: _Variant, changed: Collection[str]) -> Iterator[tuple[Any, Mapping[str, Any]]]:

@@ -43,7 +43,7 @@ def test_associate_ten_masks(benchmark, mapped) -> None:
     assert len(fuser.scene.table.records) == MASKS
 
 
-def test_write_the_labels_of_ten_masks(benchmark, mapped) -> None:
+def test_write_labels_of_ten_masks(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
     points = list_points_by_pixel(clusters, frame.depth.shape)
     overlaps = fuser.association.look_up(fuser.scene, frame, pose, points)

@@ -61,7 +61,7 @@ def compiled() -> None:
 
 @pytest.mark.parametrize("voxel_size", VOXEL_SIZES, ids=lambda size: f"{100 * size:.0f}cm")
 @pytest.mark.parametrize("name", ["redkitchen", "synthetic room"], ids=lambda name: name.replace(" ", "_"))
-def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size: float) -> None:
+def test_slam_compared_with_open3d(benchmark, recordings, tables, name: str, voxel_size: float) -> None:
     """pytest-benchmark's own figures are of our loop with lifting; the setup of a round gives the frame to Open3D."""
     recording = recordings[name]
     duel = Duel(

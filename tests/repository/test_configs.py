@@ -32,7 +32,7 @@ pytestmark = pytest.mark.integration
 
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
-def test_every_option_composes_and_builds(stage: str, name: str, ready: Callable[..., object]) -> None:
+def test_option_composes_and_builds(stage: str, name: str, ready: Callable[..., object]) -> None:
     assert isinstance(ready(stage, name), GROUPS[stage])
 
 
@@ -44,7 +44,7 @@ NEEDY = {  # by option: the first parameter that only the user knows
 
 
 @pytest.mark.parametrize(("stage", "name"), NEEDY)
-def test_what_only_the_user_knows_is_asked_for_and_what_is_absent_is_named(stage: str, name: str) -> None:
+def test_missing_required_parameter_or_file_raises(stage: str, name: str) -> None:
     key = f"{stage}.{NEEDY[stage, name]}"
     with pytest.raises(ConfigError, match=f"must be given: {key}"):
         registered.built(stage, name)
@@ -53,7 +53,7 @@ def test_what_only_the_user_knows_is_asked_for_and_what_is_absent_is_named(stage
 
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
-def test_every_parameter_is_in_the_yaml_with_a_comment(stage: str, name: str) -> None:
+def test_option_yaml_lists_all_parameters_with_comments(stage: str, name: str) -> None:
     option = registered.OPTION[stage, name]
     assert option.documentation
     assert not option.documentation.startswith("cannot be used"), option.documentation
@@ -70,7 +70,7 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
-def test_every_value_in_the_yaml_is_the_default_of_the_class(stage: str, name: str) -> None:
+def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
     """But for what a variant changes. What only the user knows has no default, in either."""
     path = CONF / stage / f"{name}.yaml"
     own = OmegaConf.load(path)
@@ -103,7 +103,7 @@ def test_every_value_in_the_yaml_is_the_default_of_the_class(stage: str, name: s
     assert of_the_run <= {"seed", "device"}, "interpolations were resolved above, against the defaults of a run"
 
 
-def test_the_defaults_of_a_training_and_of_a_table_stand_in_their_classes() -> None:
+def test_schedule_and_table_yaml_equal_class_defaults() -> None:
     schedule = OmegaConf.load(CONF / "train_detector.yaml").schedule
     assert Schedule(**schedule) == Schedule()
     assert set(schedule) == {field.name for field in dataclasses.fields(Schedule)} - {"seed", "budget"}
@@ -113,11 +113,11 @@ def test_the_defaults_of_a_training_and_of_a_table_stand_in_their_classes() -> N
 
 
 @pytest.mark.parametrize("name", registered.names("dataset", RGBDSequence))
-def test_every_recording_can_be_cut(name: str) -> None:
+def test_recorded_datasets_have_frame_range_parameters(name: str) -> None:
     assert {"start", "stop", "stride", "frame_fraction"} <= set(registered.composed("dataset", name).dataset)
 
 
-def test_the_main_config_reads_its_groups_in_the_order_that_lets_an_experiment_win() -> None:
+def test_main_config_lists_experiment_last_in_defaults() -> None:
     defaults = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults)
     assert isinstance(defaults, list)
     assert defaults[0] == "_self_"
@@ -127,7 +127,7 @@ def test_the_main_config_reads_its_groups_in_the_order_that_lets_an_experiment_w
     assert defaults[-1] == {"experiment": None}
 
 
-def test_what_changes_no_result_is_not_in_the_name_of_a_sweeps_run() -> None:
+def test_sweep_run_names_exclude_keys_without_effect() -> None:
     """Else a run that was watched, or asked for with skip_completed=true, would not be found again."""
     main = OmegaConf.load(CONF / "config.yaml")
     left_out = set(OmegaConf.select(main, "hydra.job.config.override_dirname.exclude_keys"))

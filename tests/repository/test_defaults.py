@@ -41,14 +41,14 @@ def chosen(*overrides: str, main: str = "config") -> dict[str, str]:
 
 @pytest.mark.parametrize("main", ["config", "detect", "show_refinement"])
 @pytest.mark.parametrize("dataset", registered.names("dataset"))
-def test_the_default_detector_is_of_photographs_but_for_rendered_rooms(dataset: str, main: str) -> None:
+def test_default_detector_depends_on_dataset(dataset: str, main: str) -> None:
     expected = "mask_rcnn_rooms" if dataset in OF_RENDERED_ROOMS else "maskrcnn2go"
     assert chosen(f"dataset={dataset}", main=main)["detector"] == expected
 
 
 @pytest.mark.parametrize("dataset", ["synthetic", "rgbd_folder"])
 @pytest.mark.parametrize("detector", ["none", "maskrcnn2go", "mask_rcnn_rooms"])
-def test_a_detector_that_is_chosen_wins(dataset: str, detector: str) -> None:
+def test_explicit_detector_overrides_default(dataset: str, detector: str) -> None:
     for order in ([0, 1], [1, 0]):
         words = [f"dataset={dataset}", f"detector={detector}"]
         assert chosen(*(words[k] for k in order))["detector"] == detector
@@ -61,13 +61,13 @@ def test_experiment_chooses_its_detector(experiment: str) -> None:
 
 
 @pytest.mark.parametrize("experiment", ["table1_runtime", "ablation_fuser"])
-def test_detector_of_experiment_wins_over_dataset_but_not_over_command_line(experiment: str) -> None:
+def test_experiment_detector_overrides_dataset_not_command_line(experiment: str) -> None:
     expected = chosen(f"experiment={experiment}")["detector"]
     assert chosen(f"experiment={experiment}", "dataset=synthetic")["detector"] == expected
     assert chosen(f"experiment={experiment}", "detector=none")["detector"] == "none"
 
 
-def test_a_dataset_of_another_package_needs_to_do_nothing(tmp_path: Path) -> None:
+def test_external_dataset_has_default_detector(tmp_path: Path) -> None:
     """And one that inherits the rendered rooms inherits their detector."""
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "theirs.yaml").write_text("_target_: theirs.Theirs\n")
@@ -78,15 +78,15 @@ def test_a_dataset_of_another_package_needs_to_do_nothing(tmp_path: Path) -> Non
     assert chosen(path, "dataset=their_rooms", "detector=none")["detector"] == "none"
 
 
-def test_default_dataset_is_the_desk() -> None:
+def test_default_dataset_is_desk() -> None:
     assert chosen() == {"dataset": "desk", "detector": "maskrcnn2go"}
 
 
-def test_without_a_dataset_as_from_python_it_is_the_one_of_photographs() -> None:
+def test_config_without_dataset_uses_photo_detector() -> None:
     assert composed("~dataset").detector == registered.composed("detector", "maskrcnn2go").detector
 
 
-def test_each_job_of_a_sweep_over_datasets_has_its_own_default() -> None:
+def test_dataset_sweep_jobs_have_own_default_detector() -> None:
     """The launcher composes each job from the sweep's own config and the job's overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
@@ -96,7 +96,7 @@ def test_each_job_of_a_sweep_over_datasets_has_its_own_default() -> None:
     assert [job.detector.weights for job in jobs] == ["plugins/detectors/mask_rcnn_rooms.safetensors", str(WEIGHTS)]
 
 
-def test_no_default_lies_outside_of_the_project() -> None:
+def test_default_paths_are_inside_project() -> None:
     """Each path that a YAML names is there, below the project, or the user is asked for it."""
     files = sorted(CONF.rglob("*.yaml"))
     assert len(files) > 60
@@ -106,7 +106,7 @@ def test_no_default_lies_outside_of_the_project() -> None:
     assert not [path for path in named if not (PROJECT_ROOT / path).exists()]
 
 
-def test_the_shipped_weights_are_the_published_ones() -> None:
+def test_bundled_weights_match_published_checksums() -> None:
     folder = PROJECT_ROOT / WEIGHTS
     assert MaskRCNN2Go(device="cpu").weights == WEIGHTS
     card = (PROJECT_ROOT / "plugins" / "detectors" / "maskrcnn2go.md").read_text()
@@ -117,7 +117,7 @@ def test_the_shipped_weights_are_the_published_ones() -> None:
     assert {path.name for path in folder.iterdir()} == {*SHA256, "LICENSE"}
 
 
-def test_the_wheel_has_networks_and_configs_where_an_installed_run_looks(tmp_path: Path) -> None:
+def test_wheel_contains_networks_configs_and_assets(tmp_path: Path) -> None:
     wheel = pytest.importorskip("hatchling.builders.wheel", reason="hatchling is missing: pip install --group test")
     [built] = wheel.WheelBuilder(str(PROJECT_ROOT)).build(directory=str(tmp_path), versions=["standard"])
     with zipfile.ZipFile(built) as archive:

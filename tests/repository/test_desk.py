@@ -15,13 +15,13 @@ pytestmark = pytest.mark.integration
 DESK = PROJECT_ROOT / "data" / "desk"
 
 
-def test_it_is_small_and_says_whose_it_is() -> None:
+def test_desk_data_is_small_and_has_attribution() -> None:
     assert sum(path.stat().st_size for path in DESK.rglob("*") if path.is_file()) < 12e6
     card = (DESK / "README.md").read_text()
     assert all(word in card for word in ("Sturm", "Attribution 4.0", "JPEG", "undone"))
 
 
-def test_a_real_desk_is_tracked_and_its_things_are_found() -> None:
+def test_desk_is_tracked_and_objects_are_detected() -> None:
     """Its first two dozen frames, by the network that comes with the project."""
     config = composed("dataset=desk")
     assert config.detector._target_ == "plugins.detectors.maskrcnn2go.MaskRCNN2Go"

@@ -35,7 +35,7 @@ class ParsedError(Exception):
 
 
 @pytest.mark.parametrize("command", [line for line in PARSED if line not in {*COMMANDS, *RUNNABLE, *RUN_ELSEWHERE}])
-def test_every_other_command_takes_its_arguments(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_documented_command_line_is_parsed(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     parse = argparse.ArgumentParser.parse_intermixed_args
 
     def parse_and_stop(parser: argparse.ArgumentParser, words: list[str]) -> None:
@@ -48,7 +48,7 @@ def test_every_other_command_takes_its_arguments(command: str, monkeypatch: pyte
         importlib.import_module(main.module_of(command.split()[3])).main()
 
 
-def test_nothing_is_shown_that_no_test_runs() -> None:
+def test_all_documented_commands_and_scripts_are_tested() -> None:
     """Every line of a console but those of other programs, such as viewers, and every script."""
     make = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
     looked_at = {*COMMANDS, *RUNNABLE, *PARSED, *BENCHMARKS, *(f"make {target}" for target in make), OWN_PLUGIN}
@@ -69,14 +69,14 @@ def test_nothing_is_shown_that_no_test_runs() -> None:
     assert not set(blocks("python")) - scripts
 
 
-def test_what_is_installed_by_name_is_there() -> None:
+def test_documented_extras_exist() -> None:
     extras = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = {extra for text in PAGES.values() for extra in re.findall(r"instancemap\[([\w,-]+)\]", text)}
     assert len(named) > 8
     assert not named - set(extras)
 
 
-def test_a_contract_is_inherited() -> None:
+def test_documented_contract_inherits_tests() -> None:
     names: dict[str, Any] = {"__name__": "my_package"}
     exec(CONTRACT, names)
     inherited = {name for name in dir(names["TestMyRefiner"]) if name.startswith("test_")}

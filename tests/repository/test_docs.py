@@ -42,7 +42,7 @@ def anchors(page: str) -> set[str]:
 
 
 @pytest.mark.parametrize("name", LINKING)
-def test_what_a_page_links_to_is_there(name: str) -> None:
+def test_page_links_resolve(name: str) -> None:
     here = CHECKOUT / name
     for path, anchor in LINK.findall(CODE.sub("", LINKING[name])):
         target = (here.parent / path).resolve() if path else here
@@ -71,13 +71,13 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place / "html"
 
 
-def test_the_api_reference_has_every_public_name(built: Path) -> None:
+def test_api_reference_has_all_public_names(built: Path) -> None:
     page = (built / "api.html").read_text()
     assert not [name for name in instancemap.__all__ if f'id="instancemap.{name}"' not in page]
     assert "(H, W) m along z, 0 = no reading" in page  # a comment beside a field
 
 
-def test_the_configuration_reference_has_every_parameter(built: Path) -> None:
+def test_configuration_reference_has_all_parameters(built: Path) -> None:
     for stage in GROUPS:
         page = (built / "configuration" / f"{stage}.html").read_text()
         assert not [name for name in option_names(stage) if f'id="{stage}-{name.replace("_", "-")}"' not in page]
@@ -90,7 +90,7 @@ def test_the_configuration_reference_has_every_parameter(built: Path) -> None:
     assert "every random number of a run derives from it" in (built / "configuration.html").read_text()
 
 
-def test_plugins_and_parameters_that_pages_name_are_there(built: Path) -> None:
+def test_plugins_and_parameters_in_pages_exist(built: Path) -> None:
     """`fuser=NAME` and `fuser.parameter`, in prose and commands: the configuration reference has them."""
     text = "\n".join(PAGES.values())
     for stage in GROUPS:
@@ -109,7 +109,7 @@ def test_pages_need_no_network(built: Path) -> None:
     assert "<math" in (built / "method.html").read_text()
 
 
-def test_files_of_the_project_are_pages_with_links_that_lead_somewhere(built: Path) -> None:
+def test_project_files_are_pages_with_valid_links(built: Path) -> None:
     for name in ("changelog", "contributing", "security", "desk", "guides/maskrcnn2go"):
         page = (built / f"{name}.html").read_text()
         assert len(page) > 10_000
@@ -117,7 +117,7 @@ def test_files_of_the_project_are_pages_with_links_that_lead_somewhere(built: Pa
             assert (built / name).parent.joinpath(target).resolve().exists(), f"{name}: {target}"
 
 
-def test_the_citation_has_what_its_schema_requires() -> None:
+def test_citation_file_has_required_keys() -> None:
     """Citation File Format 1.2.0: the keys that it asks for, and of each reference."""
     citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text())
     assert citation["cff-version"] == "1.2.0"
@@ -132,7 +132,7 @@ def test_the_citation_has_what_its_schema_requires() -> None:
         assert said in page
 
 
-def test_the_image_is_made_of_what_is_there() -> None:
+def test_dockerfile_matches_project_files() -> None:
     """Nobody here can build it: what it copies is there and reaches docker, and it installs what the Makefile does."""
     dockerfile = (CHECKOUT / "docker" / "Dockerfile").read_text().replace("\\\n", " ")
     steps = re.findall(r"^([A-Z]+) (.*)", dockerfile, re.MULTILINE)

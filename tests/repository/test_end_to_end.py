@@ -31,7 +31,7 @@ def mapped(sequence: Synthetic, detector: SimulatedDetector | GroundTruthDetecto
     return fuser.scene
 
 
-def test_running_ahead_changes_nothing(sequence: Synthetic) -> None:
+def test_prefetch_does_not_change_map(sequence: Synthetic) -> None:
     """The worker thread competes with the mapping kernels for the cores, and the map is the same to the byte."""
     maps = []
     for prefetch in (0, 2):
@@ -43,7 +43,7 @@ def test_running_ahead_changes_nothing(sequence: Synthetic) -> None:
     assert maps[0] == maps[1]
 
 
-def test_true_masks_give_true_instances(sequence: Synthetic) -> None:
+def test_ground_truth_masks_give_accurate_instances(sequence: Synthetic) -> None:
     """What is missing to 1 is lost by tracking and mapping, not by detection."""
     scene = mapped(sequence, GroundTruthDetector(), prefetch=2)
     truth = sequence.scene_truth()

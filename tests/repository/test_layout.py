@@ -164,7 +164,7 @@ def test_public_classes_are_defined_once() -> None:
 
 
 @pytest.mark.parametrize("package", ["framework", "plugins"])
-def test_tests_mirror_the_package(package: str) -> None:
+def test_test_folders_mirror_package(package: str) -> None:
     """Each folder of tests tests the folder of the same name."""
     folders = {path.parent.relative_to(CHECKOUT / "tests") for path in (CHECKOUT / "tests" / package).rglob("*.py")}
     assert folders <= python_folders(package) | {Path(package)}

@@ -50,7 +50,7 @@ def test_private_hydra_is_imported_in_one_module() -> None:
     assert files == {"framework/config/hydra_api.py"}
 
 
-def test_listed_versions_are_the_installed_ones() -> None:
+def test_listed_versions_match_installed_versions() -> None:
     assert hydra.__version__ in hydra_api.TESTED
     assert numba.__version__ in worker.TESTED
     assert f"hydra-core {hydra.__version__} and numba {numba.__version__}" in SECTION

@@ -57,12 +57,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def test_every_script_has_expected_output() -> None:
+def test_all_scripts_have_expected_output() -> None:
     assert list(SCRIPTS) == list(PRINTED)
 
 
 @pytest.mark.parametrize("name", PRINTED)
-def test_script_prints_what_is_expected(place: Path, name: str) -> None:
+def test_script_prints_expected_output(place: Path, name: str) -> None:
     parts = (place / "printed.txt").read_text().split(MARK)[1:]
     printed = dict(part.split("\n", 1) for part in parts)
     assert re.search(PRINTED[name], printed[name])

@@ -46,7 +46,7 @@ def lines_of(text: str) -> list[str]:
     return [" ".join(line.split()) for line in text.splitlines()]
 
 
-def test_means_and_ranks_by_hand(places: list[Path]) -> None:
+def test_means_and_ranks_match_hand_computed_values(places: list[Path]) -> None:
     lines = lines_of(write_ranks(places, [AP50], None))
     assert "| row | rooms | rank | flat | rank | hall | rank | mean of the others | rank |" in lines
     first = lines.index("| a | 0.800 | 1 | 0.500 | 2 | 0.100 | 4 | 0.300 | 3.5 |")
@@ -58,7 +58,7 @@ def test_means_and_ranks_by_hand(places: list[Path]) -> None:
     assert "- Runs of each row: rooms 2, flat 1, hall 2." in lines
 
 
-def test_rho_by_hand(places: list[Path]) -> None:
+def test_rho_matches_hand_computed_values(places: list[Path]) -> None:
     """With ranks 1 2 3 4 and 2 1 3.5 3.5, from their mean: -1.5 -0.5 0.5 1.5 and -0.5 -1.5 1 1; 3.5 / sqrt(5 * 4.5)."""
     lines = lines_of(write_ranks(places, [AP50], None))
     rhos = {line.split(" | ")[0]: line.split(" | ")[1:3] for line in lines if ", " in line and line.startswith("|")}
@@ -74,7 +74,7 @@ def test_two_places_have_no_mean_of_others(places: list[Path]) -> None:
     assert text.count("| rooms, flat ") == 1
 
 
-def test_rho_is_scipys_with_ties_too() -> None:
+def test_rho_with_ties_agrees_with_scipy() -> None:
     rng = np.random.default_rng(0)
     ours, theirs = rng.integers(0, 4, (200, 7)).astype(float), rng.integers(0, 4, (200, 7)) / 3
     expected = [
@@ -84,7 +84,7 @@ def test_rho_is_scipys_with_ties_too() -> None:
     assert np.isnan(spearman(np.ones((1, 5)), np.arange(5.0)[None])).all()
 
 
-def test_means_that_differ_by_rounding_alone_share_a_rank() -> None:
+def test_means_equal_up_to_rounding_share_rank() -> None:
     assert ranks(np.array([0.1 + 0.2, 0.0, 0.3])).tolist() == [1.5, 3, 1.5]
     assert spearman(np.array([[0.1 + 0.2, 0.0, 0.3]]), np.array([[0.3, 0.0, 0.1 + 0.2]])) == pytest.approx([1])
 
@@ -94,7 +94,7 @@ def agreement(places: Sequence[Path]) -> object:
     return found
 
 
-def test_the_interval_over_rows_is_that_of_rows_drawn_with_replacement(tmp_path: Path) -> None:
+def test_row_interval_is_bootstrap_over_rows(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     ours = rng.random(12)
     theirs = ours + rng.normal(0, 0.2, 12)
@@ -109,7 +109,7 @@ def test_the_interval_over_rows_is_that_of_rows_drawn_with_replacement(tmp_path:
     assert np.isnan(found.over_runs).all(), "one run does not say what another would be"
 
 
-def test_the_interval_over_runs_is_that_of_the_noise(tmp_path: Path) -> None:
+def test_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
     """Rows that no seed exchanges keep their order; two that each seed exchanges do not."""
     steady = {"a": (0.9, 0.8, 0.9), "b": (0.5, 0.4, 0.5), "c": (0.1, 0.2, 0.1)}
     one, same = experiment(tmp_path / "one", steady), experiment(tmp_path / "same", steady)
@@ -123,13 +123,13 @@ def test_the_interval_over_runs_is_that_of_the_noise(tmp_path: Path) -> None:
     assert agreement([one, rare]).over_runs == (1, 1)
 
 
-def test_the_same_random_numbers_each_time(places: list[Path]) -> None:
+def test_intervals_are_repeatable(places: list[Path]) -> None:
     alone, with_another = agreement(places[::2]), agreement([places[0], places[2], places[1]])
     assert alone == with_another
     assert write_ranks(places, [AP50], None) == write_ranks(places, [AP50], None)
 
 
-def test_seeds_of_a_scene_are_drawn_together(tmp_path: Path) -> None:
+def test_scenes_have_equal_weight_in_mean(tmp_path: Path) -> None:
     """One scene twice as often run counts as one: 0.9, 0.9 and 0.3 are 0.6 and not 0.7."""
     figures = {"a": (0.9, 0.3), "b": (0.5, 0.5), "c": (0.1, 0.1)}
     one = experiment(tmp_path / "one", figures, scenes=("x", "y"))
@@ -141,7 +141,7 @@ def test_seeds_of_a_scene_are_drawn_together(tmp_path: Path) -> None:
     assert "- Runs of each row: one 3, other 2." in lines
 
 
-def test_only_runs_that_all_rows_have_are_compared(tmp_path: Path) -> None:
+def test_only_runs_common_to_all_rows_are_compared(tmp_path: Path) -> None:
     """A row without the hard seed does not gain rank by the missing run."""
     one = experiment(tmp_path / "one", {"a": (0.9, 0.3), "b": (0.8, 0.2), "c": (0.7, None), "d": (0.6, 0.1)})
     other = experiment(tmp_path / "other", {"a": (0.9,), "b": (0.8,), "c": (0.7,), "d": (0.6,)})
@@ -151,19 +151,19 @@ def test_only_runs_that_all_rows_have_are_compared(tmp_path: Path) -> None:
     assert "- Left out, runs in which not every row has this figure: one 1." in lines
 
 
-def test_folders_of_one_name_are_told_apart(tmp_path: Path) -> None:
+def test_folders_of_same_name_are_shown_with_path(tmp_path: Path) -> None:
     roots = [experiment(tmp_path / k / "ranks", {"a": (0.9,), "b": (0.8,), "c": (0.7,)}) for k in "xy"]
     assert f"| row | {roots[0]} | rank | {roots[1]} | rank |" in lines_of(write_ranks(roots, [AP50], None))
 
 
-def test_rows_of_one_place_alone_are_named(places: list[Path]) -> None:
+def test_rows_missing_in_one_place_are_listed(places: list[Path]) -> None:
     run(places[1], "e", 0, 0.7)
     text = write_ranks(places, [AP50], None)
     assert "- Left out, rows that not all have: e: not in rooms, hall." in text
     assert "| e " not in text
 
 
-def test_several_figures_and_the_files(places: list[Path], tmp_path: Path) -> None:
+def test_several_figures_are_written_to_files(places: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "new" / "folder"
     text = write_ranks(places, [AP50, IOU], out)
     assert (out / "ranks.md").read_text() == text
@@ -178,7 +178,7 @@ def test_several_figures_and_the_files(places: list[Path], tmp_path: Path) -> No
     assert (float(line["mean"]), line["rank"]) == (pytest.approx(0.45), "2")
 
 
-def test_where_the_numbers_come_from(places: list[Path]) -> None:
+def test_provenance_of_runs_is_printed(places: list[Path]) -> None:
     [line] = [line for line in lines_of(write_ranks(places, [AP50], None)) if line.startswith("- flat: ")]
     assert "dataset=d, detector=seen, poses ground truth; annotation: not named; code 1234567; SHA-256" in line
 
@@ -200,7 +200,7 @@ def test_where_the_numbers_come_from(places: list[Path]) -> None:
         (["rooms", "apart"], [AP50], "apart: there is no run in which all rows have instances.ap50"),
     ],
 )
-def test_what_cannot_be_compared_is_one_line(places: list[Path], asked: list[str], keys: list[str], said: str) -> None:
+def test_incomparable_folders_raise_one_line(places: list[Path], asked: list[str], keys: list[str], said: str) -> None:
     root = places[0].parent
     (root / "empty").mkdir()
     experiment(root / "small", {"a": (0.1,), "b": (0.2,)})

@@ -40,7 +40,7 @@ COMMANDS = {  # by the main config that they compose
 BENCHMARKS = [line for line in LINES if line.startswith("python -m pytest ")]
 
 
-def test_the_loop_maps_a_sequence() -> None:
+def test_documented_loop_maps_sequence() -> None:
     fuser = GridFuser()
     stages = {"detector": SphereDetector(), "tracker": GivenPose(), "refiner": KeepAll(), "fuser": fuser}
     exec(block("python", "for frame in sequence"), {"sequence": CornerRoom(), "lift": lift, **stages})
@@ -48,7 +48,7 @@ def test_the_loop_maps_a_sequence() -> None:
     assert set(fuser.scene.instances()) == {1, 2}
 
 
-def test_frames_are_mapped_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_documented_python_example_maps_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"frames": CornerRoom()}
     exec(block("python", "for frame in frames:"), names)
@@ -57,7 +57,7 @@ def test_frames_are_mapped_from_python(tmp_path: Path, monkeypatch: pytest.Monke
     assert len(scene.mesh().vertices) > 1000
 
 
-def test_what_the_tour_names_is_there() -> None:
+def test_contributing_paths_exist() -> None:
     tour = (CHECKOUT / "CONTRIBUTING.md").read_text()
     named = re.findall(r"`((?:framework|plugins|tests|conf)/[\w/]+\.py)`", tour)
     assert len(named) > 15
@@ -77,7 +77,7 @@ def my_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_the_detector_finds_what_it_says(my_plugins: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tutorial_detector_detects_red_square(my_plugins: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     node = OmegaConf.load(my_plugins / "my_conf" / "detector" / "color_blobs.yaml")
     monkeypatch.setattr(composition, "_added", [my_plugins / "my_conf"])
     detector = build(Detector, OmegaConf.create({"detector": node}).detector)
@@ -96,7 +96,7 @@ def test_the_detector_finds_what_it_says(my_plugins: Path, monkeypatch: pytest.M
     assert len(detector.detect(blank)) == 0
 
 
-def test_the_detector_runs_by_its_name(my_plugins: Path) -> None:
+def test_tutorial_detector_runs_by_option_name(my_plugins: Path) -> None:
     """The tutorial's command, with the other stages faked for speed."""
     chosen = [f"{stage}=fake" for stage in FAKES]
     (my_plugins / "my_conf").joinpath("dataset").mkdir()
@@ -122,7 +122,7 @@ FAKES = {"dataset": "CornerRoom", "tracker": "GivenPose", "refiner": "KeepAll", 
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_composes(command: str) -> None:
+def test_documented_command_composes(command: str) -> None:
     overrides = [word for word in shlex.split(command)[3:] if "=" in word]
     choices = [override.split("=")[1].split(",") for override in overrides if override.split("=")[0] in STAGES]
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -210,7 +210,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_commands_that_take_seconds_run(ran: Path) -> None:
+def test_runnable_commands_write_expected_files(ran: Path) -> None:
     assert set(RUNNABLE) - {DEFAULTS} <= set(LINES)
     assert not [name for name in LEFT_BEHIND if not (ran / name).exists()]
     assert len(list((ran / "outputs" / "table3_map").glob("*/metrics.json"))) == 3
@@ -218,7 +218,7 @@ def test_commands_that_take_seconds_run(ran: Path) -> None:
     assert (ran / "outputs" / "check.png").exists()
 
 
-def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
+def test_default_pipeline_runs_end_to_end(ran: Path) -> None:
     """The network that comes with the project, tracked, refined by both links and fused: on four small frames."""
     metrics = json.loads((ran / "defaults" / "metrics.json").read_text())
     assert (metrics["frames"], metrics["frames_lost"], metrics["frames_skipped"]) == (4, 0, 0)
@@ -230,14 +230,14 @@ def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
-def test_every_row_of_an_experiment_is_named(name: str) -> None:
+def test_experiment_rows_are_documented(name: str) -> None:
     rows = composition.composed(f"experiment={name}", "row=any").rows
     assert rows
     assert not [row for row in rows if not any(f"`{row}`" in page for page in PAGES.values())]
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)
-def test_shown_benchmark_exists(command: str) -> None:
+def test_documented_benchmark_exists(command: str) -> None:
     folder, _, keyword = command.split()[3:]
     tests = [
         f"{path.stem}::{name}"

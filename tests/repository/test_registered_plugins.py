@@ -94,7 +94,7 @@ def come(video: LiveVideo) -> Iterator[Frame]:
             said = time.monotonic()
 
 
-def test_live_video_gives_frames_of_this_moment_in_order(video: LiveVideo) -> None:
+def test_live_video_yields_current_frames_in_order(video: LiveVideo) -> None:
     began = time.time()
     frames = list(islice(come(video), 2))
     assert video.name
@@ -105,6 +105,6 @@ def test_live_video_gives_frames_of_this_moment_in_order(video: LiveVideo) -> No
     assert began <= frames[0].timestamp < frames[1].timestamp <= time.time()
 
 
-def test_live_video_is_given_back_and_can_be_opened_again(video: LiveVideo) -> None:
+def test_live_video_can_be_reopened_after_close(video: LiveVideo) -> None:
     for _ in range(2):
         assert len(list(islice(come(video), 1))) == 1

@@ -98,7 +98,7 @@ def messages(k: int, encoding: str, in_meters: bool) -> tuple[Message, Message, 
 
 
 @pytest.mark.parametrize(("encoding", "in_meters"), [("rgb8", False), ("bgr8", True)])
-def test_it_maps_what_comes_and_publishes_objects(node_class: type[Any], encoding: str, in_meters: bool) -> None:
+def test_ros2_node_maps_messages_and_publishes_objects(node_class: type[Any], encoding: str, in_meters: bool) -> None:
     node = node_class("fuser.voxel_size=0.02")
     for k in range(8):
         node.map(*messages(k, encoding, in_meters))
@@ -113,7 +113,7 @@ def test_it_maps_what_comes_and_publishes_objects(node_class: type[Any], encodin
         assert marker.header.frame_id == "map"
 
 
-def test_a_lost_frame_is_told(node_class: type[Any]) -> None:
+def test_ros2_node_warns_about_lost_frame(node_class: type[Any]) -> None:
     node = node_class("fuser.voxel_size=0.02", "detector=none")
     color, depth, info = messages(0, "rgb8", False)
     depth.data = bytes(len(depth.data))

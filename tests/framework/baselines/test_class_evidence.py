@@ -52,7 +52,7 @@ def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
     return found
 
 
-def test_few_classes_are_kept_exactly() -> None:
+def test_class_evidence_few_classes_are_exact() -> None:
     rng = np.random.default_rng(0)
     said = rng.normal(0, 2, (30, 5))
     masks, evidence = masks_that_say(said), one_voxel(5)
@@ -62,7 +62,7 @@ def test_few_classes_are_kept_exactly() -> None:
     assert evidence.masked[0, 0] == 30
 
 
-def test_what_is_named_late_has_all_that_was_said_before() -> None:
+def test_class_evidence_late_class_includes_earlier_masks() -> None:
     """Of 14 classes each mask names 8 and finds the others alike: as a detector's floor does."""
     rng = np.random.default_rng(1)
     said = np.full((20, 14), -3.0)
@@ -73,7 +73,7 @@ def test_what_is_named_late_has_all_that_was_said_before() -> None:
     np.testing.assert_allclose(sums(evidence, 14), said.sum(axis=0), atol=1e-4)
 
 
-def test_a_voxel_without_room_drops_the_least_likely_class_and_counts_it() -> None:
+def test_class_evidence_full_voxel_drops_least_likely_class() -> None:
     said = np.full((3, 40), -5.0)
     said[0, :8], said[1, 8:16], said[2, 16:24] = 1.0, 2.0, 9.0
     masks, evidence = masks_that_say(said), one_voxel(40)
@@ -85,7 +85,7 @@ def test_a_voxel_without_room_drops_the_least_likely_class_and_counts_it() -> No
     assert evidence.log_ratio[0, 0, 0] == pytest.approx(-1)
 
 
-def test_frames_are_counted_and_the_first_and_last_are_known() -> None:
+def test_class_evidence_tracks_frame_count_first_and_last() -> None:
     evidence = one_voxel(2)
     for frame in (4, 7, 9):
         observe(evidence, masks_that_say(np.zeros((1, 2)), frame), 0)
@@ -93,7 +93,7 @@ def test_frames_are_counted_and_the_first_and_last_are_known() -> None:
     assert (evidence.masked[0, 1], evidence.first_frame[0, 1], evidence.last_frame[0, 1]) == (0, -1, -1)
 
 
-def test_of_masks_over_a_pixel_the_best_scored_speaks() -> None:
+def test_mask_classes_pixel_uses_best_scored_mask() -> None:
     clusters = PointClusters(
         np.zeros((5, 3), np.float32),
         np.int32([[0, 0], [0, 0], [1, 0], [0, 0], [2, 0]]),
@@ -106,7 +106,7 @@ def test_of_masks_over_a_pixel_the_best_scored_speaks() -> None:
     assert masks.cluster.tolist() == [1, 1, -1, -1]
 
 
-def test_a_voxel_tells_255_classes_apart() -> None:
+def test_class_rows_more_than_255_classes_raise() -> None:
     rows = ClassRows(VoxelGrid(0.01, 0.1, 8))
     rows.begin(255)
     with pytest.raises(DataError, match="255 classes"):

@@ -11,7 +11,7 @@ CAMERA = Camera(40, 30, 35.0, 33.0, 18.0, 15.5)
 NEAR = 0.2
 
 
-def test_every_point_of_a_box_is_seen_by_a_pixel_of_its_window() -> None:
+def test_box_window_contains_all_visible_points() -> None:
     random = np.random.default_rng(0)
     low = random.uniform(-3, 3, (200, 3))
     high = low + random.uniform(0.01, 2, (200, 3))
@@ -30,7 +30,7 @@ def test_every_point_of_a_box_is_seen_by_a_pixel_of_its_window() -> None:
     assert 20 < seen <= (~empty).sum() < 50, "of 200 boxes, most are out of view"
 
 
-def test_a_box_before_the_camera_has_a_tight_window_and_one_behind_none() -> None:
+def test_box_window_ahead_is_tight_and_behind_is_empty() -> None:
     low, high = np.array([[-0.1, -0.1, 1.0], [-0.1, -0.1, -2.0]]), np.array([[0.1, 0.1, 2.0], [0.1, 0.1, -1.0]])
     ahead, behind = boxes_in_view(CAMERA, np.eye(4), low, high, NEAR).tolist()
     assert ahead == [14, 12, 23, 20]  # 18 -+ 3.5 and 15.5 -+ 3.3, rounded outwards

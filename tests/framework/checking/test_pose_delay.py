@@ -61,7 +61,7 @@ def found(poses: Sequence[Float64], frames: int, noise: float = 0.0) -> PoseDela
 
 
 @pytest.mark.parametrize("frames", [-LONGEST_DELAY, -3, -1, 1, 2, 5, LONGEST_DELAY])
-def test_the_delay_is_found_and_leaves_no_error(frames: int) -> None:
+def test_pose_delay_is_found_without_residual_error(frames: int) -> None:
     delay = found(trembling_walk(), frames)
     assert delay is not None
     assert (delay.frames, delay.alike) == (frames, ())
@@ -70,28 +70,28 @@ def test_the_delay_is_found_and_leaves_no_error(frames: int) -> None:
     assert delay.finding(1, 0.1).setting == f"dataset.pose_delay={1 + frames}"
 
 
-def test_sound_poses_are_not_late_however_noisy_the_points() -> None:
+def test_correct_poses_with_noisy_points_have_no_delay() -> None:
     for noise in (0.0, 1.0, 5.0):
         assert found(trembling_walk(), 0, noise) is None
 
 
 @pytest.mark.parametrize("frames", [-2, 1, 3])
-def test_a_camera_that_moves_evenly_tells_no_delay(frames: int) -> None:
+def test_uniform_motion_has_no_detectable_delay(frames: int) -> None:
     assert found(even_walk(), frames, 0.5) is None
 
 
-def test_a_longer_delay_is_not_taken_for_the_longest() -> None:
+def test_delay_beyond_search_range_is_not_reported() -> None:
     for frames in (LONGEST_DELAY + 1, LONGEST_DELAY + 2):
         assert found(trembling_walk(), frames) is None
 
 
-def test_poses_of_another_walk_are_not_late() -> None:
+def test_unrelated_poses_have_no_delay() -> None:
     """Whichever delay fits them least badly."""
     other = [exp_se3(np.array([0, 0, 0, 0, 0, 0.5 * k])) for k in range(FRAMES)]
     assert find_delay(pairs_of(trembling_walk(), other), other, AS_IT_IS) is None
 
 
-def test_pairs_without_all_poses_around_them_are_left_out() -> None:
+def test_pairs_without_neighboring_poses_are_skipped() -> None:
     poses = trembling_walk()
     stored = late(poses, 2)
     pairs = pairs_of(poses, stored)
@@ -103,7 +103,7 @@ def test_pairs_without_all_poses_around_them_are_left_out() -> None:
     assert find_delay(pairs, [], AS_IT_IS) is None
 
 
-def test_the_delay_is_found_in_the_axes_that_fit() -> None:
+def test_pose_delay_is_found_in_fitting_axes() -> None:
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     poses = trembling_walk()
     stored = [None if T is None else T @ flip for T in late(poses, 3)]
@@ -113,7 +113,7 @@ def test_the_delay_is_found_in_the_axes_that_fit() -> None:
     assert delay.frames == 3
 
 
-def test_delayed_pairs_have_the_poses_that_belong_to_them() -> None:
+def test_delayed_pairs_have_matching_poses() -> None:
     poses = trembling_walk()
     stored = late(poses, -2)
     for pair in pairs_of(poses, stored):

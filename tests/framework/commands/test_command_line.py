@@ -16,18 +16,18 @@ from framework.errors import DataError
 pytestmark = pytest.mark.integration
 
 
-def test_overrides_become_one_directory() -> None:
+def test_directory_name_is_built_from_overrides() -> None:
     assert directory_name("dataset.root=../a/b,seed=1") == "dataset.root=.._a_b,seed=1"
     assert directory_name("") == "defaults"
 
 
-def test_long_overrides_stay_distinct_and_short() -> None:
+def test_directory_name_of_long_overrides_is_short_and_unique() -> None:
     names = [directory_name("dataset.root=" + 300 * "x" + f",seed={seed}") for seed in range(2)]
     assert names[0] != names[1]
     assert all(len(name) <= 200 for name in names)
 
 
-def test_a_directory_that_is_refused_does_not_stop_the_others(
+def test_print_for_directories_continues_after_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def write(directory: Path) -> str:
@@ -43,7 +43,7 @@ def test_a_directory_that_is_refused_does_not_stop_the_others(
 
 
 @pytest.mark.parametrize("command", ["tables", "figures", "evaluate", "plugins"])
-def test_a_command_whose_reader_has_gone_ends_without_a_word(command: str) -> None:
+def test_command_with_closed_pipe_ends_silently(command: str) -> None:
     """As in `python -m framework tables DIR | head -1`."""
     reader, writer = os.pipe()
     os.close(reader)
@@ -61,6 +61,6 @@ def test_a_command_whose_reader_has_gone_ends_without_a_word(command: str) -> No
         (["--config-dir", "mine", "seed=1", "--config-dir=theirs"], ["mine", "theirs"]),
     ],
 )
-def test_config_dirs_of_any_command_line(words: list[str], folders: list[str]) -> None:
+def test_config_dirs_are_read_from_command_line(words: list[str], folders: list[str]) -> None:
     """Also of the command without arguments, which maps the desk."""
     assert _config_dirs(words) == [Path(folder) for folder in folders]

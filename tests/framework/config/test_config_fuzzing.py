@@ -80,13 +80,13 @@ def line_of(option: Path, content: bytes) -> str:
     return line
 
 
-def test_an_option_is_composed(option: Path) -> None:
+def test_undamaged_option_is_composed(option: Path) -> None:
     assert "/nowhere/results.json could not be read" in line_of(option, OPTION)
 
 
 @settings(max_examples=EXAMPLES // 2, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 @given(content=damaged(OPTION, TOKENS))
-def test_a_damaged_option_is_built_or_refused(content: bytes, option: Path) -> None:
+def test_damaged_option_is_built_or_raises_one_line(content: bytes, option: Path) -> None:
     line_of(option, content)
 
 
@@ -104,19 +104,19 @@ def test_a_damaged_option_is_built_or_refused(content: bytes, option: Path) -> N
     ],
     ids=range(8),
 )
-def test_a_fault_of_a_file_is_one_line_that_names_it(content: str, said: str, option: Path) -> None:
+def test_invalid_option_file_raises_one_line_with_path(content: str, said: str, option: Path) -> None:
     line = line_of(option, content.encode(errors="surrogateescape"))
     assert said in line
     assert line.startswith(str(option))
 
 
-def test_what_is_no_file_is_no_option(option: Path) -> None:
+def test_option_linked_to_device_raises(option: Path) -> None:
     option.symlink_to("/dev/zero")
     with pytest.raises(InstanceMapError, match="there is no detector=mine"):
         composed("~dataset", "detector=mine")
 
 
-def test_a_stored_config_is_checked_likewise(tmp_path: Path) -> None:
+def test_stored_config_with_alias_bomb_raises(tmp_path: Path) -> None:
     from framework.runs.stored_runs import read_yaml
 
     (tmp_path / "config.yaml").write_text(BOMB)

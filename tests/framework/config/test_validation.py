@@ -11,7 +11,7 @@ from framework.config.validation import checked_rows
 from framework.errors import ConfigError
 
 
-def test_the_overrides_of_each_row() -> None:
+def test_experiment_rows_give_overrides() -> None:
     config = OmegaConf.create("{kind: gmm_em, rows: {ours: [], 2: ['refiner=${kind}', fuser.min_overlap=0.1]}}")
     found = checked_rows(config.rows)
     assert found == {"ours": [], "2": ["refiner=gmm_em", "fuser.min_overlap=0.1"]}
@@ -29,7 +29,7 @@ def test_the_overrides_of_each_row() -> None:
         ("mine", "rows must have names with overrides"),
     ],
 )
-def test_rows_that_are_written_otherwise_are_one_line(rows: Any, message: str) -> None:
+def test_invalid_experiment_rows_raise_one_line(rows: Any, message: str) -> None:
     for node in (rows, OmegaConf.create({"rows": rows}).rows):
         with pytest.raises(ConfigError, match=message) as caught:
             checked_rows(node)

@@ -80,7 +80,7 @@ def check_map_shows_its_frames(sequence: RGBDSequence, result: RunResult) -> Non
 # OpenNI 1
 
 
-def test_the_records_of_openni_1_are_whole(originals: Path) -> None:
+def test_openni_1_records_are_complete(originals: Path) -> None:
     contents = read_contents(originals / "oni/test.oni")
     counted = {stream: (images.node, images.count, images.last) for stream, images in contents.streams.items()}
     assert counted == {Stream.DEPTH: (2, 12, 12), Stream.COLOR: (3, 12, 12)}
@@ -88,7 +88,7 @@ def test_the_records_of_openni_1_are_whole(originals: Path) -> None:
 
 
 @pytest.mark.parametrize(("size", "end", "count"), [(2124473, 2124446, 12), (2_000_000, 1950114, 11)])
-def test_without_its_end_it_is_cut_off(originals: Path, tmp_path: Path, size: int, end: int, count: int) -> None:
+def test_openni_1_recording_without_end_is_truncated(originals: Path, tmp_path: Path, size: int, end: int, count: int) -> None:
     path = tmp_path / "cut.oni"
     path.write_bytes((originals / "oni/test.oni").read_bytes()[:size])
     contents = read_contents(path)
@@ -96,7 +96,7 @@ def test_without_its_end_it_is_cut_off(originals: Path, tmp_path: Path, size: in
     assert {images.count for images in contents.streams.values()} == {count}
 
 
-def test_a_recording_without_images_is_one_line(originals: Path, tmp_path: Path) -> None:
+def test_recording_without_images_raises_one_line(originals: Path, tmp_path: Path) -> None:
     path = originals / "oni/no_images.oni"
     with pytest.raises(DataError) as caught:
         convert(path, tmp_path / "out")
@@ -105,7 +105,7 @@ def test_a_recording_without_images_is_one_line(originals: Path, tmp_path: Path)
 
 
 @played
-def test_openni_1_is_played_whole(originals: Path, tmp_path: Path) -> None:
+def test_openni_1_recording_plays_completely(originals: Path, tmp_path: Path) -> None:
     frames = list(read_frames(read_contents(originals / "oni/test.oni"), tmp_path))
     assert len(frames) == 12
     assert [(f.color_time, f.depth_time) for f in (frames[0], frames[-1])] == [(0, 11680), (366719, 378742)]
@@ -120,7 +120,7 @@ def test_openni_1_is_played_whole(originals: Path, tmp_path: Path) -> None:
 
 
 @played
-def test_openni_1_is_converted_and_mapped(originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_openni_1_recording_is_converted_and_mapped(originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     convert(originals / "oni/test.oni", tmp_path / "011")
     assert capsys.readouterr().out.startswith(f"{tmp_path / '011'}: 12 frames; left out are 0 images of color and 0")
     (tmp_path / "intrinsic").mkdir()
@@ -138,7 +138,7 @@ def test_openni_1_is_converted_and_mapped(originals: Path, tmp_path: Path, capsy
 # 7-Scenes
 
 
-def test_seven_scenes_as_published(originals: Path) -> None:
+def test_published_seven_scenes_frame_matches_files(originals: Path) -> None:
     sequence = SevenScenes(originals / "seven_scenes", scene=KITCHEN)
     assert (len(sequence), sequence.name, sequence.camera) == (3, "redkitchen-seq-01", COLOR_CAMERA)
     assert sequence.camera.shape == VGA
@@ -175,7 +175,7 @@ def test_seven_scenes_is_mapped(originals: Path) -> None:
 # Replica
 
 
-def test_replica_as_nice_slam_has_it(originals: Path) -> None:
+def test_replica_nice_slam_frames_match_files(originals: Path) -> None:
     root = originals / "replica_nice_slam"
     config = composed("dataset=replica_nice_slam", f"dataset.root={root}", "dataset.scene=office0")
     sequence = build(RGBDSequence, config.dataset)
@@ -207,7 +207,7 @@ def test_replica_is_mapped(originals: Path) -> None:
     check_map_shows_its_frames(sequence, result)
 
 
-def test_of_an_excerpt_in_which_an_image_is_missing_the_others_are_mapped(originals: Path, tmp_path: Path) -> None:
+def test_replica_excerpt_skips_frames_with_missing_images(originals: Path, tmp_path: Path) -> None:
     root = shutil.copytree(originals / "replica_nice_slam", tmp_path / "replica")
     (root / "office0/results/frame000001.jpg").unlink()
     (root / "office0/results/depth000003.png").unlink()
@@ -228,7 +228,7 @@ def given_poses(tracker: PoseTracker, sequence: RGBDSequence) -> RunResult:
     return Pipeline(NoDetections(), tracker, KeepAll(), GridFuser(), prefetch=0).run(sequence)
 
 
-def test_tum_of_which_most_images_are_missing(originals: Path) -> None:
+def test_tum_excerpt_reads_available_images(originals: Path) -> None:
     sequence = TumRgbd(originals / "tum_rgbd", scene=FREIBURG1_RPY, undistort=False)
     assert (len(sequence), sequence.name) == (694, FREIBURG1_RPY)
     assert sequence.camera == PUBLISHED[Intrinsics.FREIBURG1].camera
@@ -245,7 +245,7 @@ def test_tum_of_which_most_images_are_missing(originals: Path) -> None:
         sequence[0]
 
 
-def test_a_pose_of_tum_lies_between_the_two_around_it(originals: Path) -> None:
+def test_tum_pose_is_interpolated_between_neighbors(originals: Path) -> None:
     """Lines 689 and 690 of groundtruth.txt, at ...2.8231 and ...2.8332 s; 26 % of the way to the second."""
     T_world_camera = TumRgbd(originals / "tum_rgbd", scene=FREIBURG1_RPY)[99].T_world_camera
     assert T_world_camera is not None
@@ -285,7 +285,7 @@ def around_the_gap(originals: Path, folder: Path) -> TumRgbd:
     return TumRgbd(target)
 
 
-def test_frames_in_the_gap_of_motion_capture_are_skipped_whoever_gives_the_poses(
+def test_frames_in_motion_capture_gap_are_skipped(
     originals: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     sequence = around_the_gap(originals, tmp_path)
@@ -306,7 +306,7 @@ def test_frames_in_the_gap_of_motion_capture_are_skipped_whoever_gives_the_poses
         np.testing.assert_allclose(ours.pose.T_world_camera[:3, 3], theirs.pose.T_world_camera[:3, 3], atol=0.01)
 
 
-def test_a_run_within_the_gap_alone_is_an_error_of_one_line(originals: Path, tmp_path: Path) -> None:
+def test_run_inside_motion_capture_gap_raises_one_line(originals: Path, tmp_path: Path) -> None:
     sequence = around_the_gap(originals, tmp_path)
     first = [recorded.timestamp for recorded in sequence.contents.frames].index(GAP[0])
     alone = TumRgbd(sequence.folder, start=first, stop=first + 1)
@@ -322,7 +322,7 @@ def test_a_run_within_the_gap_alone_is_an_error_of_one_line(originals: Path, tmp
 # ScanNet
 
 
-def test_scannets_first_names_are_known(shared_data: Path) -> None:
+def test_scannet_first_release_names_are_known(shared_data: Path) -> None:
     """The annotation has `trashcan` and `dishrack`, the label table `trash can` and `dish rack`: no class of COCO's."""
     root = shared_data / "scannet_scene0000"
     if not root.is_dir():

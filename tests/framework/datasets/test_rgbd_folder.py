@@ -59,7 +59,7 @@ def change_camera(folder, **changes):
     (folder / "camera.json").write_text(json.dumps(CAMERA | changes))
 
 
-def test_a_frame_holds_exactly_what_the_files_hold(folder):
+def test_frame_matches_files(folder):
     sequence = RgbdFolder(folder)
     assert (len(sequence), sequence.name) == (FRAMES, "kitchen")
     frame = sequence[2]
@@ -73,7 +73,7 @@ def test_a_frame_holds_exactly_what_the_files_hold(folder):
     assert set(np.unique(frame.truth.instance_ids)) == {0, 7, 300}
 
 
-def test_a_share_keeps_order_index_and_what_belongs_together(folder):
+def test_frame_fraction_keeps_order_index_and_contents(folder):
     sequence = RgbdFolder(folder, frame_fraction=0.5, seed=1)
     indices = [frame.index for frame in sequence]
     assert len(indices) == 2
@@ -88,7 +88,7 @@ def test_a_share_keeps_order_index_and_what_belongs_together(folder):
         RgbdFolder(folder, frame_fraction=1.5)
 
 
-def test_start_stop_stride_choose_and_the_index_counts_before_them(folder):
+def test_start_stop_stride_keep_original_frame_index(folder):
     sequence = RgbdFolder(folder, start=1, stop=4, stride=2)
     assert [frame.index for frame in (sequence[0], sequence[1])] == [1, 3]
     assert len(sequence) == 2
@@ -96,11 +96,11 @@ def test_start_stop_stride_choose_and_the_index_counts_before_them(folder):
         sequence[2]
 
 
-def test_a_scene_is_a_sub_folder(folder):
+def test_scene_selects_subfolder(folder):
     assert RgbdFolder(folder.parent, scene="kitchen").name == "kitchen"
 
 
-def test_65535_and_what_is_beyond_max_depth_are_no_reading(folder):
+def test_depth_65535_or_beyond_max_depth_is_invalid(folder):
     image = depth_mm(0)
     image[0, :3] = 65535, 2500, 0
     cv2.imwrite(str(folder / "depth/000000.png"), image)
@@ -108,7 +108,7 @@ def test_65535_and_what_is_beyond_max_depth_are_no_reading(folder):
     assert RgbdFolder(folder, max_depth=2.0)[0].depth[0, :3].tolist() == [0, 0, 0]
 
 
-def test_numbers_may_have_gaps_and_start_anywhere(folder):
+def test_frame_number_gaps_are_accepted(folder):
     for name in ("color", "depth", "instance"):
         (folder / name / "000001.png").rename(folder / name / "frame-12345.png")
     sequence = RgbdFolder(folder)
@@ -116,7 +116,7 @@ def test_numbers_may_have_gaps_and_start_anywhere(folder):
     np.testing.assert_array_equal(sequence[1].color, picture(2))
 
 
-def test_without_poses_the_pose_is_not_known(folder):
+def test_missing_poses_give_no_pose(folder):
     (folder / "poses.txt").unlink()
     sequence = RgbdFolder(folder)
     assert sequence[3].T_world_camera is None
@@ -125,7 +125,7 @@ def test_without_poses_the_pose_is_not_known(folder):
 
 
 @pytest.mark.parametrize("times", [(0, 0, 0, 0), (5, 6, 7, 6.5), (5, 6, 6, 7)])
-def test_where_times_do_not_grow_frames_come_at_30_hz(folder, caplog, times):
+def test_nonincreasing_timestamps_default_to_30_hz(folder, caplog, times):
     for k, time in enumerate(times):
         set_pose_line(folder, k, f"{time} {k} 0 0 0 0 0 1")
     sequence = RgbdFolder(folder)
@@ -134,13 +134,13 @@ def test_where_times_do_not_grow_frames_come_at_30_hz(folder, caplog, times):
     assert caplog.text.count("kitchen: the times do not grow") == 1
 
 
-def test_the_time_of_a_frame_that_cannot_be_used_does_not_matter(folder, caplog):
+def test_timestamp_of_unusable_frame_is_ignored(folder, caplog):
     set_pose_line(folder, 1, "0 nan nan nan nan nan nan nan")
     assert [RgbdFolder(folder)[k].timestamp for k in (0, 2, 3)] == [0, 0.2, 0.3]
     assert not caplog.records
 
 
-def test_poses_are_there_unless_no_chosen_frame_has_a_line(folder):
+def test_has_poses_is_false_only_without_pose_lines(folder):
     for k in range(FRAMES):
         set_pose_line(folder, k, f"{k} nan nan nan nan nan nan nan")
     assert RgbdFolder(folder).has_poses()  # reading says what is wrong with them
@@ -148,7 +148,7 @@ def test_poses_are_there_unless_no_chosen_frame_has_a_line(folder):
     assert not RgbdFolder(folder).has_poses()
 
 
-def test_without_instances_there_is_no_truth(folder):
+def test_missing_instances_give_no_truth(folder):
     shutil.rmtree(folder / "instance")
     (folder / "instances.json").unlink()
     sequence = RgbdFolder(folder)
@@ -156,7 +156,7 @@ def test_without_instances_there_is_no_truth(folder):
     assert sequence.scene_truth() is None
 
 
-def test_scene_truth_lies_on_the_labeled_surface(folder):
+def test_scene_truth_lies_on_labeled_surface(folder):
     truth = RgbdFolder(folder, stop=1).scene_truth()
     assert truth.class_names == {7: "chair", 300: None}
     depth, ids = depth_mm(0) / 1000, RgbdFolder(folder)[0].truth.instance_ids
@@ -170,12 +170,12 @@ def test_scene_truth_lies_on_the_labeled_surface(folder):
     assert nearest.max() < 0.02
 
 
-def test_scene_truth_leaves_out_frames_that_cannot_be_read(folder):
+def test_scene_truth_skips_unreadable_frames(folder):
     (folder / "depth/000001.png").write_bytes(b"")
     assert len(RgbdFolder(folder).scene_truth().points_world) > 100
 
 
-def test_a_pose_far_off_is_the_fault_of_its_frame_and_not_of_the_truth(folder, caplog):
+def test_distant_pose_raises_for_its_frame_and_truth_skips_it(folder, caplog):
     set_pose_line(folder, 1, "0.1 0 1e4 0 0 0 0 1")
     RgbdFolder(folder)[1]
     set_pose_line(folder, 1, "0.1 0 1e5 0 0 0 0 1")
@@ -188,60 +188,60 @@ def test_a_pose_far_off_is_the_fault_of_its_frame_and_not_of_the_truth(folder, c
 # Faults of the whole sequence: known when it is built.
 
 
-def test_a_missing_folder_is_named(tmp_path):
+def test_missing_folder_raises(tmp_path):
     with pytest.raises(DataError, match=r"nowhere.*does not exist"):
         RgbdFolder(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("name", ["color", "depth"])
-def test_a_missing_image_folder_is_named(folder, name):
+def test_missing_image_folder_raises(folder, name):
     shutil.rmtree(folder / name)
     with pytest.raises(DataError, match=f"{name} is missing"):
         RgbdFolder(folder)
 
 
-def test_missing_camera_json_says_what_a_folder_needs(folder):
+def test_missing_camera_json_raises(folder):
     (folder / "camera.json").unlink()
     with pytest.raises(DataError, match=r"camera\.json is missing"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("key", list(CAMERA))
-def test_a_missing_camera_key_is_named(folder, key):
+def test_missing_camera_key_raises(folder, key):
     (folder / "camera.json").write_text(json.dumps({k: v for k, v in CAMERA.items() if k != key}))
     with pytest.raises(DataError, match=f"camera.json: the key '{key}' is missing"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("changes", [{"fx": "wide"}, {"fx": -1.0}, {"width": 24.5}, {"cx": float("nan")}, {"fy": True}])
-def test_a_bad_camera_value_is_named(folder, changes):
+def test_invalid_camera_value_raises(folder, changes):
     change_camera(folder, **changes)
     with pytest.raises(DataError, match=rf"camera\.json.*{next(iter(changes))}"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("scale", [0, -1000, 0.001, 1e7])
-def test_a_depth_scale_that_cannot_be(folder, scale):
+def test_depth_scale_out_of_range_raises(folder, scale):
     told = r"depth_scale must be in \[1, 1e\+06\], as meters = value / depth_scale \(1000 for millimeters\), found"
     change_camera(folder, depth_scale=scale)
     with pytest.raises(DataError, match=rf"camera\.json: {told} {scale:g}".replace("+07", r"\+07")):
         RgbdFolder(folder)
 
 
-def test_camera_json_that_is_no_json(folder):
+def test_invalid_camera_json_raises(folder):
     (folder / "camera.json").write_text("{width: 3")
     with pytest.raises(DataError, match="not valid JSON"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("name", ["color", "depth", "instance"])
-def test_counts_that_differ_name_the_first_frame_without_partner(folder, name):
+def test_image_count_mismatch_error_names_first_frame(folder, name):
     (folder / name / "000002.png").unlink()
     with pytest.raises(DataError, match=rf"4 images .* 3: frame 2 .* not in {name}/"):
         RgbdFolder(folder)
 
 
-def test_two_files_of_one_frame(folder):
+def test_duplicate_frame_number_raises(folder):
     shutil.copy(folder / "color/000001.png", folder / "color/1.png")
     with pytest.raises(DataError, match="same frame number 1"):
         RgbdFolder(folder)
@@ -250,7 +250,7 @@ def test_two_files_of_one_frame(folder):
 @pytest.mark.parametrize(
     "names", [["9.95", "10.05", "10.1", "10.15"], ["1_8", "1_9", "2_0", "2_1"], ["1", "2", "3", "1 - Copy 4"]]
 )
-def test_names_with_more_than_one_number(folder, names):
+def test_file_names_differing_in_two_numbers_raise(folder, names):
     """The last digits alone would put the frames into another order."""
     for kind in ("color", "depth", "instance"):
         for k, name in enumerate(names):
@@ -259,7 +259,7 @@ def test_names_with_more_than_one_number(folder, names):
         RgbdFolder(folder)
 
 
-def test_a_file_without_number(folder):
+def test_file_name_without_number_raises(folder):
     shutil.copy(folder / "color/000001.png", folder / "color/cover.png")
     with pytest.raises(DataError, match="must end in the frame's number"):
         RgbdFolder(folder)
@@ -267,7 +267,7 @@ def test_a_file_without_number(folder):
 
 @pytest.mark.parametrize("name", ["poses.txt", "instances.json", "instance"])
 @pytest.mark.parametrize("kind", ["folder", "dangling link"])
-def test_what_is_there_and_cannot_be_read_does_not_count_as_missing(folder, name, kind):
+def test_unreadable_file_is_not_treated_as_missing(folder, name, kind):
     path = folder / name
     if path.is_dir():
         shutil.rmtree(path)
@@ -281,20 +281,20 @@ def test_what_is_there_and_cannot_be_read_does_not_count_as_missing(folder, name
 
 
 @pytest.mark.parametrize("key", ["Distortion", "distorsion", "depthscale", "Width"])
-def test_a_misspelt_key_of_the_camera_is_told(folder, key):
+def test_misspelled_camera_key_raises_with_suggestion(folder, key):
     change_camera(folder, **{key: 1})
     with pytest.raises(DataError, match=f"there is no key '{key}'; did you mean"):
         RgbdFolder(folder)
 
 
-def test_keys_of_the_camera_that_are_not_read_are_named(folder, caplog):
+def test_unused_camera_keys_are_logged(folder, caplog):
     change_camera(folder, serial="A7", k1=0.1)
     assert len(RgbdFolder(folder)) > 0
     [record] = caplog.records
     assert "camera.json: not read: serial, k1; its keys are width, height, fx" in record.message
 
 
-def test_fewer_poses_than_frames(folder):
+def test_fewer_poses_than_frames_raises(folder):
     lines = (folder / "poses.txt").read_text().splitlines()
     (folder / "poses.txt").write_text("\n".join(lines[:-1]))
     with pytest.raises(DataError, match="holds 3 poses, but color/ holds 4 frames"):
@@ -309,13 +309,13 @@ def test_fewer_poses_than_frames(folder):
         ("nan 1 2 3 0 0 0 1", "line 4: the timestamp"),
     ],
 )
-def test_a_bad_line_of_poses_is_named_by_number(folder, line, message):
+def test_invalid_pose_line_error_gives_line_number(folder, line, message):
     set_pose_line(folder, 2, line)
     with pytest.raises(DataError, match=rf"poses\.txt, {message}"):
         RgbdFolder(folder)
 
 
-def test_instance_images_without_names(folder):
+def test_instance_images_without_names_raise(folder):
     (folder / "instances.json").unlink()
     with pytest.raises(DataError, match=r"instances\.json is missing"):
         RgbdFolder(folder)
@@ -336,21 +336,21 @@ def test_instance_images_without_names(folder):
         ({"7": {"class": " Chairs"}}, r"instance 7: .* found ' Chairs'; did you mean 'chair'\?"),
     ],
 )
-def test_a_bad_entry_of_instances(folder, entry, message):
+def test_invalid_instances_entry_raises(folder, entry, message):
     (folder / "instances.json").write_text(json.dumps(entry))
     with pytest.raises(DataError, match=rf"instances\.json: {message}") as caught:
         RgbdFolder(folder)
     assert len(str(caught.value)) < 300
 
 
-def test_images_of_another_size_than_the_camera(folder):
+def test_image_and_camera_size_mismatch_raises(folder):
     change_camera(folder, width=48)
     with pytest.raises(DataError, match=r"000000\.png is 24x16, but .*camera\.json says 48x16"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("values", [{"max_depth": -1.0}, {"ground_truth_spacing": 0.0}, {"stride": 0}])
-def test_parameters_are_checked(folder, values):
+def test_parameter_out_of_range_raises(folder, values):
     with pytest.raises(ConfigError, match=f"dataset.{next(iter(values))}"):
         RgbdFolder(folder, **values)
 
@@ -371,7 +371,7 @@ def read_all_but(folder, bad):
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_color_image(folder, suffix, share):
+def test_truncated_color_image_raises_for_its_frame(folder, suffix, share):
     (folder / "color/000002.png").unlink()
     path = folder / f"color/000002.{suffix}"
     cv2.imwrite(str(path), np.repeat(np.repeat(picture(2), 1, axis=0), 1, axis=1))
@@ -382,7 +382,7 @@ def test_a_truncated_color_image(folder, suffix, share):
 
 
 @pytest.mark.parametrize("padding", [b"\0" * 10, b"\0" * 100_000, b"\n", b"\r\n", b"\0" * 100 + b"\n"])
-def test_zeros_and_a_line_end_behind_a_jpeg_are_no_fault(folder, padding):
+def test_jpeg_with_trailing_padding_is_read(folder, padding):
     (folder / "color/000002.png").unlink()
     path = folder / "color/000002.jpg"
     cv2.imwrite(str(path), picture(2))
@@ -390,7 +390,7 @@ def test_zeros_and_a_line_end_behind_a_jpeg_are_no_fault(folder, padding):
     assert RgbdFolder(folder)[2].index == 2
 
 
-def test_a_damaged_depth_image(folder):
+def test_damaged_depth_image_raises_for_its_frame(folder):
     path = folder / "depth/000001.png"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
@@ -398,13 +398,13 @@ def test_a_damaged_depth_image(folder):
     assert "damaged" in read_all_but(folder, 1)
 
 
-def test_a_file_that_is_no_image(folder):
+def test_non_image_file_raises_for_its_frame(folder):
     (folder / "color/000001.png").write_bytes(b"hello world" * 20)
     assert "neither a JPEG nor a PNG" in read_all_but(folder, 1)
 
 
 @pytest.mark.parametrize("name", ["color", "depth", "instance"])
-def test_one_image_of_another_size(folder, name):
+def test_image_size_mismatch_raises_for_its_frame(folder, name):
     path = folder / name / "000003.png"
     cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:-2])
     message = read_all_but(folder, 3)
@@ -412,7 +412,7 @@ def test_one_image_of_another_size(folder, name):
     assert "24x16" in message
 
 
-def test_depth_that_is_not_uint16(folder):
+def test_depth_other_than_uint16_raises_for_its_frame(folder):
     cv2.imwrite(str(folder / "depth/000001.png"), picture(1))
     assert "one channel of uint16, found 3 of uint8" in read_all_but(folder, 1)
 
@@ -427,20 +427,20 @@ def test_depth_that_is_not_uint16(folder):
         ("0.1 0 0 0 0 0 0 0", "length 0, expected 1"),
     ],
 )
-def test_a_pose_that_is_none(folder, line, message):
+def test_invalid_pose_raises_for_its_frame(folder, line, message):
     set_pose_line(folder, 1, line)
     found = read_all_but(folder, 1)
     assert message in found
     assert "poses.txt, line 3" in found
 
 
-def test_a_quaternion_of_few_digits_is_made_rigid(folder):
+def test_rounded_quaternion_is_made_rigid(folder):
     set_pose_line(folder, 1, "0.1 0 0 0 0 0.601 0 0.801")
     R = RgbdFolder(folder)[1].T_world_camera[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
-def test_an_instance_without_name(folder):
+def test_instance_without_name_raises_for_its_frame(folder):
     ids = np.full((HEIGHT, WIDTH), 9, np.uint16)
     cv2.imwrite(str(folder / "instance/000001.png"), ids)
     assert "instance 9 is not in" in read_all_but(folder, 1)
@@ -458,7 +458,7 @@ def test_an_instance_without_name(folder):
         ("redwood5", 5, (480, 640), False),
     ],
 )
-def test_real_folders(scene, frames, shape, labeled):
+def test_real_recordings_are_read(scene, frames, shape, labeled):
     if not (SHARED / scene).is_dir():
         pytest.skip(f"{SHARED / scene} is not there")
     sequence = RgbdFolder(SHARED, scene=scene)
@@ -470,7 +470,7 @@ def test_real_folders(scene, frames, shape, labeled):
     assert (frame.truth is not None) == labeled
 
 
-def test_the_truth_of_replica():
+def test_replica_truth_has_plausible_extent_and_classes():
     if not (SHARED / "replica_floor2").is_dir():
         pytest.skip(f"{SHARED / 'replica_floor2'} is not there")
     truth = RgbdFolder(SHARED, scene="replica_floor2", stride=12).scene_truth()
@@ -480,7 +480,7 @@ def test_the_truth_of_replica():
     assert {truth.class_names[i] for i in np.unique(truth.instance_ids) if i} >= {"bed", None}
 
 
-def test_a_lens_is_undone_in_color_depth_and_instances_alike(folder):
+def test_lens_is_undistorted_in_color_depth_and_instances(folder):
     change_camera(folder, distortion=[0.3, 0, 0, 0.01, 0])
     K, lens = np.array([[20.0, 0, 11.5], [0, 21.0, 7.5], [0, 0, 1]]), np.array([0.3, 0, 0, 0.01, 0])
     u, v = cv2.initUndistortRectifyMap(K, lens, None, K, (WIDTH, HEIGHT), cv2.CV_32FC1)
@@ -493,7 +493,7 @@ def test_a_lens_is_undone_in_color_depth_and_instances_alike(folder):
     assert not np.array_equal(frame.color, picture(0))
 
 
-def test_what_a_sensor_told_of_gravity_is_in_the_frames(folder):
+def test_gravity_file_gives_up_direction_of_frames(folder):
     (folder / "gravity.txt").write_text("0 -9.81 0\nnan nan nan\n0 0 -2\n# the last one\n0.6 -0.8 0\n")
     ups = [frame.up for frame in RgbdFolder(folder, start=1)]
     assert ups[0] is None
@@ -511,7 +511,7 @@ def test_what_a_sensor_told_of_gravity_is_in_the_frames(folder):
         ("0 -1 0\n" * 3 + "0 0 0\n", r"gravity\.txt, line 4: expected a direction"),
     ],
 )
-def test_damaged_directions_of_gravity_are_said(folder, content, said):
+def test_invalid_gravity_file_raises(folder, content, said):
     (folder / "gravity.txt").write_text(content)
     with pytest.raises(DataError, match=said):
         RgbdFolder(folder)

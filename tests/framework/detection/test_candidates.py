@@ -17,7 +17,7 @@ def yolox_output(rng):
     return np.concatenate([rng.normal(0, 1, (1, cells, 4)), rng.random((1, cells, 1 + CLASSES))], axis=2).astype("f4")
 
 
-def test_yolox():
+def test_decode_yolox_matches_reference():
     output = yolox_output(np.random.default_rng(0))
     found = decode(OutputLayout.yolox, {"output": output}, SHAPE, CLASSES)
     k = 0
@@ -36,7 +36,7 @@ def test_yolox():
 @pytest.mark.parametrize("transposed", [False, True])
 @pytest.mark.parametrize("batch", [False, True])
 @pytest.mark.parametrize(("layout", "objectness"), [(OutputLayout.yolo, False), (OutputLayout.yolo_objectness, True)])
-def test_yolo(layout, objectness, transposed, batch):
+def test_decode_yolo_matches_reference(layout, objectness, transposed, batch):
     rng = np.random.default_rng(1)
     rows = np.concatenate([rng.random((20, 4)) * 50, rng.random((20, CLASSES + objectness))], axis=1).astype("f4")
     output = rows.T if transposed else rows
@@ -58,14 +58,14 @@ SSD_PIXELS = {
 
 @pytest.mark.parametrize("layout", SSD_PIXELS)
 @pytest.mark.parametrize("batch", [False, True])
-def test_ssd_with_a_score_and_a_label_each(layout, batch):
+def test_decode_ssd_with_labels_matches_reference(layout, batch):
     outputs = {"labels": np.array([2, 3], "f4"), "scores": np.array([0.8, 0.3], "f4"), "boxes": SSD_BOXES}
     found = decode(layout, {n: a[None] if batch else a for n, a in outputs.items()}, SHAPE, CLASSES)
     np.testing.assert_allclose(found.boxes, SSD_PIXELS[layout], atol=1e-5)
     np.testing.assert_allclose(found.class_scores, [[0.1, 0.8, 0.1], [0.3, 0.3, 0.3]], atol=1e-6)
 
 
-def test_tensorflows_names_padding_and_background():
+def test_decode_ssd_tensorflow_skips_padding_and_background():
     outputs = {
         "detection_anchor_indices": np.zeros((1, 4)),
         "detection_boxes": np.zeros((1, 4, 4)),
@@ -85,13 +85,13 @@ def test_tensorflows_names_padding_and_background():
 
 
 @pytest.mark.parametrize("background", [0, 1])
-def test_ssd_with_scores_by_class(background):
+def test_decode_ssd_class_scores_drop_background(background):
     scores = np.random.default_rng(3).random((1, 2, CLASSES + background)).astype(np.float32)
     found = decode(OutputLayout.ssd_unit, {"scores": scores, "boxes": SSD_BOXES[None]}, SHAPE, CLASSES)
     np.testing.assert_array_equal(found.class_scores, scores[0, :, background:])
 
 
-def test_ssd_that_found_nothing():
+def test_decode_ssd_without_detections_is_empty():
     outputs = {"boxes": np.zeros((0, 4), "f4"), "labels": np.zeros(0, "f4"), "scores": np.zeros(0, "f4")}
     found = decode(OutputLayout.ssd_torchvision, outputs, SHAPE, CLASSES)
     assert (found.boxes.shape, found.class_scores.shape) == ((0, 4), (0, CLASSES))
@@ -118,13 +118,13 @@ def test_ssd_that_found_nothing():
         ),
     ],
 )
-def test_another_form_is_an_error_that_says_what_was_found(layout, outputs, message):
+def test_decode_mismatched_outputs_raise(layout, outputs, message):
     with pytest.raises(DataError, match=message) as refused:
         decode(layout, {name: value.astype(np.float32) for name, value in outputs.items()}, SHAPE, CLASSES)
     assert "\n" not in str(refused.value)
 
 
-def test_the_best_are_chosen_by_class_and_threshold():
+def test_best_candidates_are_selected_by_class_and_threshold():
     boxes = np.array(
         [[0, 0, 10, 10], [1, 0, 10, 10], [0, 0, 10, 9], [20, 20, 30, 30], [9, 9, 5, 5], [0, 0, 1, 1]], "f4"
     )

@@ -21,7 +21,7 @@ def wall(x: float, names: dict[int, str | None] | None = None, z: float = 3.0) -
     return Frame(0, 0.0, color, depth, CAMERA, T_world_camera=pose, truth=truth)
 
 
-def test_a_place_keeps_its_key_and_its_rank() -> None:
+def test_false_positive_cells_keep_key_and_rank_across_views() -> None:
     here, there = false_positive_cells(wall(0.1), 0, 99), false_positive_cells(wall(0.35), 0, 99)
     keys = [place.key for place in here]
     assert keys == sorted(set(keys))
@@ -31,7 +31,7 @@ def test_a_place_keeps_its_key_and_its_rank() -> None:
     assert [place.key for place in there if place.key in both] == both
 
 
-def test_a_place_is_a_cell_and_its_middle_lies_in_it() -> None:
+def test_false_positive_cells_are_distinct() -> None:
     for x in (0.0, 0.2):
         cells = set()
         places = false_positive_cells(wall(x), 0, 99)
@@ -43,7 +43,7 @@ def test_a_place_is_a_cell_and_its_middle_lies_in_it() -> None:
         assert len(cells) == len(places)
 
 
-def test_none_on_objects_of_a_known_class_and_without_poses() -> None:
+def test_false_positive_cells_skip_known_objects_and_no_pose() -> None:
     assert all(place.u >= 80 for place in false_positive_cells(wall(0.0, {1: "bed"}), 0, 99))
     assert any(place.u < 80 for place in false_positive_cells(wall(0.0, {1: None}), 0, 99))
     lost = wall(0.0)
@@ -51,7 +51,7 @@ def test_none_on_objects_of_a_known_class_and_without_poses() -> None:
     assert false_positive_cells(wall(0.0, z=0.0), 0, 99) == []
 
 
-def test_another_seed_has_other_places_and_so_many_as_asked() -> None:
+def test_false_positive_cells_depend_on_seed_and_count() -> None:
     first, second = (false_positive_cells(wall(0.0), seed, 3) for seed in (0, 1))
     assert len(first) == len(second) == 3
     assert [place.key for place in first] != [place.key for place in second]

@@ -69,7 +69,7 @@ def seen(table, maps=None, **given):
 @pytest.mark.parametrize("corner", [False, True])
 @pytest.mark.parametrize("unit", [False, True])
 @pytest.mark.parametrize("objectness", [False, True])
-def test_cells_in_every_layout_are_the_same_boxes(channels_last, transpose, corner, unit, objectness):
+def test_detect_layout_cells_in_any_layout_give_same_boxes(channels_last, transpose, corner, unit, objectness):
     boxes = as_corners(cells()) if corner else cells()
     table = dense(as_unit(boxes) if unit else boxes, objectness=objectness)
     layout, output = seen(
@@ -87,7 +87,7 @@ def test_cells_in_every_layout_are_the_same_boxes(channels_last, transpose, corn
 
 @pytest.mark.parametrize("unit", [False, True])
 @pytest.mark.parametrize("count", [1, 40])
-def test_detections_have_one_class_each(unit, count):
+def test_detect_layout_detections_have_one_class_each(unit, count):
     boxes = as_corners(cells())[50 : 50 + count]
     layout, output = seen(detections(as_unit(boxes) if unit else boxes, 0.7, 2))
     assert layout.suppressed
@@ -97,7 +97,7 @@ def test_detections_have_one_class_each(unit, count):
 
 
 @pytest.mark.parametrize("count", [0, 30])
-def test_a_network_that_sees_nothing_in_black_shows_its_unit_later(count):
+def test_detect_layout_without_detections_defers_unit(count):
     """What suppression leaves over is no row, or rows of zeros."""
     layout, output = seen(np.zeros((1, count, 6 + MASKS)))
     assert layout.suppressed
@@ -110,7 +110,7 @@ def test_a_network_that_sees_nothing_in_black_shows_its_unit_later(count):
         np.testing.assert_allclose(later.candidates.boxes[:1], boxes, atol=1e-3)
 
 
-def test_detections_whose_boxes_end_before_they_begin_are_no_corners():
+def test_detect_layout_inverted_corners_raise():
     boxes = cells()[50:53]
     with pytest.raises(DataError, match=r"ends before it begins: set detector\.box_format=CENTER"):
         seen(detections(boxes, 0.9, 1))
@@ -120,7 +120,7 @@ def test_detections_whose_boxes_end_before_they_begin_are_no_corners():
     assert layout.boxes is BoxKind.CENTER
 
 
-def test_two_classes_make_both_tables_equally_wide():
+def test_detect_layout_tables_of_equal_width_are_distinguished():
     """4 + 2 + M = 6 + M: only labels are whole numbers, and only cells are as many as cells."""
     layout, _ = seen(dense(cells(), classes=2).transpose(0, 2, 1), classes=2)
     assert not layout.suppressed
@@ -136,13 +136,13 @@ def test_two_classes_make_both_tables_equally_wide():
     assert not layout.suppressed
 
 
-def test_what_is_given_is_not_guessed():
+def test_detect_layout_given_box_format_is_kept():
     layout, output = seen(dense(as_corners(cells())), boxes=BoxKind.CENTER)
     assert layout.boxes is BoxKind.CENTER
     np.testing.assert_allclose(output.candidates.boxes, as_corners(as_corners(cells())), atol=1e-3)
 
 
-def test_a_map_that_may_lie_either_way():
+def test_detect_layout_ambiguous_prototype_axes_raise():
     square = {"shape": (16, 16), "maps": np.zeros((1, 4, 4, 4), np.float32)}
     boxes = cells() / 6
     with pytest.raises(DataError, match=r"may be \(1, M, h, w\) or \(1, h, w, M\): export for another size"):
@@ -169,7 +169,7 @@ MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells()
         (dense(cells())[0], {}, r"must have two outputs, .*, found output0 \(11, 126\)"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_told_is_refused_in_one_line(table, given, message):
+def test_detect_layout_ambiguous_outputs_raise(table, given, message):
     with pytest.raises(DataError, match=message) as refused:
         seen(table, **given)
     assert "\n" not in str(refused.value)

@@ -12,7 +12,7 @@ def frame_with(truth):
     return Frame(7, 0.0, np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32), CAMERA, truth=truth)
 
 
-def test_known_classes_only_largest_first():
+def test_true_instances_are_known_classes_largest_first():
     ids = np.zeros((6, 8), np.int32)
     ids[0, :3], ids[1, :], ids[2:4, :2], ids[5, :2] = 9, 4, 2, 5
     truth = true_instances(
@@ -25,11 +25,11 @@ def test_known_classes_only_largest_first():
     assert len(true_instances(frame_with(FrameTruth(ids, {9: "chair", 5: "chair"})), ("chair",), min_pixels=3)) == 1
 
 
-def test_nothing_visible():
+def test_true_instances_without_visible_instance_are_empty():
     assert true_instances(frame_with(FrameTruth(np.zeros((6, 8), np.int32), {})), ("tv",)).masks.shape == (0, 6, 8)
 
 
-def test_no_truth_and_unknown_classes_concern_the_whole_sequence():
+def test_true_instances_missing_truth_or_unknown_class_raises():
     with pytest.raises(
         DataError, match=r"frame 7 has no instance ground truth.*: set dataset\.frame_ground_truth=true"
     ) as caught:

@@ -46,7 +46,7 @@ from framework.vocabulary.label_spaces import COCO, read_labels
         (read_uint16, 2**28),
     ],
 )
-def test_a_file_that_is_too_large_is_refused_before_it_is_read(
+def test_oversized_file_raises_before_reading(
     tmp_path: Path, read: Callable[[Path], object], most: int
 ) -> None:
     with (tmp_path / "large").open("wb") as file:
@@ -72,7 +72,7 @@ def test_a_file_that_is_too_large_is_refused_before_it_is_read(
         (lambda path: read_results(path, COCO, CategoryIds.FROM_ONE), b"[]"),
     ],
 )
-def test_a_byte_order_mark_is_left_out(tmp_path: Path, read: Callable[[Path], object], content: bytes) -> None:
+def test_byte_order_mark_is_ignored(tmp_path: Path, read: Callable[[Path], object], content: bytes) -> None:
     plain, marked = tmp_path / "plain", tmp_path / "marked"
     plain.write_bytes(content)
     marked.write_bytes(BOM_UTF8 + content)
@@ -89,7 +89,7 @@ READERS = (
 
 @pytest.mark.parametrize("read", READERS)
 @pytest.mark.parametrize("kind", ["pipe", "/dev/zero", "/dev/null", "folder"])
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path], object], kind: str) -> None:
+def test_non_regular_file_raises_without_blocking(tmp_path: Path, read: Callable[[Path], object], kind: str) -> None:
     """A pipe to which nobody writes would be waited for, and zeros never end."""
     path = tmp_path / "name"
     if kind == "pipe":
@@ -105,14 +105,14 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path
     assert "\n" not in str(caught.value)
 
 
-def test_labels_are_no_device(tmp_path: Path) -> None:
+def test_labels_from_named_pipe_raise(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "labels.txt")
     with pytest.raises(ConfigError, match="labels must be one of"):
         read_labels(str(tmp_path / "labels.txt"))
 
 
 @pytest.mark.parametrize("kind", ["pipe", "/dev/full", "/dev/null", "folder"])
-def test_only_files_are_replaced(tmp_path: Path, kind: str) -> None:
+def test_writing_to_non_regular_file_raises(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "out.json"
     if kind == "pipe":
         os.mkfifo(path)
@@ -127,7 +127,7 @@ def test_only_files_are_replaced(tmp_path: Path, kind: str) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_link_is_followed(tmp_path: Path) -> None:
+def test_write_follows_symbolic_link(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     for target in (tmp_path / "real" / "there.txt", tmp_path / "real" / "not_yet.txt"):
         link = tmp_path / f"to_{target.name}"
@@ -140,7 +140,7 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
         assert not target.is_symlink()
 
 
-def test_where_nothing_can_be_written_the_file_is_named_that_was_asked_for(
+def test_failed_write_error_names_requested_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not its temporary name: on a disk that is only to be read it cannot be removed either."""

@@ -18,7 +18,7 @@ UPS = [np.array([0.0, -1.0, 0.0]), None, np.array([0.6, 0.0, -0.8])]
 CONTENT = b"# x y z\n0 -1 0\nnan nan nan\n0.6 0.0 -0.8\n"
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_gravity_round_trip_preserves_directions(tmp_path: Path) -> None:
     write_gravity(tmp_path / "gravity.txt", UPS)
     first, second, third = read_gravity(tmp_path / "gravity.txt")
     np.testing.assert_allclose(first, UPS[0], atol=1e-9)
@@ -26,7 +26,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(third, UPS[2], atol=1e-9)
 
 
-def test_an_accelerometers_m_s2_are_a_direction(tmp_path: Path) -> None:
+def test_gravity_in_m_s2_is_normalized(tmp_path: Path) -> None:
     (tmp_path / "gravity.txt").write_text("# a header\n\n0.0 -9.81 0.0  # at rest\n-1.#IND nan NaN\n")
     up, unknown = read_gravity(tmp_path / "gravity.txt")
     np.testing.assert_allclose(up, [0, -1, 0])
@@ -44,7 +44,7 @@ def test_an_accelerometers_m_s2_are_a_direction(tmp_path: Path) -> None:
         ("1 2 up", "expected 3 numbers .* found 'up'"),
     ],
 )
-def test_what_is_no_direction_is_said_in_one_line(tmp_path: Path, line: str, said: str) -> None:
+def test_invalid_gravity_line_raises_one_line(tmp_path: Path, line: str, said: str) -> None:
     (tmp_path / "gravity.txt").write_text(f"0 -1 0\n{line}\n")
     with pytest.raises(DataError, match=rf"gravity\.txt, line 2: {said}"):
         read_gravity(tmp_path / "gravity.txt")
@@ -52,7 +52,7 @@ def test_what_is_no_direction_is_said_in_one_line(tmp_path: Path, line: str, sai
 
 @examples(max_examples=EXAMPLES, deadline=None)
 @given(damaged(CONTENT, (b"nan", b"inf", b"1e-320", b"#")))
-def test_fuzzed_files_are_read_or_refused_in_one_line(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+def test_fuzzed_gravity_file_is_read_or_raises_one_line(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
     path = tmp_path_factory.mktemp("gravity") / "gravity.txt"
     path.write_bytes(content)
     try:

@@ -32,25 +32,25 @@ def message(data: bytes) -> str:
         (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
     ],
 )
-def test_jpegs_have_opencvs_pixels(parameters: tuple[int, int]) -> None:
+def test_jpeg_pixels_match_opencv(parameters: tuple[int, int]) -> None:
     data = cv2.imencode(".jpg", PICTURE, parameters)[1]
     np.testing.assert_array_equal(decode_color("x", data.tobytes()), cv2.imdecode(data, cv2.IMREAD_COLOR_RGB))
 
 
-def test_gray_jpegs_have_three_equal_channels() -> None:
+def test_gray_jpeg_has_three_equal_channels() -> None:
     gray = cv2.imencode(".jpg", PICTURE[..., 0])[1]
     np.testing.assert_array_equal(decode_color("x", gray.tobytes()), cv2.imdecode(gray, cv2.IMREAD_COLOR_RGB))
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
-def test_a_jpeg_that_was_cut_and_closed_is_damaged(share: float) -> None:
+def test_truncated_jpeg_with_end_marker_raises(share: float) -> None:
     """OpenCV gives a picture that is gray from the cut on."""
     data = JPEG[: int(share * len(JPEG))] + END
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
     assert message(data).startswith("picture.jpg is damaged: ")
 
 
-def test_a_jpeg_with_a_corrupt_block_is_damaged() -> None:
+def test_jpeg_with_corrupt_block_raises() -> None:
     """Of its entropy-coded data: noise that is no code, ends too late, or has markers in it."""
     first = JPEG.index(START_OF_SCAN) + 14
     seen = 0
@@ -65,7 +65,7 @@ def test_a_jpeg_with_a_corrupt_block_is_damaged() -> None:
     assert seen >= 36, "noise may be valid code by chance: a JPEG has no checksums"
 
 
-def test_an_animation_is_no_picture() -> None:
+def test_animated_png_raises() -> None:
     """OpenCV takes another of its pictures than Pillow does."""
     pictures = [Image.new("RGB", (8, 6), color) for color in ("red", "lime", "blue")]
     written = io.BytesIO()
@@ -73,7 +73,7 @@ def test_an_animation_is_no_picture() -> None:
     assert "is an animation of 3 pictures; a frame is one" in message(written.getvalue())
 
 
-def test_a_jpeg_is_no_depth(tmp_path) -> None:
+def test_jpeg_as_depth_raises(tmp_path) -> None:
     path = tmp_path / "depth.png"
     path.write_bytes(JPEG)
     with pytest.raises(FrameError, match="must be a PNG with one channel of uint16"):

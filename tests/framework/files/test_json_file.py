@@ -10,14 +10,14 @@ from framework.errors import DataError
 from framework.files.json_file import DEEPEST, parse_json, read_json, write_json
 
 
-def test_what_is_written_comes_back(tmp_path: Path) -> None:
+def test_json_round_trip_is_exact(tmp_path: Path) -> None:
     content = {"a": [1, 0.1, 2**62, None, True, "\u00e9"], "b": {"c": {}}}
     write_json(tmp_path / "a.json", content)
     assert read_json(tmp_path / "a.json") == content
 
 
 @pytest.mark.parametrize("marked", [b"\xef\xbb\xbf[1]", b"\xff\xfe[\x001\x00]\x00"])
-def test_a_byte_order_mark_is_left_out(marked: bytes) -> None:
+def test_byte_order_mark_is_ignored(marked: bytes) -> None:
     assert parse_json("here", marked) == [1]
 
 
@@ -36,14 +36,14 @@ def test_a_byte_order_mark_is_left_out(marked: bytes) -> None:
         (b'[{"fx": 1, "fy": 2, "fx": 3}]', "the key 'fx' is twice in an object"),
     ],
 )
-def test_a_fault_is_one_line_that_names_the_place(content: bytes, said: str) -> None:
+def test_invalid_json_raises_one_line_with_source(content: bytes, said: str) -> None:
     with pytest.raises(DataError, match=said) as caught:
         parse_json("results.json", content)
     assert str(caught.value).startswith("results.json cannot be read: it is not valid JSON")
     assert len(str(caught.value)) < 300
 
 
-def test_the_deepest_that_is_read(tmp_path: Path) -> None:
+def test_maximum_nesting_depth_is_read(tmp_path: Path) -> None:
     (tmp_path / "deep.json").write_text("[" * DEEPEST + "]" * DEEPEST)
     found = read_json(tmp_path / "deep.json")
     for _ in range(DEEPEST - 1):

@@ -15,14 +15,14 @@ QUARTER_TURN = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 
 ROWS = "0 -1 0 1\n1 0 0 2\n0 0 1 3\n0 0 0 1\n"
 
 
-def test_a_matrix_of_four_lines(tmp_path: Path) -> None:
+def test_matrix_of_four_lines_is_read(tmp_path: Path) -> None:
     path = tmp_path / "pose.txt"
     path.write_text("\n" + ROWS.replace(" ", "\t ").replace("\n", "\t\r\n"))
     np.testing.assert_array_equal(read_matrix(path).values, QUARTER_TURN)
     np.testing.assert_allclose(read_matrix(path).pose(), QUARTER_TURN, atol=1e-15)
 
 
-def test_a_matrix_a_line(tmp_path: Path) -> None:
+def test_one_matrix_per_line_is_read(tmp_path: Path) -> None:
     path = tmp_path / "traj.txt"
     path.write_text(ROWS.replace("\n", " ") + "\n\n" + "1e0 0 0 7 0 1 0 8 0 0 1 9 0 0 0 nan\n")
     first, second = read_matrix_lines(path)
@@ -36,20 +36,20 @@ def test_a_matrix_a_line(tmp_path: Path) -> None:
     ("text", "message"),
     [("1 2 3", "line 1: expected 16 numbers, found 3"), (ROWS.replace("\n", " x "), "line 1: .* found 20")],
 )
-def test_a_bad_line_is_named(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_matrix_line_error_gives_line_number(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "traj.txt").write_text(text)
     with pytest.raises(DataError, match=rf"traj\.txt, {message}"):
         read_matrix_lines(tmp_path / "traj.txt")
 
 
-def test_files_without_a_matrix(tmp_path: Path) -> None:
+def test_missing_file_raises_and_empty_file_gives_no_matrix(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"missing.txt does not exist"):
         read_matrix(tmp_path / "missing.txt")
     (tmp_path / "empty.txt").touch()
     assert read_matrix_lines(tmp_path / "empty.txt") == []
 
 
-def test_intrinsics_are_a_pinhole_camera_or_refused_with_their_place() -> None:
+def test_intrinsics_matrix_gives_pinhole_camera_or_raises() -> None:
     K = np.array([[585.0, 0, 320, 0], [0, 580, 240, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     assert PrintedMatrix("here", K).camera(640, 480) == Camera(640, 480, 585, 580, 320, 240)
     for row, column, value in ((0, 1, 0.1), (2, 0, 1), (2, 2, 2), (0, 0, np.nan), (3, 3, 0)):

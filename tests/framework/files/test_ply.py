@@ -93,7 +93,7 @@ def written(path: Path, content: bytes) -> Path:
 @pytest.mark.parametrize("polygons", [POLYGONS, POLYGONS[::-1], TRIANGLES, []])
 @pytest.mark.parametrize(("coordinate", "count", "index"), [("float", "uchar", "int"), ("float64", "int32", "uint")])
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_every_encoding_holds_the_same_mesh(tmp_path, encoding, coordinate, count, index, polygons):
+def test_ply_encodings_give_same_mesh(tmp_path, encoding, coordinate, count, index, polygons):
     mesh = read_ply(written(tmp_path / "a.ply", encoded(encoding, coordinate, count, index, polygons)))
     np.testing.assert_array_equal(mesh.vertices, VERTICES)
     fans = [[p[0], *p[k : k + 2]] for p in polygons for k in range(1, len(p) - 1)]
@@ -104,7 +104,7 @@ def test_every_encoding_holds_the_same_mesh(tmp_path, encoding, coordinate, coun
     assert mesh.properties["label"].dtype == np.int32
 
 
-def test_a_file_without_faces(tmp_path):
+def test_ply_without_faces_is_read(tmp_path):
     content = TRIANGLE.replace(b"element face 1\nproperty list uchar int vertex_indices\n", b"").replace(
         b"3 0 1 2\n", b""
     )
@@ -112,7 +112,7 @@ def test_a_file_without_faces(tmp_path):
     assert (len(mesh.vertices), mesh.triangles.shape) == (3, (0, 3))
 
 
-def test_windows_line_ends_and_empty_lines(tmp_path):
+def test_ply_with_crlf_and_empty_lines_is_read(tmp_path):
     content = TRIANGLE.replace(b"1 0 0 2\n", b"\n  \n1\t0 0   2 \n").replace(b"\n", b"\r\n")
     mesh = read_ply(written(tmp_path / "a.ply", content))
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
@@ -127,7 +127,7 @@ NUMBERS = st.sampled_from([np.int8, np.uint8, np.int16, np.uint16, np.int32, np.
 
 @settings(max_examples=50, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), count=st.integers(0, 9), types=st.dictionaries(st.sampled_from(["a", "label", "nx"]), NUMBERS))
-def test_what_is_written_is_read_back_exactly(tmp_path, data, count, types):
+def test_ply_round_trip_is_exact(tmp_path, data, count, types):
     finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
     vertices = data.draw(hnp.arrays(np.float32, (count, 3), elements=finite))
     faces = st.tuples(st.integers(0, 5 if count else 0), st.just(3))
@@ -143,7 +143,7 @@ def test_what_is_written_is_read_back_exactly(tmp_path, data, count, types):
         assert mesh.properties[name].tobytes() == values.tobytes()  # NaN included
 
 
-def test_the_golden_bytes(tmp_path):
+def test_ply_writer_matches_reference_bytes(tmp_path):
     write_ply(tmp_path / "a.ply", VERTICES[:3], np.array([[0, 1, 2]], np.int32), {"label": LABELS[:3]}, ["meters"])
     expected = (
         b"ply\nformat binary_little_endian 1.0\ncomment meters\nelement vertex 3\nproperty float x\nproperty float y\n"
@@ -157,7 +157,7 @@ def test_the_golden_bytes(tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == expected + struct.pack("<Biii", 3, 0, 1, 2)
 
 
-def test_others_read_what_is_written(tmp_path):
+def test_written_ply_is_read_by_open3d(tmp_path):
     import open3d as o3d
 
     write_ply(tmp_path / "a.ply", VERTICES, np.array(FANS, np.int32), {"label": LABELS})
@@ -211,7 +211,7 @@ def test_others_read_what_is_written(tmp_path):
         ),
     ],
 )
-def test_faults_of_a_text_file_name_the_line(tmp_path, old, new, message):
+def test_invalid_ascii_ply_error_gives_line_number(tmp_path, old, new, message):
     path = written(tmp_path / "a.ply", TRIANGLE.replace(old, new, 1))
     with pytest.raises(DataError, match=f"a.ply(, |: the header's |: ).*({message})") as caught:
         read_ply(path)
@@ -255,16 +255,16 @@ SECOND = FACES + len(GOOD)
         ),
     ],
 )
-def test_faults_of_a_binary_file_name_the_byte(tmp_path, vertices, faces, message):
+def test_invalid_binary_ply_error_gives_byte_offset(tmp_path, vertices, faces, message):
     with pytest.raises(DataError, match=f"a.ply, {message}"):
         read_ply(written(tmp_path / "a.ply", binary(vertices, faces)))
 
 
-def test_a_line_end_behind_the_last_row_is_no_fault(tmp_path):
+def test_line_end_after_last_row_is_accepted(tmp_path):
     assert len(read_ply(written(tmp_path / "a.ply", binary(THREE, GOOD * 2 + b"\r\n"))).triangles) == 2
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_missing_ply_raises(tmp_path):
     with pytest.raises(DataError, match=r"a.ply could not be read: No such file"):
         read_ply(tmp_path / "a.ply")
 
@@ -283,14 +283,14 @@ def test_a_file_that_is_not_there(tmp_path):
         ({"comments": ["a\nend_header"]}, "comment"),
     ],
 )
-def test_what_is_no_mesh_is_not_written(tmp_path, change, message):
+def test_writing_invalid_mesh_raises_and_leaves_no_file(tmp_path, change, message):
     mesh = {"vertices": VERTICES, "triangles": np.array(FANS, np.int32), "properties": {}} | change
     with pytest.raises(DataError, match=f"a.ply: .*{message}"):
         write_ply(tmp_path / "a.ply", **mesh)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_mesh_keeps_nothing_of_the_file_in_memory(tmp_path):
+def test_mesh_arrays_do_not_reference_file_buffer(tmp_path):
     """A mesh of some MB that held on to a file of hundreds would be a surprise."""
     write_ply(tmp_path / "a.ply", VERTICES, np.array(FANS, np.int32), {"label": LABELS})
     mesh = read_ply(tmp_path / "a.ply")

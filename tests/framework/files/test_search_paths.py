@@ -9,7 +9,7 @@ import pytest
 from framework.files.search_paths import PROJECT_ROOT, folder_of
 
 
-def test_a_folder_is_one_of_the_working_folder_or_else_of_the_projects(
+def test_relative_folder_prefers_working_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

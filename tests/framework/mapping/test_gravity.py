@@ -58,7 +58,7 @@ def held(turned: Float64, downwards: float = 0.5) -> GravityEstimator:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_up_is_found_however_the_world_lies(seed: int) -> None:
+def test_gravity_up_is_found_in_any_orientation(seed: int) -> None:
     turned = Rotation.random(random_state=seed).as_matrix()
     vertices, triangles = room()
     up = held(turned).estimate((vertices @ turned.T).astype(np.float32), triangles).up
@@ -68,7 +68,7 @@ def test_up_is_found_however_the_world_lies(seed: int) -> None:
     assert floor == pytest.approx(0, abs=0.005)
 
 
-def test_what_faces_up_decides_between_the_axes_of_a_box() -> None:
+def test_gravity_upward_faces_select_axis() -> None:
     """A camera that is held askew, over a table among walls, with what leans along x, as TUM's freiburg1_rpy is."""
     vertices, triangles = joined(
         rectangle(np.zeros(3), 2 * X, 2 * Y),
@@ -83,7 +83,7 @@ def test_what_faces_up_decides_between_the_axes_of_a_box() -> None:
     assert np.degrees(np.arccos(min(up @ Z, 1.0))) < 0.1
 
 
-def test_noise_and_clutter_leave_it_where_it_is() -> None:
+def test_gravity_noise_and_clutter_keep_direction() -> None:
     chosen = np.random.default_rng(0)
     vertices, triangles = room()
     heap = [rectangle(chosen.normal(size=3), chosen.normal(size=3), chosen.normal(size=3), 3) for _ in range(20)]
@@ -94,7 +94,7 @@ def test_noise_and_clutter_leave_it_where_it_is() -> None:
     assert np.degrees(np.arccos(up @ Z)) < 2
 
 
-def test_where_nothing_tells_nobody_knows() -> None:
+def test_gravity_without_evidence_is_none() -> None:
     vertices, triangles = room()
     assert GravityEstimator().estimate(vertices, triangles).up is None
     assert held(np.eye(3)).estimate(vertices, triangles[:0]).up is None
@@ -103,7 +103,7 @@ def test_where_nothing_tells_nobody_knows() -> None:
     assert held(np.eye(3)).estimate(*joined(*pebbles)).up is None
 
 
-def test_a_floor_that_was_not_seen_is_not_made_up() -> None:
+def test_floor_height_of_unseen_floor_is_none() -> None:
     """Only a table, with its legs and what lies below."""
     table = rectangle(np.array([0, 0, 0.7]), X, Y)
     legs = [rectangle(np.array([0.1 * k, 0, 0.0]), 0.3 * Y, 0.6 * Z, 4) for k in range(5)]
@@ -112,7 +112,7 @@ def test_a_floor_that_was_not_seen_is_not_made_up() -> None:
     assert floor_height(*rectangle(np.zeros(3), Y, Z), Z) is None
 
 
-def test_faces_are_those_of_the_triangles() -> None:
+def test_faces_have_triangle_normals_and_areas() -> None:
     vertices = np.float32([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 0]])
     normals, areas, centers = faces(vertices, np.int32([[0, 1, 2], [0, 3, 1]]))  # the second has no area
     np.testing.assert_allclose(normals, [[0, 0, 1]])
@@ -141,7 +141,7 @@ def degrees(up: Float64 | None, expected: Float64) -> float:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_sensors_tell_up_where_surfaces_cannot(seed: int) -> None:
+def test_gravity_sensor_is_used_without_level_surfaces(seed: int) -> None:
     """Over a slanted table alone, in a world that lies anyhow."""
     turned = Rotation.random(random_state=seed).as_matrix()
     vertices, triangles = rectangle(np.zeros(3), 2 * X, 2 * (np.cos(0.35) * Y + np.sin(0.35) * Z))
@@ -154,14 +154,14 @@ def test_sensors_tell_up_where_surfaces_cannot(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_noise_and_bias_of_a_sensor_are_less_in_the_mean(seed: int) -> None:
+def test_gravity_sensor_noise_and_bias_average_out(seed: int) -> None:
     """The noise of 40 frames; a bias about the camera's x points elsewhere with each heading."""
     noise, bias = np.radians(3), np.radians(2)
     assert degrees(sensing(np.eye(3), noise, seed=seed).sensed(), Z) < 3 * np.degrees(noise) / np.sqrt(40)
     assert degrees(sensing(np.eye(3), 0, bias, seed=seed).sensed(), Z) < 1e-3
 
 
-def test_a_sensor_whose_directions_contradict_each_other_is_not_believed(caplog: pytest.LogCaptureFixture) -> None:
+def test_gravity_contradictory_sensor_is_ignored(caplog: pytest.LogCaptureFixture) -> None:
     """As of one in other axes than the camera's."""
     vertices, triangles = room()
     gravity = held(np.eye(3))
@@ -174,7 +174,7 @@ def test_a_sensor_whose_directions_contradict_each_other_is_not_believed(caplog:
     assert caplog.text.count("is not one direction in the world") == 1
 
 
-def test_what_was_saved_is_read_back_and_nonsense_refused() -> None:
+def test_gravity_round_trips_and_invalid_values_raise() -> None:
     saved = sensing(np.eye(3)).saved()
     read = GravityEstimator.of(MapHeader(json.loads(json.dumps(saved))))
     assert read.saved() == saved
@@ -189,7 +189,7 @@ def test_what_was_saved_is_read_back_and_nonsense_refused() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_an_upright_box_is_the_box_that_was_turned(seed: int) -> None:
+def test_upright_box_recovers_rotated_box(seed: int) -> None:
     chosen = np.random.default_rng(seed)
     size, center, turn = np.sort(chosen.uniform(0.2, 2, 3)), chosen.normal(size=3), chosen.uniform(0, np.pi)
     world = Rotation.random(random_state=seed)
@@ -209,7 +209,7 @@ def test_an_upright_box_is_the_box_that_was_turned(seed: int) -> None:
     assert (within <= box.extent / 2 + 1e-4).all()
 
 
-def test_a_box_around_little_is_a_box() -> None:
+def test_box_around_degenerate_points_is_valid() -> None:
     for points in (np.zeros((1, 3)), np.array([[0, 0, 0], [1, 0, 0]]), np.array([[0, 0, 0], [0, 0, 2]])):
         box = box_around(points.astype(np.float32), Z)
         assert np.isfinite(box.center).all()

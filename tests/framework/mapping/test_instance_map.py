@@ -47,7 +47,7 @@ def scene_map() -> InstanceMap:
     return mapped(room()).scene
 
 
-def test_the_mesh_lies_on_the_true_surface(scene_map: InstanceMap) -> None:
+def test_mesh_lies_on_true_surface(scene_map: InstanceMap) -> None:
     mesh = scene_map.mesh()
     distance = room().distance(mesh.vertices.astype(np.float64))
     assert np.median(distance) < 0.1 * scene_map.volume.voxel_size
@@ -62,7 +62,7 @@ def test_triangles_face_the_camera(scene_map: InstanceMap) -> None:
     assert (towards > 0).mean() > 0.99
 
 
-def test_each_sphere_is_one_instance_of_its_size(scene_map: InstanceMap) -> None:
+def test_sphere_is_one_instance_of_correct_size(scene_map: InstanceMap) -> None:
     instances = scene_map.instances()
     mesh = scene_map.mesh()
     assert len(instances) == len(room().spheres)
@@ -83,7 +83,7 @@ def test_each_sphere_is_one_instance_of_its_size(scene_map: InstanceMap) -> None
     assert (planes > 0).mean() < 0.05
 
 
-def test_views_show_the_instances(scene_map: InstanceMap) -> None:
+def test_rendered_views_show_instances(scene_map: InstanceMap) -> None:
     T = walk(12)[6]
     frame = room().frame(T)
     assert frame.truth is not None
@@ -108,13 +108,13 @@ def test_save_and_load_round_trip(scene_map: InstanceMap, tmp_path: Path) -> Non
     assert np.array_equal(scene_map.render(camera, T).instance_ids, loaded.render(camera, T).instance_ids)
 
 
-def test_the_same_map_is_the_same_file(scene_map: InstanceMap, tmp_path: Path) -> None:
+def test_saved_map_file_is_reproducible(scene_map: InstanceMap, tmp_path: Path) -> None:
     scene_map.save(tmp_path / "map.npz")
     InstanceMap.load(tmp_path / "map.npz").save(tmp_path / "again.npz")
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
 
 
-def test_a_damaged_file_is_refused(scene_map: InstanceMap, tmp_path: Path) -> None:
+def test_damaged_map_file_raises(scene_map: InstanceMap, tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     scene_map.save(path)
     whole = path.read_bytes()
@@ -140,7 +140,7 @@ def test_a_damaged_file_is_refused(scene_map: InstanceMap, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
-def test_a_file_of_another_format_is_refused(other: int, tmp_path: Path) -> None:
+def test_map_file_of_other_format_raises(other: int, tmp_path: Path) -> None:
     """Before anything else is expected of it: other versions have other arrays."""
     path = tmp_path / "map.npz"
     np.savez(path, header=np.frombuffer(json.dumps({"format": other}).encode(), np.uint8))
@@ -150,7 +150,7 @@ def test_a_file_of_another_format_is_refused(other: int, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("threshold", [{"min_observations": 13}, {"min_confidence": 0.95}, {"min_area": 4.0}])
-def test_what_is_below_a_threshold_does_not_count(
+def test_instances_below_threshold_are_not_counted(
     scene_map: InstanceMap, tmp_path: Path, threshold: dict[str, float]
 ) -> None:
     scene_map.save(tmp_path / "map.npz")
@@ -166,13 +166,13 @@ def test_what_is_below_a_threshold_does_not_count(
 
 
 @pytest.mark.parametrize("points", [1, 2, 3])
-def test_an_instance_of_a_few_vertices_has_a_box(points: int) -> None:
+def test_oriented_box_of_few_vertices_is_valid(points: int) -> None:
     corners = np.float32([[0, 0, 1], [2, 0, 1], [0, 0, 1]])[:points]
     box = oriented_box(corners)
     assert np.allclose(np.sort(box.extent), [0, 0, 2 if points > 1 else 0], atol=1e-5)
 
 
-def test_mapping_goes_on_after_loading(tmp_path: Path) -> None:
+def test_mapping_after_loading_matches_uninterrupted_map(tmp_path: Path) -> None:
     """A map that was saved, loaded and mapped into further equals the one that was never saved."""
     whole, resumed = (assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0) for _ in range(2))
     for k, T in enumerate(walk(4)):
@@ -187,7 +187,7 @@ def test_mapping_goes_on_after_loading(tmp_path: Path) -> None:
         assert np.array_equal(getattr(ours, name), getattr(theirs, name))
 
 
-def test_an_empty_map_has_an_empty_mesh(tmp_path: Path) -> None:
+def test_empty_map_has_empty_mesh(tmp_path: Path) -> None:
     scene = BayesianTsdf().scene
     assert len(scene.mesh().vertices) == 0
     assert len(scene.instances()) == 0

@@ -199,3 +199,12 @@ def test_of_two_records_of_one_run_the_later_counts(backwards: bool) -> None:
 def test_what_an_experiment_says_about_itself_makes_no_row() -> None:
     records = [record({"seed": seed, "debug": bool(seed), "table": {"base": str(seed)}}) for seed in (0, 1)]
     assert list(names(records)) == ["all runs"]
+
+
+def test_rows_of_presets_have_their_own_names() -> None:
+    records = [
+        record({"row": "default", "seed": 0, "tracker": {"scale": 0.5}}, tracker="icp", refiner="chain", fuser="tsdf"),
+        record({"row": "paper", "seed": 0, "tracker": {"scale": 1}}, tracker="paper", refiner="tree", fuser="tsdf"),
+    ]
+    changes = {"default": ["preset=default"], "paper": ["preset=paper"]}
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["default", "paper"]

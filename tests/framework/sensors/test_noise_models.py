@@ -7,7 +7,7 @@ from numba import njit
 from framework.sensors.noise_models import axial_sigma, axial_sigma_at_angle, axial_sigma_single
 
 
-def test_rounding_does_not_depend_on_who_calls() -> None:
+def test_noise_rounding_is_independent_of_caller() -> None:
     """Without its own setting, numba would inherit fast math from the first calling kernel."""
 
     @njit(fastmath=True)
@@ -23,7 +23,7 @@ def test_rounding_does_not_depend_on_who_calls() -> None:
 
 
 @pytest.mark.parametrize("z", [0.4, 1.4, 3.4])
-def test_depth_noise_is_nguyens(z: float) -> None:
+def test_depth_noise_matches_nguyen_model(z: float) -> None:
     right = 0.0012 + 0.0019 * (z - 0.4) ** 2
     assert axial_sigma(z) == pytest.approx(right, rel=1e-12)
     assert axial_sigma_single(np.float32(z)) == pytest.approx(right, rel=1e-6)

@@ -14,7 +14,7 @@ def frame_with(truth):
     return Frame(3, 0.1, np.zeros((30, 40, 3), np.uint8), np.ones((30, 40), np.float32), CAMERA, truth=truth)
 
 
-def test_exact_masks_of_the_instances_of_known_class():
+def test_ground_truth_masks_of_known_classes_are_exact():
     ids = np.zeros((30, 40), np.int32)
     ids[2:12, 3:23], ids[15:25, 5:15], ids[20:30, 30:40], ids[0, :9] = 8, 3, 1000, 4
     detections = GroundTruthDetector(min_pixels=10).detect(
@@ -29,19 +29,19 @@ def test_exact_masks_of_the_instances_of_known_class():
     assert detections.class_probabilities[1, COCO.index("tv")] == 1
 
 
-def test_an_empty_frame_and_a_frame_without_truth():
+def test_empty_frame_has_no_detections_and_missing_truth_raises():
     empty = FrameTruth(np.zeros((30, 40), np.int32), {})
     assert len(GroundTruthDetector().detect(frame_with(empty))) == 0
     with pytest.raises(DataError, match="no instance ground truth"):
         GroundTruthDetector().detect(frame_with(None))
 
 
-def test_wrong_parameter():
+def test_invalid_parameter_raises():
     with pytest.raises(ConfigError, match=r"detector\.min_pixels must be at least 1 px, found 0"):
         GroundTruthDetector(min_pixels=0)
 
 
-def test_none_finds_nothing():
+def test_none_detector_returns_no_detections():
     detections = NoDetections().detect(frame_with(None))
     assert detections.masks.shape == (0, 30, 40)
     assert detections.classes == COCO

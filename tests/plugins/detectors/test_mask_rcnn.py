@@ -36,7 +36,7 @@ def detector(path):
     return MaskRCNNDetector(weights=path, device="cpu")
 
 
-def test_the_score_is_the_classes_share_of_all_and_the_row_its_share_of_objects(path):
+def test_score_includes_background_and_class_row_excludes_it(path):
     """Without suppression across classes, each detection is a label of a proposal with that proposal's softmax."""
     detector, frame = MaskRCNNDetector(weights=path, device="cpu", agnostic_nms_iou=1.0), noise(0)
     seen = []
@@ -55,7 +55,7 @@ def test_the_score_is_the_classes_share_of_all_and_the_row_its_share_of_objects(
     assert (found.scores > detector.score_threshold).all()
 
 
-def test_detections_keep_the_contract(detector):
+def test_detections_meet_contract(detector):
     frame = noise(1)
     found = detector.detect(frame)
     assert found.classes == detector.classes == TINY.classes
@@ -70,7 +70,7 @@ def test_detections_keep_the_contract(detector):
     assert iou.max() <= detector.agnostic_nms_iou
 
 
-def test_same_input_same_output_and_the_input_stays_as_it_was(detector):
+def test_detection_is_repeatable_and_keeps_input(detector):
     frame = noise(2)
     before = frame.color.copy()
     first = detector.detect(frame)
@@ -82,13 +82,13 @@ def test_same_input_same_output_and_the_input_stays_as_it_was(detector):
 
 
 @pytest.mark.parametrize("shape", [(120, 160), (33, 57), (24, 400), (1, 1), (3, 700)])
-def test_blank_images_of_any_size_are_fine(detector, shape):
+def test_blank_image_of_any_size_is_valid(detector, shape):
     for value in (0, 255):
         found = detector.detect(picture(np.full((*shape, 3), value, np.uint8)))
         assert found.masks.shape == (len(found), *shape)
 
 
-def test_numbers_of_proposals_and_detections(path, monkeypatch):
+def test_proposal_and_detection_limits_are_respected(path, monkeypatch):
     given = []
     propose = mask_rcnn.propose
     monkeypatch.setattr(mask_rcnn, "propose", lambda *a: given.append(propose(*a)) or given[-1])
@@ -102,7 +102,7 @@ def test_numbers_of_proposals_and_detections(path, monkeypatch):
     assert len(given[1]) <= 5, "one a level"
 
 
-def test_sides_are_the_networks_own_unless_given(path):
+def test_sides_default_to_network_settings(path):
     frame = noise(5, (120, 160))
     assert MaskRCNNDetector(weights=path, device="cpu")._resize(frame).shape[2:] == (96, 128)
     assert MaskRCNNDetector(weights=path, device="cpu", short_side=60)._resize(frame).shape[2:] == (60, 80)
@@ -140,7 +140,7 @@ def test_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch, resized):
 
 
 @pytest.mark.parametrize("short_side", [32, 40, 80])
-def test_resizing_keeps_a_ramp_in_its_place(path, short_side):
+def test_resize_keeps_ramp_position(path, short_side):
     """A pixel's value is 5 times its place: after resizing, the one at u' is of the place (u' + 0.5) / scale - 0.5."""
     ramp = np.repeat(np.tile(5 * np.arange(50, dtype=np.uint8), (40, 1))[..., None], 3, axis=2)
     image = MaskRCNNDetector(weights=path, device="cpu", short_side=short_side, long_side=400)._resize(picture(ramp))
@@ -148,7 +148,7 @@ def test_resizing_keeps_a_ramp_in_its_place(path, short_side):
     np.testing.assert_allclose(image[0, 0, 5, 2:-2].numpy(), 5 * places[2:-2], atol=0.51)  # rounded to whole numbers
 
 
-def test_numbers_that_overflow_are_an_error_and_no_empty_answer(tmp_path):
+def test_overflow_raises(tmp_path):
     network = tiny_network()
     network.roi_heads.box_head.fc6.weight.data.fill_(3e38)
     save_network(network, tmp_path / "wild.safetensors", {})
@@ -157,13 +157,13 @@ def test_numbers_that_overflow_are_an_error_and_no_empty_answer(tmp_path):
         detector.detect(noise(7))
 
 
-def test_no_proposals_are_no_detections(detector, monkeypatch):
+def test_no_proposals_give_no_detections(detector, monkeypatch):
     monkeypatch.setattr(mask_rcnn, "propose", lambda *_: np.zeros((0, 4), np.float32))
     assert len(detector.detect(noise(8))) == 0
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA here: half precision is not compared")
-def test_half_precision_finds_the_same(path):
+def test_half_precision_agrees_with_single_precision(path):
     frame = noise(9)
     half, single = (
         MaskRCNNDetector(weights=path, device="cuda", half_precision=half).detect(frame) for half in (True, False)
@@ -191,12 +191,12 @@ def test_half_precision_finds_the_same(path):
         ({"device": "tpu"}, r"detector\.device must be auto, cpu or cuda"),
     ],
 )
-def test_parameters_are_checked(path, parameters, fault):
+def test_invalid_parameter_raises(path, parameters, fault):
     with pytest.raises(ConfigError, match=fault):
         MaskRCNNDetector(**({"weights": path, "device": "cpu"} | parameters))
 
 
-def test_absent_weights_are_one_line(tmp_path, monkeypatch):
+def test_missing_or_damaged_weights_raise_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(DataError, match=r"^detector\.weights: there is no network .*resnet50_fpn_coco") as caught:
         MaskRCNNDetector(weights=Path("no/such.pth"), device="cpu")
@@ -206,6 +206,6 @@ def test_absent_weights_are_one_line(tmp_path, monkeypatch):
         MaskRCNNDetector(weights=Path("bad.safetensors"), device="cpu")
 
 
-def test_after_building_weights_is_the_file_that_was_read(path, monkeypatch):
+def test_weights_attribute_is_resolved_path(path, monkeypatch):
     monkeypatch.chdir(path.parent)
     assert MaskRCNNDetector(weights=Path(path.name), device="cpu").weights == path.resolve()

@@ -29,7 +29,7 @@ def detector() -> MaskRCNNDetector:
     return detector
 
 
-def test_it_is_small_and_says_what_it_is(detector: MaskRCNNDetector) -> None:
+def test_bundled_network_is_small_and_has_model_card(detector: MaskRCNNDetector) -> None:
     assert Path(detector.weights).stat().st_size < MOST_BYTES
     assert set(detector.classes) == set(SCENENN_TO_COCO.values())
     card = describe_network(Path(detector.weights)).card
@@ -39,7 +39,7 @@ def test_it_is_small_and_says_what_it_is(detector: MaskRCNNDetector) -> None:
 
 
 @pytest.mark.acceptance
-def test_it_finds_objects_in_rooms_that_nobody_has_seen(detector: MaskRCNNDetector, tmp_path: Path) -> None:
+def test_bundled_network_detects_objects_in_unseen_rooms(detector: MaskRCNNDetector, tmp_path: Path) -> None:
     """Few pictures, so a loose bound: what it reaches on many is in its card."""
     render_rooms(tmp_path, ROOMS, 2, 10, 1)
     pictures = RoomPictures(tmp_path, ROOMS, 2)

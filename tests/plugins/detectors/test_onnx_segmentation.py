@@ -57,7 +57,7 @@ class TestContract(DetectorContract):
 
 
 @pytest.mark.parametrize(("objectness", "transposed"), [(False, False), (True, True)])
-def test_boxes_scores_and_masks(tmp_path, objectness, transposed):
+def test_known_network_gives_expected_boxes_scores_and_masks(tmp_path, objectness, transposed):
     check_cup_and_chair(tiny(tmp_path, objectness, transposed).detect(frame()))
 
 
@@ -72,7 +72,7 @@ def check_cup_and_chair(found):
     np.testing.assert_allclose(found.class_probabilities, [[6 / 7, 1 / 7], [1 / 9, 8 / 9]], rtol=1e-5)
 
 
-def test_tensorflow_export_channels_last_and_unit_boxes(tmp_path):
+def test_tensorflow_export_with_channels_last_is_decoded(tmp_path):
     table, prototypes = outputs().values()
     table[:, :4] /= SIZE
     (tmp_path / "labels.txt").write_text("\n".join(LABELS))
@@ -100,7 +100,7 @@ def suppressed(folder, **parameters):
 
 
 @pytest.mark.parametrize(("spread", "expected"), [(1.0, [0.6, 0.5]), (0.5, [0.8, 0.7]), (0.0, [1.0, 1.0])])
-def test_one_class_a_detection_leaves_the_rest_to_the_others(tmp_path, spread, expected, caplog):
+def test_single_class_output_spreads_remaining_probability(tmp_path, spread, expected, caplog):
     """A score of 0.4 is less than the even share of two classes, with spread 1."""
     with caplog.at_level("INFO"):
         found = suppressed(tmp_path, class_spread=spread).detect(frame())
@@ -113,7 +113,7 @@ def test_one_class_a_detection_leaves_the_rest_to_the_others(tmp_path, spread, e
     np.testing.assert_allclose(found.class_probabilities.sum(axis=1), 1)
 
 
-def test_other_names_in_the_file_are_told(tmp_path, caplog):
+def test_different_class_names_in_file_are_logged(tmp_path, caplog):
     tiny(tmp_path)
     assert not caplog.text
     model = onnx.load(tmp_path / "tiny.onnx")
@@ -132,7 +132,7 @@ def test_other_names_in_the_file_are_told(tmp_path, caplog):
         ({"more": np.zeros((1, 2))}, r"found output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
     ],
 )
-def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_path, changed, message):
+def test_unsupported_network_shape_raises(tmp_path, changed, message):
     (tmp_path / "labels.txt").write_text("\n".join(LABELS))
     weights = constant_network(tmp_path / "n.onnx", (1, 3, SIZE, SIZE), {**outputs(), **changed})
     with pytest.raises(DataError, match=message):
@@ -153,7 +153,7 @@ def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_pat
         {"device": "tpu"},
     ],
 )
-def test_a_wrong_parameter_is_named(tmp_path, parameters):
+def test_invalid_parameter_raises(tmp_path, parameters):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
         OnnxSegmentation(**{"weights": tmp_path / "absent.onnx", **parameters})
@@ -185,7 +185,7 @@ def expected(yolo, photographs):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_real_network_finds_the_same_in_every_layout(tmp_path, yolo, photographs, expected, layout):
+def test_yolo_detections_agree_in_all_layouts(tmp_path, yolo, photographs, expected, layout):
     detector = OnnxSegmentation(weights=rewritten(yolo, layout, tmp_path / "n.onnx"), device="cpu")
     assert detector._layout.suppressed == ("suppressed" in layout or "best rows" in layout)
     for photograph, wanted in zip(photographs, expected, strict=True):

@@ -62,19 +62,19 @@ def detected(folder: Path, *entries: Any, **parameters: Any) -> Detections:
     ],
     ids=["packed", "list", "polygon", "polygons"],
 )
-def test_every_form_of_a_mask(tmp_path: Path, segmentation: Any) -> None:
+def test_all_segmentation_formats_are_read(tmp_path: Path, segmentation: Any) -> None:
     found = detected(tmp_path, entry(segmentation=segmentation))
     np.testing.assert_array_equal(found.masks, MASK[None])
     np.testing.assert_array_equal(found.boxes, [[2, 1, 6, 3]])  # no bbox: the mask's
 
 
 @pytest.mark.parametrize("image_id", [12, "000012", "12", "color/000012.png", "frame/000012.color.png"[6:12]])
-def test_every_form_of_an_image_id(tmp_path: Path, image_id: Any) -> None:
+def test_all_image_id_formats_are_read(tmp_path: Path, image_id: Any) -> None:
     detector = Precomputed(write(tmp_path, entry(image_id=image_id)))
     assert [len(detector.detect(frame(k))) for k in (12, 0, 11)] == [1, 0, 0]
 
 
-def test_a_label_and_a_score_become_a_distribution(tmp_path: Path) -> None:
+def test_label_and_score_give_class_distribution(tmp_path: Path) -> None:
     [row] = detected(tmp_path, entry(score=0.6)).class_probabilities
     expected = np.full(80, 0.4 / 79)
     expected[CHAIR] = 0.6
@@ -84,14 +84,14 @@ def test_a_label_and_a_score_become_a_distribution(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("spread", "score", "own"), [(0.0, 0.6, 1.0), (0.5, 0.6, 0.8), (1.0, 1.0, 1.0), (1.0, 0, 1 / 80)]
 )
-def test_spread_says_how_much_the_others_get(tmp_path: Path, spread: float, score: float, own: float) -> None:
+def test_class_spread_sets_probability_of_other_classes(tmp_path: Path, spread: float, score: float, own: float) -> None:
     """Never so much that the label is no longer the best."""
     [row] = detected(tmp_path, entry(score=score), class_spread=spread).class_probabilities
     assert row[CHAIR] == pytest.approx(own)
     np.testing.assert_allclose(np.delete(row, CHAIR), (1 - own) / 79, rtol=1e-5, atol=1e-9)
 
 
-def test_whole_distributions_are_kept_to_the_bit(tmp_path: Path) -> None:
+def test_full_distribution_is_kept_exactly(tmp_path: Path) -> None:
     row = np.random.default_rng(0).random(80).astype(np.float32)
     row /= row.sum()
     as_list = [float(p) for p in row]
@@ -100,7 +100,7 @@ def test_whole_distributions_are_kept_to_the_bit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.class_probabilities, [row, row])
 
 
-def test_names_that_are_left_out_have_no_probability_and_rounded_rows_are_normalized(tmp_path: Path) -> None:
+def test_partial_distribution_is_normalized(tmp_path: Path) -> None:
     found = detected(tmp_path, entry(class_probabilities={"chair": 0.66, "couch": 0.32}))
     expected = np.zeros(80)
     expected[CHAIR], expected[COCO.index("couch")] = 0.66 / 0.98, 0.32 / 0.98
@@ -118,13 +118,13 @@ def test_names_that_are_left_out_have_no_probability_and_rounded_rows_are_normal
         (CategoryIds.FROM_ONE, "nyu40", 5, "chair"),
     ],
 )
-def test_category_ids(tmp_path: Path, ids: CategoryIds, labels: str, category_id: int, name: str) -> None:
+def test_category_id_maps_to_label(tmp_path: Path, ids: CategoryIds, labels: str, category_id: int, name: str) -> None:
     numbered = entry(category_name=None, category_id=category_id)
     found = detected(tmp_path, numbered, category_ids=ids, label_space=labels)
     assert found.classes[int(found.class_probabilities[0].argmax())] == name
 
 
-def test_other_labels_become_cocos(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_foreign_labels_map_to_coco_or_are_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """A wall is no object: dropped, and told."""
     entries = [entry(category_name="sofa", score=0.9), entry(category_name="wall", score=0.8)]
     with caplog.at_level(logging.INFO):
@@ -134,7 +134,7 @@ def test_other_labels_become_cocos(tmp_path: Path, caplog: pytest.LogCaptureFixt
     assert "1 of 2 detections are of no class of COCO's and are dropped: wall" in caplog.text
 
 
-def test_the_best_come_first_and_the_weak_are_dropped(tmp_path: Path) -> None:
+def test_detections_are_sorted_and_filtered_by_score(tmp_path: Path) -> None:
     entries = [entry(score=s, bbox=[k, 0, 1, 1]) for k, s in enumerate((0.2, 0.9, 0.05, 0.9))]
     found = detected(tmp_path, *entries, score_threshold=0.1)
     np.testing.assert_array_equal(found.scores, np.array([0.9, 0.9, 0.2], np.float32))
@@ -150,7 +150,7 @@ def test_the_best_come_first_and_the_weak_are_dropped(tmp_path: Path) -> None:
     [SimulatedDetector(min_pixels=1, false_positives=3.0), GroundTruthDetector(min_pixels=1), SphereDetector()],
     ids=lambda detector: type(detector).__name__,
 )
-def test_written_detections_come_back_to_the_bit(tmp_path: Path, detector: Any) -> None:
+def test_detection_file_round_trip_is_exact(tmp_path: Path, detector: Any) -> None:
     path, room = tmp_path / "results.json", CornerRoom()
     expected = [detector.detect(one) for one in room]
     assert write_detections(path, detector, room) == sum(map(len, expected)) > 6
@@ -178,13 +178,13 @@ def write_folder(folder: Path, ids: np.ndarray | None = None, listed: Any = None
     return folder
 
 
-def test_a_byte_order_mark_is_left_out(tmp_path: Path) -> None:
+def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     path = write_folder(tmp_path) / "000003.json"
     path.write_text(path.read_text(), encoding="utf-8-sig")
     assert len(Precomputed(tmp_path).detect(frame(3))) == 2
 
 
-def test_a_folder_of_masks(tmp_path: Path) -> None:
+def test_mask_folder_is_read(tmp_path: Path) -> None:
     found = Precomputed(write_folder(tmp_path)).detect(frame(3))
     corner = np.zeros_like(MASK)
     corner[0, 0] = True
@@ -207,13 +207,13 @@ def test_a_folder_of_masks(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_folder_that_is_wrong_is_told(tmp_path: Path, listed: Any, said: str) -> None:
+def test_invalid_mask_folder_entry_raises(tmp_path: Path, listed: Any, said: str) -> None:
     with pytest.raises(DataError, match=said) as raised:
         Precomputed(write_folder(tmp_path, listed=listed))
     assert "000003.json" in str(raised.value)
 
 
-def test_a_folder_with_half_of_a_frame_is_told(tmp_path: Path) -> None:
+def test_mask_folder_with_unpaired_file_raises(tmp_path: Path) -> None:
     (write_folder(tmp_path) / "000003.json").rename(tmp_path / "000004.json")
     with pytest.raises(DataError, match=r"000003\.json could not be read"):
         Precomputed(tmp_path)
@@ -223,7 +223,7 @@ def test_a_folder_with_half_of_a_frame_is_told(tmp_path: Path) -> None:
         Precomputed(tmp_path)
 
 
-def test_a_folder_with_two_images_of_a_frame_is_told(tmp_path: Path) -> None:
+def test_mask_folder_with_duplicate_frame_raises(tmp_path: Path) -> None:
     write_folder(write_folder(tmp_path), name="3")
     with pytest.raises(DataError, match=r"3\.png and 000003\.png are both of frame 3"):
         Precomputed(tmp_path)
@@ -232,7 +232,7 @@ def test_a_folder_with_two_images_of_a_frame_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("ids", "error"), [(np.zeros((6, 9), np.uint16), DataError), (np.zeros((6, 8), np.uint8), FrameError)]
 )
-def test_an_image_of_another_form_is_told(tmp_path: Path, ids: np.ndarray, error: type[DataError]) -> None:
+def test_mask_image_with_wrong_size_or_type_raises(tmp_path: Path, ids: np.ndarray, error: type[DataError]) -> None:
     with pytest.raises(error, match=r"000003\.(png|json).*(9x6 px, but the frame 8x6 px|uint8)"):
         Precomputed(write_folder(tmp_path, ids)).detect(frame(3))
 
@@ -267,7 +267,7 @@ def test_an_image_of_another_form_is_told(tmp_path: Path, ids: np.ndarray, error
         ({"class_probabilities": {"sofa": 1.0}}, "'sofa'"),
     ],
 )
-def test_an_entry_that_is_wrong_is_told_in_one_line(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+def test_invalid_result_entry_raises_one_line(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
     with pytest.raises(DataError) as raised:
         Precomputed(write(tmp_path, entry(), entry(**changes)))
     assert said in str(raised.value)
@@ -284,7 +284,7 @@ def test_an_entry_that_is_wrong_is_told_in_one_line(tmp_path: Path, changes: dic
         ("[3]", "entry 0"),
     ],
 )
-def test_a_file_that_is_none_is_told(tmp_path: Path, content: str, said: str) -> None:
+def test_invalid_or_missing_result_file_raises(tmp_path: Path, content: str, said: str) -> None:
     (tmp_path / "results.json").write_text(content)
     with pytest.raises(DataError, match=said):
         Precomputed(tmp_path / "results.json")
@@ -292,13 +292,13 @@ def test_a_file_that_is_none_is_told(tmp_path: Path, content: str, said: str) ->
         Precomputed(tmp_path / "absent.json")
 
 
-def test_a_file_of_two_sequences_is_told(tmp_path: Path) -> None:
+def test_result_file_with_two_sequences_raises(tmp_path: Path) -> None:
     path = write(tmp_path, entry(image_id="kitchen/000002.png"), entry(image_id="hall/000002.png"))
     with pytest.raises(DataError, match=r"entry 1: hall/000002\.png and another image in kitchen/ are both frame 2"):
         Precomputed(path)
 
 
-def test_masks_of_another_size_than_the_frame_are_told(tmp_path: Path) -> None:
+def test_mask_with_wrong_frame_size_raises(tmp_path: Path) -> None:
     detector = Precomputed(write(tmp_path, entry()))
     with pytest.raises(DataError, match=r"entry 0: frame 0: the mask is 8x6 px, but the frame 16x12 px"):
         detector.detect(frame(camera=CAMERA.scaled(2)))
@@ -307,7 +307,7 @@ def test_masks_of_another_size_than_the_frame_are_told(tmp_path: Path) -> None:
         detector.detect(frame())
 
 
-def test_a_file_of_another_sequence_is_told(tmp_path: Path) -> None:
+def test_result_file_of_other_sequence_raises(tmp_path: Path) -> None:
     path = write(tmp_path, entry(image_id=2), entry(image_id=5))
     strange = Precomputed(path)
     for index in (0, 1, 3, 4):
@@ -318,7 +318,7 @@ def test_a_file_of_another_sequence_is_told(tmp_path: Path) -> None:
     assert [len(fitting.detect(frame(k))) for k in (2, 6, 900)] == [1, 0, 0]
 
 
-def test_a_file_that_may_be_of_another_sequence_is_doubted_once(
+def test_possible_sequence_mismatch_warns_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     detector = Precomputed(write(tmp_path, entry(image_id=5000)))
@@ -328,18 +328,18 @@ def test_a_file_that_may_be_of_another_sequence_is_doubted_once(
     assert "for none of the first 30 frames" in caplog.text
 
 
-def test_ids_of_coco_need_cocos_labels(tmp_path: Path) -> None:
+def test_coco_91_ids_with_other_label_space_raise(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="FROM_ONE or FROM_ZERO"):
         Precomputed(write(tmp_path, entry(category_name=None, category_id=1)), label_space="nyu40")
 
 
-def test_parameters_are_checked(tmp_path: Path) -> None:
+def test_invalid_parameter_raises(tmp_path: Path) -> None:
     for wrong in ({"class_spread": 1.5}, {"score_threshold": -0.1}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             Precomputed(write(tmp_path, entry()), **wrong)
 
 
-def test_a_file_of_no_class_that_counts_is_told(tmp_path: Path) -> None:
+def test_no_usable_class_or_duplicate_label_raises(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="none of the 1 detections is of a class"):
         Precomputed(write(tmp_path, entry(category_name="wall")), label_space="nyu40")
     (tmp_path / "labels.txt").write_text("chair\nchair\n")

@@ -63,12 +63,12 @@ def count_of(detector, mask, frames=400):
     return sum(bool((d.masks & mask).any()) for d in (detector.detect(frame(k)) for k in range(frames)))
 
 
-def test_without_errors_it_is_the_ground_truth():
+def test_zero_error_rates_give_ground_truth():
     for index in range(3):
         assert same(PERFECT.detect(frame(index)), GroundTruthDetector().detect(frame(index)))
 
 
-def test_everything_at_its_default_keeps_the_contract():
+def test_default_detections_meet_contract():
     detector = SimulatedDetector(false_positives=3)
     for index in range(30):
         detections = detector.detect(frame(index))
@@ -80,7 +80,7 @@ def test_everything_at_its_default_keeps_the_contract():
         np.testing.assert_array_equal(detections.boxes, tight_boxes(detections.masks))
 
 
-def test_results_depend_on_seed_and_frame_and_not_on_the_order_of_calls():
+def test_results_depend_on_seed_and_frame_but_not_call_order():
     detector = SimulatedDetector(seed=3)
     forward = [detector.detect(frame(k)) for k in range(6)]
     backward = [SimulatedDetector(seed=3).detect(frame(k)) for k in reversed(range(6))][::-1]
@@ -89,7 +89,7 @@ def test_results_depend_on_seed_and_frame_and_not_on_the_order_of_calls():
     assert not same(forward[0], SimulatedDetector(seed=4).detect(frame(0)))
 
 
-def test_changing_one_error_leaves_the_draws_of_the_others_alone():
+def test_error_types_have_independent_random_streams():
     """More misses take detections away; those that stay are the same, to the pixel."""
     few = SimulatedDetector(miss_rate=0.0, false_positives=0, merge_rate=0)
     many = replace(few, miss_rate=0.5)
@@ -98,7 +98,7 @@ def test_changing_one_error_leaves_the_draws_of_the_others_alone():
         assert {m.tobytes() for m in b.masks} <= {m.tobytes() for m in a.masks}
 
 
-def test_miss_rates():
+def test_miss_rates_match_parameters():
     chair, cup, bed = IDS == 5, IDS == 9, IDS == 12
     assert count_of(replace(PERFECT, miss_rate=0.3), chair) == pytest.approx(400 * 0.7, abs=30)  # 3 sigma
     smaller = replace(PERFECT, small_side=20.0)
@@ -109,7 +109,7 @@ def test_miss_rates():
     assert count_of(truncated, bed) == pytest.approx(400 * 0.6, abs=30)
 
 
-def test_split_objects_come_back_as_two_halves_of_the_whole():
+def test_split_object_gives_two_parts_at_split_rate():
     detections = replace(PERFECT, split_rate=1.0).detect(frame())
     assert len(detections) == 8
     assert (detections.masks.sum(axis=0) == np.isin(IDS, (5, 6, 9, 12))).all()
@@ -118,7 +118,7 @@ def test_split_objects_come_back_as_two_halves_of_the_whole():
     assert rate == pytest.approx(0.25, abs=0.05)
 
 
-def test_touching_neighbors_merge_and_others_do_not():
+def test_only_touching_neighbors_merge_at_merge_rate():
     detections = replace(PERFECT, merge_rate=1.0).detect(frame())
     assert len(detections) == 3
     assert sum((mask == np.isin(IDS, (5, 6))).all() for mask in detections.masks) == 1
@@ -126,14 +126,14 @@ def test_touching_neighbors_merge_and_others_do_not():
     assert rate == pytest.approx(0.3, abs=0.08)
 
 
-def test_a_step_in_depth_is_no_contact():
+def test_depth_step_separates_neighbors():
     flat = frame()
     assert touching_pairs(flat).tolist() == [[5, 6]]
     depth = np.where(IDS == 6, 2.0, 1.0).astype(np.float32)
     assert touching_pairs(replace(flat, depth=depth)).shape == (0, 2)
 
 
-def test_bleeding_grows_a_mask_by_exactly_that_many_pixels():
+def test_bleed_grows_mask_by_given_pixels():
     for bleed, side in ((3.0, 46), (-4.0, 32)):
         detections = replace(PERFECT, bleed=bleed).detect(frame())
         (box,) = [b for b, m in zip(detections.boxes, detections.masks, strict=True) if m[40, 40] and not m[40, 90]]
@@ -142,7 +142,7 @@ def test_bleeding_grows_a_mask_by_exactly_that_many_pixels():
     assert bed[119, 159], "a mask must not shrink away from the image's border"
 
 
-def test_shift_and_wobble_have_their_standard_deviations():
+def test_shift_and_boundary_noise_have_given_deviation():
     detector = replace(PERFECT, shift=2.0)
     centers = []
     for k in range(200):
@@ -162,13 +162,13 @@ def test_shift_and_wobble_have_their_standard_deviations():
         assert correlation == pytest.approx(np.exp(-((distance / 24) ** 2)), abs=0.08)
 
 
-def test_signed_distance_of_a_half_plane():
+def test_signed_distance_of_half_plane_is_exact():
     mask = np.zeros((5, 10), np.uint8)
     mask[:, 4:] = 1
     np.testing.assert_allclose(signed_distance(mask)[2], np.arange(10) - 3.5)
 
 
-def test_a_coarse_grid_keeps_a_square_and_blurs_a_comb():
+def test_coarse_mask_grid_keeps_square_and_blurs_comb():
     fine, coarse = PERFECT.detect(frame()), replace(PERFECT, mask_grid=28).detect(frame())
     assert (fine.masks ^ coarse.masks).mean() < 1e-3
     comb = np.zeros((120, 160), np.int32)
@@ -178,7 +178,7 @@ def test_a_coarse_grid_keeps_a_square_and_blurs_a_comb():
     assert np.mean(mask != (comb == 5)) > 0.2
 
 
-def test_the_confusion_kernel_is_a_distribution_that_prefers_lookalikes():
+def test_confusion_kernel_is_normalized_and_favors_lookalikes():
     kernel = confusion_kernel(COCO, 0.25)
     np.testing.assert_allclose(kernel.sum(axis=1), 1)
     np.testing.assert_allclose(np.diag(kernel), 0.75)
@@ -198,7 +198,7 @@ def distributions(detector, frames):
     return np.array(rows)
 
 
-def test_confused_classes_have_the_kernel_as_their_mean_and_the_truth_not_always_on_top():
+def test_confused_class_rows_average_to_confusion_kernel():
     couch = COCO.index("couch")
     detector = replace(PERFECT, confusion=0.3, confusion_concentration=3.0, confusion_consistency=0.0)
     rows = distributions(detector, 600)
@@ -209,7 +209,7 @@ def test_confused_classes_have_the_kernel_as_their_mean_and_the_truth_not_always
     assert steady == pytest.approx(np.tile(confusion_kernel(COCO, 0.3)[couch], (20, 1)), abs=0.01)
 
 
-def test_a_consistent_detector_errs_the_same_way_in_every_frame():
+def test_consistent_confusion_repeats_in_all_frames():
     detector = replace(PERFECT, confusion=0.3, confusion_consistency=1.0)
     assert np.ptp(distributions(detector, 10), axis=0).max() == 0
     half = distributions(replace(detector, confusion_consistency=0.5), 300)
@@ -217,7 +217,7 @@ def test_a_consistent_detector_errs_the_same_way_in_every_frame():
     assert counts.max() / 300 == pytest.approx(0.5, abs=0.09)
 
 
-def test_scores_follow_quality():
+def test_scores_correlate_with_detection_quality():
     detector = replace(PERFECT, score_concentration=20.0, boundary_noise=6.0, bleed=4.0, confusion=0.2)
     scores, quality = [], []
     for k in range(150):
@@ -230,7 +230,7 @@ def test_scores_follow_quality():
     assert np.mean(scores) == pytest.approx(np.mean(quality), abs=0.02)
 
 
-def test_false_positives():
+def test_false_positives_have_given_rate_and_score():
     detector = replace(PERFECT, false_positives=1.5, score_concentration=20.0)
     empty = replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {}))
     found = [detector.detect(replace(empty, index=k)) for k in range(200)]
@@ -245,7 +245,7 @@ THING[80:110, 20:50] = 32  # one that touches nothing
 ROOM = FrameTruth(THING, {5: "chair", **dict.fromkeys(range(31, 200))})
 
 
-def test_an_object_takes_the_same_neighbor_with_it_in_all_frames():
+def test_attached_neighbor_is_same_in_all_frames():
     taken = []
     for seed in range(200):
         detector = replace(PERFECT, attach_rate=0.3, seed=seed)
@@ -260,7 +260,7 @@ def test_an_object_takes_the_same_neighbor_with_it_in_all_frames():
     np.testing.assert_array_equal(alone.masks[0], large == 5)
 
 
-def test_things_are_taken_for_the_same_object_in_all_frames():
+def test_clutter_has_same_class_in_all_frames():
     detector = replace(PERFECT, clutter_rate=0.4, score_concentration=20.0)
     taken = 0
     for thing in range(31, 200):
@@ -273,7 +273,7 @@ def test_things_are_taken_for_the_same_object_in_all_frames():
     assert taken / 169 == pytest.approx(0.4, abs=0.12)
 
 
-def test_some_objects_are_missed_nearly_always_and_others_never():
+def test_miss_spread_varies_miss_rate_between_objects():
     alike = replace(PERFECT, miss_rate=0.5)
     apart = replace(alike, miss_spread=2.0)
 
@@ -290,7 +290,7 @@ def test_some_objects_are_missed_nearly_always_and_others_never():
     assert ((uneven < 0.1) | (uneven > 0.9)).mean() == pytest.approx(0.27, abs=0.15)
 
 
-def test_ghosts_stay_at_their_places_of_the_world():
+def test_recurring_false_positives_keep_world_position():
     detector = replace(PERFECT, false_positives=1.0, recurring_fraction=1.0)
     wall = np.full((120, 160), 2.0, np.float32)
     places, classes = [], []
@@ -310,7 +310,7 @@ def test_ghosts_stay_at_their_places_of_the_world():
     assert np.ptp(first) < 0.55, "a place is 0.5 m wide, and its visible part has its middle in it"
 
 
-def test_without_poses_false_detections_are_anywhere():
+def test_recurring_false_positives_need_poses():
     detector = replace(PERFECT, false_positives=1.0, recurring_fraction=1.0)
     empty = [replace(frame(k), truth=FrameTruth(np.zeros_like(IDS), {})) for k in range(5)]
     found = [detector.detect(one) for one in empty]
@@ -319,11 +319,11 @@ def test_without_poses_false_detections_are_anywhere():
     assert all(same(a, anywhere.detect(one)) for a, one in zip(found, empty, strict=True))
 
 
-def test_the_scale_of_scores():
+def test_score_scale_multiplies_scores():
     np.testing.assert_allclose(replace(PERFECT, score_scale=0.5).detect(frame()).scores, 0.5)
 
 
-def test_touching_pairs_are_those_of_the_arithmetic_on_whole_images():
+def test_touching_pairs_match_reference():
     for seed in range(5):
         rng = np.random.default_rng(seed)
         ids = np.kron(rng.integers(0, 9, (12, 16)), np.ones((10, 10), int)).astype(np.int32)
@@ -339,7 +339,7 @@ def test_touching_pairs_are_those_of_the_arithmetic_on_whole_images():
 
 
 @pytest.mark.parametrize("place", [(80.3, 60.2), (0.0, 0.0), (159.9, 119.9), (3.5, 118.0)])
-def test_false_ellipses_are_those_of_the_whole_image(place):
+def test_ellipse_matches_reference(place):
     x, y = place
     v, u = np.ogrid[:120, :160]
     for seed, (a, b) in enumerate(((12.0, 80.0), (40.5, 13.0), (79.0, 80.0))):
@@ -349,7 +349,7 @@ def test_false_ellipses_are_those_of_the_whole_image(place):
             np.testing.assert_array_equal(ellipse(x, y, a, b, field), expected)
 
 
-def test_no_truth_is_an_error_and_no_objects_are_none():
+def test_missing_truth_raises_and_empty_truth_gives_none():
     with pytest.raises(DataError, match="no instance ground truth"):
         SimulatedDetector().detect(replace(frame(), truth=None))
     assert len(PERFECT.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {})))) == 0
@@ -376,7 +376,7 @@ def test_no_truth_is_an_error_and_no_objects_are_none():
         {"recurring_fraction": 2.0},
     ],
 )
-def test_a_wrong_parameter_is_named(parameters):
+def test_invalid_parameter_raises(parameters):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
         SimulatedDetector(**parameters)

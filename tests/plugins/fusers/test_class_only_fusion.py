@@ -65,7 +65,7 @@ def mapped(frames: list[Frame]) -> SemanticMap:
 # What is an instance
 
 
-def test_two_boxes_of_a_class_apart_are_two_instances() -> None:
+def test_separate_boxes_of_one_class_are_two_instances() -> None:
     instances = mapped_boxes([LEFT, RIGHT], [0, 0]).instances()
     assert list(instances) == [1, 2]
     for instance, box in zip(sorted(instances.values(), key=lambda i: i.aabb.center[0]), [LEFT, RIGHT], strict=True):
@@ -73,12 +73,12 @@ def test_two_boxes_of_a_class_apart_are_two_instances() -> None:
         assert instance.class_probabilities.argmax() == 0
 
 
-def test_two_boxes_of_a_class_that_touch_are_one_which_is_the_limit_of_the_idea() -> None:
+def test_touching_boxes_of_one_class_are_one_instance() -> None:
     [instance] = mapped_boxes([LEFT, TOUCHING], [0, 0]).instances().values()
     assert instance.aabb.extent[0] == pytest.approx(1.0, abs=0.1)
 
 
-def test_two_boxes_of_different_classes_that_touch_are_two_instances() -> None:
+def test_touching_boxes_of_two_classes_are_two_instances() -> None:
     scene = mapped_boxes([LEFT, TOUCHING], [0, 1])
     instances = scene.instances()
     assert sorted(i.class_probabilities.argmax() for i in instances.values()) == [0, 1]
@@ -89,7 +89,7 @@ def test_two_boxes_of_different_classes_that_touch_are_two_instances() -> None:
 
 
 @pytest.mark.parametrize("when", [0, 9])
-def test_a_false_detection_in_one_of_ten_frames_vanishes(frames: list[Frame], when: int) -> None:
+def test_single_false_detection_is_removed(frames: list[Frame], when: int) -> None:
     fuser = new_fuser()
     for k, frame in enumerate(frames):
         found = [masks_of(frame)[0]] if k == when else []
@@ -101,7 +101,7 @@ def test_a_false_detection_in_one_of_ten_frames_vanishes(frames: list[Frame], wh
     assert (class_ids >= 0).sum() < 0.01 * masks_of(frames[5])[0].sum(), "on the silhouette, what that frame alone saw"
 
 
-def test_what_no_mask_says_nothing_of_keeps_its_class(frames: list[Frame]) -> None:
+def test_missed_1_ignores_unmasked_frames(frames: list[Frame]) -> None:
     fuser = new_fuser(missed=1.0)
     for k, frame in enumerate(frames):
         found = [masks_of(frame)[0]] if k == 0 else []
@@ -109,7 +109,7 @@ def test_what_no_mask_says_nothing_of_keeps_its_class(frames: list[Frame]) -> No
     assert len(fuser.scene.instances()) == 1
 
 
-def test_an_instance_that_is_small_does_not_count(frames: list[Frame]) -> None:
+def test_instance_below_min_area_is_excluded(frames: list[Frame]) -> None:
     fuser = new_fuser(min_area=40.0)
     fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [0.6])
     assert not fuser.scene.instances()
@@ -120,7 +120,7 @@ def test_an_instance_that_is_small_does_not_count(frames: list[Frame]) -> None:
 # What is said of one
 
 
-def test_each_voxel_has_the_product_of_what_its_pixels_said(mapped: SemanticMap, frames: list[Frame]) -> None:
+def test_voxel_evidence_matches_reference(mapped: SemanticMap, frames: list[Frame]) -> None:
     """Against eq. [7] over classes and background, by projecting the voxel into each frame."""
     grid, evidence, fuser = mapped.volume.voxels.grid, mapped.labels.evidence, new_fuser()
     rows = np.flatnonzero(grid.label_row[: mapped.volume.voxels.block_count] >= 0)
@@ -159,7 +159,7 @@ def test_each_voxel_has_the_product_of_what_its_pixels_said(mapped: SemanticMap,
     assert differing <= 6, "pixels on the edge of two, in float32"
 
 
-def test_an_instances_numbers_are_those_of_its_voxels(mapped: SemanticMap) -> None:
+def test_instance_attributes_match_voxel_reference(mapped: SemanticMap) -> None:
     grid, evidence, mesh = mapped.volume.voxels.grid, mapped.labels.evidence, mapped.mesh()
     voxels = mapped.volume.surface().voxels
     instances = mapped.instances()
@@ -191,7 +191,7 @@ def test_an_instances_numbers_are_those_of_its_voxels(mapped: SemanticMap) -> No
         )
 
 
-def test_the_spheres_that_were_detected_are_the_instances(mapped: SemanticMap) -> None:
+def test_detected_spheres_are_instances(mapped: SemanticMap) -> None:
     first, second = sorted(mapped.instances().values(), key=lambda instance: -instance.observations)
     assert (first.observations, first.first_frame, first.last_frame) == (10, 0, 9)
     assert (second.observations, second.first_frame, second.last_frame) == (3, 1, 5)
@@ -203,7 +203,7 @@ def test_the_spheres_that_were_detected_are_the_instances(mapped: SemanticMap) -
     assert not view.instance_ids.any(), "voxels know of no instance"
 
 
-def test_a_score_is_the_probability_of_the_best_class(frames: list[Frame]) -> None:
+def test_score_is_probability_of_best_class(frames: list[Frame]) -> None:
     """Of a best class of 0.7, score 0.33 leaves the background more than half, and 0.6 a seventh."""
     for score, label in ((0.33, -1), (0.6, 0)):
         fuser = new_fuser()
@@ -215,7 +215,7 @@ def test_a_score_is_the_probability_of_the_best_class(frames: list[Frame]) -> No
 # The map as such
 
 
-def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame]) -> None:
+def test_map_does_not_depend_on_thread_count(frames: list[Frame]) -> None:
     def mapped() -> list[bytes]:
         fuser = new_fuser()
         for frame in frames[:5]:
@@ -227,7 +227,7 @@ def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame]) -
     assert by_one == by_two
 
 
-def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: SemanticMap, tmp_path: Path) -> None:
+def test_map_file_round_trip_is_exact(mapped: SemanticMap, tmp_path: Path) -> None:
     mapped.save(tmp_path / "map.npz")
     loaded = SemanticMap.load(tmp_path / "map.npz")
     for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
@@ -243,7 +243,7 @@ def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: Sema
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
 
 
-def test_mapping_goes_on_after_loading(frames: list[Frame], tmp_path: Path) -> None:
+def test_loaded_map_can_be_extended(frames: list[Frame], tmp_path: Path) -> None:
     whole, resumed = new_fuser(), new_fuser()
     for k, frame in enumerate(frames[:4]):
         if k == 2:
@@ -256,13 +256,13 @@ def test_mapping_goes_on_after_loading(frames: list[Frame], tmp_path: Path) -> N
     assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
-def test_a_map_of_instances_is_refused(tmp_path: Path) -> None:
+def test_loading_instance_map_raises(tmp_path: Path) -> None:
     BayesianTsdf().scene.save(tmp_path / "map.npz")
     with pytest.raises(DataError, match=f"map format {FORMAT}, this version reads semantic 4"):
         SemanticMap.load(tmp_path / "map.npz")
 
 
-def test_another_label_space_is_refused(frames: list[Frame]) -> None:
+def test_different_label_space_raises(frames: list[Frame]) -> None:
     fuser = new_fuser()
     fuse_masks(fuser, frames[0], [], [])
     assert fuser.scene.classes == CLASSES
@@ -271,7 +271,7 @@ def test_another_label_space_is_refused(frames: list[Frame]) -> None:
         fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
 
 
-def test_parameters_are_checked() -> None:
+def test_invalid_parameter_raises() -> None:
     for wrong in (
         {"missed": 0.0},
         {"class_floor": 1.0},

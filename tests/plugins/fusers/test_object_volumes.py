@@ -66,7 +66,7 @@ def mapped(frames: list[Frame]) -> ObjectVolumes:
 # What is mapped
 
 
-def test_each_box_is_one_object_on_its_surface(mapped: ObjectVolumes) -> None:
+def test_each_box_is_one_instance_on_its_surface(mapped: ObjectVolumes) -> None:
     scene = mapped.scene
     mesh, instances = scene.mesh(), scene.instances()
     assert sorted(instances) == [1, 2]
@@ -78,7 +78,7 @@ def test_each_box_is_one_object_on_its_surface(mapped: ObjectVolumes) -> None:
         assert (owners == key).sum() > 300
 
 
-def test_no_surface_of_an_object_is_left_without_its_label(mapped: ObjectVolumes) -> None:
+def test_object_surface_is_fully_labeled(mapped: ObjectVolumes) -> None:
     """Or the nearest vertex to a true point would be the background's in one case of two."""
     mesh = mapped.scene.mesh()
     owners = BOXES.owners(mesh.vertices.astype(np.float64), VOXEL / 4)
@@ -86,7 +86,7 @@ def test_no_surface_of_an_object_is_left_without_its_label(mapped: ObjectVolumes
         assert (mesh.instance_ids[owners == key] == key).mean() > 0.97
 
 
-def test_rendered_ids_are_those_of_the_boxes(mapped: ObjectVolumes, frames: list[Frame]) -> None:
+def test_rendered_ids_match_ground_truth(mapped: ObjectVolumes, frames: list[Frame]) -> None:
     frame = frames[4]
     assert frame.truth is not None
     assert frame.T_world_camera is not None
@@ -95,7 +95,7 @@ def test_rendered_ids_are_those_of_the_boxes(mapped: ObjectVolumes, frames: list
     assert (view.class_ids == np.where(view.instance_ids > 0, 0, -1)).all()
 
 
-def test_bytes_and_voxels_are_those_of_all_volumes(mapped: ObjectVolumes) -> None:
+def test_statistics_include_all_volumes(mapped: ObjectVolumes) -> None:
     scene = mapped.scene
     objects = sum(volume.block_count for volume in scene.volumes.values())
     assert scene.statistics.voxels == 512 * (scene.background.voxels.block_count + objects)
@@ -111,7 +111,7 @@ def share_of_the_room(fuser: ObjectVolumes) -> float:
     return float((BOXES.owners(points, VOXEL) == 0).mean())
 
 
-def test_a_mask_that_bleeds_once_leaves_nothing_and_one_that_always_bleeds_does() -> None:
+def test_single_mask_bleed_is_removed_and_constant_bleed_stays() -> None:
     """What was never seen without the mask stays in either case: so the camera hardly moves."""
     once, always = new_fuser(), new_fuser()
     for k, frame in enumerate(pan(0.1)):
@@ -122,7 +122,7 @@ def test_a_mask_that_bleeds_once_leaves_nothing_and_one_that_always_bleeds_does(
     assert share_of_the_room(always) > 0.2, "the weakness: nothing is cleaned, so what is always wrong stays"
 
 
-def test_what_bled_over_the_wall_goes_once_it_is_seen_twice_without_a_mask(frames: list[Frame]) -> None:
+def test_bled_voxels_are_removed_after_view_without_mask(frames: list[Frame]) -> None:
     """Beta(1 + 1, 1 + 0), then Beta(2, 2), which is not above 1/2."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     mask = masks_of(frame)[0]
@@ -132,7 +132,7 @@ def test_what_bled_over_the_wall_goes_once_it_is_seen_twice_without_a_mask(frame
     assert share_of_the_room(fuser) < 0.02
 
 
-def test_only_frames_that_detect_an_object_change_its_volume(frames: list[Frame]) -> None:
+def test_object_volume_changes_only_when_detected(frames: list[Frame]) -> None:
     fuser = fuse(new_fuser(), frames[0], masks_of(frames[0]))
     first, second = ({k: a.copy() for k, a in v.arrays().items()} for v in fuser.scene.volumes.values())
     fuse(fuser, frames[1], masks_of(frames[1])[:1])
@@ -162,7 +162,7 @@ def part_of(mask: np.ndarray, share: float) -> np.ndarray:
         (MASK_FUSION, 0.15, 1, False),  # of another class
     ],
 )
-def test_a_part_of_an_object_belongs_to_it_by_the_rule(
+def test_partial_detection_matches_by_overlap_rule(
     frames: list[Frame], parameters: dict[str, object], share: float, class_id: int, same: bool
 ) -> None:
     fuser = new_fuser(**parameters)
@@ -172,7 +172,7 @@ def test_a_part_of_an_object_belongs_to_it_by_the_rule(
     assert len(fuser.scene.table.records) == (1 if same else 2)
 
 
-def test_a_large_mask_over_a_small_object_belongs_to_it_by_neither_rule(frames: list[Frame]) -> None:
+def test_large_mask_over_small_object_creates_new_instance(frames: list[Frame]) -> None:
     whole = masks_of(frames[0])[0]
     for parameters in ({}, MASK_FUSION):
         fuser = new_fuser(**parameters)
@@ -181,7 +181,7 @@ def test_a_large_mask_over_a_small_object_belongs_to_it_by_neither_rule(frames: 
         assert len(fuser.scene.table.records) == 2
 
 
-def test_a_detection_belongs_to_the_object_that_it_overlaps_most_with(frames: list[Frame]) -> None:
+def test_detection_matches_object_of_largest_overlap(frames: list[Frame]) -> None:
     frame = frames[4]
     left, right = masks_of(frame)
     fuser = fuse(new_fuser(), frame, [left, right])
@@ -189,7 +189,7 @@ def test_a_detection_belongs_to_the_object_that_it_overlaps_most_with(frames: li
     assert [record.observations for record in fuser.scene.table.records.values()] == [1, 2]
 
 
-def test_two_detections_of_one_object_are_one_observation_and_their_union_one_mask(frames: list[Frame]) -> None:
+def test_two_detections_of_one_object_are_one_observation(frames: list[Frame]) -> None:
     frame, fuser = frames[0], new_fuser()
     whole = masks_of(frame)[0]
     fuse(fuser, frame, [whole])
@@ -201,7 +201,7 @@ def test_two_detections_of_one_object_are_one_observation_and_their_union_one_ma
     assert (counts["foreground"][counts["foreground"] > 0] == 2).mean() > 0.95, "every voxel is in the second mask too"
 
 
-def test_a_weak_detection_creates_nothing_and_one_out_of_range_neither(frames: list[Frame]) -> None:
+def test_weak_or_distant_detection_creates_no_object(frames: list[Frame]) -> None:
     frame = frames[0]
     mask = masks_of(frame)[0]
     for fuser in (new_fuser(create_score=0.9), new_fuser(max_depth=0.9)):
@@ -213,7 +213,7 @@ def test_a_weak_detection_creates_nothing_and_one_out_of_range_neither(frames: l
 # What is known of an object
 
 
-def test_classes_are_the_mean_of_the_detections(frames: list[Frame]) -> None:
+def test_class_probabilities_are_mean_of_detections(frames: list[Frame]) -> None:
     fuser = new_fuser(min_observations=1)
     for k, class_id in enumerate([0, 1, 1]):
         fuse(fuser, replace(frames[0], index=k), masks_of(frames[0])[:1], [class_id])
@@ -224,7 +224,7 @@ def test_classes_are_the_mean_of_the_detections(frames: list[Frame]) -> None:
     assert set(mesh.class_ids[mesh.instance_ids == 1]) == {1}
 
 
-def test_a_false_detection_goes_when_it_should_have_been_seen_again(frames: list[Frame]) -> None:
+def test_unconfirmed_object_is_removed_when_visible(frames: list[Frame]) -> None:
     """Detected once and missed n times it exists with probability 2 / (3 + n), which is below 0.1 from n = 18 on."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     wall = np.zeros(CAMERA.shape, np.bool_)
@@ -246,7 +246,7 @@ def test_a_false_detection_goes_when_it_should_have_been_seen_again(frames: list
     assert set(fuser.scene.table.records) == {2}, "ids are never used again"
 
 
-def test_a_small_object_does_not_count(frames: list[Frame]) -> None:
+def test_object_below_min_area_is_excluded(frames: list[Frame]) -> None:
     fuser = new_fuser(min_observations=1, min_area=40.0)
     fuse(fuser, frames[0], masks_of(frames[0]))
     assert not fuser.scene.instances()
@@ -256,7 +256,7 @@ def test_a_small_object_does_not_count(frames: list[Frame]) -> None:
 # The map
 
 
-def test_the_mesh_kept_up_to_date_is_that_of_a_map_read_from_a_file(frames: list[Frame], tmp_path: Path) -> None:
+def test_incremental_mesh_equals_mesh_of_loaded_map(frames: list[Frame], tmp_path: Path) -> None:
     fuser = new_fuser(min_observations=1)
     for frame in frames[::3]:
         fuse(fuser, frame, masks_of(frame)[: 1 + frame.index % 2])
@@ -271,7 +271,7 @@ def test_the_mesh_kept_up_to_date_is_that_of_a_map_read_from_a_file(frames: list
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
 
 
-def test_overlapping_objects_both_have_their_surface(frames: list[Frame]) -> None:
+def test_overlapping_objects_both_have_surfaces(frames: list[Frame]) -> None:
     """One detection a frame, now of the whole and now of a small part: what an IoU rule makes of a partial mask."""
     fuser = new_fuser(min_observations=1)
     whole = masks_of(frames[0])[0]
@@ -284,7 +284,7 @@ def test_overlapping_objects_both_have_their_surface(frames: list[Frame]) -> Non
     assert len(second) > 20
 
 
-def test_where_objects_overlap_the_more_probable_one_is_seen_and_of_equal_ones_the_first(frames: list[Frame]) -> None:
+def test_overlap_renders_most_probable_then_first_object(frames: list[Frame]) -> None:
     frame, scene = frames[0], new_fuser().scene
     T = frame.T_world_camera
     assert T is not None
@@ -296,7 +296,7 @@ def test_where_objects_overlap_the_more_probable_one_is_seen_and_of_equal_ones_t
         assert (seen[mask[::2, ::2]] == expected).mean() > 0.9, expected
 
 
-def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame], tmp_path: Path) -> None:
+def test_map_does_not_depend_on_thread_count(frames: list[Frame], tmp_path: Path) -> None:
     def saved() -> bytes:
         fuser = new_fuser()
         for frame in frames[::2]:
@@ -308,13 +308,13 @@ def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame], t
     assert by_one == by_two
 
 
-def test_a_full_map_says_so(frames: list[Frame]) -> None:
+def test_full_map_raises(frames: list[Frame]) -> None:
     background = fuse(new_fuser(), frames[0], []).scene.background.voxels.block_count
     with pytest.raises(MapFullError, match=f"more than {background} blocks in the background and 2 objects"):
         fuse(new_fuser(max_blocks=background), frames[0], masks_of(frames[0]))
 
 
-def test_a_pixel_out_of_the_image_and_other_classes_are_refused(frames: list[Frame]) -> None:
+def test_pixel_outside_image_or_other_classes_raise(frames: list[Frame]) -> None:
     frame = frames[0]
     clusters = clusters_of(frame, masks_of(frame))
     fuser = fuse(new_fuser(), frame, [])
@@ -324,7 +324,7 @@ def test_a_pixel_out_of_the_image_and_other_classes_are_refused(frames: list[Fra
         fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, classes=("a", "b", "c")))
 
 
-def test_parameters_are_checked() -> None:
+def test_invalid_parameter_raises() -> None:
     for wrong in ({"min_overlap": 1.5}, {"min_existence": -0.1}, {"create_points": 0}, {"label_band": 9.0}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             assemble(ObjectVolumes, **wrong)

@@ -41,13 +41,13 @@ def line() -> tuple[Frame, PointClusters]:
     return frame, PointClusters(points, pixels, np.zeros(8, np.int32), ones, ones[0], ("chair",))
 
 
-def test_each_link_refines_what_the_one_before_it_left() -> None:
+def test_links_refine_in_sequence() -> None:
     frame, clusters = line()
     left = Chain({"first": Halving(), "second": Halving()}).refine(clusters, frame)
     assert left.points_world.tolist() == clusters.points_world[::4].tolist()
 
 
-def test_no_link_is_given_pixels_that_the_one_before_it_made_up() -> None:
+def test_link_with_pixels_outside_image_raises() -> None:
     class MadeUp(LargestComponent):
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
             return replace(clusters, pixels=clusters.pixels - 9)
@@ -75,7 +75,7 @@ def test_no_link_is_given_pixels_that_the_one_before_it_made_up() -> None:
         ),
     ],
 )
-def test_links_are_set_left_out_swapped_and_added(overrides: list[str], links: dict[str, type]) -> None:
+def test_overrides_set_remove_replace_and_add_links(overrides: list[str], links: dict[str, type]) -> None:
     chain = registered.built("refiner", "chain", *overrides)
     found = {name: type(link) for name, link in chain.links.items()}
     assert found == links
@@ -92,11 +92,11 @@ def test_links_are_set_left_out_swapped_and_added(overrides: list[str], links: d
         (["refiner.links=3"], "expected plugins by name, found 3|Could not|merge"),
     ],
 )
-def test_a_fault_names_the_link(overrides: list[str], said: str) -> None:
+def test_error_names_link(overrides: list[str], said: str) -> None:
     with pytest.raises(Exception, match=said):
         registered.built("refiner", "chain", *overrides)
 
 
-def test_a_chain_without_links_says_what_to_choose() -> None:
+def test_empty_chain_raises_with_advice() -> None:
     with pytest.raises(ConfigError, match="refiner=identity"):
         Chain({})

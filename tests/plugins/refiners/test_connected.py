@@ -36,7 +36,7 @@ def kept(refiner: Connected | LargestComponent, mask: Bool, depth: Float32) -> B
     return image
 
 
-def test_what_stands_in_front_does_not_part_an_object() -> None:
+def test_occluder_does_not_split_object() -> None:
     """A couch at 3 m, a pole at 2 m before it that the mask leaves out: LargestComponent loses the smaller half."""
     pole = (U >= 20) & (U < 24)
     depth = np.where(pole, 2.0, 3.0)
@@ -45,24 +45,24 @@ def test_what_stands_in_front_does_not_part_an_object() -> None:
 
 
 @pytest.mark.parametrize("beside", [4.5, 1.5])
-def test_a_step_in_depth_ends_an_object(beside: float) -> None:
+def test_depth_step_ends_object(beside: float) -> None:
     """A wall behind the couch, or a table before it, that the mask has caught."""
     depth = np.where(U < 6, beside, 3.0)
     assert (kept(Connected(), np.ones(depth.shape, np.bool_), depth) == (U >= 6)).all()
 
 
-def test_missing_readings_do_not_part_an_object() -> None:
+def test_missing_depth_does_not_split_object() -> None:
     depth = np.where((U >= 20) & (U < 26), 0.0, 3.0)
     assert (kept(Connected(), depth > 0, depth) == (depth > 0)).all()
 
 
-def test_a_carpet_between_slats_leaves_and_the_slats_stay() -> None:
+def test_background_between_slats_is_removed() -> None:
     slat = U % 8 < 4
     depth = np.where(slat, 1.5, 2.5)
     assert (kept(Connected(), np.ones(depth.shape, np.bool_), depth) == slat).all()
 
 
-def test_a_slanted_surface_may_go_on_behind_an_occluder() -> None:
+def test_slanted_surface_continues_behind_occluder() -> None:
     """At 0.8 m of depth a meter aside; at 4 m aside it would be a step."""
     x = (U - CAMERA.cx) / CAMERA.fx
     slanted = 2.0 / (1 - 0.8 * x)  # z = 2 + 0.8 x z
@@ -72,7 +72,7 @@ def test_a_slanted_surface_may_go_on_behind_an_occluder() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_agrees_with_a_slow_reference(seed: int) -> None:
+def test_connected_refiner_matches_reference(seed: int) -> None:
     """On clusters so small that every point is a sample."""
     rng = np.random.default_rng(seed)
     camera = Camera(16, 12, 20.0, 20.0, 7.5, 5.5)

@@ -119,7 +119,7 @@ def slow_masks(refiner: GmmFrame, points: Float32, masks: Int32, count: int) -> 
 @pytest.mark.parametrize("children", [2, 4, 8])
 @pytest.mark.parametrize("levels", [1, 2])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_points_move_as_in_slow_reference(levels: int, children: int, seed: int) -> None:
+def test_point_assignment_matches_reference(levels: int, children: int, seed: int) -> None:
     refiner = GmmFrame(levels=levels, children=children, min_points=1)
     points, masks, truth = three_objects(seed)
     refined = refiner.refine(clusters_of(points, masks, (0.9, 0.8, 0.7)), FRAME)
@@ -147,7 +147,7 @@ def test_foreign_points_move_drop_or_stay(treatment: ForeignPoints) -> None:
     np.testing.assert_allclose(sizes, by_treatment[treatment], atol=4)
 
 
-def test_pixel_of_several_masks_is_a_point_of_the_best_score() -> None:
+def test_pixel_in_several_masks_goes_to_best_score() -> None:
     points, masks, _ = three_objects(3, bleed=0.0)
     n = np.arange(len(points))
     pixels = np.stack([n % 80, n // 80], axis=1).astype(np.int32)
@@ -175,7 +175,7 @@ def test_small_cluster_is_dropped() -> None:
         assert len(refined) == 3, "cluster k is detection k"
 
 
-def test_k_means_start_belongs_to_masks_and_differs() -> None:
+def test_k_means_initialization_differs_but_finds_objects() -> None:
     points, masks, truth = three_objects(5)
     clusters = clusters_of(points, masks, (0.9, 0.8, 0.7))
     by_masks, by_k_means = (
@@ -189,7 +189,7 @@ def test_k_means_start_belongs_to_masks_and_differs() -> None:
     assert (found == truth).mean() > 0.93
 
 
-def test_several_gaussians_of_a_mask_are_one_object() -> None:
+def test_several_gaussians_per_mask_form_one_object() -> None:
     points, masks, truth = three_objects(6)
     refined = GmmFrame(levels=1, gaussians_per_mask=3).refine(clusters_of(points, masks, (0.9, 0.8, 0.7)), FRAME)
     found = np.empty(len(points), np.int32)
@@ -197,7 +197,7 @@ def test_several_gaussians_of_a_mask_are_one_object() -> None:
     assert (found == truth).mean() > 0.9
 
 
-def test_fit_on_a_subset_assigns_all_points() -> None:
+def test_fit_on_subset_assigns_all_points() -> None:
     points, masks, truth = three_objects(7)
     refined = GmmFrame(max_points=200).refine(clusters_of(points, masks, (0.9, 0.8, 0.7)), FRAME)
     assert len(refined.cluster) == len(points)
@@ -212,13 +212,13 @@ def test_empty_mask_and_empty_frame_are_kept() -> None:
     assert len(GmmFrame().refine(nothing, FRAME).cluster) == 0
 
 
-def test_result_does_not_depend_on_threads() -> None:
+def test_result_does_not_depend_on_thread_count() -> None:
     points, masks, _ = three_objects(9)
     clusters = clusters_of(points, masks, (0.9, 0.8, 0.7))
     by_one, by_two = by_one_thread_and_two(lambda: GmmFrame().refine(clusters, FRAME).cluster.tobytes())
     assert by_one == by_two
 
 
-def test_children_must_be_corners() -> None:
+def test_invalid_children_count_raises() -> None:
     with pytest.raises(ConfigError, match="children: expected 2, 4 or 8, got 3"):
         GmmFrame(children=3)

@@ -62,7 +62,7 @@ def kept(refined: PointClusters, cluster: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("levels", [1, 2, 3])
 @pytest.mark.parametrize("px", [4, 6, 8])
-def test_takes_the_bleeding_away(px, levels):
+def test_gmm_tree_removes_mask_bleed(px, levels):
     depth, ids = room()
     frame = frame_of(depth)
     mask = bleeding(ids > 0, px)
@@ -73,7 +73,7 @@ def test_takes_the_bleeding_away(px, levels):
     assert before[mask].all(), "there was something to take away"
 
 
-def test_evidence_pulls_points_to_its_side():
+def test_mask_log_odds_decide_in_one_plane():
     """Object and wall in one plane: geometry says nothing, and the mask alone decides, to where its log-odds are 0."""
     depth = np.full(CAMERA.shape, 2.0, np.float32)
     frame = frame_of(depth)
@@ -85,7 +85,7 @@ def test_evidence_pulls_points_to_its_side():
     assert len(GmmTree(mask_log_odds=0.0).refine(clusters, frame).pixels) == 0, "without evidence nobody's: a draw"
 
 
-def test_two_masks_do_not_disturb_each_other():
+def test_masks_are_refined_independently():
     depth, ids = room()
     frame = frame_of(depth)
     wall = np.zeros_like(ids, bool)
@@ -97,7 +97,7 @@ def test_two_masks_do_not_disturb_each_other():
     assert (both.cluster != 1).all()
 
 
-def test_too_little_to_tell_is_left_alone():
+def test_cluster_with_too_few_points_is_unchanged():
     depth, ids = room()
     frame = frame_of(depth)
     tiny = np.zeros((1, *CAMERA.shape), bool)
@@ -111,7 +111,7 @@ def test_too_little_to_tell_is_left_alone():
     assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), "a tree without a node"
 
 
-def test_points_of_no_cluster_stay():
+def test_unassigned_points_stay():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids > 0, 8)[None], frame)
@@ -121,7 +121,7 @@ def test_points_of_no_cluster_stay():
     assert (GmmTree().refine(PointClusters(*arrays), frame).cluster == -1).sum() == (cluster == -1).sum()
 
 
-def test_same_result_with_one_thread_and_with_two():
+def test_result_does_not_depend_on_thread_count():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(np.stack([bleeding(ids > 0, 8), ids > 0]), frame)
@@ -137,6 +137,6 @@ def test_same_result_with_one_thread_and_with_two():
         ({"min_support": 1.0}, "GmmTree.min_support"),
     ],
 )
-def test_parameters_are_checked(parameters, message):
+def test_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         GmmTree(**parameters)

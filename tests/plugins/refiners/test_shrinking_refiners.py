@@ -73,7 +73,7 @@ def recall_and_rejection(refined: PointClusters, before: PointClusters, ids: np.
 
 
 @pytest.mark.parametrize("px", [4, 6, 8])
-def test_gmm_em_takes_the_bleeding_away(px):
+def test_gmm_em_removes_mask_bleed(px):
     """Pole, floor and wall around the box are dropped, both faces of the box stay: better than the alternatives."""
     depth, ids = room()
     frame = frame_of(depth)
@@ -91,7 +91,7 @@ def test_gmm_em_takes_the_bleeding_away(px):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_only_shrinks_and_keeps_what_belongs_to_a_point(make):
+def test_refiner_only_shrinks_and_keeps_point_data(make):
     depth, ids = room()
     depth[100:110, 150:160] = 0
     frame = frame_of(depth)
@@ -112,7 +112,7 @@ def test_only_shrinks_and_keeps_what_belongs_to_a_point(make):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_does_not_depend_on_the_order_of_points_or_clusters_or_on_other_clusters(make):
+def test_clusters_are_refined_independently_in_any_order(make):
     depth, ids = room()
     frame = frame_of(depth)
     masks = np.stack([bleeding(ids == 1, 8), bleeding(ids == 2, 3)])
@@ -125,7 +125,7 @@ def test_does_not_depend_on_the_order_of_points_or_clusters_or_on_other_clusters
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_same_result_with_one_thread_and_with_two(make):
+def test_result_does_not_depend_on_thread_count(make):
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(np.stack([bleeding(ids == 1, 8), bleeding(ids == 2, 3)]), frame)
@@ -133,7 +133,7 @@ def test_same_result_with_one_thread_and_with_two(make):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_degenerate_input(make):
+def test_degenerate_input_is_valid(make):
     refiner = make()
     depth, ids = room()
     nothing = lifted(np.zeros((0, 240, 320), bool), frame_of(depth))
@@ -149,7 +149,7 @@ def test_degenerate_input(make):
 
 
 @pytest.mark.parametrize("make", [GmmEm, KMeans])
-def test_too_little_to_tell_is_left_alone(make):
+def test_cluster_with_too_few_points_is_unchanged(make):
     depth, ids = room()
     tiny = np.zeros((1, 240, 320), bool)
     tiny[0, 100:105, 150:155] = True
@@ -160,7 +160,7 @@ def test_too_little_to_tell_is_left_alone(make):
     assert len(make().refine(box, lonely).pixels) == (ids == 1).sum(), "a ring without readings"
 
 
-def test_points_of_no_cluster_stay():
+def test_unassigned_points_stay():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, 8)[None], frame)
@@ -173,7 +173,7 @@ def test_points_of_no_cluster_stay():
         assert (make().refine(unassigned, frame).cluster == -1).sum() == (cluster == -1).sum()
 
 
-def test_largest_component_keeps_the_larger_of_two_pieces():
+def test_largest_component_keeps_larger_of_two_pieces():
     """Two pieces beside each other, 1 m and 1.2 m away; the gap allowed at 1 m is 0.05 m."""
     camera = Camera(40, 20, 50.0, 50.0, 19.5, 9.5)
     depth = np.full((20, 40), 1.0, np.float32)
@@ -197,7 +197,7 @@ def test_largest_component_bridges_missing_readings(reach, kept):
     assert len(refined.pixels) == kept
 
 
-def test_largest_component_is_that_of_scipy():
+def test_largest_component_agrees_with_scipy():
     from scipy.ndimage import label
 
     rng = np.random.default_rng(0)
@@ -215,7 +215,7 @@ def test_largest_component_is_that_of_scipy():
 
 @pytest.mark.parametrize("reach", [1, 2, 3])
 @pytest.mark.parametrize("density", [0.05, 0.3, 0.9])
-def test_largest_component_is_that_of_all_pairs(reach, density):
+def test_largest_component_matches_reference(reach, density):
     """Over noisy depth, beside a graph with an edge for every pair of points that are near in image and depth."""
     from scipy.sparse.csgraph import connected_components
 
@@ -245,7 +245,7 @@ def test_largest_component_is_that_of_all_pairs(reach, density):
         (LargestComponent, {"connection_radius": 0}, "LargestComponent.connection_radius"),
     ],
 )
-def test_parameters_are_checked(make, parameters, message):
+def test_invalid_parameter_raises(make, parameters, message):
     with pytest.raises(ConfigError, match=message):
         make(**parameters)
 
@@ -268,7 +268,7 @@ def slow_posterior(points: np.ndarray, iterations: int, std_floor: float, outlie
     return responsibilities
 
 
-def test_gmm_em_without_ring_and_background_agrees_with_slow_reference():
+def test_gmm_em_single_gaussian_matches_reference():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, 8)[None], frame)
@@ -297,7 +297,7 @@ def test_gmm_em_without_ring_and_background_agrees_with_slow_reference():
         KMeans(ring=Ring(ring_fraction=0.0)),
     ],
 )
-def test_all_points_stay_without_a_competitor(refiner):
+def test_all_points_stay_without_background_model(refiner):
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, 8)[None], frame)

@@ -51,7 +51,7 @@ TRACKERS = pytest.mark.parametrize(
 
 
 @TRACKERS
-def test_frames_without_a_pose_are_skipped_and_told_in_one_line(
+def test_frames_without_pose_are_skipped_with_one_warning(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     fuser = GridFuser()
@@ -68,7 +68,7 @@ def test_frames_without_a_pose_are_skipped_and_told_in_one_line(
 
 
 @TRACKERS
-def test_many_of_them_hide_no_other_fault(
+def test_unposed_frames_do_not_hide_unreadable_frames(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Unreadable frames are told one by one up to a limit, which frames without poses do not count in."""
@@ -86,7 +86,7 @@ def test_many_of_them_hide_no_other_fault(
     assert len(caplog.records) == 2
 
 
-def test_the_error_of_a_trajectory_takes_frames_with_a_true_pose_only(tmp_path: Path) -> None:
+def test_trajectory_error_uses_only_frames_with_true_pose(tmp_path: Path) -> None:
     """Every pose given is wrong where the true one is not known: neither ATE nor RPE may notice."""
     poses = [np.linalg.inv(pose_at(9 * k)) if k in GAP else pose_at(k) for k in range(FRAMES)]
     write_tum(tmp_path / "poses.txt", [k / 30 for k in range(FRAMES)], poses)
@@ -99,7 +99,7 @@ def test_the_error_of_a_trajectory_takes_frames_with_a_true_pose_only(tmp_path: 
 
 
 @TRACKERS
-def test_a_run_without_any_pose_is_an_error_of_one_line(
+def test_run_without_poses_raises_one_line(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     room = CornerRoom(frames=1, unposed=GAP)
@@ -112,7 +112,7 @@ def test_a_run_without_any_pose_is_an_error_of_one_line(
     assert not caplog.records
 
 
-def test_a_sequence_that_has_no_poses_is_refused_before_it_is_read() -> None:
+def test_sequence_without_poses_raises_before_reading() -> None:
     class Unposed(CornerRoom):
         def has_poses(self) -> bool:
             return False

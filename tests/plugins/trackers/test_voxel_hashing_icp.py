@@ -43,7 +43,7 @@ def drift(pose: Pose, frame: Frame) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("color_weight", [0.0, 0.1])
-def test_a_known_motion_is_recovered(color_weight: float) -> None:
+def test_known_motion_is_recovered(color_weight: float) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(40))]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=color_weight), frames)
     assert not any(pose.lost for pose in poses)
@@ -52,7 +52,7 @@ def test_a_known_motion_is_recovered(color_weight: float) -> None:
     assert drift(poses[-1], frames[-1])[1] < 0.003
 
 
-def test_color_holds_what_geometry_does_not() -> None:
+def test_color_determines_motion_along_wall() -> None:
     """Facing one textured wall, geometry alone cannot see sideways motion; with color it is seen."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     frames = [wall.frame(T, k) for k, T in enumerate(walk(20))]
@@ -63,7 +63,7 @@ def test_color_holds_what_geometry_does_not() -> None:
     assert any(pose.lost for pose in alone), "and alone it says that the motion is not determined"
 
 
-def test_lost_frames_are_told_and_tracking_resumes() -> None:
+def test_covered_frames_are_lost_and_tracking_resumes() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(30))]
     covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[10:14]]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames[:10] + covered + frames[14:])
@@ -72,7 +72,7 @@ def test_lost_frames_are_told_and_tracking_resumes() -> None:
     assert drift(poses[-1], frames[-1])[0] < 0.006
 
 
-def test_a_jump_is_found_by_keyframes_or_lost_and_not_integrated() -> None:
+def test_jump_is_relocalized_or_lost_and_not_fused() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(20))]
     away = walk(1)[0].copy()
     away[:3, 3] += (0.0, 0.0, -1.2)
@@ -86,7 +86,7 @@ def test_a_jump_is_found_by_keyframes_or_lost_and_not_integrated() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1])
-def test_it_is_the_same_whenever_features_are_found(seconds: float) -> None:
+def test_result_does_not_depend_on_feature_timing(seconds: float) -> None:
     """Of frames that are taken aside, one is in doubt or lost and asks for keyframes right after one was offered."""
     path = [exp_se3(np.array([0.03 * k - 0.3, 0, 0, 0, 0.01 * k, 0])) for k in range(24)]
     for k in (8, 16, 17):
@@ -121,7 +121,7 @@ def test_it_is_the_same_whenever_features_are_found(seconds: float) -> None:
         np.testing.assert_array_equal(later.keyframes()[name], array, err_msg=name)
 
 
-def test_a_tracker_is_pickled_on_its_way() -> None:
+def test_tracker_pickles_with_keyframes() -> None:
     frames = [papered_frame(exp_se3(np.array([0.03 * k, 0, 0, 0, 0, 0])), k) for k in range(8)]
     tracker = VoxelHashingIcp()
     _, scene = run(tracker, frames[:-1])
@@ -133,7 +133,7 @@ def test_a_tracker_is_pickled_on_its_way() -> None:
     np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
 
 
-def test_garbage_is_lost() -> None:
+def test_random_depth_is_lost() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(5))]
     rng = np.random.default_rng(0)
     garbage = dataclasses.replace(frames[-1], depth=rng.uniform(0.5, 4, frames[-1].depth.shape).astype(np.float32))
@@ -141,7 +141,7 @@ def test_garbage_is_lost() -> None:
     assert poses[-1].lost
 
 
-def test_a_video_that_begins_covered_is_tracked_from_its_first_reading() -> None:
+def test_initially_covered_video_starts_at_first_depth() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
     covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[:3]]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), covered + frames[3:])
@@ -160,12 +160,12 @@ def test_images_of_odd_sizes_are_tracked(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("finest", [0.3, 0.75, 2.0])
-def test_the_finest_resolution_is_a_power_of_a_half(finest: float) -> None:
+def test_finest_scale_not_power_of_half_raises(finest: float) -> None:
     with pytest.raises(ConfigError, match=r"VoxelHashingIcp\.finest"):
         VoxelHashingIcp(finest_scale=finest)
 
 
-def test_the_map_is_seen_from_where_a_steady_motion_leads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_map_is_rendered_from_predicted_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(6))]
     tracker = VoxelHashingIcp(finest_scale=1.0)
     poses, scene = run(tracker, frames[:5])
@@ -178,7 +178,7 @@ def test_the_map_is_seen_from_where_a_steady_motion_leads(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("bound", [{"max_translation": 0.002}, {"max_rotation": 0.001}])
-def test_a_step_beyond_what_is_plausible_is_lost(bound: dict[str, float]) -> None:
+def test_implausible_step_is_lost(bound: dict[str, float]) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(2)[:1] + walk(60)[4:5])]
     assert not any(pose.lost for pose in run(VoxelHashingIcp(finest_scale=1.0), frames)[0])
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0, **bound), frames)
@@ -194,7 +194,7 @@ def spoilt_beginnings() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", spoilt_beginnings())
-def test_a_first_frame_that_nothing_can_be_tracked_by_is_not_the_last(name: str) -> None:
+def test_unusable_first_frame_is_lost_and_tracking_starts(name: str) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
     frames[0] = dataclasses.replace(frames[0], depth=spoilt_beginnings()[name])
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
@@ -204,7 +204,7 @@ def test_a_first_frame_that_nothing_can_be_tracked_by_is_not_the_last(name: str)
     assert drift(poses[-1], frames[-1])[0] < 0.004
 
 
-def test_poses_are_not_copied_from_the_truth_while_nothing_can_be_mapped() -> None:
+def test_unmappable_depth_is_lost_despite_true_poses() -> None:
     far = [dataclasses.replace(f, depth=100 * f.depth) for f in (room().frame(T, k) for k, T in enumerate(walk(4)))]
     poses, scene = run(VoxelHashingIcp(finest_scale=1.0), far)
     assert scene.statistics.voxels == 0
@@ -212,7 +212,7 @@ def test_poses_are_not_copied_from_the_truth_while_nothing_can_be_mapped() -> No
     assert poses[-1].reason == "0.0% of the pixels have a depth that is mapped, 0.2 to 4 m"
 
 
-def test_a_thing_taken_away_leaves_no_ghost_that_tracking_is_lost_by() -> None:
+def test_removed_object_does_not_lose_tracking() -> None:
     """No texture, so no keyframe can confirm the pose; the ball covers several per cent of the view."""
     planes = room().planes
     with_ball, without = (Scene(planes, spheres, contrast=0.0) for spheres in ([(np.array([0, 0.1, 1.3]), 0.2)], []))
@@ -222,7 +222,7 @@ def test_a_thing_taken_away_leaves_no_ghost_that_tracking_is_lost_by() -> None:
     assert drift(poses[-1], frames[-1])[0] < 0.006
 
 
-def test_the_motion_of_a_jump_is_not_expected_to_go_on() -> None:
+def test_jump_resets_motion_prediction() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(20))]
     away = walk(1)[0].copy()
     away[:3, 3] += (0.0, 0.0, -1.2)
@@ -232,7 +232,7 @@ def test_the_motion_of_a_jump_is_not_expected_to_go_on() -> None:
     assert np.array_equal(tracker._T_last_next, np.eye(4))
 
 
-def test_images_too_small_for_the_levels_are_refused_in_one_line() -> None:
+def test_image_too_small_for_pyramid_raises() -> None:
     camera = Camera(30, 23, 25.0, 25.0, 14.5, 11.0)
     frame = Frame(0, 0.0, np.zeros((23, 30, 3), np.uint8), np.ones((23, 30), np.float32), camera)
     with pytest.raises(DataError, match=r"30x23 px are too small for tracker\.finest_scale=0\.5"):
@@ -248,7 +248,7 @@ ONE_STEP = {
 }
 
 
-def test_a_pose_is_trusted_for_where_the_last_step_has_led() -> None:
+def test_pose_is_accepted_after_correct_final_step() -> None:
     """Before it, 6 cm away, too little agreed with the map; the single step goes most of that way."""
     start = walk(1)[0]
     frames = [room().frame(T, k) for k, T in enumerate((start, start @ exp_se3(np.array([0.06, 0, 0, 0, 0, 0]))))]
@@ -257,7 +257,7 @@ def test_a_pose_is_trusted_for_where_the_last_step_has_led() -> None:
     assert drift(poses[1], frames[1])[0] < 0.03
 
 
-def test_a_pose_is_lost_where_the_last_step_has_led_astray(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pose_is_lost_after_wrong_final_step(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     assert not any(pose.lost for pose in run(VoxelHashingIcp(**ONE_STEP), frames)[0])
     monkeypatch.setattr(voxel_hashing_icp, "_solved", lambda _: np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
@@ -275,7 +275,7 @@ def moved(step: float) -> np.ndarray:
     return exp_se3(np.array([step, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
-def test_less_is_enough_where_the_prediction_leads_once_it_has_been_right_for_a_while(
+def test_steady_motion_lowers_required_agreement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A camera that moves 1 cm a frame, of whose points never more than 85 % agree with the map."""
@@ -298,7 +298,7 @@ def test_less_is_enough_where_the_prediction_leads_once_it_has_been_right_for_a_
         assert tracker.track(frames[-1], fuser.scene).lost
 
 
-def test_features_are_asked_until_the_prediction_has_been_right_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_features_are_used_until_motion_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(40)[: STEADY + 4])]
     tracker, asked = VoxelHashingIcp(finest_scale=1.0), []
     search = tracker._pose_from_features
@@ -308,7 +308,7 @@ def test_features_are_asked_until_the_prediction_has_been_right_for_a_while(monk
     assert asked == list(range(1, STEADY))
 
 
-def test_a_pose_that_features_contradict_is_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pose_contradicted_by_features_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     """All points agree with the map, but features tell a place 30 cm away, from where alignment leads nowhere."""
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     tracker = VoxelHashingIcp(finest_scale=1.0)
@@ -321,7 +321,7 @@ def test_a_pose_that_features_contradict_is_not_trusted(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_without_relocalization_a_doubt_does_not_end_the_run(moving: bool) -> None:
+def test_tracking_resumes_without_relocalization(moving: bool) -> None:
     """Half of the view is hidden for some frames, during which the camera stands, or turns."""
     there = walk(30)[:14]
     frames = [room().frame(T, k) for k, T in enumerate(there)]
@@ -342,7 +342,7 @@ def coarse(frame: Frame) -> Frame:
     return dataclasses.replace(frame, depth=np.where(frame.depth > 0, steps, 0).astype(np.float32))
 
 
-def test_depth_in_coarse_steps_is_tracked_without_its_normals(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_coarse_depth_is_tracked_without_normals(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [coarse(room().frame(T, k)) for k, T in enumerate(walk(40)[::2])]
     matched: list[float] = []
     align = VoxelHashingIcp._align

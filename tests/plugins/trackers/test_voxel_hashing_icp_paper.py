@@ -49,14 +49,14 @@ def covered(frame: Frame) -> Frame:
     return dataclasses.replace(frame, depth=np.zeros_like(frame.depth))
 
 
-def test_paper_tracker_recovers_a_known_motion() -> None:
+def test_paper_tracker_recovers_known_motion() -> None:
     frames = walked(40)
     poses = run(paper_tracker(), frames)
     assert not any(pose.lost for pose in poses)
     assert max(drift(pose, frame) for pose, frame in zip(poses, frames, strict=True)) < 0.008
 
 
-def test_paper_tracker_uses_the_published_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paper_tracker_uses_published_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each level: iterations, weights of color and depth, and gates."""
     calls: list[tuple[int, Any, float, Any]] = []
     linearize = voxel_hashing_icp.linearize
@@ -80,7 +80,7 @@ def test_paper_tracker_uses_the_published_parameters(monkeypatch: pytest.MonkeyP
         assert brightness == 0, "exposure is not compensated"
 
 
-def test_lost_frame_stays_lost_until_it_can_be_tracked() -> None:
+def test_lost_frames_keep_last_pose_until_tracking_resumes() -> None:
     frames = walked(30)
     away = [room().frame(exp_se3(np.array([0, 0, -1.4, 0, 0, 0])) @ walk(1)[0], k) for k in range(10, 13)]
     shown = [*frames[:10], *away, covered(frames[10]), *frames[10:]]
@@ -133,7 +133,7 @@ def test_steady_motion_has_no_effect(monkeypatch: pytest.MonkeyPatch, steady: in
         np.testing.assert_array_equal(pose.T_world_camera, other.T_world_camera)
 
 
-def test_one_alignment_ends_a_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_single_alignment_ends_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     aligned: list[bool] = []
     align = VoxelHashingIcp._align
     monkeypatch.setattr(VoxelHashingIcp, "_align", lambda *a: aligned.append(True) or align(*a))  # type: ignore[func-returns-value]
@@ -153,14 +153,14 @@ def test_frame_with_few_matching_points_is_lost() -> None:
     assert all(pose.lost for pose in poses[1:])
 
 
-def test_frame_after_an_implausible_step_is_lost() -> None:
+def test_frame_after_implausible_step_is_lost() -> None:
     frames = walked(8)
     assert not run(paper_tracker(), [frames[0], frames[4]])[1].lost
     poses = run(paper_tracker("tracker.max_translation=0.002"), [frames[0], frames[4]])
     assert "not plausible" in poses[1].reason
 
 
-def test_frame_of_a_single_wall_is_lost() -> None:
+def test_frame_of_single_wall_is_lost() -> None:
     """The finest level uses no color, so that nothing determines a motion along the wall."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     poses = run(paper_tracker(), [wall.frame(T, k) for k, T in enumerate(walk(3))])
@@ -186,6 +186,6 @@ def test_linear_weights_alone_change_poses_little() -> None:
         (["tracker.depth_weight=0"], "color_levels must be 3 without depth, found 2"),
     ],
 )
-def test_wrong_parameter_is_named(overrides: list[str], message: str) -> None:
+def test_invalid_parameter_raises(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         paper_tracker(*overrides)

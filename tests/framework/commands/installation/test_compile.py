@@ -27,7 +27,7 @@ def compiling(cache: Path, *words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(line, cwd=CHECKOUT, env=environment, stdout=pipe, stderr=pipe, text=True)
 
 
-def test_a_second_call_has_nothing_to_compile(tmp_path: Path) -> None:
+def test_compile_second_call_compiles_no_kernels(tmp_path: Path) -> None:
     first, _ = compiling(tmp_path, "allocation_kernels.unpack", "binary_masks_kernels.mask_bounds").communicate()
     assert first.startswith("2 of 2 kernels compiled in ")
     second, _ = compiling(tmp_path, "allocation_kernels.unpack", "binary_masks_kernels.mask_bounds").communicate()
@@ -35,7 +35,7 @@ def test_a_second_call_has_nothing_to_compile(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
-def test_ctrl_c_ends_it_in_one_line(tmp_path: Path) -> None:
+def test_compile_ctrl_c_ends_in_one_line(tmp_path: Path) -> None:
     process = compiling(tmp_path)
     time.sleep(3)  # it is at work, or about to be
     process.send_signal(signal.SIGINT)
@@ -47,6 +47,6 @@ def test_ctrl_c_ends_it_in_one_line(tmp_path: Path) -> None:
     assert said.splitlines()[-1] == "interrupted"
 
 
-def test_a_word_that_no_kernel_has_is_refused() -> None:
+def test_compile_unknown_kernel_name_raises() -> None:
     with pytest.raises(ConfigError, match="no kernel with nothing in its name"):
         compile_named(listed(DEFAULT), ["nothing"])

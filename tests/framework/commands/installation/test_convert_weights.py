@@ -22,7 +22,7 @@ def command(monkeypatch, *arguments):
     convert_weights.main()
 
 
-def test_a_detectron2_checkpoint_becomes_a_detector(tmp_path, monkeypatch, capsys):
+def test_convert_weights_detectron2_checkpoint_is_usable(tmp_path, monkeypatch, capsys):
     source, target = tmp_path / "model_final_abc123.pkl", tmp_path / "r101.safetensors"
     source.write_bytes(pickle.dumps({"model": synthetic_state("resnet101"), "__author__": "Detectron2"}))
     command(monkeypatch, source, target, "--kind", "detectron2", "--half")
@@ -34,7 +34,7 @@ def test_a_detectron2_checkpoint_becomes_a_detector(tmp_path, monkeypatch, capsy
     assert MaskRCNNDetector(weights=target, device="cpu").classes == COCO
 
 
-def test_own_classes_and_normalization_of_torchvision(tmp_path, monkeypatch):
+def test_convert_weights_torchvision_keeps_classes_and_eps(tmp_path, monkeypatch):
     source, target = tmp_path / "own.pth", tmp_path / "own.safetensors"
     torch.save(tiny_network().state_dict(), source)
     command(monkeypatch, source, target, "--classes", "chair, couch,dining table", "--norm-eps", "1e-5")
@@ -51,7 +51,7 @@ def test_own_classes_and_normalization_of_torchvision(tmp_path, monkeypatch):
         ("broken.pkl", "out.pth", "out.pth: expected a file name that ends in .safetensors"),
     ],
 )
-def test_faults_are_one_line(tmp_path, monkeypatch, capsys, source, target, fault):
+def test_convert_weights_errors_are_one_line(tmp_path, monkeypatch, capsys, source, target, fault):
     (tmp_path / "broken.pkl").write_bytes(b"broken")
     with pytest.raises(SystemExit, match="1"):
         command(monkeypatch, tmp_path / source, tmp_path / target)

@@ -30,7 +30,7 @@ EXAMPLE = CHECKOUT / "examples" / "instancemap-depth-median"
 SITE = Path(sysconfig.get_paths()["purelib"])
 
 
-def test_the_example_is_what_new_plugin_writes() -> None:
+def test_example_plugin_matches_new_plugin_output() -> None:
     written = files_of("refiner", "depth_median")
     files = {path.relative_to(EXAMPLE) for path in EXAMPLE.rglob("*") if path.is_file()}
     left = {path for path in files if not {"__pycache__", ".ruff_cache", ".pytest_cache"}.intersection(path.parts)}
@@ -41,7 +41,7 @@ def test_the_example_is_what_new_plugin_writes() -> None:
 
 @pytest.mark.parametrize("name", ["x", "a" * LONGEST_NAME])
 @pytest.mark.parametrize("stage", GROUPS)
-def test_what_is_written_is_in_style(stage: str, name: str, tmp_path: Path) -> None:
+def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> None:
     """Undefined names and invalid Python in a template fail, too."""
     made = write_repository(stage, name, tmp_path)
     for line in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
@@ -71,14 +71,14 @@ def test_what_is_written_is_in_style(stage: str, name: str, tmp_path: Path) -> N
         ("cluster_refiner", "its class ClusterRefiner would have the name of another"),
     ],
 )
-def test_a_name_that_cannot_be_is_refused_in_one_line(name: str, said: str) -> None:
+def test_new_plugin_invalid_name_raises(name: str, said: str) -> None:
     with pytest.raises(ConfigError) as error:
         check_name("refiner", name)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_nothing_is_written_over_and_nothing_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_plugin_failure_keeps_existing_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = write_repository("refiner", "mine", tmp_path)
     (made / "README.md").write_text("my own")
     with pytest.raises(ConfigError, match="is there already"):
@@ -146,7 +146,7 @@ def run(place: Path, *line: str) -> str:
 
 
 @pytest.mark.acceptance
-def test_each_plugins_own_tests_pass_where_it_is_installed(place: Path) -> None:
+def test_installed_plugins_pass_their_own_tests(place: Path) -> None:
     where = run(place, "python", "-c", "import framework, instancemap_my_refiner; print(framework.__file__)")
     assert where.startswith(str(place))
     (place / "pytest.ini").touch()
@@ -158,7 +158,7 @@ def test_each_plugins_own_tests_pass_where_it_is_installed(place: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_a_plugin_is_swept_beside_one_of_ours_and_both_are_in_the_table(place: Path) -> None:
+def test_sweep_of_plugin_and_builtin_tabulates_both(place: Path) -> None:
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
@@ -180,7 +180,7 @@ def test_a_plugin_is_swept_beside_one_of_ours_and_both_are_in_the_table(place: P
 
 
 @pytest.mark.acceptance
-def test_an_installed_package_examines_itself_and_writes_plugins(place: Path) -> None:
+def test_installed_package_runs_doctor_and_new_plugin(place: Path) -> None:
     sections = json.loads(run(place, "instancemap", "doctor", "--json"))
     found = {section["title"]: {check["name"]: check for check in section["checks"]} for section in sections}
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]

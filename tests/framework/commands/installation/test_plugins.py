@@ -116,7 +116,7 @@ def run(environment: dict[str, str], directory: Path, *arguments: str) -> subpro
     return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
 
 
-def test_an_installed_package_is_listed(environment: dict[str, str], tmp_path: Path) -> None:
+def test_plugins_lists_options_of_installed_package(environment: dict[str, str], tmp_path: Path) -> None:
     done = run(environment, tmp_path, "framework", "plugins", "detector")
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
@@ -138,7 +138,7 @@ def test_an_installed_package_is_listed(environment: dict[str, str], tmp_path: P
     assert "acme_nobody" in lines[at + 1]
 
 
-def test_an_installed_package_runs(environment: dict[str, str], tmp_path: Path) -> None:
+def test_installed_package_option_runs(environment: dict[str, str], tmp_path: Path) -> None:
     fakes = [f"{stage}=fake" for stage in STAGES if stage != "detector"]
     places = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), "hydra.run.dir=run"]
     done = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_everything", "dataset.frames=1")
@@ -156,14 +156,14 @@ def test_an_installed_package_runs(environment: dict[str, str], tmp_path: Path) 
     assert len(wrong.stderr.splitlines()) == 1
 
 
-def test_asking_for_what_is_not_there_is_one_line(environment: dict[str, str], tmp_path: Path) -> None:
+def test_plugins_unknown_option_error_is_one_line(environment: dict[str, str], tmp_path: Path) -> None:
     done = run(environment, tmp_path, "framework", "plugins", "detector", "acme_nothing")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("error: there is no detector=acme_nothing; the options are: acme_")
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_an_option_reads_like_its_yaml() -> None:
+def test_describe_option_formats_parameters_like_yaml() -> None:
     parameters = (Parameter("n", "int", "3", "px, size"), Parameter("longer", "str", "x", ""))
     option = Option("detector", "own", "a.b.C", "main", "Finds things.", parameters)
     assert describe(option).splitlines() == [
@@ -189,7 +189,7 @@ FAULTY_OPTIONS = {
 }
 
 
-def test_options_of_a_folder_are_listed_and_each_faulty_one_is_told(
+def test_plugins_faulty_options_are_listed_with_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     group = tmp_path / "detector"
@@ -208,7 +208,7 @@ def test_options_of_a_folder_are_listed_and_each_faulty_one_is_told(
     assert len(found["maskrcnn2go"].parameters) > 3
 
 
-def test_every_registered_option_can_be_described() -> None:
+def test_registered_options_can_be_described() -> None:
     options = registered(*GROUPS)
     assert {option.stage for option in options} == set(GROUPS)
     for option in options:
@@ -217,7 +217,7 @@ def test_every_registered_option_can_be_described() -> None:
         assert not option.documentation.startswith("cannot be used")
 
 
-def test_no_option_imports_open3d_before_it_is_chosen(tmp_path: Path) -> None:
+def test_plugins_listing_does_not_import_open3d(tmp_path: Path) -> None:
     """It takes half a second and 170 MB, and a run with the default stages needs none of it."""
     code = (
         "import sys; from framework.commands.installation.plugins import *; "

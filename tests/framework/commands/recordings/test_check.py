@@ -27,7 +27,7 @@ def inverted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_damaged(tmp_path_factory.mktemp("desk") / "inverted", DESK, pose=inverse)
 
 
-def test_what_it_names_mends_the_recording(inverted: Path, tmp_path: Path) -> None:
+def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Path) -> None:
     asked = ("dataset=rgbd_folder", f"dataset.root={inverted}")
     done = checked(tmp_path, *asked)
     assert done.returncode == 1
@@ -53,7 +53,7 @@ def test_what_it_names_mends_the_recording(inverted: Path, tmp_path: Path) -> No
         (("dataset=rgbd_folder", "dataset.root=.", "dataset.camera_axes=UNITY"), "camera_axes"),
     ],
 )
-def test_wrong_arguments_are_one_line(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+def test_check_invalid_arguments_are_one_line_errors(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
     done = checked(tmp_path, *arguments)
     assert done.returncode == 1
     assert said in done.stderr

@@ -62,7 +62,7 @@ def check_images(folder, count):
 
 
 @played
-def test_a_recording_becomes_the_images_of_a_scene(tmp_path, monkeypatch, capsys, source):
+def test_convert_oni_writes_scene_images(tmp_path, monkeypatch, capsys, source):
     command(monkeypatch, source, tmp_path / "011")
     assert names(tmp_path / "011") == written(4)
     check_images(tmp_path / "011", 4)
@@ -70,20 +70,20 @@ def test_a_recording_becomes_the_images_of_a_scene(tmp_path, monkeypatch, capsys
     assert f"{tmp_path / '011'}: 4 frames; skipped 0 color" in capsys.readouterr().out
 
 
-def test_color_and_depth_have_times_of_their_own(tmp_path, monkeypatch, source):
+def test_convert_oni_color_and_depth_keep_own_timestamps(tmp_path, monkeypatch, source):
     deliver(monkeypatch, 3)
     convert_oni.convert(source, tmp_path / "011")
     assert (tmp_path / "011/timestamp.txt").read_text() == "1 7 0\n2 1007 1000\n3 2007 2000\n"
     assert read_timestamps(tmp_path / "011/timestamp.txt") == {1: 0.0, 2: 0.001, 3: 0.002}
 
 
-def test_images_that_are_left_out_are_counted(tmp_path, monkeypatch, capsys, source):
+def test_convert_oni_skipped_images_are_counted(tmp_path, monkeypatch, capsys, source):
     deliver(monkeypatch, 3)
     convert_oni.convert(source, tmp_path / "011")
     assert "3 frames; skipped 1 color and 1 depth" in capsys.readouterr().out
 
 
-def test_the_folder_may_hold_the_other_files_of_a_scene(tmp_path, monkeypatch, source):
+def test_convert_oni_folder_with_other_files_is_accepted(tmp_path, monkeypatch, source):
     folder = tmp_path / "011"
     folder.mkdir()
     (folder / "trajectory.log").write_text("0 0 1\n")
@@ -93,7 +93,7 @@ def test_the_folder_may_hold_the_other_files_of_a_scene(tmp_path, monkeypatch, s
 
 
 @pytest.mark.parametrize("file", ["image/image00001.png", "depth/depth00001.png", "timestamp.txt"])
-def test_nothing_is_written_over(tmp_path, monkeypatch, source, file):
+def test_convert_oni_existing_output_is_not_overwritten(tmp_path, monkeypatch, source, file):
     (tmp_path / "011" / file).parent.mkdir(parents=True)
     (tmp_path / "011" / file).write_bytes(b"mine")
     deliver(monkeypatch, 4)
@@ -102,7 +102,7 @@ def test_nothing_is_written_over(tmp_path, monkeypatch, source, file):
     assert names(tmp_path / "011") == [file]
 
 
-def test_ctrl_c_leaves_whole_frames_and_their_times(tmp_path, monkeypatch, capsys, source):
+def test_convert_oni_ctrl_c_leaves_complete_frames(tmp_path, monkeypatch, capsys, source):
     deliver(monkeypatch, 2, KeyboardInterrupt())
     with pytest.raises(SystemExit, match="130"):
         command(monkeypatch, source, tmp_path / "011")
@@ -112,7 +112,7 @@ def test_ctrl_c_leaves_whole_frames_and_their_times(tmp_path, monkeypatch, capsy
     assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
 
 
-def test_of_a_damaged_recording_what_was_read_is_kept(tmp_path, monkeypatch, capsys, source):
+def test_convert_oni_damaged_recording_keeps_read_frames(tmp_path, monkeypatch, capsys, source):
     deliver(monkeypatch, 3, DataError("it is damaged"))
     with pytest.raises(SystemExit, match="1"):
         command(monkeypatch, source, tmp_path / "011")
@@ -120,7 +120,7 @@ def test_of_a_damaged_recording_what_was_read_is_kept(tmp_path, monkeypatch, cap
     assert capsys.readouterr().err.splitlines()[-1] == "error: it is damaged"
 
 
-def test_of_a_recording_that_was_cut_off_the_last_good_image_is_named(tmp_path, monkeypatch, capsys, source):
+def test_convert_oni_truncated_recording_names_last_image(tmp_path, monkeypatch, capsys, source):
     source.write_bytes(source.read_bytes()[:-400])
     deliver(monkeypatch, 3)
     with pytest.raises(SystemExit, match="1"):
@@ -131,14 +131,14 @@ def test_of_a_recording_that_was_cut_off_the_last_good_image_is_named(tmp_path, 
     assert "up to image00003.png; download it again" in fault
 
 
-def test_a_recording_without_a_frame_is_an_error(tmp_path, monkeypatch, source):
+def test_convert_oni_recording_without_frames_raises(tmp_path, monkeypatch, source):
     deliver(monkeypatch, 0)
     with pytest.raises(DataError, match="no color and depth images of the same time"):
         convert_oni.convert(source, tmp_path / "011")
     assert names(tmp_path / "011") == []
 
 
-def test_what_is_no_recording_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
+def test_convert_oni_invalid_file_leaves_no_output(tmp_path, monkeypatch, capsys):
     (tmp_path / "a.oni").write_bytes(b"PK\3\4 a zip file")
     with pytest.raises(SystemExit, match="1"):
         command(monkeypatch, tmp_path / "a.oni", tmp_path / "011")

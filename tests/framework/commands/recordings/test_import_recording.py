@@ -26,7 +26,7 @@ def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
     import_recording.main()
 
 
-def test_it_says_what_it_wrote_and_how_to_go_on(
+def test_import_prints_written_frames_and_next_commands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_stray_scanner(tmp_path / "export", room_frames())
@@ -42,7 +42,7 @@ def test_it_says_what_it_wrote_and_how_to_go_on(
     assert RgbdFolder(tmp_path / "out").camera.width == 160
 
 
-def test_turned_images_have_turned_poses(
+def test_import_turned_images_have_turned_poses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The room's y points down and ARKit's up: for a phone, these images stand on their heads."""
@@ -59,7 +59,7 @@ def test_turned_images_have_turned_poses(
         np.testing.assert_allclose(seen.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)
 
 
-def test_a_place_that_is_taken_is_told_before_anything_is_read(
+def test_import_existing_output_raises_before_reading(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "out").mkdir()
@@ -74,7 +74,7 @@ def test_a_place_that_is_taken_is_told_before_anything_is_read(
 
 
 @pytest.mark.acceptance
-def test_a_phones_recording_gives_a_map(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_import_of_phone_recording_is_mappable(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """256x192 depth, a video and ARKit's poses, made of a real kitchen: no fault, no frame lost."""
     kitchen = RgbdFolder(shared_data / "redkitchen", stride=3, stop=180)
     write_stray_scanner(tmp_path / "export", list(seen_by_phone(list(kitchen))))

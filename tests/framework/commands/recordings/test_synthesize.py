@@ -30,7 +30,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
         (["--width", "30"], "width must be a multiple of 4"),
     ],
 )
-def test_impossible_wishes_are_one_line(
+def test_synthesize_invalid_arguments_are_one_line_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments, complaint: str
 ) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -42,7 +42,7 @@ def test_impossible_wishes_are_one_line(
     assert not (tmp_path / "rooms").exists()
 
 
-def test_it_writes_all_scenes_unless_told_which(
+def test_synthesize_writes_all_scenes_by_default(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = []

@@ -76,7 +76,7 @@ def write_metrics(directory: Path, metrics: dict[str, Any]) -> None:
     (directory / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
 
 
-def test_an_untouched_run_gets_its_own_figures_to_the_last_bit(stored: Path, command) -> None:
+def test_evaluate_unchanged_run_keeps_exact_metrics(stored: Path, command) -> None:
     before, time = metrics_of(stored), (stored / "metrics.json").stat().st_mtime_ns
     assert 0 < before["instances.mean_iou"] < 1
     assert 0 < before["instances.to_map.mean_iou"] < 1
@@ -89,7 +89,7 @@ def test_an_untouched_run_gets_its_own_figures_to_the_last_bit(stored: Path, com
     assert metrics_of(stored) == after
 
 
-def test_figures_of_other_code_are_replaced_and_all_others_kept(stored: Path, command) -> None:
+def test_evaluate_old_metrics_are_replaced_and_others_kept(stored: Path, command) -> None:
     true = metrics_of(stored)
     old = {key: value for key, value in true.items() if not key.startswith("instances.to_map.")}
     old |= {"instances.ap50": 0.125, "instances.ap50.sofa": 0.5, "annotation_release": "first", "fps": 3.0}
@@ -101,7 +101,7 @@ def test_figures_of_other_code_are_replaced_and_all_others_kept(stored: Path, co
     assert metrics_of(stored) == true | CODE | {"fps": 3.0, "trajectory.ate_rmse_m": 0.25}
 
 
-def test_the_figures_of_the_other_transfer_can_be_printed(stored: Path, command) -> None:
+def test_evaluate_to_map_transfer_is_printed(stored: Path, command) -> None:
     true = metrics_of(stored)
     write_metrics(stored, true | {"instances.ap50": 0.125, "instances.to_map.ap25": 0.25})
     assert command(stored, "--transfer", "to_map", "--dry-run")[1].startswith(
@@ -109,14 +109,14 @@ def test_the_figures_of_the_other_transfer_can_be_printed(stored: Path, command)
     )
 
 
-def test_last_digits_are_told(stored: Path, command) -> None:
+def test_evaluate_tiny_difference_prints_all_digits(stored: Path, command) -> None:
     true = metrics_of(stored)
     write_metrics(stored, true | {"instances.mean_iou": true["instances.mean_iou"] + 1e-12})
     [line] = command(stored)[1].splitlines()
     assert line.endswith(f"-> {true['instances.mean_iou']!r}")
 
 
-def test_another_truth_is_refused_unless_it_is_asked_for(stored: Path, command) -> None:
+def test_evaluate_other_truth_requires_option(stored: Path, command) -> None:
     """A relative dataset.root means another folder elsewhere, and its truth says nothing about this run."""
     true = metrics_of(stored)
     write_metrics(stored, true | {"truth_sha256": "0" * 64})
@@ -131,14 +131,14 @@ def test_another_truth_is_refused_unless_it_is_asked_for(stored: Path, command) 
     assert metrics_of(stored) == true | CODE
 
 
-def test_a_record_from_before_truths_had_a_hash_is_evaluated(stored: Path, command) -> None:
+def test_evaluate_record_without_truth_hash_is_evaluated(stored: Path, command) -> None:
     true = metrics_of(stored)
     write_metrics(stored, {key: value for key, value in true.items() if key != "truth_sha256"})
     assert command(stored)[:2] == (0, f"{stored}: 1 new\n")
     assert metrics_of(stored) == true | CODE
 
 
-def test_a_dry_run_writes_nothing(stored: Path, command) -> None:
+def test_evaluate_dry_run_writes_nothing(stored: Path, command) -> None:
     write_metrics(stored, metrics_of(stored) | {"instances.ap50": 0.125})
     before = {path.name: path.read_bytes() for path in stored.iterdir()}
     assert "AP50 0.125 -> 1.000" in command("--dry-run", stored)[1]
@@ -198,7 +198,7 @@ def _truncated_mesh(directory: Path) -> None:
         (lambda directory: _with_dataset(directory, colour=1), "there is no parameter 'colour'"),
     ],
 )
-def test_what_cannot_be_evaluated_is_refused_in_one_line_and_the_others_go_on(
+def test_evaluate_unusable_run_is_refused_and_others_continue(
     stored: Path, command, spoil: Callable[[Path], None], said: str
 ) -> None:
     spoilt = Path(shutil.copytree(stored, stored.parent / "a spoilt one"))
@@ -214,13 +214,13 @@ def test_what_cannot_be_evaluated_is_refused_in_one_line_and_the_others_go_on(
     assert {path.name: path.read_bytes() for path in spoilt.iterdir()} == before
 
 
-def test_a_folder_without_runs_is_told(stored: Path, tmp_path: Path, command) -> None:
+def test_evaluate_folder_without_runs_is_refused(stored: Path, tmp_path: Path, command) -> None:
     status, out, err = command(tmp_path / "nothing", stored)
     assert (status, out) == (1, f"{stored}: unchanged\n")
     assert err == f"refused: {tmp_path / 'nothing'}: there is no run at or below it\n"
 
 
-def test_runs_on_the_same_truth_share_it_and_each_is_evaluated_once(
+def test_evaluate_runs_with_same_truth_load_it_once(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(stored, stored.parent / "second")
@@ -234,7 +234,7 @@ def test_runs_on_the_same_truth_share_it_and_each_is_evaluated_once(
     assert sorted(made) == [3, 4]
 
 
-def test_a_run_that_begins_again_meanwhile_is_left_alone(
+def test_evaluate_run_restarted_meanwhile_is_unchanged(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def begins_again(self: CornerRoom) -> None:
@@ -249,7 +249,7 @@ def test_a_run_that_begins_again_meanwhile_is_left_alone(
     assert not (stored / "metrics.json").exists()
 
 
-def test_a_run_without_truth_stays_as_it_is(stored: Path, command) -> None:
+def test_evaluate_run_without_truth_is_unchanged(stored: Path, command) -> None:
     write_metrics(
         stored, {key: value for key, value in metrics_of(stored).items() if not reevaluation.is_evaluation(key)}
     )
@@ -259,7 +259,7 @@ def test_a_run_without_truth_stays_as_it_is(stored: Path, command) -> None:
     assert (stored / "metrics.json").read_bytes() == before
 
 
-def test_as_a_process(mapped: Path, tmp_path: Path) -> None:
+def test_evaluate_process_reports_results_and_status(mapped: Path, tmp_path: Path) -> None:
     shutil.copytree(mapped, tmp_path / "run")
     done = subprocess.run(
         [sys.executable, "-m", "framework", "evaluate", "--config-dir", str(reported_run.FAKES), "run", "absent"],
@@ -274,7 +274,7 @@ def test_as_a_process(mapped: Path, tmp_path: Path) -> None:
     assert done.returncode == 1
 
 
-def test_a_run_that_is_at_work_in_the_directory_is_left_alone(stored: Path, command) -> None:
+def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
     """Between its look at the file and its own writing of it, nobody may begin the run again."""
     write_metrics(stored, metrics_of(stored) | {"instances.ap50": 0.5})
     before = (stored / "metrics.json").read_bytes()
@@ -287,7 +287,7 @@ def test_a_run_that_is_at_work_in_the_directory_is_left_alone(stored: Path, comm
 
 
 @pytest.mark.parametrize("started", [["-m", "framework"], ["-P", "-m", "framework"]])
-def test_a_record_brings_no_code(started: list[str], stored: Path) -> None:
+def test_evaluate_does_not_execute_code_in_record(started: list[str], stored: Path) -> None:
     """Somebody sends a folder, and one looks at it in place: modules in it are neither imported nor found."""
     (stored / "brought.py").write_text(
         "print('runs')\nfrom tests.support.scenes.corner_room import CornerRoom as Brought\n"
@@ -309,7 +309,7 @@ def test_a_record_brings_no_code(started: list[str], stored: Path) -> None:
     assert "dataset brought.Brought: no registered option of dataset has this _target_" in done.stderr
 
 
-def test_a_stored_config_asks_for_nothing_of_this_machine(
+def test_evaluate_stored_config_cannot_read_environment(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SECRET", "hunter2")

@@ -27,7 +27,7 @@ def exported(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
     export.main()
 
 
-def test_it_says_what_it_wrote(
+def test_export_prints_written_files(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ("--out", tmp_path, "--resolution", 0.1, "--robot-height", 0.5)
@@ -42,14 +42,14 @@ def test_it_says_what_it_wrote(
     assert "resolution: 0.1" in (tmp_path / "map.yaml").read_text()
 
 
-def test_one_object_goes_into_the_runs_own_folder(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_objects_default_to_run_folder(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exported(monkeypatch, run, "--to", "obj", "--object", "cube", "--object", 1, "--triangles", 100)
     found = sorted((run / "export").rglob("*.obj"))
     assert [path.name for path in found] == ["cube_2.obj", "dining_table_1.obj"]
     assert all(len(trimesh.load(path).faces) <= 100 for path in found)
 
 
-def test_without_a_format_it_is_glb(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_default_format_is_glb(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     exported(monkeypatch, run, "--object", "cube", "--out", tmp_path)
     assert [path.name for path in tmp_path.rglob("*.*")] == ["cube_2.glb"]
 
@@ -62,7 +62,7 @@ def test_without_a_format_it_is_glb(run: Path, tmp_path: Path, monkeypatch: pyte
         (("--to", "glb", "--up", "0", "1"), "expected 3 arguments"),
     ],
 )
-def test_wrong_words_are_told(
+def test_export_invalid_arguments_exit_with_status_2(
     words: tuple[str, ...], said: str, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -88,7 +88,7 @@ def test_wrong_words_are_told(
         (("--to", "floorplan", "--floor=-1e300"), "the floor, must be a height within 10000 m"),
     ],
 )
-def test_what_cannot_be_exported_is_one_line(
+def test_export_impossible_request_is_one_line_error(
     words: tuple[str, ...], said: str, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -99,7 +99,7 @@ def test_what_cannot_be_exported_is_one_line(
     assert said in line
 
 
-def test_from_python_it_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_python_function_matches_command(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = instancemap.export(run, "glb", out=tmp_path / "a", objects=["cube"], coloring="class")
     exported(monkeypatch, run, "--to", "glb", "--out", tmp_path / "b", "--object", "cube", "--colors", "class")
     assert written == [tmp_path / "a" / "objects" / "cube_2.glb"]
@@ -115,7 +115,7 @@ def test_from_python_it_is_the_same(run: Path, tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("damage", ["mesh", "instances", "metrics", "trajectory"])
-def test_damaged_files_are_one_line(
+def test_export_damaged_run_is_one_line_error(
     damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = ExportedRoom().write(tmp_path / "run")

@@ -55,7 +55,7 @@ def texts(page: str) -> str:
     return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", body))
 
 
-def test_a_run_becomes_one_page_the_same_each_time(stored: Path, command) -> None:
+def test_report_of_run_is_one_reproducible_page(stored: Path, command) -> None:
     status, out, err = command(stored)
     page = stored / "report.html"
     assert (status, out, err) == (0, f"{page.resolve().as_uri()}\n", "")
@@ -74,7 +74,7 @@ def test_a_run_becomes_one_page_the_same_each_time(stored: Path, command) -> Non
     assert not re.search(rb'(src|href)="(?!data:|#)', before)
 
 
-def test_names_of_a_hostile_record_stay_text(stored: Path, command) -> None:
+def test_report_escapes_html_in_class_names(stored: Path, command) -> None:
     rename_class(stored, "<script>alert(1)</script>")
     assert command(stored)[0] == 0
     page = (stored / "report.html").read_text()
@@ -83,7 +83,7 @@ def test_names_of_a_hostile_record_stay_text(stored: Path, command) -> None:
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
 
 
-def test_without_the_recording_pictures_are_of_the_map_and_it_says_so(
+def test_report_without_recording_shows_map_images(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(composition, "_added", [])
@@ -95,7 +95,7 @@ def test_without_the_recording_pictures_are_of_the_map_and_it_says_so(
     assert "Individual objects cannot be compared" in texts(page)
 
 
-def test_a_view_from_above_alone_leaves_no_empty_place_beside_it(
+def test_report_top_view_alone_omits_enlarged_path(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(composition, "_added", [])  # no recording, and so no true way
@@ -107,7 +107,7 @@ def test_a_view_from_above_alone_leaves_no_empty_place_beside_it(
     assert '<div class="column">' not in page
 
 
-def test_another_recording_in_its_place_is_not_taken_for_it(stored: Path, command, tmp_path: Path) -> None:
+def test_report_other_recording_is_detected(stored: Path, command, tmp_path: Path) -> None:
     lines = (stored / "trajectory.txt").read_text().splitlines()
     moved = [f"{float(line.split()[0]) + 5:.9f} {line.partition(' ')[2]}" for line in lines]
     (stored / "trajectory.txt").write_text("\n".join(moved) + "\n")
@@ -115,13 +115,13 @@ def test_another_recording_in_its_place_is_not_taken_for_it(stored: Path, comman
     assert "the recording is not the one that was mapped" in texts((stored / "report.html").read_text())
 
 
-def test_names_that_are_no_text_are_written_as_their_codes(stored: Path, command) -> None:
+def test_report_invalid_unicode_names_are_escaped(stored: Path, command) -> None:
     rename_class(stored, "cup \ud800")
     assert command(stored)[0] == 0
     assert "cup \\ud800" in texts((stored / "report.html").read_text())
 
 
-def test_an_object_of_no_class_is_an_object(stored: Path, command) -> None:
+def test_report_object_without_class_is_listed(stored: Path, command) -> None:
     """As in the map of a fuser that knows no classes."""
     entries = json.loads((stored / "instances.json").read_text())
     entries[0] |= {"class": None, "class_probabilities": {}}
@@ -130,13 +130,13 @@ def test_an_object_of_no_class_is_an_object(stored: Path, command) -> None:
     assert f"object {entries[0]['id']}" in texts((stored / "report.html").read_text())
 
 
-def test_another_run_into_the_folder_takes_the_report_with_it(stored: Path, command) -> None:
+def test_report_is_removed_by_new_run_in_folder(stored: Path, command) -> None:
     assert command(stored)[0] == 0
     write_run(stored, frames=3)
     assert not (stored / "report.html").exists()
 
 
-def test_a_truth_that_cannot_be_read_is_said(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_report_unreadable_truth_reason_is_shown(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
     def unreadable(_: CornerRoom) -> None:
         raise DataError("instances.json is not valid JSON")
 
@@ -147,7 +147,7 @@ def test_a_truth_that_cannot_be_read_is_said(stored: Path, command, monkeypatch:
     assert "AP50" in said
 
 
-def test_a_partial_run_says_that_it_is_one(stored: Path, command) -> None:
+def test_report_of_partial_run_is_marked_partial(stored: Path, command) -> None:
     metrics = json.loads((stored / "metrics.json").read_text())
     (stored / "metrics.json").unlink()
     (stored / "metrics.partial.json").write_text(json.dumps({"partial": "interrupted by Ctrl-C", **metrics}))
@@ -159,7 +159,7 @@ def test_a_partial_run_says_that_it_is_one(stored: Path, command) -> None:
     assert "The map is empty" in said
 
 
-def test_a_run_that_mapped_nothing_has_a_page(stored: Path, command) -> None:
+def test_report_of_empty_run_is_written(stored: Path, command) -> None:
     (stored / "trajectory.txt").write_text("")
     (stored / "mesh.ply").unlink()
     (stored / "instances.json").write_text("[]")
@@ -182,7 +182,7 @@ def test_a_run_that_mapped_nothing_has_a_page(stored: Path, command) -> None:
         ("config.yaml", "seed: 9\n", "config_hash differs"),
     ],
 )
-def test_a_damaged_record_is_one_line_and_no_page(stored: Path, command, name: str, content: str, said: str) -> None:
+def test_report_damaged_record_is_one_line_error(stored: Path, command, name: str, content: str, said: str) -> None:
     (stored / name).write_text(content)
     status, out, err = command(stored)
     assert (status, out, len(err.splitlines())) == (1, "", 1), err
@@ -191,7 +191,7 @@ def test_a_damaged_record_is_one_line_and_no_page(stored: Path, command, name: s
 
 
 @pytest.mark.parametrize(("key", "value"), [("center", [1e300, 0, 0]), ("extent", [float("nan"), 1, 1])])
-def test_boxes_that_no_room_has_are_one_line(stored: Path, command, key: str, value: list[float]) -> None:
+def test_report_out_of_range_boxes_are_one_line_error(stored: Path, command, key: str, value: list[float]) -> None:
     entries = json.loads((stored / "instances.json").read_text())
     entries[1]["obb"][key] = value
     (stored / "instances.json").write_text(json.dumps(entries))
@@ -200,7 +200,7 @@ def test_boxes_that_no_room_has_are_one_line(stored: Path, command, key: str, va
     assert f"instances.json, entry 2: {key} must hold numbers of shape (3,), up to 1e+06" in err
 
 
-def test_where_the_page_cannot_go_is_told_before_the_map_is_looked_at(
+def test_report_invalid_output_path_fails_before_reading(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(RunReport, "of", pytest.fail)
@@ -208,18 +208,18 @@ def test_where_the_page_cannot_go_is_told_before_the_map_is_looked_at(
     assert "is no file but a folder" in command(stored, "--out", stored)[2]
 
 
-def test_the_address_is_one_that_a_browser_takes(stored: Path, command) -> None:
+def test_report_url_is_percent_encoded(stored: Path, command) -> None:
     moved = stored.rename(stored.parent / "my run #2 50%")
     _, out, _ = command(moved)
     assert out.endswith("my%20run%20%232%2050%25/report.html\n")
 
 
-def test_what_is_no_run_is_refused(stored: Path, command, tmp_path: Path) -> None:
+def test_report_invalid_or_repeated_run_is_refused(stored: Path, command, tmp_path: Path) -> None:
     assert "holds no run" in command(tmp_path)[2]
     assert "expected each run once" in command(stored, stored.parent / "." / "first")[2]
 
 
-def test_several_runs_are_set_side_by_side(mapped: Path, stored: Path, command) -> None:
+def test_report_of_several_runs_writes_comparison(mapped: Path, stored: Path, command) -> None:
     second = Path(shutil.copytree(mapped, stored.parent / "sec & ond"))
     metrics = json.loads((second / "metrics.json").read_text())
     metrics |= {"instances.ap50": metrics["instances.ap50"] - 0.25, "trajectory.ate_rmse_m": 0.0005, "fps": 1000.0}

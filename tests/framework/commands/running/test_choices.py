@@ -21,7 +21,7 @@ ROWS = ("ours", "voxblox_pp", "label_count")
         (["seed=range(0,3)", "dataset=glob(*)"], 3 * MANY),
     ],
 )
-def test_sweeps_that_have_runs_are_counted(overrides: list[str], runs: int) -> None:
+def test_checked_sweep_counts_runs(overrides: list[str], runs: int) -> None:
     assert checked_sweep(overrides, ROWS) == runs
 
 
@@ -34,16 +34,16 @@ def test_sweeps_that_have_runs_are_counted(overrides: list[str], runs: int) -> N
         (["seed=range(0,0)", "row=ours"], "seed=range(0,0) has no value: the sweep would be empty"),
     ],
 )
-def test_sweeps_that_cannot_run_are_refused(overrides: list[str], message: str) -> None:
+def test_checked_sweep_invalid_overrides_raise(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         checked_sweep(overrides, ROWS)
     assert str(caught.value).startswith(message)
 
 
-def test_without_rows_a_row_is_a_key_like_others() -> None:
+def test_checked_sweep_without_rows_accepts_any_row() -> None:
     assert checked_sweep(["row=a,b"], ()) == 2
 
 
-def test_the_first_run_of_a_sweep() -> None:
+def test_single_run_takes_first_value_of_each_sweep() -> None:
     overrides = ["row=a,b", "+x@y=range(2,5)", "seed=3", "~tracker", "name='a,b'", "dataset=glob(*)"]
     assert single_run(overrides) == ["row=a", "+x@y=2", "seed=3", "~tracker", "name='a,b'", "dataset=glob(*)"]

@@ -40,7 +40,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return tables(directory)
 
 
-def test_a_slurm_job_that_is_preempted_is_run_again_and_one_that_is_killed_by_the_same_command(
+def test_slurm_sweep_resumes_preempted_and_killed_jobs(
     tmp_path: Path, undisturbed: dict[str, bytes]
 ) -> None:
     """By submitit's own queue, with the signal that SLURM sends before it takes a job's node, and with `kill -9`."""
@@ -79,7 +79,7 @@ def ray_cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     cluster.shutdown()
 
 
-def test_a_ray_node_that_dies_is_replaced_by_another(
+def test_ray_sweep_replaces_dead_node(
     tmp_path: Path, undisturbed: dict[str, bytes], ray_cluster: object
 ) -> None:
     nodes = [ray_cluster.add_node(num_cpus=1) for _ in range(2)]
@@ -94,7 +94,7 @@ def test_a_ray_node_that_dies_is_replaced_by_another(
     assert not all(psutil.pid_exists(pid) for pid in at_work), "a run had to be begun again"
 
 
-def test_the_same_command_goes_on_where_ray_gave_up(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
+def test_ray_sweep_restarted_after_failure_resumes(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
     pytest.importorskip("hydra_plugins.hydra_ray_launcher")
     here = ("launcher=ray", "hydra.launcher.ray.init.num_cpus=1", *THREE)
     sweep = begin(tmp_path, *here, "hydra.launcher.ray.remote.max_retries=0")

@@ -29,7 +29,7 @@ def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return completed(directory, "detect", *fakes, *arguments)
 
 
-def test_writes_a_file_that_precomputed_reads(tmp_path: Path) -> None:
+def test_detect_output_is_read_by_precomputed(tmp_path: Path) -> None:
     done = start(tmp_path, "dataset.unreadable=1", "out=found.json")
     assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "found.labels.txt"]
@@ -46,7 +46,7 @@ def test_writes_a_file_that_precomputed_reads(tmp_path: Path) -> None:
     assert [len(detector.detect(frame)) for frame in CornerRoom()] == [2, 0, 2, 2, 2, 2]
 
 
-def test_what_it_writes_is_what_cocos_evaluation_reads(tmp_path: Path) -> None:
+def test_detect_output_is_read_by_pycocotools(tmp_path: Path) -> None:
     from pycocotools.coco import COCO
 
     path = tmp_path / "found.json"
@@ -74,7 +74,7 @@ def test_what_it_writes_is_what_cocos_evaluation_reads(tmp_path: Path) -> None:
         (["out=[a,b]"], "out must be a path; quote what looks like a number, found ['a', 'b']"),
     ],
 )
-def test_a_fault_is_one_line_and_a_status(tmp_path: Path, overrides: list[str], said: str) -> None:
+def test_detect_errors_are_one_line(tmp_path: Path, overrides: list[str], said: str) -> None:
     done = start(tmp_path, *overrides)
     assert done.returncode == 1
     assert said in done.stderr
@@ -82,7 +82,7 @@ def test_a_fault_is_one_line_and_a_status(tmp_path: Path, overrides: list[str], 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_detector_that_fails_leaves_no_file(tmp_path: Path) -> None:
+def test_detect_failing_detector_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "found.json").write_text("before")
     with pytest.raises(DataError, match="no true instances"):
         write_detections(tmp_path / "found.json", SphereDetector(), CornerRoom(truth=False))
@@ -91,7 +91,7 @@ def test_a_detector_that_fails_leaves_no_file(tmp_path: Path) -> None:
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("found.json", "before")]
 
 
-def test_a_file_without_detections_is_valid(tmp_path: Path) -> None:
+def test_result_file_without_detections_is_valid(tmp_path: Path) -> None:
     class Nothing(SphereDetector):
         def detect(self, frame):  # type: ignore[no-untyped-def]
             found = super().detect(frame)

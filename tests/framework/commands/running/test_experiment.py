@@ -46,7 +46,7 @@ def figures(line: dict[str, str], column: str) -> list[float | None]:
     return [float(line[f"{column}.{name}"]) if line[f"{column}.{name}"] else None for name in names]
 
 
-def test_an_experiment_runs_what_is_missing_and_writes_its_table(tmp_path: Path) -> None:
+def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
     """The values are those of the experiment's own comment: all 8 frames or 4 of them, `seed` of which are lost."""
     first = start(tmp_path)
     out = tmp_path / "outputs" / "fake_ablation"
@@ -88,7 +88,7 @@ def test_an_experiment_runs_what_is_missing_and_writes_its_table(tmp_path: Path)
     assert "frames_lost.mean" not in table(out)["half"]
 
 
-def test_a_column_is_a_sequence(tmp_path: Path) -> None:
+def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
     """Names with zeros in front stay names; what the table looks like is in no directory's name."""
     done = start(tmp_path, "experiment=fake_scenes", "table.average_over=[seed]")
     assert done.returncode == 0, done.stderr
@@ -114,7 +114,7 @@ def composed(overrides: list[str], *directories: Path) -> tuple[DictConfig, Any]
         return with_row(config, own)
 
 
-def test_a_row_may_be_called_by_a_number() -> None:
+def test_experiment_row_name_may_be_number() -> None:
     assert OmegaConf.create("{rows: {ours: [], 2: []}, all: '${all_of:${rows}}'}").all == "ours,2"
 
 
@@ -123,7 +123,7 @@ def test_a_row_may_be_called_by_a_number() -> None:
     ("preset", "all_rows"),
     [(None, False), ("paper", False), *(pytest.param(p, True, marks=pytest.mark.acceptance) for p in [None, *PRESETS])],
 )
-def test_every_preset_composes_with_every_row(experiment: str, preset: str | None, all_rows: bool) -> None:
+def test_preset_composes_with_experiment_rows(experiment: str, preset: str | None, all_rows: bool) -> None:
     """Compose rows as the command does, and build their stages. The last rows without `all_rows`."""
     hashes: dict[str, str] = {}
     asked = [f"experiment={experiment}", "seed=1", *ONLY_THE_USER_KNOWS] + ([f"preset={preset}"] if preset else [])
@@ -154,7 +154,7 @@ def build_detector(node: DictConfig) -> None:
         assert str(node.weights) in str(error)
 
 
-def test_the_row_is_what_its_overrides_say() -> None:
+def test_row_applies_its_overrides() -> None:
     config, choices = composed(["experiment=ablation_refiner", "row=chain_with_kmeans", "seed=4"])
     assert config.refiner.links.gmm_em._target_ == "plugins.refiners.kmeans.KMeans"
     assert (choices["refiner"], config.seed, config.dataset.stride, config.fuser.voxel_size) == ("chain", 4, 2, 0.02)
@@ -192,7 +192,7 @@ def test_default_preset_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("experiment", ["table1_runtime", "table2_class_ap", "table3_map", "figure3_stage_times"])
-def test_one_word_measures_on_the_real_scenenn(experiment: str) -> None:
+def test_scenenn_sequences_select_real_data_settings(experiment: str) -> None:
     """A network that knows real pictures, no rendered truth, the paper's sequences, and a folder of its own."""
     overrides = [f"experiment={experiment}", "sequences=scenenn", "dataset.root=DIR"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -209,7 +209,7 @@ def test_one_word_measures_on_the_real_scenenn(experiment: str) -> None:
 
 
 @pytest.mark.parametrize("experiment", ["table3_map", "figure4_progress", "figure5_refinement", "ablation_overlap"])
-def test_an_experiment_runs_in_the_rooms(experiment: str) -> None:
+def test_experiment_on_rooms_uses_simulated_detector(experiment: str) -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=[f"experiment={experiment}"], return_hydra_config=True)
     assert (config.hydra.runtime.choices.detector, config.dataset.frame_ground_truth) == ("simulated_yolo11n", True)
@@ -219,12 +219,12 @@ def test_an_experiment_runs_in_the_rooms(experiment: str) -> None:
 
 
 @pytest.mark.parametrize(("sequences", "stop"), [("benchmark", 40), ("scenenn", 1000)])
-def test_what_is_in_progress_depends_on_how_long_the_sequences_are(sequences: str, stop: int) -> None:
+def test_progress_row_stop_depends_on_sequence_length(sequences: str, stop: int) -> None:
     config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=third"])
     assert config.dataset.stop == stop
 
 
-def test_ranks_have_a_folder_for_each_data_and_detector() -> None:
+def test_ranks_folder_depends_on_sequences_and_detector() -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose(
             "config",
@@ -237,18 +237,18 @@ def test_ranks_have_a_folder_for_each_data_and_detector() -> None:
     assert asked.hydra.sweeper.params.seed == "0,1,2,3"
 
 
-def test_the_command_line_wins_over_the_experiment() -> None:
+def test_command_line_overrides_experiment() -> None:
     config, _ = composed(["experiment=ablation_fuser", "row=label_count", "fuser.voxel_size=0.04", "tracker=icp_only"])
     assert config.fuser.voxel_size == 0.04
     assert config.tracker._target_ == "plugins.trackers.voxel_hashing_icp.VoxelHashingIcp"
 
 
-def test_a_picture_that_cannot_be_drawn_is_told_before_anything_runs() -> None:
+def test_figure_kind_unknown_raises_before_runs() -> None:
     with pytest.raises(ConfigError, match=r"figure\.kind must be one of"):
         composed(["experiment=figure4_progress", "row=whole", "figure.kind=pie"])
 
 
-def test_a_row_that_is_not_there_is_told() -> None:
+def test_experiment_unknown_row_raises() -> None:
     with pytest.raises(ConfigError, match=r"there is no row=chian; did you mean chain\? The experiment has chain"):
         composed(["experiment=ablation_refiner", "row=chian"])
 
@@ -264,7 +264,7 @@ def test_a_row_that_is_not_there_is_told() -> None:
         (["seed=range(0,0)"], "error: seed=range(0,0) has no value: the sweep would be empty"),
     ],
 )
-def test_what_is_wrong_with_a_sweep_is_told_before_its_first_run(
+def test_sweep_errors_are_reported_before_first_run(
     tmp_path: Path, arguments: list[str], said: str
 ) -> None:
     done = start(tmp_path, *arguments)
@@ -274,14 +274,14 @@ def test_what_is_wrong_with_a_sweep_is_told_before_its_first_run(
     assert not list(tmp_path.rglob("config.yaml"))
 
 
-def test_a_run_without_experiment_is_left_alone() -> None:
+def test_run_without_experiment_is_unchanged() -> None:
     config, choices = composed(["refiner=kmeans"])
     assert "row" not in config
     assert not config.get("skip_completed")
     assert choices["refiner"] == "kmeans"
 
 
-def test_what_an_experiment_compares_its_runs_for_changes_no_result() -> None:
+def test_experiment_settings_do_not_change_config_hash() -> None:
     told = {
         "row": "a",
         "rows": {"a": []},

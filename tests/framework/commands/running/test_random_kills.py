@@ -47,13 +47,13 @@ def whole_files(place: Path) -> set[str]:
     return there
 
 
-def test_a_torn_file_would_be_seen(tmp_path: Path) -> None:
+def test_torn_file_is_detected(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text('{"frames": 2')
     with pytest.raises(DataError):
         whole_files(tmp_path)
 
 
-def test_a_run_that_is_killed_at_any_moment_loses_nothing(tmp_path: Path) -> None:
+def test_run_killed_at_random_moment_leaves_valid_record(tmp_path: Path) -> None:
     chosen = random.Random(19)
     place, undisturbed = tmp_path / "run", tmp_path / "undisturbed"
     arguments = (*SHORT, f"hydra.run.dir={place}")

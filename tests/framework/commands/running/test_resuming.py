@@ -42,7 +42,7 @@ def mapped(frames: Iterable[Frame], *overrides: str) -> tuple[Mapper, list[Pose]
 
 
 @pytest.mark.parametrize("fuser", ["bayesian_tsdf", "label_count", "max_confidence", "last_write"])
-def test_it_is_the_map_of_one_run_to_the_byte(tmp_path: Path, room: CornerRoom, fuser: str) -> None:
+def test_resumed_map_is_identical_to_single_run(tmp_path: Path, room: CornerRoom, fuser: str) -> None:
     stages = (*GIVEN, f"fuser={fuser}")
     first, _ = mapped([room[k] for k in range(3)], *stages)
     before = put_away(first, tmp_path / "first")
@@ -53,7 +53,7 @@ def test_it_is_the_map_of_one_run_to_the_byte(tmp_path: Path, room: CornerRoom, 
     assert (tmp_path / "continued.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
 
 
-def test_frames_of_another_recording_count_on(tmp_path: Path, room: CornerRoom) -> None:
+def test_resumed_map_continues_frame_numbers(tmp_path: Path, room: CornerRoom) -> None:
     """Both number their frames from 0: an object that both show was seen in the frames of both."""
     first, _ = mapped(room, *GIVEN)
     again, _ = mapped(room, *GIVEN, f"resume_from={put_away(first, tmp_path / 'first')}")
@@ -81,17 +81,17 @@ def check_halves(tmp_path: Path, recording: Recording) -> None:
     assert continued.scene.statistics.voxels == pytest.approx(whole.scene.statistics.voxels, rel=0.02)
 
 
-def test_the_desk_is_gone_on_with(tmp_path: Path) -> None:
+def test_resumed_desk_tracking_matches_single_run(tmp_path: Path) -> None:
     check_halves(tmp_path, DESK)
 
 
 @pytest.mark.acceptance
-def test_resumed_kitchen_is_the_same(tmp_path: Path, shared_data: Path) -> None:
+def test_resumed_kitchen_tracking_matches_single_run(tmp_path: Path, shared_data: Path) -> None:
     check_halves(tmp_path, RgbdFolder(shared_data / "redkitchen", stride=3))
 
 
 @pytest.mark.parametrize("tracker", ["voxel_hashing_icp", "pycolmap_pnp"])
-def test_a_recording_of_another_place_leaves_the_map_as_it_was(tmp_path: Path, shared_data: Path, tracker: str) -> None:
+def test_resume_in_other_place_leaves_map_unchanged(tmp_path: Path, shared_data: Path, tracker: str) -> None:
     stages = (*TRACKED, f"tracker={tracker}")
     desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *stages)
     before = put_away(desk, tmp_path / "desk")
@@ -102,7 +102,7 @@ def test_a_recording_of_another_place_leaves_the_map_as_it_was(tmp_path: Path, s
     assert (tmp_path / "after.npz").read_bytes() == (before / "map.npz").read_bytes()
 
 
-def test_a_lost_camera_enters_the_map_when_it_sees_what_is_there(tmp_path: Path) -> None:
+def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
     desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *TRACKED)
     before = put_away(desk, tmp_path / "desk")
     black = replace(DESK[5], color=np.zeros_like(DESK[5].color))
@@ -122,21 +122,21 @@ def test_a_lost_camera_enters_the_map_when_it_sees_what_is_there(tmp_path: Path)
         (("tracker=open3d_odometry",), "Open3dOdometry cannot relocalize"),
     ],
 )
-def test_what_cannot_go_on_says_so(tmp_path: Path, room: CornerRoom, overrides: tuple[str, ...], said: str) -> None:
+def test_resume_with_incompatible_config_raises(tmp_path: Path, room: CornerRoom, overrides: tuple[str, ...], said: str) -> None:
     first, _ = mapped([room[0]], *GIVEN)
     before = put_away(first, tmp_path / "first")
     with pytest.raises(ConfigError, match=said):
         Mapper(*GIVEN, *overrides, f"resume_from={before}")
 
 
-def test_a_map_that_is_not_there(tmp_path: Path) -> None:
+def test_resume_from_missing_map_raises(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"resume_from: there is no .*map\.npz: expected the directory of a run"):
         Mapper(*GIVEN, f"resume_from={tmp_path}")
     with pytest.raises(ConfigError, match="resume_from must be a path"):
         Mapper(*GIVEN, "resume_from=7")
 
 
-def test_keyframes_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> None:
+def test_keyframes_round_trip_and_damage_raises(tmp_path: Path) -> None:
     desk, _ = mapped([DESK[k] for k in range(0, 30, 5)], *TRACKED)
     keyframes = desk.pipeline.tracker.keyframes()
     path = tmp_path / "keyframes.npz"
@@ -168,14 +168,14 @@ def test_keyframes_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> Non
         read_keyframes(path)
 
 
-def test_a_map_with_views_of_two_recordings_is_stored_and_read(tmp_path: Path, room: CornerRoom) -> None:
+def test_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerRoom) -> None:
     first, _ = mapped(room, *GIVEN)
     again, _ = mapped(room, *GIVEN, f"resume_from={put_away(first, tmp_path / 'first')}")
     again.scene.save(tmp_path / "again.npz")
     assert list(load_map(tmp_path / "again.npz").instances()) == list(again.instances())
 
 
-def test_a_map_of_its_own_lies_in_the_world_of_another(tmp_path: Path) -> None:
+def test_localize_in_places_new_map_in_stored_world(tmp_path: Path) -> None:
     """Without true poses: those of the second recording are of the first one's world all the same."""
     unposed = [replace(DESK[k], T_world_camera=None) for k in range(40)]
     first, poses = mapped(unposed[:25], *TRACKED)

@@ -66,7 +66,7 @@ def ignore_ctrl_c() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("background", [False, True])
-def test_a_signal_leaves_a_partial_record(tmp_path: Path, number: signal.Signals, background: bool) -> None:
+def test_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, background: bool) -> None:
     """Also where a script has started the run in the background, which ignores Ctrl-C then."""
     place = tmp_path / "run"
     process = begin(tmp_path, *ENDLESS, f"hydra.run.dir={place}", before=ignore_ctrl_c if background else None)
@@ -91,7 +91,7 @@ def test_a_signal_leaves_a_partial_record(tmp_path: Path, number: signal.Signals
         ("masks", "masks"),
     ],
 )
-def test_a_fault_of_a_stage_leaves_a_partial_record(tmp_path: Path, kind: str, said: str) -> None:
+def test_stage_error_leaves_partial_record(tmp_path: Path, kind: str, said: str) -> None:
     place = tmp_path / "run"
     status, stderr = end(begin(tmp_path, "detector=faulty", f"detector.kind={kind}", f"hydra.run.dir={place}"))
     assert status == 3
@@ -104,7 +104,7 @@ def test_a_fault_of_a_stage_leaves_a_partial_record(tmp_path: Path, kind: str, s
     assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
 
 
-def test_a_folder_that_is_deleted_meanwhile_is_made_again(tmp_path: Path) -> None:
+def test_run_folder_deleted_during_run_is_recreated(tmp_path: Path) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, *ENDLESS, "dataset.frames=100", f"hydra.run.dir={place}")
     wait_for(tmp_path / "note", process)
@@ -115,14 +115,14 @@ def test_a_folder_that_is_deleted_meanwhile_is_made_again(tmp_path: Path) -> Non
     assert (place / "config.yaml").read_bytes() == config
 
 
-def test_a_fault_before_anything_is_mapped_leaves_nothing_to_keep(tmp_path: Path) -> None:
+def test_error_before_first_frame_leaves_no_record(tmp_path: Path) -> None:
     place = tmp_path / "run"
     status, _ = end(begin(tmp_path, "detector=faulty", "detector.at=0", f"hydra.run.dir={place}"))
     assert status == 1
     assert {path.name for path in place.iterdir()}.isdisjoint({*MAPPED, "metrics.partial.json", "metrics.json"})
 
 
-def test_a_stage_that_ends_the_process_leaves_a_partial_record(tmp_path: Path) -> None:
+def test_stage_system_exit_leaves_partial_record(tmp_path: Path) -> None:
     """As submitit does when its job is preempted."""
     place = tmp_path / "run"
     status, _ = end(begin(tmp_path, "detector=faulty", "detector.kind=SystemExit", f"hydra.run.dir={place}"))
@@ -130,7 +130,7 @@ def test_a_stage_that_ends_the_process_leaves_a_partial_record(tmp_path: Path) -
     assert figures(place)["frames"] == 3
 
 
-def test_on_a_full_disk_the_small_files_are_written(tmp_path: Path) -> None:
+def test_full_disk_leaves_small_files(tmp_path: Path) -> None:
     place = tmp_path / "run"
     place.mkdir()
     (place / "mesh.ply").write_text("of an earlier run")
@@ -148,7 +148,7 @@ def test_on_a_full_disk_the_small_files_are_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_the_record_is_written_lets_it_be_finished(tmp_path: Path, number: signal.Signals) -> None:
+def test_signal_during_saving_completes_record(tmp_path: Path, number: signal.Signals) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, "fuser.slow_save_s=1", f"hydra.run.dir={place}")
     wait_for(place / "metrics.partial.json", process)
@@ -160,7 +160,7 @@ def test_a_signal_while_the_record_is_written_lets_it_be_finished(tmp_path: Path
     assert not (place / "metrics.partial.json").exists()
 
 
-def test_a_second_one_leaves_what_is_written_whole(tmp_path: Path) -> None:
+def test_second_signal_during_saving_leaves_complete_files(tmp_path: Path) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, "fuser.slow_save_s=30", f"hydra.run.dir={place}")
     wait_for(place / "mesh.ply", process)
@@ -181,7 +181,7 @@ LIVE = ("dataset=live", "dataset.frames_sent=100000", "fuser.capacity=100000", "
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_is_the_end_of_a_live_video(tmp_path: Path, number: signal.Signals) -> None:
+def test_signal_completes_live_run(tmp_path: Path, number: signal.Signals) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, *LIVE, f"hydra.run.dir={place}")
     wait_for(tmp_path / "note", process)
@@ -198,7 +198,7 @@ def test_a_signal_is_the_end_of_a_live_video(tmp_path: Path, number: signal.Sign
     assert left["frames"] == len((place / "trajectory.txt").read_text().splitlines()) > 0
 
 
-def test_a_second_signal_leaves_a_live_video_partial(tmp_path: Path) -> None:
+def test_second_signal_leaves_live_run_partial(tmp_path: Path) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, *LIVE, "fuser.slow_s=2", f"hydra.run.dir={place}")
     wait_for(tmp_path / "note", process)
@@ -211,7 +211,7 @@ def test_a_second_signal_leaves_a_live_video_partial(tmp_path: Path) -> None:
     assert figures(place)["partial"] == "ended by SIGTERM"
 
 
-def test_a_live_video_that_breaks_down_leaves_a_partial_record(tmp_path: Path) -> None:
+def test_live_source_failure_leaves_partial_record(tmp_path: Path) -> None:
     place = tmp_path / "run"
     status, stderr = end(begin(tmp_path, "dataset=live", "dataset.fails_after=3", f"hydra.run.dir={place}"))
     assert status == 3
@@ -219,7 +219,7 @@ def test_a_live_video_that_breaks_down_leaves_a_partial_record(tmp_path: Path) -
     assert figures(place)["frames"] == 3
 
 
-def test_in_a_sweep_a_signal_while_a_record_is_written_ends_it_after_that(tmp_path: Path) -> None:
+def test_sweep_signal_during_saving_ends_after_record(tmp_path: Path) -> None:
     sweep = (
         "hydra.mode=MULTIRUN",
         "seed=1,2",
@@ -236,7 +236,7 @@ def test_in_a_sweep_a_signal_while_a_record_is_written_ends_it_after_that(tmp_pa
     assert not (tmp_path / "2").exists()
 
 
-def test_in_a_sweep_the_fault_of_a_run_goes_on_with_the_next(tmp_path: Path) -> None:
+def test_sweep_run_error_continues_with_next_run(tmp_path: Path) -> None:
     sweep = ("hydra.mode=MULTIRUN", "detector=faulty", "detector.at=3,99", f"hydra.sweep.dir={tmp_path}")
     status, _ = end(begin(tmp_path, *sweep, "hydra.sweep.subdir=${detector.at}"))
     assert status == 1
@@ -244,7 +244,7 @@ def test_in_a_sweep_the_fault_of_a_run_goes_on_with_the_next(tmp_path: Path) -> 
     assert (tmp_path / "99" / "metrics.json").exists()
 
 
-def test_a_run_that_is_refused_changes_nothing(tmp_path: Path) -> None:
+def test_run_in_locked_folder_changes_nothing(tmp_path: Path) -> None:
     place = tmp_path / "run"
     assert end(begin(tmp_path, "seed=1", f"hydra.run.dir={place}"))[0] == 0
     before = {path: path.read_bytes() for path in place.rglob("*") if path.is_file() and path.name != ".lock_holder"}
@@ -257,7 +257,7 @@ def test_a_run_that_is_refused_changes_nothing(tmp_path: Path) -> None:
     assert {path for path in place.rglob("*") if path.is_file()} - set(before) == {place / ".lock_holder"}
 
 
-def test_a_pipe_for_a_log_is_refused(tmp_path: Path) -> None:
+def test_run_with_pipe_as_log_is_refused(tmp_path: Path) -> None:
     place = tmp_path / "run"
     place.mkdir()
     os.mkfifo(place / "instancemap.log")
@@ -267,7 +267,7 @@ def test_a_pipe_for_a_log_is_refused(tmp_path: Path) -> None:
     assert "Traceback" not in stderr
 
 
-def test_a_place_that_nobody_chose_is_named_after_the_dataset(tmp_path: Path) -> None:
+def test_run_default_folder_is_named_after_dataset(tmp_path: Path) -> None:
     assert end(begin(tmp_path))[0] == 0
     [place] = (tmp_path / "outputs").iterdir()
     assert place.name.endswith("_fake")
@@ -275,7 +275,7 @@ def test_a_place_that_nobody_chose_is_named_after_the_dataset(tmp_path: Path) ->
 
 
 @pytest.mark.acceptance
-def test_runs_and_sweeps_of_the_same_moment_have_places_of_their_own(tmp_path: Path) -> None:
+def test_simultaneous_runs_and_sweeps_have_own_folders(tmp_path: Path) -> None:
     runs = [begin(tmp_path, "hydra.run.dir=${new_directory:runs/now}") for _ in range(2)]
     assert [end(process)[0] for process in runs] == [0, 0]
     assert {path.parent.name for path in tmp_path.glob("runs/*/metrics.json")} == {"now", "now_2"}
@@ -284,7 +284,7 @@ def test_runs_and_sweeps_of_the_same_moment_have_places_of_their_own(tmp_path: P
     assert {path.parent.parent.name for path in tmp_path.glob("sweeps/*/*/metrics.json")} == {"now", "now_2"}
 
 
-def test_what_was_being_written_when_a_run_was_killed_is_removed(tmp_path: Path) -> None:
+def test_run_removes_leftover_partial_files(tmp_path: Path) -> None:
     torn, mine = tmp_path / ".mesh.4711-0123abcd.partial.ply", tmp_path / ".mine.partial.ply"
     torn.touch()
     mine.touch()

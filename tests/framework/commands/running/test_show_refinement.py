@@ -24,7 +24,7 @@ def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return completed(directory, "show-refinement", *fakes, *arguments)
 
 
-def test_draws_one_frame(tmp_path: Path) -> None:
+def test_show_refinement_draws_one_frame(tmp_path: Path) -> None:
     done = start(tmp_path, "refiner=largest_component", "frame=2", "out=refinement.png")
     assert done.returncode == 0, done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["refinement.png"]
@@ -32,7 +32,7 @@ def test_draws_one_frame(tmp_path: Path) -> None:
     assert "refinement.png: 2 detections in frame 2 of corner_room" in done.stderr
 
 
-def test_without_detections_it_says_so_and_draws(tmp_path: Path) -> None:
+def test_show_refinement_without_detections_draws_frame(tmp_path: Path) -> None:
     done = start(tmp_path, "refiner=gmm_em", "detector=none", "out=refinement.png")
     assert done.returncode == 0, done.stderr
     assert "nothing was detected" in done.stderr
@@ -49,7 +49,7 @@ def test_without_detections_it_says_so_and_draws(tmp_path: Path) -> None:
         (["out=r.png", "frame=1", "dataset.unreadable=1"], "frame 1: depth/000001.png is truncated"),
     ],
 )
-def test_a_fault_is_one_line_and_a_status(tmp_path: Path, overrides: list[str], said: str) -> None:
+def test_show_refinement_errors_are_one_line(tmp_path: Path, overrides: list[str], said: str) -> None:
     done = start(tmp_path, *overrides)
     assert done.returncode == 1
     assert said in done.stderr
@@ -69,7 +69,7 @@ class FoundOnlyIn(SphereDetector):
         return found if frame.index == self.index else Detections.none(frame.camera.shape, self.classes)
 
 
-def test_without_a_position_the_frame_with_most_detections_is_taken() -> None:
+def test_show_refinement_default_frame_has_most_detections() -> None:
     position, frame, found = detected(CornerRoom(), FoundOnlyIn(4), None)
     assert (position, frame.index, len(found)) == (4, 4, 2)
     position, _, _ = detected(CornerRoom(), SphereDetector(), None)
@@ -78,7 +78,7 @@ def test_without_a_position_the_frame_with_most_detections_is_taken() -> None:
     assert (position, frame.index, len(found)) == (0, 2, 2)
 
 
-def test_frames_that_cannot_be_used_are_passed_over_unless_they_are_asked_for() -> None:
+def test_show_refinement_skips_unusable_frames() -> None:
     position, _, _ = detected(CornerRoom(unreadable=0), SphereDetector(), None)
     assert position == 1
     with pytest.raises(FrameError, match="truncated"):
@@ -88,12 +88,12 @@ def test_frames_that_cannot_be_used_are_passed_over_unless_they_are_asked_for() 
 
 
 @pytest.mark.parametrize("position", [-1, 6, "first", 1.0, True])
-def test_a_position_that_there_is_not_is_refused(position: object) -> None:
+def test_show_refinement_invalid_position_raises(position: object) -> None:
     with pytest.raises(ConfigError, match=r"frame must be in \[0, 5\]"):
         detected(CornerRoom(), SphereDetector(), position)
 
 
-def test_a_long_video_costs_a_few_frames() -> None:
+def test_show_refinement_tries_few_frames_of_long_video() -> None:
     class Counted(SphereDetector):
         calls = 0
 
@@ -105,7 +105,7 @@ def test_a_long_video_costs_a_few_frames() -> None:
     assert Counted.calls == TRIED
 
 
-def test_the_refiner_is_called_as_on_the_command_line() -> None:
+def test_called_returns_refiner_overrides() -> None:
     overrides = ["refiner=chain", "refiner.links.gmm_em=null", "refiner@refiner.links.x=kmeans", "frame=3", "seed=1"]
     assert called("chain", overrides) == "refiner=chain refiner.links.gmm_em=null refiner@refiner.links.x=kmeans"
     added = "+refiner@refiner.links.last=largest_component"

@@ -89,7 +89,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.Co
     return directory, end(begin(directory, *BY_JOBLIB, *SIX))
 
 
-def test_joblib_runs_all_and_the_failed_do_not_stop_the_others(
+def test_joblib_sweep_continues_after_failed_runs(
     whole: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
     directory, done = whole
@@ -107,7 +107,7 @@ def test_joblib_runs_all_and_the_failed_do_not_stop_the_others(
     assert "threads=1" in text, "how fast the runs were depends on it"
 
 
-def test_another_launcher_goes_on_where_the_first_ended(
+def test_sweep_with_other_launcher_keeps_completed_runs(
     whole: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
     directory, _ = whole
@@ -119,7 +119,7 @@ def test_another_launcher_goes_on_where_the_first_ended(
 
 
 @pytest.mark.acceptance
-def test_a_killed_sweep_goes_on_to_the_same_table(
+def test_killed_sweep_resumes_to_same_table(
     whole: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
     """First one of its workers is killed, then all of it at once."""
@@ -152,7 +152,7 @@ def test_a_killed_sweep_goes_on_to_the_same_table(
         assert (tmp_path / PLACE / name).read_bytes() == (whole[0] / PLACE / name).read_bytes()
 
 
-def test_a_sweep_without_an_experiment_has_one_place_and_tells_what_failed(tmp_path: Path) -> None:
+def test_plain_sweep_has_one_folder_and_reports_failures(tmp_path: Path) -> None:
     """Its place is named after the time, which workers must not read anew."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     done = end(begin(tmp_path, *FAKES, "dataset.frames=few,many", "launcher=joblib", sweep="-m"))
@@ -173,7 +173,7 @@ def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess
     return done, {path.parent.name.partition("refiner=fake,")[2]: path.stat().st_mtime_ns for path in runs}
 
 
-def test_a_sweep_without_an_experiment_is_resumed(tmp_path: Path) -> None:
+def test_plain_sweep_is_resumed(tmp_path: Path) -> None:
     """With whatever else that changes no result: it is not in the name of a run's directory."""
     _, first = swept(tmp_path, "seed=1,2")
     assert set(first) == {"seed=1,tracker=fake", "seed=2,tracker=fake"}
@@ -191,7 +191,7 @@ def test_a_sweep_without_an_experiment_is_resumed(tmp_path: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_runs_that_differ_in_what_changes_no_result_have_places_of_their_own(tmp_path: Path) -> None:
+def test_sweep_over_neutral_settings_has_separate_folders(tmp_path: Path) -> None:
     """As those of a sweep that times them; workers name them alike."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     _, first = swept(tmp_path, "threads=1,2", "prefetch=0")
@@ -203,7 +203,7 @@ def test_runs_that_differ_in_what_changes_no_result_have_places_of_their_own(tmp
 
 @pytest.mark.parametrize("signal_sent", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.acceptance
-def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, signal_sent: signal.Signals) -> None:
+def test_sweep_signal_leaves_no_worker_processes(tmp_path: Path, signal_sent: signal.Signals) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     process = begin(tmp_path, *BY_JOBLIB, "row=all", "dataset.slow_s=1")
     wait_until(lambda: len(begun(tmp_path)) == 2, process)
@@ -229,7 +229,7 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
         pytest.param(signal.SIGINT, False, 1, "1,2", 1, marks=pytest.mark.acceptance),  # joblib starts no worker
     ],
 )
-def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
+def test_sweep_signal_leaves_partial_record_of_active_runs(
     tmp_path: Path, signal_sent: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
 ) -> None:
     """A terminal sends Ctrl-C to the workers, too; `kill` does not."""
@@ -256,7 +256,7 @@ def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
 
 
 @pytest.mark.acceptance
-def test_a_second_signal_ends_the_workers_at_once(tmp_path: Path) -> None:
+def test_sweep_second_signal_ends_workers_immediately(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     slow_record = ("fuser.slow_save_s=100", "fuser.note=${seed}.note")
     process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1,2", *ENDLESS, *slow_record)
@@ -275,7 +275,7 @@ def test_a_second_signal_ends_the_workers_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_runs_of_a_killed_sweep_that_still_go_on_are_waited_for(tmp_path: Path) -> None:
+def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
     """`kill -9` of the sweep alone leaves its workers to their runs."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     arguments = (*BY_JOBLIB, "row=half", "dataset.slow_s=1")
@@ -300,7 +300,7 @@ def test_runs_of_a_killed_sweep_that_still_go_on_are_waited_for(tmp_path: Path) 
     assert "mapping" not in done.stderr
 
 
-def test_two_sweeps_do_not_share_a_place(tmp_path: Path) -> None:
+def test_sweep_in_locked_folder_is_refused(tmp_path: Path) -> None:
     with locked(tmp_path / PLACE):
         done = end(begin(tmp_path))
     assert (done.returncode, done.stdout) == (1, "")
@@ -324,7 +324,7 @@ def test_two_sweeps_do_not_share_a_place(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_the_launchers_of_clusters_run_here(tmp_path: Path, package: str, arguments: list[str]) -> None:
+def test_cluster_launchers_run_locally(tmp_path: Path, package: str, arguments: list[str]) -> None:
     pytest.importorskip(package)
     done = end(begin(tmp_path, *arguments, "row=half,broken", "seed=1"))
     assert done.returncode == 1, done.stderr
@@ -338,13 +338,13 @@ def test_the_launchers_of_clusters_run_here(tmp_path: Path, package: str, argume
 # Without a process
 
 
-def test_a_launcher_that_is_not_installed_is_told_with_its_extra() -> None:
+def test_missing_launcher_error_names_extra() -> None:
     error = MissingConfigException("?", missing_cfg_file="hydra/launcher/submitit_slurm", options=["basic"])
     assert one_line(error).endswith("pip install instancemap[slurm]")
 
 
 @pytest.mark.parametrize(("threads", "jobs"), [(1, 12), (5, 2), (12, 1), (13, 1), (0, 1)])
-def test_jobs_get_as_many_threads_as_there_are_cores(monkeypatch: pytest.MonkeyPatch, threads: int, jobs: int) -> None:
+def test_jobs_at_once_depend_on_threads_and_cores(monkeypatch: pytest.MonkeyPatch, threads: int, jobs: int) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
     assert jobs_at_once(threads) == jobs
 
@@ -352,7 +352,7 @@ def test_jobs_get_as_many_threads_as_there_are_cores(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("launcher", "node"), [("joblib", "n_jobs"), ("slurm", "cpus_per_task"), ("ray", "ray.remote.num_cpus")]
 )
-def test_a_launcher_knows_the_threads_of_a_job(launcher: str, node: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_launcher_config_uses_job_threads(launcher: str, node: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of twelve cores; threads=0 are all of them: a job that counted for no core would never be one too many."""
     pytest.importorskip(f"hydra_plugins.hydra_{launcher.replace('slurm', 'submitit')}_launcher")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
@@ -364,5 +364,5 @@ def test_a_launcher_knows_the_threads_of_a_job(launcher: str, node: str, monkeyp
         assert own.hydra.job.env_set.TQDM_DISABLE == "1"
 
 
-def test_threads_change_no_result() -> None:
+def test_threads_do_not_change_config_hash() -> None:
     assert config_hash({"seed": 1, "threads": 0}) == config_hash({"seed": 1, "threads": 8})

@@ -14,12 +14,12 @@ from framework.errors import DataError
 KEYS = ("w", "h", "fx", "fy", "cx", "cy", "s")
 
 
-def test_keys_are_in_the_order_of_the_camera() -> None:
+def test_camera_json_keys_map_to_camera_fields() -> None:
     content = {"s": 1000, "cy": 7, "cx": 8, "fy": 9, "fx": 10, "h": 16, "w": 24.0, "model": "Kinect"}
     assert camera_of(Path("c.json"), content, KEYS) == (Camera(24, 16, 10, 9, 8, 7), 1000)
 
 
-def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_missing_or_invalid_json_raises(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"c\.json could not be read: No such file"):
         read_json_object(tmp_path / "c.json")
     (tmp_path / "c.json").write_bytes(b"\xff")
@@ -27,18 +27,18 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
         read_json_object(tmp_path / "c.json")
 
 
-def test_the_distortion_of_a_lens() -> None:
+def test_lens_distortion_is_read() -> None:
     assert distortion_of(Path("c.json"), {}) is None
     content = {"distortion": [0.1, -0.2, 0, 0.001, 1]}
     assert distortion_of(Path("c.json"), content) == Distortion(k1=0.1, k2=-0.2, p1=0, p2=0.001, k3=1)
 
 
 @pytest.mark.parametrize("value", [0.1, [0.1, 0.2, 0, 0], [0.1] * 8, {"k1": 0.1}, None])
-def test_a_distortion_of_other_than_five_numbers_is_refused(value: object) -> None:
+def test_distortion_without_five_numbers_raises(value: object) -> None:
     with pytest.raises(DataError, match=r"c\.json: distortion \[k1, k2, .* must be a list of 5 numbers, found"):
         distortion_of(Path("c.json"), {"distortion": value})
 
 
-def test_coefficient_that_is_text_is_refused() -> None:
+def test_text_distortion_coefficient_raises() -> None:
     with pytest.raises(DataError, match=r"c\.json: distortion .* 5 numbers, found .*'0\.2'"):
         distortion_of(Path("c.json"), {"distortion": [0.1, 0, "0.2", 0, 0]})

@@ -64,7 +64,7 @@ def sent(video: LiveVideo, frames: int) -> Generator[Frame]:
             yield reader()
 
 
-def test_frames_are_the_cameras_registered_to_color(brand: Brand, device: FakeCamera) -> None:
+def test_camera_frames_are_registered_to_color(brand: Brand, device: FakeCamera) -> None:
     found = list(sent(brand.video(), 3))
     assert [frame.index for frame in found] == [0, 1, 2]
     for frame, true in zip(found, CornerRoom(), strict=False):
@@ -75,7 +75,7 @@ def test_frames_are_the_cameras_registered_to_color(brand: Brand, device: FakeCa
     assert not device.running
 
 
-def test_what_is_asked_of_the_device(brand: Brand, device: FakeCamera) -> None:
+def test_device_stream_request_matches_parameters(brand: Brand, device: FakeCamera) -> None:
     video = brand.video(serial=SERIAL, fps=60)
     assert video.name == f"{brand.name}_{SERIAL}"
     assert not device.started, "nothing before frames are asked for"
@@ -86,14 +86,14 @@ def test_what_is_asked_of_the_device(brand: Brand, device: FakeCamera) -> None:
     assert len(device.started) == 2
 
 
-def test_far_readings_are_none(brand: Brand, device: FakeCamera) -> None:
+def test_depth_beyond_max_depth_is_invalid(brand: Brand, device: FakeCamera) -> None:
     [frame] = sent(brand.video(max_depth=2.5), 1)
     assert 2.4 < frame.depth.max() <= 2.5
     [whole] = sent(brand.video(max_depth=0.0), 1)
     assert whole.depth.max() > 2.9
 
 
-def test_a_lens_is_undone_where_its_model_is_ours_and_told_where_it_is_not(
+def test_lens_is_undistorted_only_for_supported_model(
     brand: Brand, device: FakeCamera, caplog: pytest.LogCaptureFixture
 ) -> None:
     device.coeffs = (0.1, -0.05, 0.01, 0.02, 0.001)
@@ -109,7 +109,7 @@ def test_a_lens_is_undone_where_its_model_is_ours_and_told_where_it_is_not(
     assert caplog.messages == [told]
 
 
-def test_a_missing_package_is_one_line(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_raises_one_line(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, brand.library, None)
     with pytest.raises(
         ConfigError, match=rf"^{brand.library}, .* is not there: pip install instancemap\[{brand.name}\]$"
@@ -117,7 +117,7 @@ def test_a_missing_package_is_one_line(brand: Brand, monkeypatch: pytest.MonkeyP
         next(brand.video().frames())
 
 
-def test_a_device_that_is_not_there_is_one_line(brand: Brand, device: FakeCamera) -> None:
+def test_missing_device_raises_one_line(brand: Brand, device: FakeCamera) -> None:
     device.plugged_in = False
     with pytest.raises(DataError, match=f"a device with 96x72 at 30 Hz could not be started: {brand.nothing_there}$"):
         next(brand.video().frames())
@@ -126,7 +126,7 @@ def test_a_device_that_is_not_there_is_one_line(brand: Brand, device: FakeCamera
 @pytest.mark.parametrize(
     ("parameters", "said"), [({"serial": "999"}, "the device 999 with 96x72"), ({"width": 640}, "a device with 640x72")]
 )
-def test_a_device_that_cannot_do_that_is_one_line(
+def test_unsupported_device_request_raises_one_line(
     brand: Brand, device: FakeCamera, parameters: dict[str, object], said: str
 ) -> None:
     with pytest.raises(DataError, match=f"{said} at 30 Hz could not be started: ") as caught:
@@ -135,7 +135,7 @@ def test_a_device_that_cannot_do_that_is_one_line(
     assert not device.running
 
 
-def test_a_cable_that_is_pulled_out_ends_it(brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disconnected_device_raises_and_stops(brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
     device.unplugged_at = 2
     with pytest.raises(DataError, match="Device disconnected"):
         list(sent(brand.video(), 3))
@@ -147,7 +147,7 @@ def test_a_cable_that_is_pulled_out_ends_it(brand: Brand, device: FakeCamera, mo
     assert not device.running
 
 
-def test_a_camera_may_be_silent_for_a_while_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_camera_pauses_below_timeout_are_tolerated(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
     monkeypatch.setattr(device_frames, "time", clock)
     said: list[str | None] = []
@@ -159,13 +159,13 @@ def test_a_camera_may_be_silent_for_a_while_again_and_again(monkeypatch: pytest.
     assert said == ["first", None, "second", None, "third", None]
 
 
-def test_it_says_something_while_nothing_comes(brand: Brand, device: FakeCamera) -> None:
+def test_idle_device_yields_none(brand: Brand, device: FakeCamera) -> None:
     device.frames = 0
     with closing(brand.video().frames()) as readers:
         assert [next(readers), next(readers)] == [None, None]
 
 
-def test_a_frame_without_depth_is_of_no_use_and_the_next_one_is(brand: Brand, device: FakeCamera) -> None:
+def test_frame_without_depth_raises_and_next_is_read(brand: Brand, device: FakeCamera) -> None:
     device.without_depth = 1
     with closing(brand.video().frames()) as readers:
         first, second, third = (reader for reader in (next(readers) for _ in range(3)) if reader)
@@ -174,7 +174,7 @@ def test_a_frame_without_depth_is_of_no_use_and_the_next_one_is(brand: Brand, de
     assert [first().index, third().index] == [0, 2]
 
 
-def test_orbbec_waits_for_a_first_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_orbbec_waits_for_first_depth_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its units are known from there."""
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", orbbec_module(FakeCamera(without_depth=0)))
     [frame] = sent(BRANDS[1].video(), 1)
@@ -182,6 +182,6 @@ def test_orbbec_waits_for_a_first_depth(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.parametrize("parameter", [{"width": 0}, {"height": 10_000}, {"fps": 0}, {"max_depth": -1.0}], ids=str)
-def test_parameters_have_bounds(brand: Brand, parameter: dict[str, object]) -> None:
+def test_camera_parameter_out_of_range_raises(brand: Brand, parameter: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match=next(iter(parameter))):
         brand.video(**parameter)

@@ -81,7 +81,7 @@ def outcome(reader: FrameReader) -> int | str:
         return str(error)
 
 
-def test_frames_are_those_of_a_recording_of_the_same_files(folder: Path) -> None:
+def test_watched_frames_match_recorded_folder(folder: Path) -> None:
     watched, before = Watched(folder), time.time()
     assert watched.look() == []
     found: list[Frame] = []
@@ -98,7 +98,7 @@ def test_frames_are_those_of_a_recording_of_the_same_files(folder: Path) -> None
 
 @pytest.mark.parametrize("share", [0, 0.3, 0.999])
 @pytest.mark.parametrize("late", ["color", "depth"])
-def test_a_frame_counts_when_both_of_its_files_are_whole(folder: Path, late: str, share: float) -> None:
+def test_frame_is_emitted_once_both_files_are_complete(folder: Path, late: str, share: float) -> None:
     watched, files = Watched(folder), encoded(4)
     [slow] = [name for name in files if name.startswith(late)]
     [fast] = files.keys() - {slow}
@@ -112,7 +112,7 @@ def test_a_frame_counts_when_both_of_its_files_are_whole(folder: Path, late: str
     assert watched.look() == []
 
 
-def test_a_frame_that_is_overtaken_is_told_once(folder: Path) -> None:
+def test_overtaken_incomplete_frame_is_reported_once(folder: Path) -> None:
     watched, files = Watched(folder), encoded(1)
     color, depth = files
     write(folder, 0)
@@ -133,7 +133,7 @@ def test_a_frame_that_is_overtaken_is_told_once(folder: Path) -> None:
     ]
 
 
-def test_numbers_that_go_back_are_told(folder: Path) -> None:
+def test_decreasing_frame_number_is_reported(folder: Path) -> None:
     watched = Watched(folder)
     write(folder, 7)
     assert watched.look() == [7]
@@ -143,13 +143,13 @@ def test_numbers_that_go_back_are_told(folder: Path) -> None:
     assert watched.look() == [9]
 
 
-def test_what_was_there_before_comes_first_and_the_newest_last(folder: Path) -> None:
+def test_existing_frames_are_read_in_order(folder: Path) -> None:
     write(folder, *range(12))
     watched = Watched(folder)
     assert watched.look() == list(range(12))
 
 
-def test_files_may_be_removed(folder: Path) -> None:
+def test_removed_files_do_not_stop_watching(folder: Path) -> None:
     watched = Watched(folder)
     write(folder, 0, 1)
     first, second = watched.readers()
@@ -162,7 +162,7 @@ def test_files_may_be_removed(folder: Path) -> None:
     assert watched.look() == [2]
 
 
-def test_other_files_are_no_frames(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_unrelated_files_are_ignored_and_ambiguous_names_raise(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     watched = Watched(folder)
     for name in (".000000.jpg", "000000.jpg.part", "preview.jpg", f"{2**53}.jpg"):
         (folder / "color" / name).write_bytes(b"?")
@@ -178,14 +178,14 @@ def test_other_files_are_no_frames(folder: Path, caplog: pytest.LogCaptureFixtur
         watched.look()
 
 
-def test_images_of_another_size_are_of_no_use(folder: Path) -> None:
+def test_image_size_mismatch_is_reported(folder: Path) -> None:
     (folder / "camera.json").write_text(json.dumps(CALIBRATION | {"depth_scale": 1000, "width": 97}))
     write(folder, 0)
     assert str(*Watched(folder).look()).endswith("says 97x72; color, depth and camera must agree")
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_it_ends_when_it_is_told_with_what_was_there(folder: Path, half: bool) -> None:
+def test_end_file_stops_watching_after_remaining_frames(folder: Path, half: bool) -> None:
     watched = Watched(folder)
     assert watched.look() == []
     write(folder, 5)
@@ -197,7 +197,7 @@ def test_it_ends_when_it_is_told_with_what_was_there(folder: Path, half: bool) -
     assert watched.over
 
 
-def test_it_ends_when_nothing_comes_for_long(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_timeout_stops_watching(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=100.0, time=time.time, sleep=lambda _: None, monotonic=lambda: clock.now)
     monkeypatch.setattr(folder_watch, "time", clock)
     watched = Watched(folder, idle_timeout=5.0)
@@ -212,7 +212,7 @@ def test_it_ends_when_nothing_comes_for_long(folder: Path, monkeypatch: pytest.M
     assert watched.over
 
 
-def test_it_waits_for_its_camera(folder: Path) -> None:
+def test_folder_watch_waits_for_camera_file(folder: Path) -> None:
     whole = (folder / "camera.json").read_text()
     (folder / "camera.json").unlink()
     write(folder, 0)
@@ -227,7 +227,7 @@ def test_it_waits_for_its_camera(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"), [(None, "No such file"), ("{", "not valid JSON"), ("{}", "'width' is missing")]
 )
-def test_a_camera_that_does_not_come_is_an_error(folder: Path, text: str | None, said: str) -> None:
+def test_missing_or_invalid_camera_file_raises_after_timeout(folder: Path, text: str | None, said: str) -> None:
     (folder / "camera.json").unlink()
     if text is not None:
         (folder / "camera.json").write_text(text)
@@ -242,7 +242,7 @@ def test_a_camera_that_does_not_come_is_an_error(folder: Path, text: str | None,
     [{"idle_timeout": -1}, {"camera_timeout": float("nan")}, {"poll_interval": 0.2}, {"max_depth": -1}],
     ids=str,
 )
-def test_parameters_have_bounds(folder: Path, parameter: dict[str, float]) -> None:
+def test_watch_parameter_out_of_range_raises(folder: Path, parameter: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(parameter))):
         FolderWatch(folder, **parameter)
 
@@ -255,7 +255,7 @@ class Known(PoseTracker):
         return Pose(pose_at(frame.index))
 
 
-def test_a_folder_that_is_written_is_mapped(folder: Path) -> None:
+def test_folder_is_mapped_while_being_written(folder: Path) -> None:
     """By a writer that is slow, writes its files in place, and ends."""
 
     def writer() -> None:

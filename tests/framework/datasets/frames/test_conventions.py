@@ -25,7 +25,7 @@ def some_pose(seed: int) -> Float64:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_each_reading_finds_the_pose_that_was_meant(seed: int) -> None:
+def test_pose_reading_recovers_original_pose(seed: int) -> None:
     T_world_camera = some_pose(seed)
     np.testing.assert_array_equal(PoseReading().pose(T_world_camera), T_world_camera)
     inverted = PoseReading(pose_kind=PoseKind.T_CAMERA_WORLD)
@@ -40,7 +40,7 @@ def test_each_reading_finds_the_pose_that_was_meant(seed: int) -> None:
     np.testing.assert_allclose(scalar_first.pose(misread), T_world_camera, atol=1e-12)
 
 
-def test_the_axes_are_those_that_the_systems_say() -> None:
+def test_camera_axes_match_system_conventions() -> None:
     """What is ahead, to the right and below in the image, in the axes of each."""
     right, below, ahead = np.eye(3)
     for axes, expected in {
@@ -64,7 +64,7 @@ def test_the_axes_are_those_that_the_systems_say() -> None:
         ({"depth_delay": 1001}, "delay"),
     ],
 )
-def test_impossible_readings_are_refused(wrong: dict[str, float], said: str) -> None:
+def test_invalid_reading_parameter_raises(wrong: dict[str, float], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         DepthReading(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="pose_unit"):
@@ -80,7 +80,7 @@ def images(k: int) -> StoredImages:
 
 
 @pytest.mark.parametrize("delay", [-2, 0, 1])
-def test_a_delay_pairs_color_with_the_depth_that_belongs_to_it(delay: int) -> None:
+def test_depth_delay_pairs_color_with_matching_depth(delay: int) -> None:
     frames = delay_depth([RecordedFrame(images(k), k / 30) for k in range(5)], delay)
     for k, frame in enumerate(frames):
         if 0 <= k + delay < 5:
@@ -93,7 +93,7 @@ def test_a_delay_pairs_color_with_the_depth_that_belongs_to_it(delay: int) -> No
 
 
 @pytest.mark.parametrize("delay", [-2, 0, 1])
-def test_a_delay_gives_images_the_pose_that_belongs_to_them(delay: int) -> None:
+def test_pose_delay_pairs_images_with_matching_pose(delay: int) -> None:
     stored = [RecordedFrame(images(k), k / 30, some_pose(k), up=np.array([0.0, -1.0, 0.0])) for k in range(5)]
     stored[3] = RecordedFrame(images(3), 3 / 30, error="line 3 is no pose")
     for k, frame in enumerate(delay_poses(stored, delay)):
@@ -109,7 +109,7 @@ def test_a_delay_gives_images_the_pose_that_belongs_to_them(delay: int) -> None:
             assert frame.up is stored[k].up
 
 
-def test_a_recording_is_read_as_it_is_meant() -> None:
+def test_recording_is_read_with_configured_conventions() -> None:
     desk = {"root": Path("data/desk"), "scene": "rgbd_dataset_freiburg1_rpy"}
     plain = TumRgbd(**desk)  # type: ignore[arg-type]
     meant = TumRgbd(

@@ -4,7 +4,7 @@ from framework.datasets.frames.sequence_reader import check_selection, choose_fr
 from framework.errors import ConfigError
 
 
-def test_chooses_as_a_slice_does():
+def test_frame_selection_matches_slice():
     assert list(choose_frames(10, 0, -1, 1)) == list(range(10))
     assert list(choose_frames(10, 2, 9, 3)) == [2, 5, 8]
     assert list(choose_frames(10, 8, 99, 1)) == [8, 9]
@@ -14,17 +14,17 @@ def test_chooses_as_a_slice_does():
     ("start", "stop", "stride", "name"),
     [(-1, -1, 1, "start"), (0, -2, 1, "stop"), (5, 5, 1, "stop"), (0, -1, 0, "stride")],
 )
-def test_impossible_choices_name_their_parameter(start, stop, stride, name):
+def test_invalid_selection_error_names_parameter(start, stop, stride, name):
     with pytest.raises(ConfigError, match=f"dataset.{name}"):
         check_selection(start, stop, stride)
 
 
-def test_a_start_behind_the_end_says_how_many_frames_there_are():
+def test_start_past_end_error_gives_frame_count():
     with pytest.raises(ConfigError, match="only 3 frames"):
         choose_frames(3, 3, -1, 1)
 
 
-def test_a_share_is_a_seeded_subset_in_order():
+def test_frame_fraction_is_seeded_ordered_subset():
     first = choose_frames(100, 10, 90, 2, frame_fraction=0.85, seed=3)
     assert len(first) == 34  # of 40
     assert list(first) == sorted(set(first))
@@ -34,7 +34,7 @@ def test_a_share_is_a_seeded_subset_in_order():
     assert all(type(index) is int for index in first)  # frame numbers go into JSON
 
 
-def test_a_share_is_uniform():
+def test_frame_fraction_sampling_is_uniform():
     """Each of 20 frames is in half of the subsets of half of them: 500 +- 5 standard deviations of 1000."""
     taken = [index for seed in range(1000) for index in choose_frames(20, 0, -1, 1, frame_fraction=0.5, seed=seed)]
     counts = [taken.count(index) for index in range(20)]
@@ -42,17 +42,17 @@ def test_a_share_is_uniform():
     assert max(counts) < 580
 
 
-def test_the_whole_share_is_all_frames_and_the_least_is_one():
+def test_frame_fraction_one_keeps_all_and_minimum_keeps_one():
     assert list(choose_frames(7, 1, -1, 2, frame_fraction=1.0, seed=9)) == [1, 3, 5]
     assert len(choose_frames(7, 0, -1, 1, frame_fraction=1e-9)) == 1
 
 
 @pytest.mark.parametrize("share", [0.0, -0.1, 1.001, float("nan")])
-def test_an_impossible_share_names_its_parameter(share):
+def test_invalid_frame_fraction_error_names_parameter(share):
     with pytest.raises(ConfigError, match=r"dataset.frame_fraction must be in \(0, 1\]"):
         check_selection(0, -1, 1, share)
 
 
-def test_a_negative_seed_is_told():
+def test_negative_seed_raises():
     with pytest.raises(ConfigError, match="seed must be 0 or positive, found -1"):
         choose_frames(7, 0, -1, 1, frame_fraction=0.5, seed=-1)

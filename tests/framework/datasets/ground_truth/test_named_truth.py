@@ -137,12 +137,12 @@ def test_named_mesh_replaces_the_recordings_annotation(folder: Path, mesh: Path)
     assert RgbdFolder(folder, ground_truth=mesh).scene_truth() is not None
 
 
-def test_instances_json_may_be_in_the_folder_above(folder: Path, mesh: Path) -> None:
+def test_instances_json_is_found_in_parent_folder(folder: Path, mesh: Path) -> None:
     (mesh.parent / "instances.json").rename(mesh.parents[1] / "instances.json")
     assert read_named_truth(mesh).mesh.class_names == {CHAIR: "chair", UNKNOWN: None}
 
 
-def test_directory_with_an_annotated_mesh_is_that_mesh(mesh: Path) -> None:
+def test_directory_with_annotated_mesh_selects_mesh(mesh: Path) -> None:
     mesh.rename(mesh.parent / "mesh.ply")
     named = read_named_truth(mesh.parent)
     assert (named.name, named.trajectory) == ("annotation/mesh.ply", None)
@@ -157,13 +157,13 @@ def test_frame_without_a_pose_has_no_rendered_truth(folder: Path, tracked_run: P
     assert frame_hash(frame, ("color", "truth")), "a stored detection is found without rendering"
 
 
-def test_mesh_needs_given_poses(folder: Path, mesh: Path) -> None:
+def test_mesh_without_given_poses_raises(folder: Path, mesh: Path) -> None:
     (folder / "poses.txt").unlink()
     with pytest.raises(ConfigError, match=r"dataset\.ground_truth: expected given poses.*name the directory of a run"):
         RgbdFolder(folder, ground_truth=mesh)
 
 
-def test_run_needs_a_common_time(folder: Path, tracked_run: Path) -> None:
+def test_run_without_common_time_raises(folder: Path, tracked_run: Path) -> None:
     _, poses = read_tum(tracked_run / "trajectory.txt")
     write_tum(tracked_run / "trajectory.txt", [10.0 + k for k in range(FRAMES)], poses)
     with pytest.raises(ConfigError, match=r"dataset\.ground_truth: expected a run of this recording"):

@@ -127,13 +127,13 @@ FORMATS: dict[str, tuple[Callable[[Path], object], bytes, tuple[bytes, ...]]] = 
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_undamaged_file_is_read(name: str, tmp_path: Path) -> None:
+def test_undamaged_file_is_read(name: str, tmp_path: Path) -> None:
     read, content, _ = FORMATS[name]
     assert check(read, tmp_path / name, content) == ""
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_damaged_file_is_read_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
+def test_damaged_file_is_read_or_raises_one_line(name: str, tmp_path: Path) -> None:
     read, content, tokens = FORMATS[name]
 
     @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
@@ -145,7 +145,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(name: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", ["ascii.ply", "little.ply", "big.ply", "011.xml", "trajectory.log"])
-def test_every_cut_is_noticed_and_placed(name: str, tmp_path: Path) -> None:
+def test_truncated_file_error_gives_position(name: str, tmp_path: Path) -> None:
     read, content, _ = FORMATS[name]
     for length in range(len(content.rstrip()) - 1):
         line = check(read, tmp_path / name, content[:length])
@@ -154,7 +154,7 @@ def test_every_cut_is_noticed_and_placed(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["color.png", "depth.png"])
-def test_every_flipped_bit_of_a_png_is_noticed(name: str, tmp_path: Path) -> None:
+def test_png_with_flipped_bit_raises(name: str, tmp_path: Path) -> None:
     read, content, _ = FORMATS[name]
     for k in range(len(content)):
         assert check(read, tmp_path / name, content[:k] + bytes([content[k] ^ 1 << k % 8]) + content[k + 1 :]), k
@@ -162,7 +162,7 @@ def test_every_flipped_bit_of_a_png_is_noticed(name: str, tmp_path: Path) -> Non
 
 @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
-def test_a_png_with_damage_under_right_checksums_is_read_or_refused(tmp_path_factory, data: st.DataObject) -> None:
+def test_damaged_png_with_valid_crc_is_read_or_raises(tmp_path_factory, data: st.DataObject) -> None:
     content = FORMATS["color.png"][1]
     chunks, position = [], 8
     while position < len(content):
@@ -179,7 +179,7 @@ def test_a_png_with_damage_under_right_checksums_is_read_or_refused(tmp_path_fac
     check(read_color, tmp_path_factory.mktemp("png") / "color.png", built)
 
 
-def test_an_image_that_claims_to_be_huge_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+def test_oversized_image_header_raises_before_decoding(tmp_path: Path) -> None:
     content = FORMATS["color.png"][1]
     header = b"IHDR" + struct.pack(">II", 100000, 100000) + content[24:29]
     huge = content[:12] + header + struct.pack(">I", zlib.crc32(header)) + content[33:]

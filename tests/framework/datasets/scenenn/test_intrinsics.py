@@ -11,7 +11,7 @@ from framework.errors import DataError
 ASUS = (544.47329, 544.47329, 320.0, 240.0)
 
 
-def test_what_is_written_is_read_back_exactly(tmp_path):
+def test_intrinsics_round_trip_is_exact(tmp_path):
     camera = Camera(640, 480, 544.47329, 1600 / 3, 319.5, -0.1)
     write_intrinsics(tmp_path / "asus.ini", camera)
     assert read_intrinsics(tmp_path / "asus.ini") == (camera.fx, camera.fy, camera.cx, camera.cy)
@@ -33,7 +33,7 @@ def test_what_is_written_is_read_back_exactly(tmp_path):
         "depth_width 9\ncx 320\nfx 544.47329\nfy 544.47329\ncy 240\n",
     ],
 )
-def test_spellings(tmp_path, text):
+def test_intrinsics_syntax_variants_are_read(tmp_path, text):
     (tmp_path / "asus.ini").write_bytes(text.encode())
     assert read_intrinsics(tmp_path / "asus.ini") == ASUS
 
@@ -51,13 +51,13 @@ def test_spellings(tmp_path, text):
         ("cy 240\n", "", "asus.ini has no line with cy; it must give fx, fy, cx, cy"),
     ],
 )
-def test_faults_name_file_and_line(tmp_path, old, new, message):
+def test_invalid_intrinsics_error_gives_file_and_line(tmp_path, old, new, message):
     (tmp_path / "asus.ini").write_text("# asus\nfx 544\nfy 544\ncx 320\ncy 240\n".replace(old, new))
     with pytest.raises(DataError, match=message):
         read_intrinsics(tmp_path / "asus.ini")
 
 
-def test_unreadable_files(tmp_path):
+def test_missing_or_oversized_intrinsics_file_raises(tmp_path):
     with pytest.raises(DataError, match=r"asus.ini could not be read: No such file"):
         read_intrinsics(tmp_path / "asus.ini")
     (tmp_path / "large.ini").write_bytes(b"fx 1\n" * 2**18)

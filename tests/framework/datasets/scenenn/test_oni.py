@@ -44,7 +44,7 @@ def frames_of(path):
 
 @played
 @pytest.mark.parametrize("wide", [True, False])
-def test_openni_plays_all_frames_of_an_uncompressed_recording(tmp_path, wide):
+def test_openni_plays_uncompressed_recording_completely(tmp_path, wide):
     frames = frames_of(OniFile(recording(), wide).write(tmp_path / "a.oni"))
     assert [(frame.color_time, frame.depth_time) for frame in frames] == [(time + 5, time) for time in TIMES]
     np.testing.assert_array_equal([frame.depth_mm for frame in frames], depths())
@@ -53,7 +53,7 @@ def test_openni_plays_all_frames_of_an_uncompressed_recording(tmp_path, wide):
 
 
 @played
-def test_openni_unpacks_its_codecs(tmp_path):
+def test_openni_decodes_compressed_streams(tmp_path):
     nodes = recording(codec=b"16zT")
     nodes[1].codec = b"JPEG"
     frames = frames_of(OniFile(nodes).write(tmp_path / "a.oni"))
@@ -62,14 +62,14 @@ def test_openni_unpacks_its_codecs(tmp_path):
 
 
 @played
-def test_depth_in_tenths_of_a_millimeter_is_rounded_to_millimeters(tmp_path):
+def test_depth_in_100_um_units_is_rounded_to_millimeters(tmp_path):
     frames = frames_of(OniFile(recording(pixel_format=oni.DEPTH_100_UM)).write(tmp_path / "a.oni"))
     expected = np.floor(np.array(depths()) / 10 + 0.5)
     np.testing.assert_array_equal([frame.depth_mm for frame in frames], expected)
 
 
 @played
-def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(tmp_path):
+def test_truncated_recording_plays_complete_frames(tmp_path):
     path = OniFile(recording()).write(tmp_path / "a.oni")
     second = OniFile(recording())
     second.write(tmp_path / "b.oni")
@@ -80,7 +80,7 @@ def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(tmp_path):
 
 
 @played
-def test_other_pixels_than_depth_and_rgb_are_refused(tmp_path):
+def test_unsupported_pixel_format_raises(tmp_path):
     nodes = recording()
     nodes[1].pixel_format = YUV422
     with pytest.raises(DataError, match=r"a\.oni: OpenNI 2 gives color in its pixel format 201; expected 200"):
@@ -88,7 +88,7 @@ def test_other_pixels_than_depth_and_rgb_are_refused(tmp_path):
 
 
 @played
-def test_a_player_that_is_stuck_is_not_waited_for(tmp_path, monkeypatch):
+def test_stalled_player_raises_after_timeout(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "PATIENCE", 200)
     path = OniFile(recording()).write(tmp_path / "a.oni")
     streams = {stream: Images(node=1, count=9, last=9) for stream in Stream}
@@ -96,7 +96,7 @@ def test_a_player_that_is_stuck_is_not_waited_for(tmp_path, monkeypatch):
         list(oni.play(path, streams))
 
 
-def test_a_player_that_crashes_is_an_error_of_one_line(tmp_path, monkeypatch):
+def test_player_crash_raises_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "_deliver", crash)
     path = OniFile(recording()).write(tmp_path / "a.oni")
     with pytest.raises(DataError) as caught:
@@ -104,14 +104,14 @@ def test_a_player_that_crashes_is_an_error_of_one_line(tmp_path, monkeypatch):
     assert str(caught.value) == f"{path}: it is damaged, OpenNI 2 crashed on it with status {-signal.SIGKILL}"
 
 
-def test_without_openni_the_package_is_named(tmp_path, monkeypatch):
+def test_missing_openni_error_names_package(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "LIBRARIES", ("libNotThere.so",))
     with pytest.raises(ConfigError, match="OpenNI 2 is not installed: apt-get install libopenni2-0"):
         next(oni.play(tmp_path / "a.oni", {}))
 
 
 @played
-def test_a_path_that_openni_would_cut_is_refused(tmp_path):
+def test_path_over_255_bytes_raises(tmp_path):
     with pytest.raises(DataError, match="paths of at most 255 bytes"):
         next(oni.play(tmp_path / ("a" * 250 + ".oni"), {}))
 
@@ -141,7 +141,7 @@ def play_back(color_times, depth_times):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_frames_are_paired_as_the_play_back_of_scenenn_does(seed):
+def test_frame_pairing_matches_scenenn_playback(seed):
     rng = np.random.default_rng(seed)
     times = {stream: 33_333 * np.flatnonzero(rng.random(60) < 0.8) + rng.integers(0, 30_000) for stream in Stream}
     images = sorted((image(stream, int(time)) for stream in Stream for time in times[stream]), key=lambda one: one.time)
@@ -150,17 +150,17 @@ def test_frames_are_paired_as_the_play_back_of_scenenn_does(seed):
     assert times_of(pair(images)) == expected
 
 
-def test_images_just_close_enough_are_a_frame():
+def test_frame_pairing_accepts_maximum_time_difference():
     at_limit = [image(Stream.DEPTH, 0), image(Stream.COLOR, LARGEST_TIME_DIFFERENCE)]
     assert times_of(pair(at_limit)) == [(LARGEST_TIME_DIFFERENCE, 0)]
     assert times_of(pair([image(Stream.DEPTH, 0), image(Stream.COLOR, LARGEST_TIME_DIFFERENCE + 1)])) == []
 
 
-def test_a_stream_that_stays_alone_does_not_fill_the_memory():
+def test_unpaired_stream_buffer_is_bounded():
     alone = [image(Stream.DEPTH, time) for time in range(WAITING + 1)]
     assert times_of(pair([*alone, image(Stream.COLOR, 0)])) == [(0, 1)]
 
 
-def test_color_and_depth_of_different_sizes_are_refused():
+def test_color_and_depth_size_mismatch_raises():
     with pytest.raises(DataError, match="color is 6x4 and depth 3x2; they must have the same size"):
         list(pair([image(Stream.DEPTH, 0), image(Stream.COLOR, 0, (4, 6, 3))]))

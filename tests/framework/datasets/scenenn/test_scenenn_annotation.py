@@ -50,19 +50,19 @@ def assert_same(a, b):
         np.testing.assert_allclose(a.obb.rotation, b.obb.rotation, atol=1e-15)
 
 
-def test_the_golden_text(path):
+def test_annotation_writer_matches_reference_text(path):
     write_annotation(path, OBJECTS)
     assert path.read_text() == GOLDEN
 
 
-def test_what_is_written_is_read_back(path):
+def test_annotation_round_trip_preserves_labels(path):
     odd = Annotated(3, 'a <b> & "c\'s"\n\tKüche', "sofa", (1, 2, 3), None, dataclasses.replace(BOX, rotation=TURN))
     write_annotation(path, (*OBJECTS, odd))
     for read, written in zip(read_annotation(path), (*OBJECTS, odd), strict=True):
         assert_same(read, written)
 
 
-def test_an_oriented_box_is_turned_by_its_quaternion(path):
+def test_oriented_box_is_rotated_by_quaternion(path):
     """A quarter turn about z: the box's x axis is the world's y."""
     half = np.sqrt(0.5)
     box = read_label(path, f'id="1" obbox="1 2 3 4 5 6 0 0 {half} {half}"').obb
@@ -70,43 +70,43 @@ def test_an_oriented_box_is_turned_by_its_quaternion(path):
     assert (box.center.tolist(), box.extent.tolist()) == ([1, 2, 3], [4, 5, 6])
 
 
-def test_what_is_not_known_is_left_out(path):
+def test_unknown_xml_content_is_ignored(path):
     path.write_text('<scene v="2"><!-- x --><camera id="x"/>text<label id=" 7 " z="1"><part id="8"/></label></scene>')
     (label,) = read_annotation(path)
     assert_same(label, Annotated(7, "", "", NO_COLOR, None, None))
 
 
-def test_a_namespace_is_left_out(path):
+def test_xml_namespace_is_ignored(path):
     path.write_text('<annotation xmlns="http://a.b/c"><label id="7" text="chair"/></annotation>')
     assert [(label.id, label.text) for label in read_annotation(path)] == [(7, "chair")]
     path.write_text('<n:annotation xmlns:n="http://a.b/c"><n:label id="7" text="chair"/></n:annotation>')
     assert [(label.id, label.text) for label in read_annotation(path)] == [(7, "chair")]
 
 
-def test_a_label_that_is_there_twice_counts_once_when_both_say_the_same(path):
+def test_identical_duplicate_labels_count_once(path):
     path.write_text('<a><label id="5" text="chair"/><label id="6"/><label id="5" text="chair"/></a>')
     assert [label.id for label in read_annotation(path)] == [5, 6]
 
 
 @pytest.mark.parametrize("text", ["<annotation/>", "<annotation><labels/></annotation>", "<a><b id='1'/></a>"])
-def test_a_file_without_labels_is_no_annotation(path, text):
+def test_annotation_without_labels_raises(path, text):
     path.write_text(text)
     with pytest.raises(DataError, match=r"011.xml holds no <label>"):
         read_annotation(path)
 
 
 @pytest.mark.parametrize("text", ["", "1 2", "1 2 3 4", "1 2 256", "1 2 -1", "1 2 x", "1 2 nan", "1 2 2.5"])
-def test_a_color_that_is_none(path, text):
+def test_invalid_label_color_reads_as_no_color(path, text):
     assert read_label(path, f'id="1" color="{text}"').color == NO_COLOR
 
 
 @pytest.mark.parametrize("text", ["", "0 0 0 1 1", "0 0 0 1 1 1 1", "0 0 0 1 1 inf", "0 0 0 1 1 x", "0 0 2 1 1 1"])
-def test_an_axis_aligned_box_that_is_none(path, text):
+def test_invalid_axis_aligned_box_reads_as_none(path, text):
     assert read_label(path, f'id="1" aabbox="{text}"').aabb is None
 
 
 @pytest.mark.parametrize("text", ["0 0 0 1 1 1", "0 0 0 1 1 -1 0 0 0 1", "0 0 0 1 1 1 0 0 0 0", "0 0 0 1 1 1 0 0 0 9"])
-def test_an_oriented_box_that_is_none(path, text):
+def test_invalid_oriented_box_reads_as_none(path, text):
     assert read_label(path, f'id="1" obbox="{text}"').obb is None
 
 
@@ -125,7 +125,7 @@ def test_an_oriented_box_that_is_none(path, text):
         ('<label id="&a;"/>', "line 3: this is not XML: undefined entity"),
     ],
 )
-def test_faults_name_file_and_line(path, label, message):
+def test_malformed_annotation_error_gives_file_and_line(path, label, message):
     path.write_text(f'<annotation>\n<label id="5"/>\n{label}\n</annotation>')
     with pytest.raises(DataError, match=f"011.xml, {message}"):
         read_annotation(path)
@@ -144,7 +144,7 @@ BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10 if k else "ha"}">' for k in 
         f'<!DOCTYPE l [<!ATTLIST label text CDATA "{"x" * 100000}">]>',  # each label would hold it
     ],
 )
-def test_entities_and_document_types_are_refused(path, prologue):
+def test_xml_entities_and_document_types_raise(path, prologue):
     path.write_text(f'<?xml version="1.0"?>\n{prologue}\n<l><label id="1" text="&a11;"/></l>')
     began = time.perf_counter()
     with pytest.raises(DataError, match=r"011.xml, line 2: document types and entities are refused") as caught:
@@ -154,25 +154,25 @@ def test_entities_and_document_types_are_refused(path, prologue):
 
 
 @pytest.mark.parametrize("encoding", ["rot13", "hex", "shift_jis", "idna", "x" * 1000])
-def test_an_unknown_encoding(path, encoding):
+def test_unknown_encoding_raises(path, encoding):
     path.write_text(f'<?xml version="1.0" encoding="{encoding}"?><l/>')
     with pytest.raises(DataError, match=r"011.xml, line 1: its encoding is not known, expected UTF-8$"):
         read_annotation(path)
 
 
-def test_other_encodings_are_read(path):
+def test_latin_1_and_utf_16_encodings_are_read(path):
     path.write_text('<?xml version="1.0" encoding="latin-1"?><l><label id="1" text="Küche"/></l>', encoding="latin-1")
     assert read_annotation(path)[0].text == "Küche"
     path.write_bytes('<?xml version="1.0" encoding="utf-16"?><l><label id="1" text="Küche"/></l>'.encode("utf-16"))
     assert read_annotation(path)[0].text == "Küche"
 
 
-def test_deep_nesting_is_no_recursion(path):
+def test_deeply_nested_xml_is_read_without_recursion(path):
     path.write_text("<a>" * 50000 + '<label id="1"/>' + "</a>" * 50000)
     assert [label.id for label in read_annotation(path)] == [1]
 
 
-def test_a_file_that_is_too_large_or_not_there(path, monkeypatch):
+def test_missing_or_oversized_annotation_raises(path, monkeypatch):
     with pytest.raises(DataError, match=r"011.xml could not be read: No such file"):
         read_annotation(path)
     monkeypatch.setattr(scenenn_annotation, "LARGEST_FILE", 100)
@@ -195,7 +195,7 @@ def test_a_file_that_is_too_large_or_not_there(path, monkeypatch):
         ({"obb": dataclasses.replace(BOX, extent=np.array([1, 1, -1.0]))}, "a box of label 5"),
     ],
 )
-def test_what_could_not_be_read_back_is_not_written(path, change, message):
+def test_writing_invalid_label_raises_and_leaves_no_file(path, change, message):
     with pytest.raises(DataError, match=message):
         write_annotation(path, (OBJECTS[1], dataclasses.replace(Annotated(5, "chair", "chair"), **change)))
     with pytest.raises(DataError, match="at least one label"):

@@ -99,7 +99,7 @@ def fault(model="somebody/something"):
     return str(caught.value)
 
 
-def test_a_model_is_downloaded_once_with_its_licence_and_size_said(hub, caplog):
+def test_hub_model_is_downloaded_once_and_logged(hub, caplog):
     with caplog.at_level("INFO", "framework"):
         folder = find_model("somebody/something", "main")
     assert f"downloading somebody/something, 1 MB, license apache-2.0, from {hub.address} into" in caplog.text
@@ -112,7 +112,7 @@ def test_a_model_is_downloaded_once_with_its_licence_and_size_said(hub, caplog):
     assert hub.sent == wanted
 
 
-def test_weights_in_several_files(hub):
+def test_hub_model_sharded_weights_download_missing_shard(hub):
     hub.files["model-00001-of-00002.safetensors"] = hub.files.pop("model.safetensors")
     hub.files["model-00002-of-00002.safetensors"] = b"more"
     names = {"a": "model-00001-of-00002.safetensors", "b": "model-00002-of-00002.safetensors"}
@@ -127,7 +127,7 @@ def test_weights_in_several_files(hub):
     assert f"is damaged: delete {folder.parents[1]}, and run again" in fault()
 
 
-def test_a_tokenizer_comes_in_one_file_or_in_the_two_of_older_models(hub):
+def test_hub_tokenizer_in_one_or_two_files_is_found(hub):
     with pytest.raises(DataError, match=r"has no tokenizer\.json and no tokenizer_config\.json"):
         find_model("somebody/something", "main", TOKENIZER)
     hub.files |= dict.fromkeys(("vocab.json", "merges.txt", "tokenizer_config.json"), b"{}")
@@ -142,7 +142,7 @@ def test_a_tokenizer_comes_in_one_file_or_in_the_two_of_older_models(hub):
     assert names == {*hub.files} - {"README.md", "vocab.json", "merges.txt"}
 
 
-def test_what_was_not_published_is_not_kept(hub):
+def test_hub_model_with_wrong_hash_is_discarded(hub):
     hub.served["model.safetensors"] = bytes(len(WEIGHTS))
     assert "model.safetensors is not what was published" in fault()
     hub.served.clear()
@@ -150,7 +150,7 @@ def test_what_was_not_published_is_not_kept(hub):
 
 
 @pytest.mark.parametrize("value", ["1", "true"])
-def test_offline_nothing_is_asked_for(hub, monkeypatch, value):
+def test_hub_model_offline_makes_no_requests(hub, monkeypatch, value):
     monkeypatch.setenv("HF_HUB_OFFLINE", value)
     assert "HF_HUB_OFFLINE forbids to download it: unset that, or give a local folder" in fault()
     assert not hub.sent
@@ -160,7 +160,7 @@ def test_offline_nothing_is_asked_for(hub, monkeypatch, value):
     assert find_model("somebody/something", "main") == folder
 
 
-def test_faults_are_one_line(hub):
+def test_hub_model_errors_are_one_line(hub):
     assert "check the name and the network" in fault("somebody/else")
     assert "is neither a folder nor a model id" in fault("no//such")
     del hub.files["preprocessor_config.json"]
@@ -169,5 +169,5 @@ def test_faults_are_one_line(hub):
     assert "has no preprocessor_config.json and no model.safetensors" in fault()
 
 
-def test_a_folder_is_itself(tmp_path):
+def test_hub_model_local_folder_is_returned_unchanged(tmp_path):
     assert find_model(str(tmp_path), "main") == tmp_path

@@ -179,7 +179,7 @@ def as_tensors(state):
 
 
 @pytest.mark.parametrize("name", ["resnet50", "resnet101"])
-def test_computes_what_detectron2_would(name):
+def test_detectron2_network_matches_reference(name):
     state = synthetic_state(name)
     reference, network = Detectron2(state), from_detectron2(as_tensors(state), "here")
     assert network.architecture.classes == COCO
@@ -212,7 +212,7 @@ def test_computes_what_detectron2_would(name):
         np.testing.assert_allclose(masks[:, 1:], reference.masks(expected, boxes), atol=1e-4)
 
 
-def test_older_checkpoints_bring_their_anchors():
+def test_detectron2_stored_anchors_are_read():
     state = as_tensors(synthetic_state())
     cells = "proposal_generator.anchor_generator.cell_anchors"
     state[f"{cells}.1"] = torch.tensor([[-34, -17, 34, 17], [-24, -24, 24, 24], [-17, -34, 17, 34.0]])
@@ -223,7 +223,7 @@ def test_older_checkpoints_bring_their_anchors():
         from_detectron2(state, "here")
 
 
-def test_networks_that_are_not_read_say_why():
+def test_detectron2_unsupported_networks_raise():
     state = as_tensors(synthetic_state())
     with pytest.raises(
         DataError, match=r"^here: pixel_std is \[57.375, 57.12, 58.395\]; only networks that start from MSRA"
@@ -255,7 +255,7 @@ class Runs:
 
 
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
-def test_a_pickle_of_arrays_is_read(tmp_path, protocol):
+def test_pickle_of_arrays_is_read(tmp_path, protocol):
     path, state = tmp_path / "model_final_abc123.pkl", synthetic_state()
     path.write_bytes(pickle.dumps({"model": state, "__author__": "Detectron2 Model Zoo"}, protocol=protocol))
     read = read_pickle(path)
@@ -265,7 +265,7 @@ def test_a_pickle_of_arrays_is_read(tmp_path, protocol):
     assert read_network(path).architecture.backbone.name == "resnet50"
 
 
-def test_numpys_older_module_names(tmp_path):
+def test_pickle_with_old_numpy_module_names_is_read(tmp_path):
     path = tmp_path / "model.pkl"
     content = pickle.dumps({"model": {"a": np.arange(3.0)}}, protocol=2)
     assert b"numpy._core" in content
@@ -273,7 +273,7 @@ def test_numpys_older_module_names(tmp_path):
     np.testing.assert_array_equal(read_pickle(path)["a"], [0, 1, 2])
 
 
-def test_a_pickle_runs_nothing(tmp_path):
+def test_pickle_with_code_raises_without_execution(tmp_path):
     path, touched = tmp_path / "model.pkl", tmp_path / "touched"
     path.write_bytes(pickle.dumps({"model": {"a": np.zeros(1), "b": Runs(touched)}}))
     with pytest.raises(DataError, match=r"model\.pkl is no pickle of numpy arrays: it wants to call") as caught:
@@ -295,7 +295,7 @@ def test_a_pickle_runs_nothing(tmp_path):
         (pickle.dumps({"model": {"a": np.array(["text"])}}), "a is no array of numbers"),
     ],
 )
-def test_damaged_pickles(tmp_path, content, fault):
+def test_pickle_damaged_raises(tmp_path, content, fault):
     path = tmp_path / "model.pkl"
     path.write_bytes(content)
     with pytest.raises(DataError, match=fault) as caught:
@@ -303,7 +303,7 @@ def test_damaged_pickles(tmp_path, content, fault):
     assert "\n" not in str(caught.value)
 
 
-def test_a_pth_file_of_detectron2s_trainer(tmp_path):
+def test_pth_of_detectron2_trainer_is_read(tmp_path):
     path, state = tmp_path / "model_final.pth", as_tensors(synthetic_state())
     torch.save({"model": state, "iteration": 3}, path)
     assert read_network(path).architecture.half_pixel
@@ -312,7 +312,7 @@ def test_a_pth_file_of_detectron2s_trainer(tmp_path):
         read_network(path, CheckpointKind.TORCHVISION)
 
 
-def test_a_pth_file_that_is_none(tmp_path):
+def test_pth_with_invalid_content_raises(tmp_path):
     path, touched = tmp_path / "model.pth", tmp_path / "touched"
     torch.save({"model": {"a": Runs(touched)}}, path)
     for content in (None, b"<html>", b""):

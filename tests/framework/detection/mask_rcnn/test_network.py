@@ -9,7 +9,7 @@ from framework.detection.mask_rcnn.network import best_first, fuse_batch_norms
 from tests.support.networks.tiny_mask_rcnn import tiny_network
 
 
-def test_a_fused_network_computes_the_same():
+def test_network_with_fused_batch_norms_matches_original():
     network, fused = tiny_network(), tiny_network()
     fuse_batch_norms(fused)
     assert sum(isinstance(module, nn.BatchNorm2d) for module in network.modules()) == 20  # 17 layers, 3 shortcuts
@@ -28,7 +28,7 @@ def test_best_first_equals_stable_sort(count, decimals):
     np.testing.assert_array_equal(best_first(scores, count), np.argsort(-scores, kind="stable")[:count])
 
 
-def test_anchors_follow_the_shapes_of_the_pyramid():
+def test_anchors_follow_pyramid_shapes():
     network = tiny_network()
     counts = []
     for height in (64, 64, 128, 64):

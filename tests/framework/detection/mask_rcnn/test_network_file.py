@@ -36,7 +36,7 @@ def assert_one_line(path, *parts):
         assert part in message
 
 
-def test_a_network_comes_back_as_it_was(tmp_path):
+def test_network_file_round_trip_keeps_weights_and_card(tmp_path):
     network, path = tiny_network(), tmp_path / "network.safetensors"
     save_network(network, path, {"steps": 300, "mask_ap50": 0.51, "data": "rooms"})
     loaded = load_network(path)
@@ -49,7 +49,7 @@ def test_a_network_comes_back_as_it_was(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["network.safetensors"]
 
 
-def test_half_precision_rounds_the_kernels_and_keeps_the_statistics(tmp_path):
+def test_network_file_half_precision_keeps_float32_statistics(tmp_path):
     network, path = tiny_network(), tmp_path / "half.safetensors"
     network.backbone.body.bn1.running_var.fill_(1e6)  # float16 ends at 65504
     save_network(network, path, {}, half=True)
@@ -63,7 +63,7 @@ def test_half_precision_rounds_the_kernels_and_keeps_the_statistics(tmp_path):
     assert path.stat().st_size < 0.8 * whole.stat().st_size
 
 
-def test_a_network_that_is_not_finite_is_not_written(tmp_path):
+def test_network_file_non_finite_weights_are_not_written(tmp_path):
     network = tiny_network()
     network.rpn.head.cls_logits.bias.data[0] = torch.nan
     with pytest.raises(DataError, match=r"cls_logits\.bias are not finite"):
@@ -71,11 +71,11 @@ def test_a_network_that_is_not_finite_is_not_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_an_absent_file(tmp_path):
+def test_network_file_missing_raises(tmp_path):
     assert_one_line(tmp_path / "absent.safetensors", "there is no network")
 
 
-def test_a_cut_file(tmp_path):
+def test_network_file_truncated_raises(tmp_path):
     path = tiny_network_file(tmp_path)
     path.write_bytes(path.read_bytes()[:-100])
     assert_one_line(path, "damaged")
@@ -83,7 +83,7 @@ def test_a_cut_file(tmp_path):
     assert_one_line(path, "damaged")
 
 
-def test_a_single_flipped_bit(tmp_path):
+def test_network_file_with_flipped_bit_raises(tmp_path):
     path = tiny_network_file(tmp_path)
     content = bytearray(path.read_bytes())
     content[-1000] ^= 1
@@ -91,7 +91,7 @@ def test_a_single_flipped_bit(tmp_path):
     assert_one_line(path, "damaged")
 
 
-def test_a_file_without_an_architecture(tmp_path):
+def test_network_file_without_architecture_raises(tmp_path):
     path = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(1)}, path)
     assert_one_line(path, "no architecture")
@@ -111,25 +111,25 @@ def test_a_file_without_an_architecture(tmp_path):
         (lambda fields: fields | {"head_features": 17}, "fc6.bias must be 17, found 16"),
     ],
 )
-def test_an_architecture_that_is_none(tmp_path, change, fault):
+def test_network_file_invalid_architecture_raises(tmp_path, change, fault):
     path = tiny_network_file(tmp_path)
     fields = json.loads(json.dumps(vars(TINY) | {"backbone": vars(TINY.backbone)}))
     rewritten(path, architecture=json.dumps(change(fields)))
     assert_one_line(path, fault)
 
 
-def test_an_architecture_that_is_no_json(tmp_path):
+def test_network_file_malformed_architecture_json_raises(tmp_path):
     assert_one_line(rewritten(tiny_network_file(tmp_path), architecture="{"))
 
 
-def test_a_field_that_older_files_lack_has_its_default(tmp_path):
+def test_network_file_missing_field_uses_default(tmp_path):
     fields = json.loads(json.dumps(vars(TINY) | {"backbone": vars(TINY.backbone)}))
     del fields["truncated_strides"]
     path = rewritten(tiny_network_file(tmp_path), architecture=json.dumps(fields))
     assert load_network(path).architecture == TINY
 
 
-def test_weights_that_are_not_the_networks():
+def test_network_weights_mismatch_raises():
     tensors = weights(tiny_network())
     with pytest.raises(DataError, match=r"^here lacks weights backbone\.body\.bn1\.bias and 1 more"):
         filled(

@@ -64,7 +64,7 @@ def fault(name="offered"):
     return str(caught.value)
 
 
-def test_a_published_network_is_downloaded_once_with_its_licence_and_size_said(server, cache, monkeypatch, caplog):
+def test_published_network_is_downloaded_once_and_logged(server, cache, monkeypatch, caplog):
     offer(monkeypatch, f"{server.address}/network.pth")
     with caplog.at_level("INFO"):
         path = find_network(Path("offered"))
@@ -76,18 +76,18 @@ def test_a_published_network_is_downloaded_once_with_its_licence_and_size_said(s
     assert [file.name for file in cache.iterdir()] == ["network.pth"]
 
 
-def test_other_hashes_than_sha256(server, monkeypatch):
+def test_published_network_md5_hash_is_accepted(server, monkeypatch):
     offer(monkeypatch, f"{server.address}/network.pth", hashlib.md5(CONTENT).hexdigest()[:6], "md5")
     assert find_network(Path("offered")).read_bytes() == CONTENT
 
 
-def test_what_was_not_published_is_not_kept(server, cache, monkeypatch):
+def test_published_network_with_wrong_hash_is_discarded(server, cache, monkeypatch):
     offer(monkeypatch, f"{server.address}/network.pth", "00000000")
     assert f"sha256 begins with {SHA256[:8]}, expected 00000000" in fault()
     assert not list(cache.iterdir())
 
 
-def test_after_half_a_file_the_next_try_begins_anew(server, cache, monkeypatch):
+def test_published_network_truncated_download_is_restarted(server, cache, monkeypatch):
     offer(monkeypatch, f"{server.address}/cut.pth")
     fault()
     offer(monkeypatch, f"{server.address}/network.pth")
@@ -95,7 +95,7 @@ def test_after_half_a_file_the_next_try_begins_anew(server, cache, monkeypatch):
     assert [file.name for file in cache.iterdir()] == ["network.pth"]
 
 
-def test_half_a_file_is_not_kept(server, cache, monkeypatch):
+def test_published_network_truncated_download_is_discarded(server, cache, monkeypatch):
     offer(monkeypatch, f"{server.address}/cut.pth")
     message = fault()
     assert f"ended after {len(CONTENT) - 1000} of {len(CONTENT)} bytes" in message
@@ -103,7 +103,7 @@ def test_half_a_file_is_not_kept(server, cache, monkeypatch):
     assert not list(cache.iterdir())
 
 
-def test_an_absent_page_and_no_connection_say_what_to_put_where(server, cache, monkeypatch):
+def test_published_network_download_error_names_url_and_path(server, cache, monkeypatch):
     offer(monkeypatch, f"{server.address}/absent.pth")
     message = fault()
     assert "Not Found" in message
@@ -113,7 +113,7 @@ def test_an_absent_page_and_no_connection_say_what_to_put_where(server, cache, m
     assert not list(cache.iterdir())
 
 
-def test_offline_nothing_is_asked_for(server, cache, monkeypatch):
+def test_published_network_offline_makes_no_requests(server, cache, monkeypatch):
     monkeypatch.setenv("INSTANCEMAP_OFFLINE", "1")
     offer(monkeypatch, f"{server.address}/network.pth")
     assert f"put it at {cache / 'network.pth'}" in fault()
@@ -123,7 +123,7 @@ def test_offline_nothing_is_asked_for(server, cache, monkeypatch):
     assert find_network(Path("offered")).read_bytes() == CONTENT
 
 
-def test_a_cached_file_that_was_damaged_is_not_used(server, cache, monkeypatch):
+def test_published_network_damaged_cache_file_raises(server, cache, monkeypatch):
     offer(monkeypatch, f"{server.address}/network.pth")
     path = find_network(Path("offered"))
     path.write_bytes(CONTENT[:-1])
@@ -131,13 +131,13 @@ def test_a_cached_file_that_was_damaged_is_not_used(server, cache, monkeypatch):
     assert "delete it" in fault()
 
 
-def test_a_cache_that_cannot_be_written_is_not_the_connections_fault(server, tmp_path, monkeypatch):
+def test_published_network_unwritable_cache_raises(server, tmp_path, monkeypatch):
     (tmp_path / "cache").write_text("a file, where a folder should be")
     offer(monkeypatch, f"{server.address}/network.pth")
     assert "could not be made" in fault()
 
 
-def test_a_path_is_looked_for_in_the_working_then_in_the_project_folder(tmp_path, monkeypatch):
+def test_network_path_is_searched_in_working_then_project_dir(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.pth").write_bytes(b"")
     assert find_network(Path("own.pth")) == (tmp_path / "own.pth").resolve()

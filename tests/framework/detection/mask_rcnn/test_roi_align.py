@@ -31,7 +31,7 @@ def random_boxes(rng, n):
 
 @pytest.mark.parametrize("ratio", [0, 2])
 @pytest.mark.parametrize("half_pixel", [False, True])
-def test_agrees_with_the_loops(path, ratio, half_pixel):
+def test_roi_align_matches_reference_loops(path, ratio, half_pixel):
     rng = np.random.default_rng(3)
     plane = rng.normal(0, 1, (5, 20, 27)).astype(np.float32)
     boxes = random_boxes(rng, 25)
@@ -40,7 +40,7 @@ def test_agrees_with_the_loops(path, ratio, half_pixel):
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-4)
 
 
-def test_a_map_narrower_than_a_window(path):
+def test_roi_align_narrow_feature_map_matches_reference(path):
     rng = np.random.default_rng(4)
     plane = rng.normal(0, 1, (2, 1, 3)).astype(np.float32)
     boxes = np.array([[0, 0, 40, 12], [5, 1, 30, 200]], np.float32)
@@ -49,7 +49,7 @@ def test_a_map_narrower_than_a_window(path):
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-5)
 
 
-def test_chunks_are_put_back_in_the_boxes_order(monkeypatch):
+def test_roi_align_chunks_keep_box_order(monkeypatch):
     rng = np.random.default_rng(5)
     features = torch.from_numpy(rng.normal(0, 1, (1, 3, 20, 27)).astype(np.float32))
     boxes = torch.from_numpy(random_boxes(rng, 30))
@@ -60,7 +60,7 @@ def test_chunks_are_put_back_in_the_boxes_order(monkeypatch):
 
 
 @pytest.mark.parametrize("ratio", [0, 2])
-def test_the_gradient_is_how_much_each_cell_contributes(path, ratio):
+def test_roi_align_gradient_matches_cell_contributions(path, ratio):
     """Pooling is linear: the gradient of its sum is, cell by cell, the sum of what a unit at that cell pools to."""
     rng = np.random.default_rng(6)
     boxes = rng.uniform(0, 60, (4, 2))
@@ -73,19 +73,19 @@ def test_the_gradient_is_how_much_each_cell_contributes(path, ratio):
     assert not features.grad[0, 0].any()
 
 
-def test_a_large_map_with_small_boxes_is_not_multiplied_out(monkeypatch):
+def test_roi_align_large_map_with_small_boxes_uses_sums(monkeypatch):
     monkeypatch.setattr(module, "_products", lambda *_: pytest.fail("this takes seconds"))
     boxes = torch.rand(50, 2).repeat(1, 2) * 600 + torch.tensor([0.0, 0.0, 60.0, 40.0])
     assert roi_align(torch.zeros(1, 8, 200, 336), boxes, 7, 1 / 4, 2).shape == (50, 8, 7, 7)
 
 
-def test_a_small_map_with_large_boxes_is(monkeypatch):
+def test_roi_align_small_map_with_large_boxes_uses_products(monkeypatch):
     monkeypatch.setattr(module, "_sums", lambda *_: pytest.fail("the products are faster here"))
     boxes = torch.tensor([[0.0, 0.0, 200.0, 200.0]])
     assert roi_align(torch.zeros(1, 8, 13, 13), boxes, 7, 1 / 16).shape == (1, 8, 7, 7)
 
 
-def test_half_precision_places_boxes_in_single(path):
+def test_roi_align_half_precision_keeps_box_coordinates(path):
     rng = np.random.default_rng(7)
     features = torch.from_numpy(rng.normal(0, 1, (1, 4, 30, 40)).astype(np.float32))
     boxes = torch.tensor([[1001.3, 903.7, 1181.9, 950.2]])
@@ -95,7 +95,7 @@ def test_half_precision_places_boxes_in_single(path):
     np.testing.assert_allclose(half.float(), single, atol=0.03)
 
 
-def test_a_linear_ramp_is_pooled_to_the_centers_of_the_bins(path):
+def test_roi_align_linear_ramp_gives_bin_centers(path):
     y, x = np.meshgrid(np.arange(20.0), np.arange(27.0), indexing="ij")
     ramp = torch.from_numpy((3 * x - 2 * y).astype(np.float32))[None, None]
     box = torch.tensor([[32.0, 48.0, 32.0 + 6 * 32, 48.0 + 6 * 16]])  # bins of 2 x 1 cells
@@ -104,5 +104,5 @@ def test_a_linear_ramp_is_pooled_to_the_centers_of_the_bins(path):
     np.testing.assert_allclose(roi_align(ramp, box, 6, 1 / 16)[0, 0].numpy(), expected, atol=1e-4)
 
 
-def test_no_boxes(path):
+def test_roi_align_without_boxes_is_empty(path):
     assert roi_align(torch.zeros(1, 4, 5, 6), torch.zeros(0, 4), 6, 1 / 16).shape == (0, 4, 6, 6)

@@ -37,7 +37,7 @@ def published(name="resnet50", width=2):
     return network, state
 
 
-def test_the_old_names_are_those_of_the_published_file():
+def test_torchvision_old_names_match_published_checkpoint():
     _, state = published()
     assert {
         "backbone.body.layer4.2.bn3.running_var",
@@ -57,7 +57,7 @@ def test_the_old_names_are_those_of_the_published_file():
 
 
 @pytest.mark.parametrize("name", ["resnet50", "resnet101", "resnet18"])
-def test_the_80_classes_are_the_rows_of_their_numbers(name):
+def test_torchvision_coco_labels_select_80_classes(name):
     whole, state = published(name)
     network = from_torchvision(state, "here")
     assert network.architecture.classes == COCO
@@ -76,7 +76,7 @@ def test_the_80_classes_are_the_rows_of_their_numbers(name):
         torch.testing.assert_close(network.segment(pyramid, boxes), whole.segment(pyramid, boxes)[:, rows])
 
 
-def test_newer_names_and_other_classes():
+def test_torchvision_new_names_and_custom_classes_are_read():
     network = tiny_network()
     again = from_torchvision(network.state_dict(), "here", TINY.classes, norm_eps=1e-5)
     assert again.architecture.backbone == TINY.backbone
@@ -84,7 +84,7 @@ def test_newer_names_and_other_classes():
         assert torch.equal(tensor, network.state_dict()[name]), name
 
 
-def test_what_is_wrong_is_one_line():
+def test_torchvision_invalid_checkpoints_raise():
     state = tiny_network().state_dict()
     with pytest.raises(DataError, match=r"^here: 4 labels are not COCO's 91: the classes must be given$"):
         from_torchvision(state, "here")
@@ -97,7 +97,7 @@ def test_what_is_wrong_is_one_line():
         from_torchvision(blocks, "here", TINY.classes)
 
 
-def test_anchors_of_p6_are_spaced_as_torchvision_does():
+def test_torchvision_p6_anchor_stride_is_matched():
     """At 800 px P5 has 25 rows and P6 13: 800 // 13 = 61, where 64 would be right."""
     _, state = published()
     network = from_torchvision(state, "here")
@@ -112,7 +112,7 @@ def test_anchors_of_p6_are_spaced_as_torchvision_does():
     assert network.anchors(pyramid)[0][:3].tolist() == [[-23, -11, 23, 11], [-16, -16, 16, 16], [-11, -23, 11, 23]]
 
 
-def test_agrees_with_torchvision():
+def test_network_outputs_match_torchvision():
     """The same random weights in torchvision's own model: every step gives the same numbers."""
     try:
         import torchvision

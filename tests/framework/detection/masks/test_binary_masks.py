@@ -37,7 +37,7 @@ def paste_by_pixel(grid, borders, shape, threshold):
     "borders",
     [(5.2, 3.1, 44.7, 30.3), (-20, -10, 25, 60), (10.4, 10.4, 11.1, 12.3), (30, 5, 400, 38), (-50, -50, -9, -9)],
 )
-def test_pasting_agrees_with_interpolating_every_pixel(borders):
+def test_paste_masks_matches_per_pixel_interpolation(borders):
     rng = np.random.default_rng(4)
     grid = rng.uniform(0, 1, (24, 24)).astype(np.float32)
     (mask,) = paste_masks(grid[None], np.array([borders], np.float32), (40, 60), 0.5)
@@ -45,7 +45,7 @@ def test_pasting_agrees_with_interpolating_every_pixel(borders):
     assert (mask != expected).sum() <= 2  # float32 against float64, at the threshold itself
 
 
-def test_a_full_grid_gives_exactly_its_box():
+def test_paste_masks_full_grid_fills_box_exactly():
     """A cell of 1 beside the ring's 0 crosses 0.5 right at the box's border."""
     (mask,) = paste_masks(np.ones((1, 24, 24), np.float32), np.array([[9.5, 4.5, 33.5, 28.5]], np.float32), (40, 60))
     expected = np.zeros((40, 60), bool)
@@ -53,13 +53,13 @@ def test_a_full_grid_gives_exactly_its_box():
     np.testing.assert_array_equal(mask, expected)
 
 
-def test_degenerate_boxes_paste_nothing():
+def test_paste_masks_degenerate_boxes_are_empty():
     borders = np.array([[5, 5, 5, 9], [9, 5, 5, 9]], np.float32)
     assert not paste_masks(np.ones((2, 8, 8), np.float32), borders, (20, 20)).any()
     assert paste_masks(np.ones((0, 8, 8), np.float32), np.zeros((0, 4), np.float32), (20, 20)).shape == (0, 20, 20)
 
 
-def test_tight_boxes_are_the_first_and_last_pixels():
+def test_tight_boxes_span_first_to_last_pixel():
     rng = np.random.default_rng(5)
     masks = rng.random((20, 31, 47)) > 0.995
     masks[3] = False
@@ -69,7 +69,7 @@ def test_tight_boxes_are_the_first_and_last_pixels():
         assert box.tolist() == ([u.min(), v.min(), u.max(), v.max()] if len(u) else [0, 0, 0, 0])
 
 
-def test_overlaps_count_shared_pixels():
+def test_mask_overlaps_count_shared_pixels():
     """Of masks that fill the image, lie in a corner of it, meet in a row or column, or are empty."""
     rng = np.random.default_rng(6)
     masks = rng.random((12, 40, 300)) > 0.5
@@ -84,7 +84,7 @@ def test_overlaps_count_shared_pixels():
     assert mask_overlaps(masks[:0], tight_boxes(masks[:0])).shape == (0, 0)
 
 
-def test_duplicates_fall_to_the_first_survivor_and_empty_masks_go():
+def test_suppress_duplicates_drops_duplicates_and_empty_masks():
     masks = np.zeros((5, 10, 10), bool)
     masks[0, :, :6] = True
     masks[1, :, :7] = True  # IoU 6/7 with 0

@@ -25,7 +25,7 @@ def decode_one(box, delta, extent):
 
 
 @pytest.mark.parametrize("extent", [0.0, 1.0])
-def test_decode_agrees_with_the_formula(extent):
+def test_decode_matches_formula(extent):
     rng = np.random.default_rng(1)
     corners = rng.uniform(0, 200, (50, 2))
     boxes = np.hstack([corners, corners + rng.uniform(1, 100, (50, 2))]).astype(np.float32)
@@ -34,7 +34,7 @@ def test_decode_agrees_with_the_formula(extent):
     np.testing.assert_allclose(decode(boxes, deltas, extent), expected, rtol=1e-4, atol=1e-3)
 
 
-def test_zero_deltas_move_nothing_and_huge_ones_stay_finite():
+def test_decode_zero_deltas_are_identity_huge_deltas_finite():
     box = np.array([[10, 20, 29, 59]], np.float32)
     np.testing.assert_allclose(decode(box, np.zeros((1, 4), np.float32)), box)
     huge = decode(box, np.full((1, 4), 1000, np.float32))
@@ -42,27 +42,27 @@ def test_zero_deltas_move_nothing_and_huge_ones_stay_finite():
     assert huge[0, 2] - huge[0, 0] + 1 == pytest.approx(20 * 1000 / 16, rel=1e-4)
 
 
-def test_clip_keeps_to_the_last_pixel_in_the_old_convention_and_to_the_border_in_the_new():
+def test_clip_extent_selects_last_pixel_or_border():
     box = np.array([[-5, -6, 700, 800]], np.float32)
     np.testing.assert_array_equal(clip(box, (480, 640), extent=1), [[0, 0, 639, 479]])
     np.testing.assert_array_equal(clip(box, (480, 640), extent=0), [[0, 0, 640, 480]])
 
 
-def test_anchor_grid_runs_over_rows_then_columns_then_anchors():
+def test_anchor_grid_order_is_rows_columns_anchors():
     anchors = np.array([[-8, -8, 8, 8], [-16, -4, 16, 4]], np.float32)
     grid = anchor_grid(anchors, rows=2, columns=3, stride=16)
     assert grid.shape == (12, 4)
     np.testing.assert_array_equal(grid.reshape(2, 3, 2, 4)[1, 2, 1], anchors[1] + [32, 16, 32, 16])
 
 
-def test_a_box_of_one_resized_pixel_covers_its_pixels_of_the_original_image():
+def test_to_original_image_maps_pixel_box_exactly():
     borders = to_original_image(np.array([[3, 5, 3, 5]], np.float32), resized=(240, 320), original=(480, 640))
     np.testing.assert_allclose(borders, [[5.5, 9.5, 7.5, 11.5]])  # columns 6 and 7, rows 10 and 11
     same = np.array([[3, 5, 4, 6]], np.float32)  # in the newer convention
     np.testing.assert_allclose(to_original_image(same, (240, 320), (480, 640), extent=0.0), borders)
 
 
-def test_anchors_may_be_spaced_otherwise_along_y():
+def test_anchor_grid_accepts_separate_strides_per_axis():
     anchors = np.array([[-8, -8, 8, 8]], np.float32)
     grid = anchor_grid(anchors, rows=2, columns=2, stride=(61, 64))
     np.testing.assert_array_equal(grid[3], anchors[0] + [64, 61, 64, 61])

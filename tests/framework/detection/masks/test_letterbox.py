@@ -17,13 +17,13 @@ from framework.detection.masks.letterbox import Letterbox, Placement, network_in
         ((2, 4000), Placement.top_left, (1, 416), 0, 0),
     ],
 )
-def test_placement(image, placement, resized, top, left):
+def test_letterbox_placement_sets_size_and_offsets(image, placement, resized, top, left):
     letterbox = Letterbox.fit(image, (416, 416), placement)
     assert (letterbox.resized, letterbox.top, letterbox.left) == (resized, top, left)
 
 
 @pytest.mark.parametrize("placement", Placement)
-def test_the_images_borders_come_back_exactly(placement):
+def test_letterbox_image_borders_round_trip_exactly(placement):
     """Also where the resized size had to be rounded: the image spans -0.5 to W - 0.5."""
     letterbox = Letterbox.fit((333, 217), (416, 320), placement)
     height, width = letterbox.resized
@@ -33,7 +33,7 @@ def test_the_images_borders_come_back_exactly(placement):
 
 
 @pytest.mark.parametrize("placement", Placement)
-def test_a_blob_is_found_where_it_was(placement):
+def test_letterbox_blob_position_round_trips(placement):
     """Resizing as OpenCV does and mapping back agree to a small part of a pixel: no half pixel is lost."""
     v, u = np.indices((120, 160))
     blob = 250 * np.exp(-((u - 101.0) ** 2 + (v - 37.0) ** 2) / (2 * 6.0**2))
@@ -45,7 +45,7 @@ def test_a_blob_is_found_where_it_was(placement):
     np.testing.assert_allclose(back, [101, 37], atol=0.05)
 
 
-def test_padding_is_all_around_and_nothing_of_the_image_is_lost():
+def test_letterbox_fill_centers_image_in_padding():
     letterbox = Letterbox.fit((10, 20), (40, 40), Placement.center)
     canvas = letterbox.fill(np.full((10, 20, 3), 200, np.uint8), 114)
     assert (canvas[10:30] == 200).all()
@@ -53,7 +53,7 @@ def test_padding_is_all_around_and_nothing_of_the_image_is_lost():
     assert (canvas[30:] == 114).all()
 
 
-def test_values_of_the_input():
+def test_network_input_values_match_type_and_range():
     canvas = np.array([[[0, 51, 255]]], np.uint8)
     as_is = network_input(canvas, "float32", bgr=False, black=0.0, white=255.0)
     assert as_is.dtype == np.float32

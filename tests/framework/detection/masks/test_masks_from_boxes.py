@@ -28,19 +28,19 @@ def disk(radius, u=69.5, v=49.5):
     return (U - u) ** 2 + (V - v) ** 2 < radius**2
 
 
-def test_a_thing_in_front_of_a_wall_is_its_mask_to_the_pixel():
+def test_masks_in_boxes_foreground_object_is_exact():
     depth = np.where(disk(28), np.float32(1.5), wall())
     np.testing.assert_array_equal(mask_of(depth), disk(28))
 
 
-def test_a_mask_ends_at_its_box():
+def test_masks_in_boxes_mask_is_clipped_to_box():
     inside = (U >= 40) & (U <= 99) & (V >= 20) & (V <= 79)
     np.testing.assert_array_equal(mask_of(wall()), inside)
     outside_image = np.array([[-30.5, -10.5, 19.5, 9.5]], np.float32)
     np.testing.assert_array_equal(mask_of(wall(), outside_image), (U < 20) & (V < 10))
 
 
-def test_a_thin_thing_in_front_is_not_the_object():
+def test_masks_in_boxes_thin_occluder_is_excluded():
     depth = np.where(disk(28), np.float32(1.5), wall())
     depth[:, 66:70] = 0.8  # a pole before it
     mask = mask_of(depth)
@@ -52,20 +52,20 @@ def test_a_thin_thing_in_front_is_not_the_object():
     assert mask_of(depth, significance=0.0)[50, 66:70].all()
 
 
-def test_where_nothing_is_significant_the_heaviest_mode_is_taken():
+def test_masks_in_boxes_without_significant_mode_use_heaviest():
     depth = np.choose((U // 10) % 3, [1.0, 2.0, 4.0]).astype(np.float32)
     mask = mask_of(depth, significance=0.99)
     assert mask.any()
     assert len(np.unique(depth[mask])) == 1
 
 
-def test_two_things_at_one_depth_are_told_apart_and_the_centers_is_taken():
+def test_masks_in_boxes_equal_depths_select_central_object():
     depth = np.where(disk(14) | disk(8, u=95), np.float32(1.5), wall())
     np.testing.assert_array_equal(mask_of(depth), disk(14))
 
 
 @pytest.mark.parametrize(("slant", "whole"), [(75.0, True), (84.0, False)])
-def test_a_plane_holds_together_when_it_is_slanted_less_than_allowed(slant, whole):
+def test_masks_in_boxes_slanted_plane_is_whole_below_limit(slant, whole):
     """The plane z = 3 + tan(slant) x m, seen along u: it falls apart where its slant is above 80 degrees."""
     direction = (U - 69.5) / CAMERA.fx
     depth = np.clip(3 / (1 - np.tan(np.radians(slant)) * direction), 0, None).astype(np.float32)
@@ -74,7 +74,7 @@ def test_a_plane_holds_together_when_it_is_slanted_less_than_allowed(slant, whol
     assert (mask.sum() == 12 * 60) == whole
 
 
-def test_the_largest_step_grows_with_depth_and_focal_length():
+def test_grow_joins_pixels_below_largest_step():
     for z in (0.5, 1.0, 4.0):
         limit = masks_from_boxes_kernels._largest_step(z, np.tan(np.radians(80)) / 150)
         assert limit == pytest.approx(z * np.tan(np.radians(80)) / 150 + 3 * (0.0012 + 0.0019 * (z - 0.4) ** 2))
@@ -87,7 +87,7 @@ def test_the_largest_step_grows_with_depth_and_focal_length():
             assert mask.all() == joined
 
 
-def test_the_component_is_that_of_a_plain_labeling():
+def test_grow_and_hole_closing_match_labeling():
     rng = np.random.default_rng(3)
     for _ in range(20):
         depth = np.where(rng.random((30, 40)) < 0.62, 1.0, rng.choice([0.0, 2.0], (30, 40))).astype(np.float32)
@@ -110,7 +110,7 @@ def test_the_component_is_that_of_a_plain_labeling():
         np.testing.assert_array_equal(mask, expected)
 
 
-def test_holes_without_readings_are_closed_and_large_ones_with_readings_are_seen_through():
+def test_masks_in_boxes_holes_close_by_readings_and_size():
     solid = disk(28)
     depth = np.where(solid, np.float32(1.5), wall())
     depth[disk(15)] = 0
@@ -122,7 +122,7 @@ def test_holes_without_readings_are_closed_and_large_ones_with_readings_are_seen
     np.testing.assert_array_equal(mask_of(depth), solid)
 
 
-def test_without_depth_there_is_no_mask_and_it_is_said():
+def test_masks_in_boxes_without_depth_reports_no_mask():
     boxes = np.concatenate([BOX, BOX + 60, [[500, 500, 600, 600]], [[50, 50, 40, 40]]]).astype(np.float32)
     depth = np.where(U < 70, np.float32(0), wall())
     depth[V < 70] = 0
@@ -133,12 +133,12 @@ def test_without_depth_there_is_no_mask_and_it_is_said():
     assert found.tolist() == [True, True, False, False]
 
 
-def test_no_boxes():
+def test_masks_in_boxes_without_boxes_are_empty():
     masks, found = masks_in_boxes(np.zeros((0, 4), np.float32), wall(), CAMERA, SIGNIFICANCE, SLANT, READINGS)
     assert (masks.shape, found.shape) == ((0, 120, 160), (0,))
 
 
-def test_noise_does_not_tear_a_surface():
+def test_masks_in_boxes_noise_keeps_surface_whole():
     rng = np.random.default_rng(4)
     depth = np.where(disk(28), 2.0, 4.0)
     depth = (depth + rng.normal(0, 0.0012 + 0.0019 * (depth - 0.4) ** 2)).astype(np.float32)

@@ -30,7 +30,7 @@ def lengths_of(mask: np.ndarray) -> list[int]:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (7, 5), (48, 64)])
-def test_masks_survive(shape: tuple[int, int]) -> None:
+def test_run_length_round_trip_matches_pycocotools(shape: tuple[int, int]) -> None:
     masks = random_masks(1, 6, shape)
     packed = encode(masks)
     for mask, counts in zip(masks, packed, strict=True):
@@ -44,14 +44,14 @@ def test_masks_survive(shape: tuple[int, int]) -> None:
     np.testing.assert_array_equal(found, masks)
 
 
-def test_long_runs_are_unpacked() -> None:
+def test_run_length_unpack_reads_long_runs() -> None:
     """Numbers of several characters, and differences of either sign."""
     mask = np.zeros((480, 640), np.bool_)
     mask[100:400, 3], mask[5, 4:600], mask[200:, 630] = True, True, True
     assert unpack(encode(mask[None])[0]).tolist() == lengths_of(mask)
 
 
-def test_no_masks() -> None:
+def test_run_length_without_masks_is_empty() -> None:
     assert encode(np.zeros((0, 4, 6), np.bool_)) == []
     assert decode([], (4, 6)).shape == (0, 4, 6)
 
@@ -67,13 +67,13 @@ def test_no_masks() -> None:
         (b"O8I", "negative"),
     ],
 )
-def test_broken_run_lengths_are_refused(counts: bytes, said: str) -> None:
+def test_run_length_malformed_string_raises(counts: bytes, said: str) -> None:
     with pytest.raises(DataError, match=said) as raised:
         check(counts, (4, 4))
     assert "\n" not in str(raised.value)
 
 
-def test_run_lengths_of_another_image_are_refused() -> None:
+def test_run_length_of_other_image_size_raises() -> None:
     counts = encode(np.ones((1, 4, 6), np.bool_))[0]
     check(counts, (6, 4))  # as many pixels: the size beside it must tell
     with pytest.raises(DataError, match="must fill 5x4 = 20 px, found 24 px"):
@@ -81,6 +81,6 @@ def test_run_lengths_of_another_image_are_refused() -> None:
 
 
 @pytest.mark.parametrize("lengths", [[3, 4], [20, -4], [1.0, 15], [True, 15], []])
-def test_broken_lists_are_refused(lengths: list[int]) -> None:
+def test_run_length_invalid_list_raises(lengths: list[int]) -> None:
     with pytest.raises(DataError, match="run lengths"):
         pack(lengths, (4, 4))

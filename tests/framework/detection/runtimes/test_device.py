@@ -9,7 +9,7 @@ from framework.detection.runtimes.device import one_torch_thread
 PATIENCE_S = 10.0
 
 
-def test_threads_that_take_one_torch_thread_at_once_leave_the_number_as_it_was():
+def test_one_torch_thread_overlapping_uses_restore_count():
     """Torch gives the number that was set last to threads that are new to it, or have not asked yet."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)

@@ -20,7 +20,7 @@ from tests.support.networks.tiny_networks import constant_network, doubling_netw
         ((1, 4, 6, 3), TensorProto.UINT8, np.uint8),
     ],
 )
-def test_the_image_arrives_as_it_is(tmp_path, shape, element, dtype):
+def test_onnx_network_image_arrives_unchanged(tmp_path, shape, element, dtype):
     network = OnnxNetwork(doubling_network(tmp_path / "n.onnx", shape, element), "", "cpu", 0)
     image = np.random.default_rng(1).integers(0, 256, (4, 6, 3)).astype(dtype)
     assert network.shape == (4, 6)
@@ -29,7 +29,7 @@ def test_the_image_arrives_as_it_is(tmp_path, shape, element, dtype):
     np.testing.assert_array_equal(doubled, expected)
 
 
-def test_outputs_keep_their_names(tmp_path):
+def test_onnx_network_outputs_keep_names(tmp_path):
     rng = np.random.default_rng(2)
     outputs = {"scores": rng.random((1, 5)), "boxes": rng.random((1, 5, 4)), "last": rng.random((1, 2, 3, 4))}
     network = OnnxNetwork(constant_network(tmp_path / "n.onnx", (1, 3, 8, 8), outputs), "", "cpu", 0)
@@ -40,7 +40,7 @@ def test_outputs_keep_their_names(tmp_path):
         np.testing.assert_array_equal(found[name], value.astype(np.float32))
 
 
-def test_the_size_of_an_input_that_takes_any(tmp_path):
+def test_onnx_network_dynamic_input_requires_size(tmp_path):
     path = doubling_network(tmp_path / "n.onnx", (1, 3, "h", "w"))
     network = OnnxNetwork(path, "", "cpu", 32)
     assert network.shape == (32, 32)
@@ -52,13 +52,13 @@ def test_the_size_of_an_input_that_takes_any(tmp_path):
         OnnxNetwork(fixed, "", "cpu", 32)
 
 
-def test_what_to_install_where_onnxruntime_is_missing_is_said(tmp_path, monkeypatch):
+def test_onnx_network_without_onnxruntime_names_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ConfigError, match=r"pip install instancemap\[onnx\]"):
         OnnxNetwork(doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8)), "", "cpu", 0)
 
 
-def test_it_takes_as_many_threads_as_opencv(tmp_path, monkeypatch):
+def test_onnx_network_thread_count_matches_opencv(tmp_path, monkeypatch):
     import onnxruntime
 
     taken = []
@@ -75,7 +75,7 @@ def test_it_takes_as_many_threads_as_opencv(tmp_path, monkeypatch):
     assert taken == [1]
 
 
-def test_cuda_where_there_is_none_is_refused(tmp_path):
+def test_onnx_network_cuda_unavailable_raises(tmp_path):
     import onnxruntime
 
     if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
@@ -86,7 +86,7 @@ def test_cuda_where_there_is_none_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("device", "loaded"), [("cpu", 0), ("auto", 1)])
-def test_cuda_libraries_are_loaded_before_the_session(tmp_path, monkeypatch, device, loaded):
+def test_cuda_libraries_are_loaded_before_session(tmp_path, monkeypatch, device, loaded):
     import onnxruntime
 
     calls = []
@@ -98,7 +98,7 @@ def test_cuda_libraries_are_loaded_before_the_session(tmp_path, monkeypatch, dev
     assert calls == ["libraries"] * loaded + ["session"]
 
 
-def test_files_that_are_not_it(tmp_path):
+def test_onnx_file_missing_or_invalid_raises(tmp_path):
     with pytest.raises(DataError, match=r"detector\.weights: there is no file .*absent\.onnx"):
         find_file(tmp_path / "absent.onnx")
     path = doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8))
@@ -111,7 +111,7 @@ def test_files_that_are_not_it(tmp_path):
         OnnxNetwork(path, "", "cpu", 0)
 
 
-def test_a_network_that_onnxruntime_refuses_is_named(tmp_path):
+def test_onnx_network_rejected_by_onnxruntime_names_file(tmp_path):
     image = helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, 8, 8))
     node = helper.make_node("NoSuchThing", ["images"], ["y"], domain="nobody")
     graph = helper.make_graph(
@@ -129,18 +129,18 @@ def test_a_network_that_onnxruntime_refuses_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 8, 8), (2, 3, 8, 8), (3, 8, 8)])
-def test_an_input_that_is_no_image_is_refused(tmp_path, shape):
+def test_onnx_network_non_image_input_raises(tmp_path, shape):
     with pytest.raises(DataError, match="expected one image"):
         OnnxNetwork(doubling_network(tmp_path / "n.onnx", shape), "", "cpu", 0)
 
 
-def test_an_input_of_another_type_is_refused(tmp_path):
+def test_onnx_network_input_type_unsupported_raises(tmp_path):
     path = doubling_network(tmp_path / "n.onnx", (1, 4, 4, 3), TensorProto.BOOL)
     with pytest.raises(DataError, match=r"one of float32, float16, uint8, found images \(1, 4, 4, 3\) tensor\(bool\)"):
         OnnxNetwork(path, "", "cpu", 0)
 
 
-def test_weights_that_are_listed_as_inputs_are_none(tmp_path):
+def test_onnx_network_weights_listed_as_inputs_are_ignored(tmp_path):
     """As they had to be before version 4 of the format."""
     image, weight = (helper.make_tensor_value_info(n, TensorProto.FLOAT, (1, 3, 4, 4)) for n in ("images", "weight"))
     path = save(
@@ -153,7 +153,7 @@ def test_weights_that_are_listed_as_inputs_are_none(tmp_path):
     assert OnnxNetwork(path, "", "cpu", 0)(np.ones((4, 4, 3), np.float32))["y"].max() == 2
 
 
-def test_whatever_is_cut_off_or_mixed_up_it_answers_in_one_line(tmp_path):
+def test_onnx_network_damaged_file_error_is_one_line(tmp_path):
     path = constant_network(tmp_path / "n.onnx", (1, 3, 4, 4), {"y": np.zeros((2, 4))})
     content = path.read_bytes()
     rng = np.random.default_rng(0)
@@ -171,7 +171,7 @@ def test_whatever_is_cut_off_or_mixed_up_it_answers_in_one_line(tmp_path):
     assert refused > 0.9 * len(damaged)
 
 
-def test_numbers_that_are_not_finite_are_an_error(tmp_path):
+def test_onnx_network_non_finite_output_raises(tmp_path):
     image = helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, 4, 4))
     path = save(
         tmp_path / "n.onnx",
@@ -186,7 +186,7 @@ def test_numbers_that_are_not_finite_are_an_error(tmp_path):
         network(np.zeros((4, 4, 3), np.float32))
 
 
-def test_an_export_of_ultralytics():
+def test_export_metadata_of_ultralytics_is_parsed():
     texts = {"names": "{0: 'person', 1: 'dog'}", "imgsz": "[480, 640]", "author": "Ultralytics", "stride": "32"}
     assert ExportMetadata.parse(texts) == ExportMetadata(("person", "dog"), (480, 640), "Ultralytics")
     assert ExportMetadata.parse({"names": '{"1": "dog", "0": "person"}', "imgsz": "640"}) == ExportMetadata(
@@ -209,5 +209,5 @@ OTHER = (
 
 
 @pytest.mark.parametrize("text", OTHER)
-def test_other_texts_say_nothing(text):
+def test_export_metadata_other_text_is_ignored(text):
     assert ExportMetadata.parse({"names": text, "imgsz": text}) == ExportMetadata()

@@ -97,17 +97,17 @@ def assert_same(a: Detections, b: Detections) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_an_entry_comes_back_to_the_bit(seed: int) -> None:
+def test_cache_entry_round_trip_is_bit_exact(seed: int) -> None:
     before = random_detections(seed, (37, 53))
     assert_same(before, unpack(pack(before), COCO))
 
 
-def test_an_entry_without_detections_comes_back() -> None:
+def test_cache_entry_without_detections_round_trips() -> None:
     before = Detections.none((37, 53), COCO)
     assert_same(before, unpack(pack(before), COCO))
 
 
-def test_embeddings_come_back_and_are_only_there_where_there_were_some() -> None:
+def test_cache_entry_embeddings_are_optional_and_round_trip() -> None:
     before = random_detections(1, (37, 53))
     embedded = replace(before, embeddings=np.eye(7, 5, dtype=np.float32), embedding_space="words@1 \N{SNOWMAN}")
     after = unpack(pack(embedded), COCO)
@@ -118,7 +118,7 @@ def test_embeddings_come_back_and_are_only_there_where_there_were_some() -> None
     assert b"embedding" not in pack(before)
 
 
-def test_the_second_time_the_detector_is_not_asked(room: CornerRoom, tmp_path: Path) -> None:
+def test_cache_second_run_does_not_call_detector(room: CornerRoom, tmp_path: Path) -> None:
     first = CachedDetector(Noise(), tmp_path)
     plain = [Noise().detect(frame) for frame in room]
     for frame, expected in zip(room, plain, strict=True):
@@ -134,7 +134,7 @@ def test_the_second_time_the_detector_is_not_asked(room: CornerRoom, tmp_path: P
 
 
 @pytest.mark.parametrize("changed", [Noise(strength=2.0), SphereDetector()], ids=["parameter", "class"])
-def test_another_detector_misses(room: CornerRoom, tmp_path: Path, changed: Detector) -> None:
+def test_cache_with_other_detector_misses(room: CornerRoom, tmp_path: Path, changed: Detector) -> None:
     CachedDetector(Noise(), tmp_path).detect(room[0])
     other = CachedDetector(changed, tmp_path)
     other.detect(room[0])
@@ -159,7 +159,7 @@ class NamedAsOnce(Noise):
         return f"{super().fingerprint()} main"  # type: ignore[misc]
 
 
-def test_a_detector_is_identified_by_what_it_says_or_by_what_it_is(tmp_path: Path) -> None:
+def test_cache_identity_uses_detector_fingerprint(tmp_path: Path) -> None:
     """The contract knows of no cache: a detector says what it reads, and what it is, if it wants to."""
     assert not {"reads", "fingerprint"} & set(dir(Detector))
     silent = SphereDetector()
@@ -171,7 +171,7 @@ def test_a_detector_is_identified_by_what_it_says_or_by_what_it_is(tmp_path: Pat
         CachedDetector(NamedAsOnce(), tmp_path)
 
 
-def test_other_weights_miss(room: CornerRoom, tmp_path: Path) -> None:
+def test_cache_with_other_weights_misses(room: CornerRoom, tmp_path: Path) -> None:
     weights = tmp_path / "weights"
     counts = []
     for content in (b"1", b"1", b"2"):
@@ -189,7 +189,7 @@ class Weighted(Noise):
     weights: Path = Path()
 
 
-def test_what_a_detector_reads_of_a_frame_counts(room: CornerRoom) -> None:
+def test_frame_hash_covers_fields_read_by_detector(room: CornerRoom) -> None:
     frame = room[0]
     assert frame.truth is not None
     color, depth = frame.color.copy(), frame.depth.copy()
@@ -224,7 +224,7 @@ def mesh(**changes: Any) -> LabeledMesh:
     return LabeledMesh(**(parts | changes))
 
 
-def test_truth_of_a_mesh_counts_by_where_it_is_from_and_a_hit_spares_its_rendering(
+def test_cache_mesh_truth_hit_skips_rendering(
     room: CornerRoom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frame, T = room[0], np.eye(4)
@@ -253,7 +253,7 @@ def test_truth_of_a_mesh_counts_by_where_it_is_from_and_a_hit_spares_its_renderi
     Noise().detect(replace(frame, truth=mesh().seen_by(CAMERA, T)))
 
 
-def test_reading_a_field_that_there_is_not_is_told(tmp_path: Path) -> None:
+def test_cache_unknown_read_field_raises(tmp_path: Path) -> None:
     detector = Noise()
     detector.reads = ("colour",)
     with pytest.raises(ConfigError, match=r"Noise\.reads.*colour"):
@@ -261,7 +261,7 @@ def test_reading_a_field_that_there_is_not_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", registered.names("detector"))
-def test_detectors_read_no_more_than_they_say(
+def test_detectors_read_only_declared_frame_fields(
     name: str, ready: Callable[..., Detector], room: CornerRoom, tmp_path: Path
 ) -> None:
     """Else the cache would give one frame's detections to another."""
@@ -282,7 +282,7 @@ def test_detectors_read_no_more_than_they_say(
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "another frame's"])
-def test_a_damaged_entry_is_a_miss_and_is_mended(
+def test_cache_damaged_entry_misses_and_is_replaced(
     room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
     expected = CachedDetector(Noise(), tmp_path).detect(room[0])
@@ -309,7 +309,7 @@ def test_a_damaged_entry_is_a_miss_and_is_mended(
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("nothing")])
-def test_what_is_no_entry_is_named_and_the_run_goes_on(
+def test_cache_non_regular_entry_warns_and_detects_again(
     room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, make: Callable[[Path], None]
 ) -> None:
     expected = CachedDetector(Noise(), tmp_path).detect(room[0])
@@ -321,7 +321,7 @@ def test_what_is_no_entry_is_named_and_the_run_goes_on(
     assert "detected again" in caplog.records[0].message
 
 
-def test_read_only_writes_nothing(room: CornerRoom, tmp_path: Path) -> None:
+def test_cache_read_only_writes_nothing(room: CornerRoom, tmp_path: Path) -> None:
     absent = tmp_path / "absent"
     detector = CachedDetector(Noise(), absent, CacheMode.READ_ONLY)
     detector.detect(room[0])
@@ -335,7 +335,7 @@ def test_read_only_writes_nothing(room: CornerRoom, tmp_path: Path) -> None:
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_full_disk_ends_storing_and_not_the_run(
+def test_cache_full_disk_stops_storing_but_not_run(
     room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path) -> Any:
@@ -350,13 +350,13 @@ def test_a_full_disk_ends_storing_and_not_the_run(
     assert "No space left on device; nothing more is stored in this run" in caplog.text
 
 
-def test_a_folder_that_cannot_be_made_is_told_at_once(tmp_path: Path) -> None:
+def test_cache_unusable_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"detection_cache_dir: .*choose another folder"):
         CachedDetector(Noise(), tmp_path / "file")
 
 
-def test_what_the_detector_refuses_is_not_stored(room: CornerRoom, tmp_path: Path) -> None:
+def test_cache_frame_error_is_not_stored(room: CornerRoom, tmp_path: Path) -> None:
     detector = CachedDetector(Noise(broken_at=0), tmp_path)
     for _ in range(2):
         with pytest.raises(FrameError, match="frame 0 is broken"):
@@ -384,7 +384,7 @@ for k in range(9):  # an entry is removed now and then, so that both write again
 """
 
 
-def test_two_processes_may_share_a_folder(tmp_path: Path) -> None:
+def test_cache_folder_is_shared_by_two_processes(tmp_path: Path) -> None:
     line = [sys.executable, "-c", FILL, str(tmp_path)]
     environment = os.environ | {"PYTHONPATH": str(CHECKOUT)}
     both = [
@@ -416,7 +416,7 @@ def config(*overrides: str) -> DictConfig:
 
 
 @pytest.mark.parametrize("off", ["off", "false", '"off"'])
-def test_off_is_the_detector_itself(off: str) -> None:
+def test_cache_off_returns_detector_itself(off: str) -> None:
     detector = Noise()
     assert with_cache(detector, config(f"detection_cache={off}")) is detector
     assert with_cache(detector, config()) is detector
@@ -424,17 +424,17 @@ def test_off_is_the_detector_itself(off: str) -> None:
 
 
 @pytest.mark.parametrize("chosen", ["7", "[a]", "''"])
-def test_a_folder_that_is_no_path_is_told(chosen: str) -> None:
+def test_cache_invalid_folder_option_raises(chosen: str) -> None:
     with pytest.raises(ConfigError, match="detection_cache_dir must be a path; quote"):
         with_cache(Noise(), config("detection_cache=read_write", f"detection_cache_dir={chosen}"))
 
 
-def test_a_misspelt_mode_is_told() -> None:
+def test_cache_unknown_mode_raises() -> None:
     with pytest.raises(ConfigError, match="detection_cache must be one of off, read_write, read_only, found 'on'"):
         with_cache(Noise(), config("detection_cache=on"))
 
 
-def test_the_folder_is_the_users_by_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cache_default_folder_is_user_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     detector = with_cache(Noise(), config("detection_cache=read_write"))
     assert isinstance(detector, CachedDetector)
@@ -443,7 +443,7 @@ def test_the_folder_is_the_users_by_default(monkeypatch: pytest.MonkeyPatch, tmp
 
 @pytest.mark.usefixtures("fakes_registered")
 @pytest.mark.usefixtures("fakes_registered")
-def test_a_run_with_the_cache_is_the_same_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_with_cache_is_identical_to_run_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The whole record, but for times: without, while it fills, and from it."""
     asked: list[int] = []
     detect = SphereDetector.detect
@@ -465,7 +465,7 @@ def test_a_run_with_the_cache_is_the_same_run(tmp_path: Path, monkeypatch: pytes
     assert records[0][0]["config_hash"]
 
 
-def test_a_seeded_detector_is_cached_frame_by_frame(room: CornerRoom, tmp_path: Path) -> None:
+def test_cache_seeded_detector_is_keyed_by_frame_index(room: CornerRoom, tmp_path: Path) -> None:
     """The simulated one draws by the frame's number: the same picture at another number is another entry."""
     detector = CachedDetector(SimulatedDetector(min_pixels=1), tmp_path)
     frame = room[0]

@@ -37,16 +37,16 @@ class Other(Network):
     pass
 
 
-def test_equal_ones_are_equal() -> None:
+def test_fingerprint_equal_detectors_match() -> None:
     assert fingerprint(Network()) == fingerprint(Network())
 
 
 @pytest.mark.parametrize("changed", [Network(threshold=0.5000001), Network(color=Color.BLUE), Other()])
-def test_class_and_parameters_count(changed: Network) -> None:
+def test_fingerprint_depends_on_class_and_parameters(changed: Network) -> None:
     assert fingerprint(changed) != fingerprint(Network())
 
 
-def test_the_bytes_of_a_file_count_and_its_name_does_not(tmp_path: Path) -> None:
+def test_fingerprint_depends_on_file_content_not_name(tmp_path: Path) -> None:
     for name, content in (("a.npz", b"weights"), ("b.npz", b"weights"), ("c.npz", b"Weights")):
         (tmp_path / name).write_bytes(content)
     a, b, c = (fingerprint(Network(tmp_path / name)) for name in ("a.npz", "b.npz", "c.npz"))
@@ -54,7 +54,7 @@ def test_the_bytes_of_a_file_count_and_its_name_does_not(tmp_path: Path) -> None
     assert a != fingerprint(Network())
 
 
-def test_every_file_of_a_folder_counts_with_its_name(tmp_path: Path) -> None:
+def test_content_hash_covers_folder_files_and_names(tmp_path: Path) -> None:
     folder = tmp_path / "weights"
     (folder / "deep").mkdir(parents=True)
     (folder / "deep" / "a").write_bytes(b"1")
@@ -68,18 +68,18 @@ def test_every_file_of_a_folder_counts_with_its_name(tmp_path: Path) -> None:
     assert len(set(seen)) == 4
 
 
-def test_a_relative_path_is_looked_for_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_content_hash_resolves_path_in_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "weights").write_bytes(b"1")
     monkeypatch.chdir(tmp_path)
     assert content_hash(Path("weights")) == content_hash(tmp_path / "weights")
 
 
-def test_a_path_that_is_not_there_cannot_be_told(tmp_path: Path) -> None:
+def test_fingerprint_missing_path_raises(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"there is no .*absent.*fingerprint"):
         fingerprint(Network(tmp_path / "absent"))
 
 
-def test_code_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fingerprint_depends_on_source_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same class path and parameters, after an edit of the module."""
     path = tmp_path / "mine.py"
     code = "from dataclasses import dataclass\n@dataclass\nclass Mine:\n    a: int = 1\n"
@@ -96,7 +96,7 @@ def test_code_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert seen[0] != seen[1]
 
 
-def test_all_of_detection_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fingerprint_covers_all_detection_modules(monkeypatch: pytest.MonkeyPatch) -> None:
     hashed: list[Path] = []
     monkeypatch.setattr(module, "path_hash", lambda path: str(hashed.append(path)))
     fingerprint(Network())
@@ -105,7 +105,7 @@ def test_all_of_detection_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     assert folder / "mask_rcnn" / "roi_align.py" in hashed
 
 
-def test_code_without_a_file_cannot_be_told() -> None:
+def test_fingerprint_without_source_file_raises() -> None:
     notebook = type("Mine", (), {"__module__": "a_notebook"})
     with pytest.raises(ConfigError, match="Mine has no source file"):
         fingerprint(dataclass(notebook)())
@@ -119,7 +119,7 @@ def test_fingerprint_auto_device_includes_its_name(monkeypatch: pytest.MonkeyPat
     assert fingerprint(Network(device="auto")) != on_cpu
 
 
-def test_a_name_that_is_a_file_counts_by_its_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fingerprint_of_file_option_depends_on_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Labels may be `coco` or a file; a model a name or a folder."""
     monkeypatch.chdir(tmp_path)
     before = fingerprint(Network(labels="labels.txt"))

@@ -69,7 +69,7 @@ def add_poses(bag: BagWriter, topic: str = "/pose") -> None:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_camera_of_ros_with_poses(tmp_path: Path, name: str) -> None:
+def test_ros_camera_with_poses_is_imported(tmp_path: Path, name: str) -> None:
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
     add_poses(bag)
@@ -78,7 +78,7 @@ def test_a_camera_of_ros_with_poses(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(("folder", "suffix"), [("mcap_folder", ".mcap"), ("plain", ".db3")])
-def test_the_file_in_the_folder_alone(tmp_path: Path, folder: str, suffix: str) -> None:
+def test_single_file_of_bag_folder_is_imported(tmp_path: Path, folder: str, suffix: str) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     [file] = bag.write(tmp_path / folder).glob(f"*{suffix}")
@@ -90,7 +90,7 @@ def test_the_file_in_the_folder_alone(tmp_path: Path, folder: str, suffix: str) 
 @pytest.mark.parametrize(
     ("child", "T_camera_child"), [("camera_color_optical_frame", np.eye(4)), ("base", T_CAMERA_ROS)]
 )
-def test_odometry_is_read_in_the_axes_that_its_frame_has(
+def test_odometry_is_read_in_axes_of_its_child_frame(
     tmp_path: Path, child: str, T_camera_child: np.ndarray
 ) -> None:
     bag = BagWriter()
@@ -114,7 +114,7 @@ def test_poses_are_interpolated(tmp_path: Path) -> None:
     assert walked == pytest.approx([0.01 + k / 30 for k in range(COUNT)], abs=2e-6)
 
 
-def test_frames_far_from_all_poses_are_left_out(tmp_path: Path) -> None:
+def test_frames_far_from_poses_are_skipped(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.add_pose(time_of(0) - 0.08, "/pose", np.eye(4))
@@ -124,7 +124,7 @@ def test_frames_far_from_all_poses_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgba8", "bgra8", "mono8"])
-def test_encodings_of_color(tmp_path: Path, encoding: str) -> None:
+def test_color_encodings_are_decoded(tmp_path: Path, encoding: str) -> None:
     bag = BagWriter()
     color, depth = seen(0)
     stored = {
@@ -145,7 +145,7 @@ def test_encodings_of_color(tmp_path: Path, encoding: str) -> None:
 @pytest.mark.parametrize(
     "kind", ["16UC1", "mono16", "Z16", "32FC1", "big-endian", "compressed", "packed mm", "packed m"]
 )
-def test_encodings_of_depth(tmp_path: Path, kind: str) -> None:
+def test_depth_encodings_are_decoded(tmp_path: Path, kind: str) -> None:
     bag = BagWriter()
     for k in range(COUNT):
         color, depth = seen(k)
@@ -172,7 +172,7 @@ def test_encodings_of_depth(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["jpeg", "png"])
-def test_compressed_color(tmp_path: Path, kind: str) -> None:
+def test_compressed_color_is_decoded(tmp_path: Path, kind: str) -> None:
     bag = BagWriter(ros1=True)
     for k in range(COUNT):
         color, depth = seen(k)
@@ -185,14 +185,14 @@ def test_compressed_color(tmp_path: Path, kind: str) -> None:
     check_room(tmp_path / "out", posed=False)
 
 
-def test_realsense_recordings_are_registered(tmp_path: Path) -> None:
+def test_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_realsense(bag, DEPTH_CAMERA)
     assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
     check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # readings are moved to the nearest pixel
 
 
-def test_depth_of_another_camera_is_refused(tmp_path: Path) -> None:
+def test_unregistered_depth_raises(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag, "depth")
     bag.messages = [entry for entry in bag.messages if entry[1] != "/camera/depth/camera_info"]
@@ -204,7 +204,7 @@ def test_depth_of_another_camera_is_refused(tmp_path: Path) -> None:
         open_source(path)
 
 
-def test_depth_of_the_same_camera_in_another_size_is_taken(tmp_path: Path) -> None:
+def test_registered_depth_of_other_size_is_accepted(tmp_path: Path) -> None:
     bag = BagWriter()
     half = ROOM.scaled(0.5)
     for k in range(COUNT):
@@ -216,7 +216,7 @@ def test_depth_of_the_same_camera_in_another_size_is_taken(tmp_path: Path) -> No
     check_room(tmp_path / "out", posed=False)
 
 
-def test_a_lens_is_written_for_who_reads_the_folder(tmp_path: Path) -> None:
+def test_lens_distortion_is_written_to_camera_json(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.messages = [entry for entry in bag.messages if not entry[1].endswith("camera_info")]
@@ -226,7 +226,7 @@ def test_a_lens_is_written_for_who_reads_the_folder(tmp_path: Path) -> None:
     assert RgbdFolder(tmp_path / "out").calibration.lens is not None
 
 
-def test_a_lens_of_another_model_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_unsupported_lens_model_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.messages = [entry for entry in bag.messages if not entry[1].endswith("camera_info")]
@@ -235,7 +235,7 @@ def test_a_lens_of_another_model_is_told(tmp_path: Path, caplog: pytest.LogCaptu
     assert "a lens of the model 'equidistant' is not undone" in caplog.text
 
 
-def test_headers_of_another_clock_fall_back_to_the_times_of_recording(tmp_path: Path) -> None:
+def test_invalid_header_stamps_fall_back_to_recording_times(tmp_path: Path) -> None:
     bag = BagWriter()
     for k in range(COUNT):
         color, depth = seen(k)
@@ -246,7 +246,7 @@ def test_headers_of_another_clock_fall_back_to_the_times_of_recording(tmp_path: 
     check_room(tmp_path / "out", posed=False)
 
 
-def test_images_without_a_partner_in_time_are_no_frames(tmp_path: Path) -> None:
+def test_images_without_time_match_are_dropped(tmp_path: Path) -> None:
     bag = BagWriter()
     color, depth = seen(0)
     for k in range(COUNT):
@@ -296,20 +296,20 @@ def two_cameras() -> BagWriter:
         ),
     ],
 )
-def test_what_names_do_not_tell_is_asked(tmp_path: Path, given: dict[str, str], said: str) -> None:
+def test_ambiguous_or_invalid_topic_error_names_option(tmp_path: Path, given: dict[str, str], said: str) -> None:
     path = two_cameras().write(tmp_path / "bag")
     with pytest.raises(ConfigError, match=said):
         open_source(path, Topics(**given))
 
 
-def test_what_is_given_is_taken(tmp_path: Path) -> None:
+def test_given_topics_are_used(tmp_path: Path) -> None:
     path = two_cameras().write(tmp_path / "bag")
     given = {"depth": "/right/depth/image", "color": "/left/color/image", "poses": "/left/pose"}
     assert not imported(path, tmp_path / "out", **given, camera_info="/right/color/camera_info")
     assert len(RgbdFolder(tmp_path / "out")) == 1
 
 
-def test_registered_depth_and_uncompressed_color_come_first(tmp_path: Path) -> None:
+def test_registered_depth_and_raw_color_are_preferred(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     color, depth = seen(0)
@@ -323,7 +323,7 @@ def test_registered_depth_and_uncompressed_color_come_first(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("left_out", "said"), [("/color/image", "no topic can be its color"), ("camera_info", "has no")]
 )
-def test_what_is_missing_is_said(tmp_path: Path, left_out: str, said: str) -> None:
+def test_missing_topic_raises(tmp_path: Path, left_out: str, said: str) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.messages = [entry for entry in bag.messages if left_out not in entry[1]]
@@ -332,7 +332,7 @@ def test_what_is_missing_is_said(tmp_path: Path, left_out: str, said: str) -> No
         open_source(path)
 
 
-def test_phones_have_no_topics(tmp_path: Path) -> None:
+def test_topics_for_phone_export_raise(tmp_path: Path) -> None:
     (tmp_path / "a.r3d").touch()
     with pytest.raises(ConfigError, match="has no topics: --color, --poses are for ROS bags"):
         open_source(tmp_path / "a.r3d", Topics(color="/a", poses="/b"))
@@ -366,7 +366,7 @@ def check_up(folder: Path, within: float = 1.0) -> None:
 
 
 @pytest.mark.parametrize("name", ["ros1.bag", "ros2_folder"])
-def test_an_accelerometer_tells_up_in_the_cameras_axes(tmp_path: Path, name: str) -> None:
+def test_accelerometer_gives_up_in_camera_axes(tmp_path: Path, name: str) -> None:
     """Over a chain of frames, both up and down it; a gyroscope's topic has no acceleration."""
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
@@ -383,7 +383,7 @@ def test_an_accelerometer_tells_up_in_the_cameras_axes(tmp_path: Path, name: str
     check_up(tmp_path / "out")
 
 
-def test_realsenses_accelerometer_tells_up(tmp_path: Path) -> None:
+def test_realsense_accelerometer_gives_up_in_camera_axes(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_realsense(bag, DEPTH_CAMERA)
     add_accelerometer(bag, "/device_0/sensor_2/Accel_0/imu/data", "2")
@@ -404,7 +404,7 @@ def test_realsenses_accelerometer_tells_up(tmp_path: Path) -> None:
         ({"late": 100.0}, r"/camera/imu measured nothing within 0\.05 s of a frame"),
     ],
 )
-def test_an_accelerometer_that_cannot_tell_is_said_in_one_line(
+def test_unusable_accelerometer_logs_one_line(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, changed: dict[str, Any], said: str
 ) -> None:
     bag = BagWriter()
@@ -418,7 +418,7 @@ def test_an_accelerometer_that_cannot_tell_is_said_in_one_line(
     assert "\n" not in line
 
 
-def test_damaged_messages_of_an_accelerometer_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_accelerometer_messages_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     add_accelerometer(bag)
@@ -454,7 +454,7 @@ def spoilt(message: Any, name: str) -> Any:
 
 @pytest.mark.parametrize("topic", ["/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"])
 @pytest.mark.parametrize("name", ["encoding", "height", "step", "width", "data"])
-def test_a_damaged_message_is_one_frame(tmp_path: Path, topic: str, name: str) -> None:
+def test_damaged_message_loses_one_frame(tmp_path: Path, topic: str, name: str) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     number = [k for k, entry in enumerate(bag.messages) if entry[1] == topic][1]
@@ -467,7 +467,7 @@ def test_a_damaged_message_is_one_frame(tmp_path: Path, topic: str, name: str) -
 
 
 @pytest.mark.parametrize("depth", [b"", b"123", bytes(12), bytes(12) + b"\x89PNG\r\n\x1a\n" + bytes(40)])
-def test_a_damaged_packed_image_is_one_frame(tmp_path: Path, depth: bytes) -> None:
+def test_damaged_compressed_depth_loses_one_frame(tmp_path: Path, depth: bytes) -> None:
     bag = BagWriter()
     for k in range(COUNT):
         color, metric = seen(k)
@@ -479,7 +479,7 @@ def test_a_damaged_packed_image_is_one_frame(tmp_path: Path, depth: bytes) -> No
     assert "/depth/image/compressedDepth" in fault
 
 
-def test_depth_packed_by_rvl_is_said(tmp_path: Path) -> None:
+def test_rvl_compressed_depth_raises(tmp_path: Path) -> None:
     bag = BagWriter()
     bag.add_image(time_of(0), "/rgb/image", seen(0)[0], "rgb8")
     bag.add_compressed(time_of(0), "/depth/image/compressedDepth", bytes(100), "16UC1; compressedDepth rvl")
@@ -492,7 +492,7 @@ def test_depth_packed_by_rvl_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
-def test_a_torn_bag_is_said_in_one_line_or_gives_what_it_has(tmp_path: Path, name: str, share: float) -> None:
+def test_truncated_bag_is_imported_or_raises_one_line(tmp_path: Path, name: str, share: float) -> None:
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
     path = bag.write(tmp_path / name)
@@ -508,7 +508,7 @@ def test_a_torn_bag_is_said_in_one_line_or_gives_what_it_has(tmp_path: Path, nam
         assert 0 < len(RgbdFolder(tmp_path / "out")) <= COUNT
 
 
-def test_a_flipped_byte_amid_the_images_costs_what_it_hits(tmp_path: Path) -> None:
+def test_inverted_byte_loses_at_most_one_frame(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_camera_of_ros(bag)
     path = bag.write(tmp_path / "a.bag")
@@ -519,7 +519,7 @@ def test_a_flipped_byte_amid_the_images_costs_what_it_hits(tmp_path: Path) -> No
     assert len(RgbdFolder(tmp_path / "out")) >= COUNT - 1
 
 
-def test_a_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_error_names_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.bag").touch()
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(

@@ -35,7 +35,7 @@ def write(path: Path, tmp_path: Path, least: int = 1) -> list[str]:
 
 
 @pytest.mark.parametrize("least", [0, 1, 2])
-def test_the_room_is_where_it_is(export: tuple[str, Path], tmp_path: Path, least: int) -> None:
+def test_export_matches_room_geometry(export: tuple[str, Path], tmp_path: Path, least: int) -> None:
     name, path = export
     source = open_source(path)
     assert (source.format, source.count) == (name, len(FRAMES))
@@ -43,7 +43,7 @@ def test_the_room_is_where_it_is(export: tuple[str, Path], tmp_path: Path, least
     check_imported(tmp_path / "out", FRAMES, least=least)
 
 
-def test_optimised_poses_and_undistorted_images_of_polycam_are_taken(tmp_path: Path) -> None:
+def test_polycam_optimized_poses_and_images_are_used(tmp_path: Path) -> None:
     drifted = [replace(frame, T_world_camera=DRIFT @ frame.T_world_camera, color=255 - frame.color) for frame in FRAMES]
     write_polycam(tmp_path / "export", drifted)
     write_polycam(tmp_path / "export", FRAMES, "corrected_")
@@ -53,7 +53,7 @@ def test_optimised_poses_and_undistorted_images_of_polycam_are_taken(tmp_path: P
         np.testing.assert_allclose(frame.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)
 
 
-def test_optimised_poses_of_polycam_without_such_images(tmp_path: Path) -> None:
+def test_polycam_optimized_poses_without_images_are_used(tmp_path: Path) -> None:
     """As in exports of which the app has left out the images, and of the camera all but the pose."""
     drifted = [replace(frame, T_world_camera=DRIFT @ frame.T_world_camera) for frame in FRAMES]
     write_polycam(tmp_path / "export", drifted)
@@ -67,7 +67,7 @@ def test_optimised_poses_of_polycam_without_such_images(tmp_path: Path) -> None:
     check_imported(tmp_path / "out", FRAMES, tells_up=False)
 
 
-def test_frames_of_the_scanner_app_without_color_are_none(tmp_path: Path) -> None:
+def test_scanner_app_frames_without_color_are_dropped(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "export", FRAMES)
     (tmp_path / "export/frame_00001.jpg").unlink()
     assert open_source(tmp_path / "export").count == 3
@@ -77,7 +77,7 @@ def test_frames_of_the_scanner_app_without_color_are_none(tmp_path: Path) -> Non
         open_source(tmp_path / "export")
 
 
-def test_older_scans_without_times_have_them_by_their_numbers(tmp_path: Path) -> None:
+def test_scan_without_times_is_timed_by_frame_number(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "export", FRAMES)
     for path in (tmp_path / "export").glob("frame_*.json"):
         change(path, lambda content: content.pop("time"))
@@ -85,7 +85,7 @@ def test_older_scans_without_times_have_them_by_their_numbers(tmp_path: Path) ->
     assert [frame.timestamp for frame in RgbdFolder(tmp_path / "out")] == pytest.approx([k / 30 for k in range(4)])
 
 
-def test_polycam_without_depth_is_refused(tmp_path: Path) -> None:
+def test_polycam_export_without_depth_raises(tmp_path: Path) -> None:
     write_polycam(tmp_path / "export", FRAMES)
     (tmp_path / "export/keyframes/depth").rename(tmp_path / "depth")
     with pytest.raises(DataError, match="has no depth/ or no cameras: Polycam keeps them with a LiDAR"):
@@ -123,7 +123,7 @@ SPOILT_CAMERAS = {
 @pytest.mark.parametrize(
     ("app", "how", "said"), [(app, *case) for app, cases in SPOILT_CAMERAS.items() for case in cases]
 )
-def test_a_damaged_camera_is_one_frame(tmp_path: Path, app: str, how, said: str) -> None:
+def test_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, said: str) -> None:
     WRITERS[app](tmp_path / "export", FRAMES)
     change(second(tmp_path / "export", "frame_*.json" if app == "3D Scanner App" else "cameras/*.json"), how)
     [fault] = write(tmp_path / "export", tmp_path)
@@ -138,7 +138,7 @@ def test_a_damaged_camera_is_one_frame(tmp_path: Path, app: str, how, said: str)
         *(("Polycam", f"{kind}/*") for kind in ("cameras", "images", "depth", "confidence")),
     ],
 )
-def test_a_torn_file_is_one_frame(tmp_path: Path, app: str, pattern: str) -> None:
+def test_truncated_file_loses_one_frame(tmp_path: Path, app: str, pattern: str) -> None:
     WRITERS[app](tmp_path / "export", FRAMES)
     path = second(tmp_path / "export", pattern)
     path.write_bytes(path.read_bytes()[:-10])

@@ -52,7 +52,7 @@ def columns(first: int, last: int) -> np.ndarray:
     return mask
 
 
-def test_votes_are_pixels_shared() -> None:
+def test_overlap_votes_count_shared_pixels() -> None:
     seen = np.zeros(SHAPE, np.int32)
     seen[:, :2] = 7
     seen[:, 4] = 3
@@ -69,7 +69,7 @@ def test_votes_are_pixels_shared() -> None:
     assert overlaps.by(OverlapRule.CLUSTER, min_pixels=16).tolist() == [[0, 0.5], [0.25, 0], [0, 0]]
 
 
-def test_classes_agree_by_their_bhattacharyya_coefficient() -> None:
+def test_class_agreement_is_bhattacharyya_coefficient() -> None:
     clusters = np.float32([[1, 0, 0], [0.5, 0.5, 0]])
     instances = np.float32([[1, 0, 0], [0, 0, 1]])
     assert np.allclose(class_agreement(clusters, instances), [[1, 0], [0.5**0.5, 0]])
@@ -80,7 +80,7 @@ def best_first(overlap: np.ndarray, threshold: float) -> np.ndarray:
     return match_one_to_one(overlap > threshold, overlap)
 
 
-def test_nothing_seen_and_nothing_detected() -> None:
+def test_overlaps_without_instances_or_clusters_are_empty() -> None:
     seen = np.zeros(SHAPE, np.int32)
     assert overlaps_of(clusters_of([columns(0, 2)], [1]), seen).votes.shape == (1, 0)
     empty = PointClusters(
@@ -95,7 +95,7 @@ def test_nothing_seen_and_nothing_detected() -> None:
     assert len(best_first(overlaps_of(empty, seen + 1).over_smaller(min_pixels=1), 0.3)) == 0
 
 
-def test_every_second_pixel_stands_for_four() -> None:
+def test_overlaps_with_stride_match_full_resolution() -> None:
     seen = np.zeros((8, 8), np.int32)
     seen[:, 4:] = 3
     pixels = np.stack(np.meshgrid(np.arange(2, 8), np.arange(8)), axis=-1).reshape(-1, 2).astype(np.int32)
@@ -116,13 +116,13 @@ def test_every_second_pixel_stands_for_four() -> None:
         assert getattr(odd, name).tolist() == getattr(sampled, name).tolist(), name
 
 
-def test_the_best_overlap_goes_first_and_each_instance_goes_once() -> None:
+def test_match_prefers_best_overlap_and_is_one_to_one() -> None:
     overlap = np.array([[0.6, 0.9], [0.0, 0.8], [0.3, 0.2]])
     assert best_first(overlap, 0.35).tolist() == [1, -1, -1]
     assert best_first(overlap, 0.25).tolist() == [1, -1, 0]
 
 
-def test_stray_pixels_of_an_instance_do_not_win_a_cluster() -> None:
+def test_overlap_stray_pixels_do_not_win_cluster() -> None:
     seen = np.zeros(SHAPE, np.int32)
     seen[:, :3] = 1  # the object, of which the cluster sees most
     seen[0, 0] = 2  # a stray voxel of another one
@@ -131,7 +131,7 @@ def test_stray_pixels_of_an_instance_do_not_win_a_cluster() -> None:
     assert best_first(overlaps.over_smaller(min_pixels=4), 0.35).tolist() == [0]
 
 
-def test_a_table_does_not_get_the_book_that_lies_on_it() -> None:
+def test_match_table_is_not_assigned_to_book_on_it() -> None:
     """Its mask covers all of the book, and not quite all of the table."""
     seen = np.full(SHAPE, 1, np.int32)
     seen[:, 2] = 2  # the book
@@ -143,7 +143,7 @@ def test_a_table_does_not_get_the_book_that_lies_on_it() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10_000))
-def test_the_order_of_detections_does_not_matter(seed: int) -> None:
+def test_match_is_independent_of_detection_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
     overlap = rng.permutation(np.linspace(0, 1, 20)).reshape(5, 4)  # no ties
     order = rng.permutation(5)
@@ -151,14 +151,14 @@ def test_the_order_of_detections_does_not_matter(seed: int) -> None:
 
 
 @pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
-def test_a_pixel_outside_the_image_is_refused(pixel: tuple[int, int]) -> None:
+def test_points_outside_image_raise(pixel: tuple[int, int]) -> None:
     clusters = clusters_of([columns(0, 2)], [1])
     clusters.pixels[3] = pixel
     with pytest.raises(DataError, match="image of 5x4"):
         list_points_by_pixel(clusters, SHAPE)
 
 
-def test_points_of_no_cluster_have_no_say() -> None:
+def test_points_without_cluster_are_ignored() -> None:
     clusters = clusters_of([columns(0, 3), columns(1, 4)], [1, 0.5])
     clusters.cluster[clusters.pixels[:, 0] == 1] = -1
     seen = np.full(SHAPE, 4, np.int32)
@@ -176,7 +176,7 @@ def clusters_at(points: PixelLists) -> list[list[int]]:
     return [lists[i] for i in points.list_ids.ravel()]
 
 
-def test_a_book_on_a_table_has_its_pixels_for_itself() -> None:
+def test_keep_on_top_assigns_pixels_to_smaller_object() -> None:
     table, book = columns(0, 5), columns(2, 3)
     clusters = clusters_of([table, book], [0.9, 0.2])
     points = list_points_by_pixel(clusters, SHAPE)
@@ -190,7 +190,7 @@ def test_a_book_on_a_table_has_its_pixels_for_itself() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10_000))
-def test_each_pixel_has_its_clusters_in_the_order_of_the_points(seed: int) -> None:
+def test_points_by_pixel_keep_point_order(seed: int) -> None:
     """Points in any order, some of no cluster, some twice at one pixel under one cluster."""
     rng = np.random.default_rng(seed)
     clusters = clusters_of([rng.random(SHAPE) < filled for filled in rng.random(4)], [1] * 4)
@@ -214,7 +214,7 @@ def test_each_pixel_has_its_clusters_in_the_order_of_the_points(seed: int) -> No
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0, 1))
-def test_who_keeps_a_pixel_agrees_with_a_slow_reference(seed: int, share: float) -> None:
+def test_keep_on_top_matches_reference(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     masks = [rng.random(SHAPE) < filled for filled in rng.random(4)]
     clusters = clusters_of(masks, [1] * 4)
@@ -230,7 +230,7 @@ def test_who_keeps_a_pixel_agrees_with_a_slow_reference(seed: int, share: float)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_who_leaves_a_pixel_to_what_lies_there_agrees_with_a_slow_reference(seed: int) -> None:
+def test_remove_supports_matches_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
     clusters = clusters_of([rng.random(SHAPE) < filled for filled in rng.random(4)], [1] * 4)
     points = list_points_by_pixel(clusters, SHAPE)

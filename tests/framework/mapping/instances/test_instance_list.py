@@ -7,7 +7,7 @@ from framework.mapping.instances.instance_list import LEAST_VERTICES, Confirmati
 from framework.mapping.instances.instance_table import FrameSet, InstanceTable
 
 
-def test_an_instance_counts_when_it_was_seen_often_enough_and_is_trusted() -> None:
+def test_confirmation_requires_observations_and_confidence() -> None:
     table = InstanceTable()
     for scores in ([0.9, 0.9], [0.9, 0.9, 0.9], [0.1, 0.1, 0.1], [0.5, 0.5, 0.5]):
         record = table.create(1, 0)
@@ -29,7 +29,7 @@ def test_an_instance_counts_when_it_was_seen_often_enough_and_is_trusted() -> No
         (0.0, 0.01, LEAST_VERTICES),
     ],
 )
-def test_an_area_is_a_number_of_vertices(min_area: float, voxel_size: float, vertices: int) -> None:
+def test_confirmation_area_converts_to_vertex_count(min_area: float, voxel_size: float, vertices: int) -> None:
     confirmation = Confirmation(1, 0, min_area)
     assert confirmation.min_vertices(voxel_size) == vertices
     ids = np.repeat(np.int32([0, 2, 5]), [1, vertices, vertices - 1])

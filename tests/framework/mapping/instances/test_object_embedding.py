@@ -23,7 +23,7 @@ X, Y = np.float32([1, 0, 0]), np.float32([0, 1, 0])
 WITH_TABLES = ("bayesian_tsdf", "last_write", "object_volumes", "open3d_vbg")
 
 
-def test_the_mean_is_a_unit_vector_and_the_spread_what_it_lost() -> None:
+def test_embedding_mean_is_unit_and_spread_is_lost_length() -> None:
     once = ObjectEmbedding.of(X, 0.7)
     np.testing.assert_allclose(once.mean, X, atol=1e-6)
     assert once.spread == pytest.approx(0, abs=1e-6)
@@ -38,7 +38,7 @@ def test_the_mean_is_a_unit_vector_and_the_spread_what_it_lost() -> None:
     assert np.isfinite(opposite.mean).all()
 
 
-def test_merged_instances_have_both_histories() -> None:
+def test_merged_instances_combine_embeddings() -> None:
     table = InstanceTable()
     for embedding in (X, Y, None):
         record = table.create(1, 0)
@@ -70,7 +70,7 @@ def test_merged_instances_have_both_histories() -> None:
         (np.eye(2, 3, dtype=np.float32), "w" * 301, "at most 300 characters"),
     ],
 )
-def test_what_cannot_be_embeddings_is_refused(
+def test_invalid_embeddings_raise(
     kind: type, embeddings: np.ndarray | None, space: str, fault: str
 ) -> None:
     scores, rows = np.ones(2, np.float32), np.ones((2, 1), np.float32)
@@ -102,7 +102,7 @@ def embeddings_of(scene: SceneMap) -> list[list[float] | None]:
 
 
 @pytest.mark.parametrize("name", WITH_TABLES)
-def test_objects_keep_their_embeddings_in_every_map_and_in_its_file(name: str, tmp_path: Path) -> None:
+def test_embeddings_are_kept_in_map_and_file(name: str, tmp_path: Path) -> None:
     scene = mapped(name, embeddings=EMBEDDINGS).scene
     assert embeddings_of(scene) == [[1, 0], [0, 1], None]
     assert scene.embedding_space == "words@1"
@@ -114,7 +114,7 @@ def test_objects_keep_their_embeddings_in_every_map_and_in_its_file(name: str, t
 
 
 @pytest.mark.parametrize("name", WITH_TABLES)
-def test_a_map_without_embeddings_has_nothing_of_them(name: str, tmp_path: Path) -> None:
+def test_map_without_embeddings_stores_none(name: str, tmp_path: Path) -> None:
     scene = mapped(name).scene
     assert embeddings_of(scene) == [None] * 3
     scene.save(tmp_path / "map.npz")
@@ -125,7 +125,7 @@ def test_a_map_without_embeddings_has_nothing_of_them(name: str, tmp_path: Path)
     assert (tmp_path / "zeros.npz").read_bytes() == (tmp_path / "map.npz").read_bytes()
 
 
-def test_a_map_that_is_gone_on_with_counts_on(tmp_path: Path) -> None:
+def test_resumed_map_accumulates_embeddings(tmp_path: Path) -> None:
     first = mapped("bayesian_tsdf", embeddings=EMBEDDINGS)
     first.scene.save(tmp_path / "map.npz")
     second: MapFuser = registered.built("fuser", "bayesian_tsdf", "fuser.voxel_size=0.08")
@@ -137,7 +137,7 @@ def test_a_map_that_is_gone_on_with_counts_on(tmp_path: Path) -> None:
     assert turned.embedding_spread == pytest.approx(1 - np.sqrt(17) / 5)
 
 
-def test_other_embeddings_than_the_maps_are_refused() -> None:
+def test_embeddings_of_other_space_raise() -> None:
     fuser = mapped("bayesian_tsdf", embeddings=EMBEDDINGS)
     frame = room().frame(walk(4)[0], 9)
     with pytest.raises(DataError, match=r"the map has embeddings of words@1, and .* of words@2"):
@@ -160,7 +160,7 @@ def test_other_embeddings_than_the_maps_are_refused() -> None:
         ("embedding_counts", None, "names an embedding space and has no embedding_counts"),
     ],
 )
-def test_damaged_embeddings_are_refused_in_one_line(
+def test_damaged_embeddings_in_file_raise(
     tmp_path: Path, array: str, value: np.ndarray | None, fault: str
 ) -> None:
     path = tmp_path / "map.npz"

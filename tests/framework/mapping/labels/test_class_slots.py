@@ -38,7 +38,7 @@ def voxel(seed: int, largest: int) -> tuple[np.ndarray, np.ndarray]:
 
 @settings(max_examples=300, deadline=None)
 @given(st.integers(0, 100_000), st.sampled_from([1, 5, MAX_SCORE]))
-def test_a_vector_says_what_the_loops_say(seed: int, largest: int) -> None:
+def test_class_slots_vectorized_match_loops(seed: int, largest: int) -> None:
     classes, scores = voxel(seed, largest)
     rng = np.random.default_rng(seed)
     cluster_scores = rng.integers(-MAX_CLUSTER_SCORE, MAX_CLUSTER_SCORE + 1, NO_CLASS + 1).astype(np.int32)
@@ -55,7 +55,7 @@ def test_a_vector_says_what_the_loops_say(seed: int, largest: int) -> None:
     np.testing.assert_array_equal(scores, by_loop)
 
 
-def test_exact_storage_has_more_slots_than_a_vector() -> None:
+def test_class_slots_exact_storage_handles_80_classes() -> None:
     classes, scores = np.arange(80, dtype=np.uint8), np.arange(80) ** 2
     cluster_scores = np.full(NO_CLASS + 1, 3 << NEW_CLASSES)
     assert most_likely_slot(classes, scores) == 79
@@ -64,7 +64,7 @@ def test_exact_storage_has_more_slots_than_a_vector() -> None:
     np.testing.assert_array_equal(scores, np.arange(80) ** 2 + 3)
 
 
-def test_slots_need_not_be_aligned() -> None:
+def test_class_slots_may_be_unaligned() -> None:
     """Those of all voxels lie in one array of records, between other fields."""
     record = np.dtype([("flag", np.uint8), ("classes", np.uint8, (CLASS_SLOTS,)), ("scores", np.int16, (CLASS_SLOTS,))])
     records = np.zeros(3, record)

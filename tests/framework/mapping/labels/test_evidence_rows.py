@@ -37,7 +37,7 @@ def with_voxels(count: int) -> EvidenceRows:
         ([1, 3, 4, 0], [5, 4, 3, 0], [1, 3, 4, 0], [5, 4, 3, 0]),  # the dropped one not there: nothing changes
     ],
 )
-def test_merging_adds_evidence_and_keeps_the_best_first(
+def test_merge_adds_evidence_and_keeps_best_first(
     ids: list[int], logs: list[float], merged_ids: list[int], merged_logs: list[float]
 ) -> None:
     rows = with_voxels(1)
@@ -50,7 +50,7 @@ def test_merging_adds_evidence_and_keeps_the_best_first(
 
 
 @pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
-def test_merging_finds_every_voxel(count: int) -> None:
+def test_merge_updates_all_labeled_voxels(count: int) -> None:
     """Of thousands, a few know the instance: the first and the last in use, and some between; none beyond."""
     rows = with_voxels(count)
     evidence = rows.evidence
@@ -68,7 +68,7 @@ def test_merging_finds_every_voxel(count: int) -> None:
     np.testing.assert_array_equal(evidence.instance_value[: count + 100], value)
 
 
-def test_too_many_classes_are_refused() -> None:
+def test_evidence_rows_with_256_classes_raise() -> None:
     with pytest.raises(DataError, match="255 classes apart, and the detector has 256"):
         EvidenceRows(VoxelGrid(0.01, 0.05, 10)).begin(256)
 
@@ -93,7 +93,7 @@ def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
     )
 
 
-def test_only_voxels_that_are_named_have_slots() -> None:
+def test_evidence_rows_allocate_only_named_voxels() -> None:
     for storage in Storage:
         rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=storage)
         rows.begin(6)
@@ -109,7 +109,7 @@ def test_only_voxels_that_are_named_have_slots() -> None:
 
 
 @pytest.mark.parametrize(("blocks", "frames", "max_blocks"), [(4, 40, 4), (4, 40, 400), (3 * GROUP + 5, 8, 400)])
-def test_many_blocks_are_updated_as_voxel_by_voxel(
+def test_evidence_update_of_many_blocks_matches_voxelwise(
     blocks: int, frames: int, max_blocks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Update pixels under no, one or several clusters, with and without instance, with and without new slots."""
@@ -168,7 +168,7 @@ def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
     return evidence
 
 
-def test_slots_that_a_new_voxel_gives_away_count() -> None:
+def test_evictions_of_new_voxel_are_counted() -> None:
     said = voted([1, 2, 3, 4, 5, 6], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0] * 6, Combine.SUM)
     expected = update_voxel(blank(), 0, said, COVERED)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
@@ -178,7 +178,7 @@ def test_slots_that_a_new_voxel_gives_away_count() -> None:
     assert rows.evicted == expected == 2
 
 
-def test_exact_storage_never_forgets() -> None:
+def test_exact_storage_keeps_all_evidence() -> None:
     """Many more instances and classes than the compact slots: every sum is there."""
     rng = np.random.default_rng(0)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=Storage.EXACT)

@@ -21,7 +21,7 @@ from tests.support.one_pixel import BARE, COVERED, FLOOR, SCORE_SCALE, blank, di
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10_000), labels=st.integers(1, INSTANCE_SLOTS))
-def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) -> None:
+def test_update_matches_full_recursion_if_labels_fit(seed: int, labels: int) -> None:
     """With no more labels than slots, nothing is ever dropped, so posteriors are exact: eqs. [7] and [8]."""
     rng = np.random.default_rng(seed)
     classes = labels  # every class is named
@@ -49,7 +49,7 @@ def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) 
     assert best_class(evidence, 0) == np.argmax(class_log)
 
 
-def test_agrees_with_the_full_recursion_for_eighty_classes() -> None:
+def test_update_matches_full_recursion_for_80_classes() -> None:
     """More classes than slots: the argmax still agrees nearly always, and evictions are counted."""
     rng = np.random.default_rng(0)
     agree = 0
@@ -71,7 +71,7 @@ def test_agrees_with_the_full_recursion_for_eighty_classes() -> None:
     assert evictions > 0
 
 
-def test_a_voxel_under_two_masks_hears_both() -> None:
+def test_voxel_under_two_masks_gets_both_updates() -> None:
     evidence = blank()
     p = np.full((2, 3), 1 / 3)
     update_voxel(evidence, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), COVERED)
@@ -80,7 +80,7 @@ def test_a_voxel_under_two_masks_hears_both() -> None:
     assert found[2] == np.float32(np.log(0.5 / FLOOR))
 
 
-def test_absence_counts_only_against_instances_found_in_the_frame() -> None:
+def test_absence_counts_only_against_detected_instances() -> None:
     evidence = blank()
     one = np.full((1, 3), 1 / 3)
     update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), COVERED)
@@ -94,14 +94,14 @@ def test_absence_counts_only_against_instances_found_in_the_frame() -> None:
     assert best_instance(evidence, 0) == 0, "the rest has become more likely"
 
 
-def test_a_cluster_without_instance_says_nothing() -> None:
+def test_cluster_without_instance_adds_no_evidence() -> None:
     evidence = blank()
     update_voxel(evidence, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), COVERED)
     assert (evidence.instance_ids == 0).all()
     assert (evidence.class_ids == NO_CLASS).all()
 
 
-def test_class_gains_are_relative_to_the_classes_not_named() -> None:
+def test_class_gains_are_relative_to_unnamed_classes() -> None:
     p = np.array([[0.5, 0.2, 0.1, 0.06, 0.04, 0.03, 0.025, 0.02, 0.01, 0.009, 0.006]])
     relative, named, bits = named_classes(np.log(p), logarithmic=True)
     assert named.tolist() == [list(range(NEW_CLASSES))]
@@ -111,7 +111,7 @@ def test_class_gains_are_relative_to_the_classes_not_named() -> None:
     assert np.allclose(relative, np.log(p / rest), atol=1e-5)
 
 
-def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None:
+def test_full_slots_replace_least_likely_label() -> None:
     labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
     assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM, np.float32(9)) == 1
     assert labels.tolist() == [1, 2, 3, 4], "the newcomer itself is the least likely"
@@ -119,7 +119,7 @@ def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None
     assert dict(zip(labels.tolist(), logs.tolist(), strict=True)) == {1: 4, 9: 1.5, 3: 2, 4: 3}
 
 
-def test_the_likeliest_instance_that_counts_need_not_be_the_likeliest() -> None:
+def test_best_counted_instance_skips_uncounted() -> None:
     evidence = blank()
     evidence.instance_ids[0], evidence.instance_value[0] = [1, 5, 3, 2], [9, 4, 7, -1]
     counts = np.ones(6, np.bool_)
@@ -142,7 +142,7 @@ SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2
         (Combine.LATEST, False, 3, 2),
     ],
 )
-def test_the_other_rules(combine: Combine, weighed: bool, instance: int, label: int) -> None:
+def test_combine_rules_select_expected_labels(combine: Combine, weighed: bool, instance: int, label: int) -> None:
     evidence = blank()
     for ids, scores, classes in SEEN:
         update_voxel(evidence, 0, voted(ids, scores if weighed else [1.0], classes, combine), COVERED)
@@ -150,7 +150,7 @@ def test_the_other_rules(combine: Combine, weighed: bool, instance: int, label: 
     assert best_class(evidence, 0) == label
 
 
-def test_the_later_of_two_clusters_over_one_pixel_is_what_was_written_last() -> None:
+def test_latest_rule_uses_last_cluster_at_pixel() -> None:
     evidence = blank()
     update_voxel(evidence, 0, voted([1, 2], [1.0, 1.0], [4, 5], Combine.LATEST), COVERED)
     assert best_instance(evidence, 0) == 2
@@ -158,7 +158,7 @@ def test_the_later_of_two_clusters_over_one_pixel_is_what_was_written_last() -> 
     assert (evidence.instance_ids[0, 1:] == 0).all()
 
 
-def test_counts_are_counts() -> None:
+def test_sum_rule_counts_observations() -> None:
     evidence = blank()
     for _ in range(3):
         assert update_voxel(evidence, 0, voted([7], [1.0], [2], Combine.SUM), COVERED) == 0
@@ -167,7 +167,7 @@ def test_counts_are_counts() -> None:
     assert evidence.class_ids[0].tolist() == [2, *[NO_CLASS] * (CLASS_SLOTS - 1)]
 
 
-def test_small_numbers_saturate_and_do_not_wrap() -> None:
+def test_compact_scores_saturate_without_wrapping() -> None:
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
     said = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(max_score=MAX_SCORE)
     relative = np.zeros((2, 6))
@@ -180,7 +180,7 @@ def test_small_numbers_saturate_and_do_not_wrap() -> None:
 
 
 @pytest.mark.parametrize(("classes", "best"), [(2, 0.7), (3, 0.6), (9, 0.8), (80, 0.5)])
-def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classes: int, best: float) -> None:
+def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) -> None:
     """The same distribution 1000 times, its best class the last one and most of the rest on the first."""
     p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
@@ -194,7 +194,7 @@ def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classe
         assert best_class(evidence, 0) == classes - 1
 
 
-def test_both_kinds_of_integers_say_the_same() -> None:
+def test_packed_scores_match_in_int32_and_int64() -> None:
     """The largest relative that compact storage allows."""
     relative = np.array([[MAX_CLUSTER_SCORE, -MAX_CLUSTER_SCORE, 0.4, -0.6]])
     bits = np.zeros((1, NO_CLASS + 1), np.uint8)

@@ -77,7 +77,7 @@ def slow_election(fuser: BayesianTsdf, counts: np.ndarray, vertex: np.ndarray) -
 
 
 @pytest.mark.parametrize("dropped", [(), (2, 3)])
-def test_agrees_with_the_slow_one(fuser: BayesianTsdf, dropped: tuple[int, ...]) -> None:
+def test_vertex_labels_match_voxelwise_reference(fuser: BayesianTsdf, dropped: tuple[int, ...]) -> None:
     scene = fuser.scene
     counts = np.ones(scene.table.last_id + 1, np.bool_)
     counts[list(dropped)] = False
@@ -94,7 +94,7 @@ def test_agrees_with_the_slow_one(fuser: BayesianTsdf, dropped: tuple[int, ...])
     assert not set(dropped) & set(instances.tolist())
 
 
-def test_a_vertex_where_nothing_is_mapped_shows_nothing(fuser: BayesianTsdf) -> None:
+def test_vertex_in_unmapped_space_has_no_label(fuser: BayesianTsdf) -> None:
     scene = fuser.scene
     counts = np.ones(scene.table.last_id + 1, np.bool_)
     far = UnlabeledMesh(np.full((1, 3), 1e3, np.float32), np.zeros((0, 3), np.int32), np.zeros(1, np.int32))

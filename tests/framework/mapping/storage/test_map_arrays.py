@@ -46,7 +46,7 @@ def refused(kind: type[SceneMap], path: Path, changes: dict[str, np.ndarray]) ->
     return message
 
 
-def test_another_type_or_shape_is_refused(saved: tuple[type[SceneMap], Path]) -> None:
+def test_map_arrays_of_wrong_type_or_shape_raise(saved: tuple[type[SceneMap], Path]) -> None:
     kind, path = saved
     for name, array in content(path).items():
         if name != "header":
@@ -57,7 +57,7 @@ def test_another_type_or_shape_is_refused(saved: tuple[type[SceneMap], Path]) ->
             refused(kind, path, {name: array[:-1]})  # which of two arrays has the wrong length cannot be known
 
 
-def test_numbers_of_rows_instances_and_classes_that_there_are_not_are_refused(
+def test_map_arrays_with_invalid_ids_raise(
     saved: tuple[type[SceneMap], Path],
 ) -> None:
     kind, path = saved
@@ -80,7 +80,7 @@ def test_numbers_of_rows_instances_and_classes_that_there_are_not_are_refused(
     assert "block_coords" in refused(kind, path, {"block_coords": twice})
 
 
-def test_a_header_with_something_else_is_refused(saved: tuple[type[SceneMap], Path]) -> None:
+def test_map_header_with_invalid_values_raises(saved: tuple[type[SceneMap], Path]) -> None:
     kind, path = saved
     header: dict[str, Any] = json.loads(content(path)["header"].tobytes())
     others: dict[str, Any] = {"sensor": [1], "settings": [1], "voxel_size": 0, "classes": 3}
@@ -92,7 +92,7 @@ def test_a_header_with_something_else_is_refused(saved: tuple[type[SceneMap], Pa
         refused(kind, path, {"header": np.frombuffer(changed, np.uint8)})
 
 
-def test_a_header_that_lacks_something_is_refused(saved: tuple[type[SceneMap], Path]) -> None:
+def test_map_header_with_missing_key_raises(saved: tuple[type[SceneMap], Path]) -> None:
     kind, path = saved
     header: dict[str, Any] = json.loads(content(path)["header"].tobytes())
     for key in header.keys() - {"format"}:

@@ -30,7 +30,7 @@ def saved(tmp_path: Path) -> Path:
     return tmp_path / "map.npz"
 
 
-def test_header_and_arrays_come_back(saved: Path) -> None:
+def test_map_file_round_trip_keeps_header_and_arrays(saved: Path) -> None:
     header, arrays = read_map(saved, 7, list(ARRAYS))
     assert header.values == HEADER
     with np.load(saved) as file:
@@ -41,14 +41,14 @@ def test_header_and_arrays_come_back(saved: Path) -> None:
                 np.testing.assert_array_equal(found, array)
 
 
-def test_the_same_arrays_give_the_same_bytes(saved: Path, tmp_path: Path) -> None:
+def test_map_file_is_reproducible(saved: Path, tmp_path: Path) -> None:
     write_map(tmp_path / "again.npz", HEADER, {name: array.copy() for name, array in ARRAYS.items()})
     assert (tmp_path / "again.npz").read_bytes() == saved.read_bytes()
     with zipfile.ZipFile(saved) as archive:
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}, "the same at another time"
 
 
-def test_it_is_lightly_compressed(saved: Path) -> None:
+def test_map_file_is_lightly_compressed(saved: Path) -> None:
     with zipfile.ZipFile(saved) as archive:
         sizes = {info.filename: info.compress_size for info in archive.infolist()}
         few = archive.read("few.npy")
@@ -58,7 +58,7 @@ def test_it_is_lightly_compressed(saved: Path) -> None:
     assert sizes["few.npy"] == len(by_zlib.compress(few) + by_zlib.flush())
 
 
-def test_a_changed_byte_is_found(saved: Path) -> None:
+def test_map_file_changed_byte_raises(saved: Path) -> None:
     content = bytearray(saved.read_bytes())
     content[len(content) // 3] ^= 0x10
     saved.write_bytes(content)
@@ -66,6 +66,6 @@ def test_a_changed_byte_is_found(saved: Path) -> None:
         read_map(saved, 7, list(ARRAYS))
 
 
-def test_another_format_is_refused(saved: Path) -> None:
+def test_map_file_of_other_format_raises(saved: Path) -> None:
     with pytest.raises(DataError, match="it has map format 7, this version reads 8"):
         read_map(saved, 8, list(ARRAYS))

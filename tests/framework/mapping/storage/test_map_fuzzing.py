@@ -136,7 +136,7 @@ def odd_number(draw: st.DrawFn, dtype: np.dtype[Any]) -> Any:
     max_examples=EXAMPLES // 3, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
 )
 @given(data=st.data())
-def test_a_changed_map_is_used_or_refused(saved: Saved, data: st.DataObject) -> None:
+def test_map_fuzz_changed_content_loads_or_raises(saved: Saved, data: st.DataObject) -> None:
     arrays = dict(saved.arrays)
     for _ in range(data.draw(st.integers(1, 2))):
         if data.draw(st.booleans()):
@@ -152,7 +152,7 @@ def test_a_changed_map_is_used_or_refused(saved: Saved, data: st.DataObject) -> 
     max_examples=EXAMPLES // 3, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
 )
 @given(data=st.data())
-def test_a_damaged_file_is_used_or_refused(saved: Saved, data: st.DataObject) -> None:
+def test_map_fuzz_damaged_bytes_load_or_raise(saved: Saved, data: st.DataObject) -> None:
     """Bytes changed anywhere, headers of the archive and of its arrays among them."""
     content = bytearray(archive(saved.arrays))
     headers = [match.start() for match in re.finditer(rb"PK|\x93NUMPY", content)]
@@ -162,5 +162,5 @@ def test_a_damaged_file_is_used_or_refused(saved: Saved, data: st.DataObject) ->
     load_and_use(saved.path, bytes(content))
 
 
-def test_what_was_saved_is_used(saved: Saved) -> None:
+def test_map_fuzz_unchanged_file_loads(saved: Saved) -> None:
     assert load_and_use(saved.path, archive(saved.arrays)) == ""

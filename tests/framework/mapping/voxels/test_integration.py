@@ -39,7 +39,7 @@ def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) ->
     return seen.blocks, pixels
 
 
-def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
+def test_integration_of_one_frame_matches_reference() -> None:
     """Every voxel of the active blocks, in double precision and plain numpy."""
     frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
     integrator = new_integrator()
@@ -77,7 +77,7 @@ def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
 
 
 @pytest.mark.parametrize("promised", [100_000, 10], ids=["reserved", "memory is counted by what is asked for"])
-def test_a_frame_that_sees_more_blocks_takes_no_memory_that_was_reserved(
+def test_integration_reuses_reserved_memory_for_more_blocks(
     monkeypatch: pytest.MonkeyPatch, promised: int
 ) -> None:
     monkeypatch.setattr(integration, "reserved", lambda most, make: make(min(most, promised)))
@@ -99,7 +99,7 @@ def near_pixels(seen: SeenBlocks) -> list[int]:
     return sorted(p for first, count in parts for p in seen.near_pixel[first : first + count].tolist())
 
 
-def test_every_voxel_near_the_surface_is_seen() -> None:
+def test_integration_allocates_blocks_near_surface() -> None:
     """Blocks are allocated for the whole band, not only where a ray happens to pass."""
     frame = room().frame(pose())
     integrator = new_integrator()
@@ -114,14 +114,14 @@ def test_every_voxel_near_the_surface_is_seen() -> None:
     )
 
 
-def test_averages_have_no_rounding_bias() -> None:
+def test_rounding_averages_are_unbiased() -> None:
     """A constant that is no multiple of the stored unit is met on average, though values are stored as integers."""
     rounding = [(k * GOLDEN) % 1.0 for k in range(1, 1001)]
     assert abs(np.mean(np.floor(0.3 + np.array(rounding))) - 0.3) < 0.01
 
 
 @pytest.mark.parametrize("frame_number", [987, 2584, 121393])
-def test_rounding_does_not_wrap_round(frame_number: int) -> None:
+def test_rounding_does_not_wrap_around(frame_number: int) -> None:
     """At these frames frac(k * GOLDEN) is all but 1; air at the widest truncation stays air and white stays white."""
     assert (frame_number * GOLDEN) % 1.0 > 0.9995
     scene = room()
@@ -144,7 +144,7 @@ def channels(packed: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("depth", [0.0, 0.1, 7.0])
-def test_readings_outside_the_range_of_the_sensor_allocate_nothing(depth: float) -> None:
+def test_readings_outside_sensor_range_allocate_no_blocks(depth: float) -> None:
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), np.full(CAMERA.shape, depth, np.float32), CAMERA)
     integrator = new_integrator()
     integrator.integrate(frame, np.eye(4), VOXEL)
@@ -164,7 +164,7 @@ def test_readings_outside_the_range_of_the_sensor_allocate_nothing(depth: float)
         ({"voxel_size": 1e-3}, 9e3, FrameError, "sees 90[0-9.]+ m from the origin"),
     ],
 )
-def test_what_one_frame_asks_for_is_limited_before_memory_is(
+def test_frame_exceeding_limits_raises_before_allocation(
     options: dict[str, float], T: float, error: type[Exception], said: str
 ) -> None:
     volume = assemble(VoxelHashing, max_blocks=1000, **options).new_volume()
@@ -181,7 +181,7 @@ def test_what_one_frame_asks_for_is_limited_before_memory_is(
         tracemalloc.stop()
 
 
-def test_color_belongs_to_the_surface_and_not_to_the_air_before_it() -> None:
+def test_color_is_stored_only_near_surface() -> None:
     frame = room().frame(pose())
     frame.color[:] = (10, 200, 90)
     sensor = SENSOR._replace(truncation_slope=np.float32(0.0))
@@ -194,7 +194,7 @@ def test_color_belongs_to_the_surface_and_not_to_the_air_before_it() -> None:
     assert (grid.color[active][air] == 0).all()
 
 
-def test_air_has_no_color_to_be_averaged_with() -> None:
+def test_air_color_is_not_averaged() -> None:
     """A wall comes nearer to where air was seen before: its color is its own, not a mixture with black."""
     integrator = new_integrator()
     for depth, frames in ((1.5, 5), (1.4, 13)):
@@ -208,7 +208,7 @@ def test_air_has_no_color_to_be_averaged_with() -> None:
     assert np.abs(channels(packed[packed > 0]) - 200).max() <= 0.25
 
 
-def test_old_surfaces_give_way_at_the_greatest_weight() -> None:
+def test_weight_is_limited_to_maximum() -> None:
     """The weight stops at max_weight, in the stored unit, at the highest that may be set too."""
     frame = room().frame(pose())
     for most in (3.0, 255.0):
@@ -242,7 +242,7 @@ def test_noise_averages_out() -> None:
     assert np.std(np.concatenate(errors)) == pytest.approx(0.01 / np.sqrt(40), rel=0.15)
 
 
-def test_carving_removes_what_is_seen_through() -> None:
+def test_carving_removes_objects_seen_through() -> None:
     """A sphere that is taken away disappears from the map once the wall behind it has been seen often enough."""
     scene, empty = room(), room()
     empty.spheres = []
@@ -265,7 +265,7 @@ def test_carving_removes_what_is_seen_through() -> None:
     assert before > 0
 
 
-def test_the_map_does_not_depend_on_the_number_of_threads() -> None:
+def test_integration_is_independent_of_thread_count() -> None:
     def integrated() -> list[bytes]:
         integrator = new_integrator()
         for k, T in enumerate(walk(4)):

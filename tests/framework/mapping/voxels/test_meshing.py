@@ -73,7 +73,7 @@ def slow_surface_nets(stored: np.ndarray, most_jump: float) -> tuple[dict, set]:
     return vertices, quads
 
 
-def test_equals_the_definition_cell_by_cell() -> None:
+def test_surface_nets_match_reference() -> None:
     """A random field with steps, voxels never seen and blocks that are absent, across the origin of coordinates."""
     rng = np.random.default_rng(5)
     side, origin = 24, (-1, -2, 7)
@@ -115,7 +115,7 @@ def sphere() -> VoxelGrid:
     return grid_of(stored, blocks, (0, 0, 0))
 
 
-def test_a_sphere_is_closed_and_faces_outwards(sphere: VoxelGrid) -> None:
+def test_surface_nets_sphere_is_closed_and_faces_outward(sphere: VoxelGrid) -> None:
     vertices, triangles, _ = SurfaceNets(sphere).extract()
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     assert len(np.unique(edges, axis=0)) == len(edges), "no edge is run through twice in one direction"
@@ -133,7 +133,7 @@ def copied(surface: UnlabeledMesh) -> UnlabeledMesh:
     return UnlabeledMesh(*(array.copy() for array in surface))
 
 
-def test_only_changed_blocks_are_read_again(sphere: VoxelGrid) -> None:
+def test_surface_nets_reread_only_changed_blocks(sphere: VoxelGrid) -> None:
     """A block that is written without a word keeps its old surface; named, it and its neighbors get the new one."""
     nets = SurfaceNets(sphere)
     before = copied(nets.extract())
@@ -154,7 +154,7 @@ def test_only_changed_blocks_are_read_again(sphere: VoxelGrid) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_the_number_of_threads_changes_nothing(sphere: VoxelGrid, threads: int) -> None:
+def test_surface_nets_are_independent_of_thread_count(sphere: VoxelGrid, threads: int) -> None:
     if threads > numba.config.NUMBA_NUM_THREADS:
         pytest.skip(f"this machine runs at most {numba.config.NUMBA_NUM_THREADS} threads")
     expected = SurfaceNets(sphere).extract()
@@ -194,7 +194,7 @@ def equal(ours: InstanceMesh, theirs: InstanceMesh) -> bool:
     return all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in MESH_ARRAYS)
 
 
-def test_updates_equal_extraction_from_scratch() -> None:
+def test_mesh_updates_match_full_extraction() -> None:
     """After every frame and every merge, to the last bit, while blocks, instances and what counts keep changing."""
     updated, asked_late = (assemble(BayesianTsdf, voxel_size=0.019, max_depth=4.0) for _ in range(2))
     sizes, named = [], []
@@ -221,7 +221,7 @@ def test_updates_equal_extraction_from_scratch() -> None:
     assert same_mesh(updated.scene)
 
 
-def test_the_mesh_of_a_furnished_room_lies_on_its_surface() -> None:
+def test_mesh_of_furnished_room_lies_on_surface() -> None:
     """Exact poses, no noise, 1 cm voxels: median 0.1 voxel, 95 % within 0.5 voxel, and next to nothing is missing."""
     sequence = Synthetic(kind=RoomKind.LIVING_ROOM, frames=240, stride=12, noise=0.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.01)

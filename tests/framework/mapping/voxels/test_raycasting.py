@@ -27,7 +27,7 @@ def mapped(scene: Scene, poses: list[np.ndarray]) -> VoxelGrid:
 
 
 @pytest.mark.parametrize("slant", [0.0, 0.4, 0.8, 1.1])
-def test_depth_of_a_slanted_plane_is_unbiased(slant: float) -> None:
+def test_raycast_slanted_plane_depth_is_unbiased(slant: float) -> None:
     """Half-pixel and half-voxel faults show as a bias that changes sign with the slant."""
     n = np.array([np.sin(slant), 0.3, -np.cos(slant)]) / np.linalg.norm([np.sin(slant), 0.3, -np.cos(slant)])
     scene = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.8]))])
@@ -43,7 +43,7 @@ def test_depth_of_a_slanted_plane_is_unbiased(slant: float) -> None:
     assert np.median(view.normals_world[both] @ n) > 0.999
 
 
-def test_noise_does_not_push_a_far_wall_away() -> None:
+def test_raycast_noisy_distant_wall_is_unbiased() -> None:
     """Readings too near and too far must weigh alike around a surface, where noise is wider than a voxel."""
     voxel, depth = 0.01, 4.0
     sensor = Sensor(*map(np.float32, (4 * voxel, 0.01, 0.2, 5.0, 200.0, 1.5)))
@@ -58,7 +58,7 @@ def test_noise_does_not_push_a_far_wall_away() -> None:
     assert abs(np.median(seen[seen > 0]) - depth) < 0.2 * voxel
 
 
-def test_depth_of_spheres_and_coverage() -> None:
+def test_raycast_spheres_have_accurate_depth_without_holes() -> None:
     scene = room()
     voxels = mapped(scene, walk(30))
     T = walk(30)[15]
@@ -73,7 +73,7 @@ def test_depth_of_spheres_and_coverage() -> None:
     assert (view.class_ids == -1).all()
 
 
-def test_views_from_outside_and_of_an_empty_map() -> None:
+def test_raycast_from_outside_or_of_empty_map_is_empty() -> None:
     voxels = mapped(room(), [pose()])
     evidence = EvidenceRows(voxels).evidence
     away = render(voxels, evidence, SENSOR, CAMERA, pose(rotvec=(0, np.pi, 0)))
@@ -86,7 +86,7 @@ def test_views_from_outside_and_of_an_empty_map() -> None:
 
 
 @pytest.mark.parametrize("d", [0.0, -0.0, 1e-20, -1e-20])
-def test_a_ray_along_a_slab_leaves_it_by_another_side(d: float) -> None:
+def test_leave_cell_axis_parallel_ray_exits_other_side(d: float) -> None:
     """A ray on a block face must not advance in steps of a thousandth of a voxel.
 
     The middle column of a camera with cx at a pixel center has such rays.
@@ -98,7 +98,7 @@ def test_a_ray_along_a_slab_leaves_it_by_another_side(d: float) -> None:
 
 
 @pytest.mark.parametrize("d", [0.3, -0.3])
-def test_a_slanted_ray_leaves_its_cell_by_the_nearest_border(d: float) -> None:
+def test_leave_cell_slanted_ray_exits_nearest_border(d: float) -> None:
     direction = tuple(np.float32([d, 0.0, 1.0]))
     start = tuple(np.float32([0.02 if d < 0 else 0.14, 0.0, 0.0]))
     side = np.float32(0.16)
@@ -107,7 +107,7 @@ def test_a_slanted_ray_leaves_its_cell_by_the_nearest_border(d: float) -> None:
 
 
 @pytest.mark.parametrize("k", range(6))
-def test_bounds_and_interpolation_lose_nothing(k: int) -> None:
+def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
     """Every pixel searched from the nearest to the farthest depth shows no surface that is missed otherwise."""
     voxels = mapped(room(), [pose()])
     camera = Camera(161, 119, 90.0, 95.0, 70.0, 61.0) if k % 2 else CAMERA
@@ -124,7 +124,7 @@ def test_bounds_and_interpolation_lose_nothing(k: int) -> None:
 
 
 @pytest.mark.parametrize("sparse", ["every pixel", "every fourth column", "one in ten"])
-def test_what_has_a_reading_is_found_near_it(sparse: str) -> None:
+def test_raycast_near_readings_finds_surface(sparse: str) -> None:
     """Also where the readings miss all the coarse rays."""
     voxels = mapped(room(), [pose()])
     T = pose(0.1, -0.05, 0.1, (0.05, 0.1, 0.0))
@@ -143,7 +143,7 @@ def test_what_has_a_reading_is_found_near_it(sparse: str) -> None:
     assert np.quantile(np.abs(depth - exhaustive)[found], 0.99) < 0.05 * VOXEL
 
 
-def test_nothing_is_seen_beyond_the_sensors_reach() -> None:
+def test_raycast_ignores_surface_beyond_sensor_range() -> None:
     """Of a map that a farther-sighted sensor has made."""
     voxels = mapped(room(), [pose()])
     farthest = cast_view(voxels, SENSOR, CAMERA, pose())[0].max()
@@ -163,7 +163,7 @@ def every_ray(voxels: VoxelGrid, T: np.ndarray, camera: Camera = CAMERA) -> np.n
     return depth[:-1, :-1]
 
 
-def test_a_block_beside_the_camera_does_not_unbound_every_tile() -> None:
+def test_tile_bounds_ignore_block_beside_camera() -> None:
     voxels = mapped(room(), walk(3))
     voxels.allocate(np.int32([[0, 2, 0]]))  # 32 cm below the camera, out of view
     voxels.grid.solid[voxels.block_count - 1] = True

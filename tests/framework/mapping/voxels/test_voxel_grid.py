@@ -21,7 +21,7 @@ def look_up(grid, coords):
     return found
 
 
-def test_every_block_is_found_by_its_coordinates_and_no_other() -> None:
+def test_find_block_returns_only_allocated_blocks() -> None:
     rng = np.random.default_rng(0)
     coords = rng.integers(-3000, 3000, (5000, 3)).astype(np.int32)
     voxels = VoxelGrid(0.01, 0.05, 100_000)
@@ -37,7 +37,7 @@ def test_every_block_is_found_by_its_coordinates_and_no_other() -> None:
 
 
 @pytest.mark.parametrize("promised", [64, 100_000])
-def test_growing_keeps_what_is_stored(promised: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxel_grid_growth_keeps_content(promised: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the system promises memory for all blocks, nothing need be copied; some promise less."""
     monkeypatch.setattr(voxel_grid, "reserved", lambda most, make: make(min(most, promised)))
     voxels = VoxelGrid(0.01, 0.05, 100_000)
@@ -49,7 +49,7 @@ def test_growing_keeps_what_is_stored(promised: int, monkeypatch: pytest.MonkeyP
     assert (voxels.grid.tsdf[1:8000] == UNSEEN).all()
 
 
-def test_less_is_reserved_where_memory_is_counted_by_what_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reserved_memory_is_smaller_under_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     def make(length: int) -> int:
         if length > 3000:
             raise MemoryError
@@ -65,7 +65,7 @@ def test_less_is_reserved_where_memory_is_counted_by_what_is_asked_for(monkeypat
     assert reserved(2000, make) == FIRST_RESERVED
 
 
-def test_the_budget_is_an_error_that_names_the_setting() -> None:
+def test_voxel_grid_over_budget_raises() -> None:
     voxels = VoxelGrid(0.01, 0.05, 10)
     with pytest.raises(MapFullError, match=r"fuser\.max_blocks"):
         voxels.allocate(np.arange(33, dtype=np.int32).reshape(11, 3))
