@@ -34,7 +34,7 @@ pytestmark = pytest.mark.integration
 STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
 
 
-def test_a_mapper_makes_the_map_of_a_run(room: CornerRoom) -> None:
+def test_mapper_map_equals_pipeline_map(room: CornerRoom) -> None:
     mapper = Mapper(*STAGES)
     poses = [mapper.add(frame) for frame in room]
     assert not any(pose.lost for pose in poses)
@@ -50,7 +50,7 @@ def test_a_mapper_makes_the_map_of_a_run(room: CornerRoom) -> None:
     assert list(mapper.instances()) == list(result.scene.instances()) != []
 
 
-def test_mapper_detection_interval_is_that_of_a_run(room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mapper_detection_interval_detects_every_nth_frame(room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     mapper = Mapper(*STAGES, detection_interval=3)
     detector, detected = mapper.pipeline.detector, []
     detect = detector.detect
@@ -61,7 +61,7 @@ def test_mapper_detection_interval_is_that_of_a_run(room: CornerRoom, monkeypatc
     assert {record.visible for record in mapper.scene.table.records.values()} == {2}
 
 
-def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) -> None:
+def test_mapper_add_unusable_frame_keeps_map_unchanged(room: CornerRoom) -> None:
     mapper = Mapper(*STAGES)
     mapper.add(room[0])
     before = mapper.scene.mesh().vertices
@@ -72,7 +72,7 @@ def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) 
 
 
 @pytest.mark.parametrize("fuser", ["bayesian_tsdf", "open3d_vbg", "object_volumes", "class_only_fusion"])
-def test_what_a_sensor_tells_is_up_in_the_map_and_in_its_file(fuser: str, tmp_path: Path) -> None:
+def test_mapper_sensor_up_direction_is_saved_in_map(fuser: str, tmp_path: Path) -> None:
     """A camera over a slanted table alone, which surfaces take for level; the tracker's world is the first frame."""
     tilt = np.radians(20)
     up = np.array([np.sin(tilt), -np.cos(tilt) * np.sin(1.0), -np.cos(tilt) * np.cos(1.0)])  # in the first camera
@@ -96,7 +96,7 @@ def test_what_a_sensor_tells_is_up_in_the_map_and_in_its_file(fuser: str, tmp_pa
     assert again.up_source() == "sensor"
 
 
-def test_several_threads_share_a_mapper(room: CornerRoom) -> None:
+def test_mapper_is_thread_safe(room: CornerRoom) -> None:
     """Without the lock the kernels write over each other's buffers, and the process dies."""
     mapper, alone, faults = Mapper(*STAGES), Mapper(*STAGES), []
 
@@ -125,7 +125,7 @@ def test_several_threads_share_a_mapper(room: CornerRoom) -> None:
 
 
 @pytest.mark.parametrize("fuser", ["bayesian_tsdf", "object_volumes", "class_only_fusion"])
-def test_a_mapper_is_pickled(room: CornerRoom, fuser: str) -> None:
+def test_mapper_pickle_round_trip_continues_mapping(room: CornerRoom, fuser: str) -> None:
     mapper = Mapper(*STAGES, f"fuser={fuser}")
     mapper.add(room[0])
     pickled = pickle.dumps(mapper)
@@ -136,7 +136,7 @@ def test_a_mapper_is_pickled(room: CornerRoom, fuser: str) -> None:
     np.testing.assert_array_equal(copied.scene.mesh().vertices, mapper.scene.mesh().vertices)
 
 
-def test_what_is_no_frame_is_told() -> None:
+def test_mapper_add_none_raises() -> None:
     with pytest.raises(DataError, match=r"Mapper\.add takes a Frame, or color and depth, found NoneType alone"):
         Mapper(*STAGES).add(None)  # type: ignore[arg-type]
 
@@ -155,13 +155,13 @@ def test_what_is_no_frame_is_told() -> None:
         (None, "Mapper takes words such as 'fuser.voxel_size=0.02', found None"),
     ],
 )
-def test_a_name_or_a_value_that_there_is_not_is_one_line(override: Any, said: str) -> None:
+def test_mapper_invalid_override_raises_one_line_error(override: Any, said: str) -> None:
     with pytest.raises(ConfigError, match=said.replace("?", r"\?")) as refused:
         Mapper(*STAGES, override)
     assert "\n" not in str(refused.value)
 
 
-def test_it_works_inside_of_another_program_that_uses_hydra(tmp_path: Path) -> None:
+def test_mapper_works_inside_hydra_application(tmp_path: Path) -> None:
     (tmp_path / "theirs.yaml").write_text("theirs: 1\n")
     with initialize_config_dir(str(tmp_path), version_base="1.3"):
         Mapper(*STAGES)
@@ -169,7 +169,7 @@ def test_it_works_inside_of_another_program_that_uses_hydra(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("fuser", registered.names("fuser"))
-def test_any_map_is_read_back(fuser: str, room: CornerRoom, tmp_path: Path) -> None:
+def test_load_map_restores_map_of_any_fuser(fuser: str, room: CornerRoom, tmp_path: Path) -> None:
     config = composed("~dataset", f"fuser={fuser}", "fuser.voxel_size=0.04")
     made: MapFuser = build(MapFuser, config.fuser)
     detector = registered.built("detector", "ground_truth")
@@ -184,13 +184,13 @@ def test_any_map_is_read_back(fuser: str, room: CornerRoom, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("place", [None, 7])
-def test_a_place_that_is_no_path_is_told(place: Any) -> None:
+def test_save_map_invalid_path_raises(place: Any) -> None:
     with pytest.raises(DataError, match=f"a map is saved to a path, found {place}"):
         Mapper(*STAGES).scene.save(place)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"[]"])
-def test_what_is_no_map_is_told_in_one_line(content: bytes, tmp_path: Path) -> None:
+def test_load_map_other_file_raises(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "map.npz").write_bytes(content)
     with pytest.raises(DataError, match=r"map\.npz is not a map that can be read"):
         load_map(tmp_path / "map.npz")
@@ -199,7 +199,7 @@ def test_what_is_no_map_is_told_in_one_line(content: bytes, tmp_path: Path) -> N
         load_map(tmp_path / "others.npz")
 
 
-def test_a_damaged_map_is_told_in_one_line(room: CornerRoom, tmp_path: Path) -> None:
+def test_load_map_damaged_file_raises_data_error(room: CornerRoom, tmp_path: Path) -> None:
     mapper = Mapper(*STAGES)
     mapper.add(room[0])
     mapper.scene.save(tmp_path / "map.npz")
@@ -214,12 +214,12 @@ def test_a_damaged_map_is_told_in_one_line(room: CornerRoom, tmp_path: Path) -> 
             assert "map.npz" in str(error)
 
 
-def test_configs_are_those_of_the_command() -> None:
+def test_api_configs_match_command() -> None:
     assert (CONF / "config.yaml").exists()
     assert composed("dataset=synthetic").fuser.voxel_size == composed("~dataset").fuser.voxel_size
 
 
-def test_the_help_is_a_page_to_work_from() -> None:
+def test_instancemap_help_lists_public_api() -> None:
     done = subprocess.run(
         [sys.executable, "-c", "import instancemap; help(instancemap)"], capture_output=True, text=True, check=True
     )
@@ -227,7 +227,7 @@ def test_the_help_is_a_page_to_work_from() -> None:
         assert words in done.stdout
 
 
-def test_another_package_in_the_way_is_named(tmp_path: Path) -> None:
+def test_import_names_conflicting_framework_package(tmp_path: Path) -> None:
     (tmp_path / "framework").mkdir()
     (tmp_path / "framework" / "__init__.py").touch()
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import instancemap"

@@ -43,17 +43,17 @@ def frame(**changes: Any) -> Frame:
 
 
 @pytest.mark.parametrize("index", [1.5, "a", -5, None, True])
-def test_a_frames_index_is_a_whole_number(index: object) -> None:
+def test_frame_invalid_index_raises(index: object) -> None:
     with pytest.raises(DataError, match=r"Frame\.index must be a whole number, 0 or more, found"):
         frame(index=index)
 
 
-def test_numpys_numbers_are_numbers() -> None:
+def test_camera_and_frame_accept_numpy_scalars() -> None:
     camera = Camera(np.int64(4), np.int32(3), np.float32(5), np.float64(5), np.int64(1), 1)  # type: ignore[arg-type]
     assert frame(index=np.int64(3), timestamp=np.float32(1), camera=camera).index == 3
 
 
-def test_up_in_a_frame_is_a_unit_vector() -> None:
+def test_frame_up_must_be_unit_vector() -> None:
     np.testing.assert_array_equal(frame(up=np.array([0.6, -0.8, 0.0])).up, [0.6, -0.8, 0.0])
     for wrong, said in (
         ([0.0, -9.81, 0.0], "a unit vector, found one of length 9.81"),
@@ -65,18 +65,18 @@ def test_up_in_a_frame_is_a_unit_vector() -> None:
 
 
 @pytest.mark.parametrize("camera", [None, (4, 3, 5.0, 5.0, 1.5, 1.0)])
-def test_a_frames_camera_is_a_camera(camera: object) -> None:
+def test_frame_invalid_camera_type_raises(camera: object) -> None:
     with pytest.raises(DataError, match="frame 7: camera must be a Camera, found"):
         frame(camera=camera)
 
 
 @pytest.mark.parametrize(("name", "value"), [("width", "160"), ("height", 3.0), ("fx", None), ("cy", True)])
-def test_a_camera_is_made_of_numbers(name: str, value: object) -> None:
+def test_camera_non_numeric_value_raises(name: str, value: object) -> None:
     with pytest.raises(DataError, match=rf"Camera\.{name} must be a (whole )?number of px, found"):
         replace(CAMERA, **{name: value})
 
 
-def test_read_only_images_are_copied_and_others_are_not() -> None:
+def test_frame_copies_only_read_only_images() -> None:
     """Read-only arrays would compile the kernels again."""
     depth = np.ones((3, 4), np.float32)
     assert frame(depth=depth).depth is depth
@@ -125,7 +125,7 @@ def with_nan(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
     return array
 
 
-def test_sound_data_pass() -> None:
+def test_valid_data_objects_are_accepted() -> None:
     assert len(detections()) == len(clusters()) == 2
     assert len(Detections.none((3, 4), ("chair",))) == 0
     frame()
@@ -173,13 +173,15 @@ def test_sound_data_pass() -> None:
         (mesh, {"triangles": [[0, 1, 2]]}, "triangles must be an array of int32, found list"),
     ],
 )
-def test_unsound_data_are_refused_in_one_line(make: Callable[..., object], changes: dict[str, Any], said: str) -> None:
+def test_invalid_data_objects_raise_one_line_error(
+    make: Callable[..., object], changes: dict[str, Any], said: str
+) -> None:
     with pytest.raises(DataError, match=said) as caught:
         make(**changes)
     assert "\n" not in str(caught.value)
 
 
-def test_an_instance_has_a_mesh_of_its_own() -> None:
+def test_instance_mesh_of_instance_has_only_its_vertices() -> None:
     """The quad 0 1 2 3, of which the instance has all but vertex 1."""
     whole = mesh(
         vertices=np.arange(12, dtype=np.float32).reshape(4, 3),
@@ -197,7 +199,7 @@ def test_an_instance_has_a_mesh_of_its_own() -> None:
     assert own.instance_ids.tolist() == [5, 5, 5]
 
 
-def test_a_frame_takes_views_of_images_and_hands_out_whole_ones() -> None:
+def test_frame_converts_image_views_to_contiguous_arrays() -> None:
     """bgr[..., ::-1] is a view that the kernels could not read."""
     bgr = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
     depth = np.ones((4, 3), np.float32).T
@@ -208,7 +210,7 @@ def test_a_frame_takes_views_of_images_and_hands_out_whole_ones() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"width": 0}, {"fx": 0.0}, {"fy": -3.0}, {"cx": np.nan}, {"cy": np.inf}])
-def test_a_camera_checks_itself(wrong: dict[str, float]) -> None:
+def test_camera_out_of_range_value_raises(wrong: dict[str, float]) -> None:
     numbers = {"width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "cx": 1.5, "cy": 1.0}
     with pytest.raises(DataError, match="Camera"):
         Camera(**(numbers | wrong))  # type: ignore[arg-type]
@@ -229,19 +231,19 @@ def test_a_camera_checks_itself(wrong: dict[str, float]) -> None:
         ({"width": 10**9, "height": 10**9}, "at most 33554432 px, not 1000000000x1000000000"),
     ],
 )
-def test_a_camera_that_there_cannot_be_is_refused(wrong: dict[str, float], said: str) -> None:
+def test_camera_implausible_intrinsics_raise(wrong: dict[str, float], said: str) -> None:
     numbers = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5}
     with pytest.raises(DataError, match=said):
         Camera(**(numbers | wrong))  # type: ignore[arg-type]
 
 
-def test_parts_of_an_image_and_wide_and_long_lenses_are_cameras() -> None:
+def test_camera_accepts_crops_and_extreme_lenses() -> None:
     Camera(1, 1, 525.0, 525.0, -319.5, 239.5)  # its last pixel, alone
     Camera(640, 480, 60.0, 60.0, 319.5, 239.5)  # 160 degrees
     Camera(640, 480, 20000.0, 20000.0, 319.5, 239.5)  # 2 degrees
 
 
-def test_a_pose_is_rigid_within_the_digits_that_files_carry() -> None:
+def test_pose_rigidity_check_tolerates_rounding() -> None:
     rounded = np.round(exp_se3(np.array([1, 2, 3, 0.3, -0.7, 0.2])), 4)
     Pose(rounded)
     with pytest.raises(DataError, match="not a rigid transform"):
@@ -259,7 +261,7 @@ def deferred(render: Callable[[], np.ndarray], shape: tuple[int, int] = (3, 4)) 
     return DeferredTruth(render, shape, {1: "chair"}, origin="somewhere")
 
 
-def test_truth_is_rendered_when_it_is_asked_for_and_not_before() -> None:
+def test_deferred_truth_is_rendered_on_first_access() -> None:
     calls: list[int] = []
 
     def render() -> np.ndarray:
@@ -278,7 +280,7 @@ def test_truth_is_rendered_when_it_is_asked_for_and_not_before() -> None:
     assert calls == [1]
 
 
-def test_truth_that_many_threads_ask_for_is_rendered_once() -> None:
+def test_deferred_truth_is_rendered_once_for_all_threads() -> None:
     calls: list[int] = []
     entered, gate = threading.Event(), threading.Event()
 
@@ -298,7 +300,7 @@ def test_truth_that_many_threads_ask_for_is_rendered_once() -> None:
     assert all(ids is found[0] for ids in found)
 
 
-def test_what_rendering_raises_is_raised_where_truth_is_asked_for() -> None:
+def test_deferred_truth_render_error_is_raised_on_access() -> None:
     outcomes: list[DataError | np.ndarray] = [DataError("the mesh is gone"), np.ones((3, 4), np.int32)]
 
     def render() -> np.ndarray:
@@ -315,11 +317,11 @@ def test_what_rendering_raises_is_raised_where_truth_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.ones((4, 3), np.int32), np.ones((3, 4), np.int64)], ids=["shape", "dtype"])
-def test_what_is_rendered_is_checked(wrong: np.ndarray) -> None:
+def test_deferred_truth_invalid_image_raises(wrong: np.ndarray) -> None:
     with pytest.raises(DataError, match=r"DeferredTruth\.instance_ids must"):
         _ = deferred(lambda: wrong).instance_ids
 
 
-def test_deferred_truth_of_another_shape_is_refused_before_it_is_rendered() -> None:
+def test_frame_deferred_truth_shape_mismatch_raises_unrendered() -> None:
     with pytest.raises(DataError, match=r"frame 7: truth.instance_ids must have shape \(3, 4\), found \(2, 2\)"):
         frame(truth=deferred(lambda: pytest.fail("rendered"), (2, 2)))

@@ -25,7 +25,7 @@ def hat(xi: np.ndarray) -> np.ndarray:
 
 
 @given(twists)
-def test_exp_se3_is_the_matrix_exponential(xi: np.ndarray) -> None:
+def test_exp_se3_equals_matrix_exponential(xi: np.ndarray) -> None:
     np.testing.assert_allclose(geometry.exp_se3(xi), expm(hat(xi)), atol=1e-12)
 
 
@@ -36,32 +36,32 @@ def test_exp_se3_is_exact_at_small_and_large_angles(angle: float) -> None:
 
 
 @given(twists)
-def test_inverse_cancels(xi: np.ndarray) -> None:
+def test_inverse_times_transform_is_identity(xi: np.ndarray) -> None:
     T = geometry.exp_se3(xi)
     np.testing.assert_allclose(geometry.inverse(T) @ T, np.eye(4), atol=1e-12)
 
 
 @given(twists, arrays(np.float64, (5, 3), elements=st.floats(-10, 10, width=32)))
-def test_transform_is_the_homogeneous_product(xi: np.ndarray, points: np.ndarray) -> None:
+def test_transform_equals_homogeneous_product(xi: np.ndarray, points: np.ndarray) -> None:
     T = geometry.exp_se3(xi)
     expected = (np.c_[points, np.ones(5)] @ T.T)[:, :3]
     np.testing.assert_allclose(geometry.transform(T, points), expected, atol=1e-11)
     assert geometry.transform(T, points.astype(np.float32)).dtype == np.float32
 
 
-def test_skew_is_the_cross_product() -> None:
+def test_skew_equals_cross_product() -> None:
     v, w = np.array([1.0, -2.0, 3.0]), np.array([0.5, 4.0, -1.0])
     np.testing.assert_allclose(geometry.skew(v) @ w, np.cross(v, w))
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-6, 0.3, 3.0, np.pi])
-def test_rotation_angle(angle: float) -> None:
+def test_rotation_angle_matches_rotation_vector(angle: float) -> None:
     R = Rotation.from_rotvec(angle * np.array([2.0, -1.0, 2.0]) / 3).as_matrix()
     assert geometry.rotation_angle(R) == pytest.approx(angle, rel=1e-9, abs=1e-15)
 
 
 @given(arrays(np.float64, (3, 3), elements=st.floats(-1, 1, width=32)))
-def test_nearest_rotation_is_a_rotation_and_no_other_is_nearer(noise: np.ndarray) -> None:
+def test_nearest_rotation_minimizes_distance(noise: np.ndarray) -> None:
     M = np.eye(3) + 0.3 * noise
     R = geometry.nearest_rotation(M)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
@@ -72,7 +72,7 @@ def test_nearest_rotation_is_a_rotation_and_no_other_is_nearer(noise: np.ndarray
             assert np.linalg.norm(M - R) <= np.linalg.norm(M - other) + 1e-12
 
 
-def test_nearest_rotation_of_a_reflection_is_no_reflection() -> None:
+def test_nearest_rotation_of_reflection_is_rotation() -> None:
     assert np.linalg.det(geometry.nearest_rotation(np.diag([1.0, 1.0, -1.0]))) == pytest.approx(1)
 
 
@@ -86,14 +86,14 @@ def test_project_inverts_back_project_at_every_pixel() -> None:
     np.testing.assert_allclose(geometry.project(CAMERA, points), pixels, atol=1e-4)
 
 
-def test_the_principal_point_is_a_pixel_center() -> None:
+def test_principal_point_is_pixel_center() -> None:
     camera = Camera(3, 3, 10.0, 10.0, 1.0, 1.0)
     center = geometry.back_project(camera, np.array([[1, 1]], np.int32), np.array([2.0], np.float32))
     np.testing.assert_array_equal(center, [[0, 0, 2]])
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.25, 2.0])
-def test_a_scaled_camera_sees_the_same_rays(factor: float) -> None:
+def test_scaled_camera_keeps_rays(factor: float) -> None:
     """Pixel k of the half image covers pixels 2k and 2k + 1: their mean ray is its ray."""
     scaled = CAMERA.scaled(factor)
     point = np.array([[0.3, -0.2, 1.5]])
@@ -102,7 +102,7 @@ def test_a_scaled_camera_sees_the_same_rays(factor: float) -> None:
 
 
 @given(twists, arrays(np.float64, (3, 3), elements=st.floats(-1, 1, width=32)))
-def test_nearest_rigid_removes_the_rounding_of_a_published_pose(xi: np.ndarray, noise: np.ndarray) -> None:
+def test_nearest_rigid_removes_rounding_of_pose(xi: np.ndarray, noise: np.ndarray) -> None:
     T = geometry.exp_se3(xi)
     rounded = T.copy()
     rounded[:3, :3] += 1e-4 * noise
@@ -112,7 +112,7 @@ def test_nearest_rigid_removes_the_rounding_of_a_published_pose(xi: np.ndarray, 
     np.testing.assert_array_equal(repaired[:, 3], T[:, 3])
 
 
-def test_nearest_rigid_keeps_an_exact_pose_to_the_last_bit() -> None:
+def test_nearest_rigid_keeps_exact_pose_unchanged() -> None:
     T = geometry.exp_se3(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
     np.testing.assert_array_equal(geometry.nearest_rigid(T), T)
 
@@ -128,13 +128,13 @@ def test_nearest_rigid_keeps_an_exact_pose_to_the_last_bit() -> None:
         (np.array([[1e200, -1e200, 0, 0], [1e200, 1e200, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "not rigid"),
     ],
 )
-def test_nearest_rigid_refuses_what_is_no_pose(matrix: np.ndarray, why: str) -> None:
+def test_nearest_rigid_non_rigid_matrix_raises(matrix: np.ndarray, why: str) -> None:
     with pytest.raises(DataError, match=why):
         geometry.nearest_rigid(matrix)
 
 
 @given(twists, twists)
-def test_interpolate_starts_at_a_ends_at_b_and_moves_evenly(xi_a: np.ndarray, xi_b: np.ndarray) -> None:
+def test_interpolate_moves_evenly_between_poses(xi_a: np.ndarray, xi_b: np.ndarray) -> None:
     T_a, T_b = geometry.exp_se3(xi_a), geometry.exp_se3(xi_b)
     np.testing.assert_allclose(geometry.interpolate(T_a, T_b, 0), T_a, atol=1e-12)
     np.testing.assert_allclose(geometry.interpolate(T_a, T_b, 1), T_b, atol=1e-7)  # half turns are ill-conditioned

@@ -63,7 +63,7 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
         ("--experimental-r=config.pickle", ["--experimental-rerun reads a pickle, which may bring code"]),
     ],
 )
-def test_a_fault_is_one_line_and_a_status(tmp_path: Path, override: str, said: list[str]) -> None:
+def test_run_invalid_override_exits_with_one_line_error(tmp_path: Path, override: str, said: list[str]) -> None:
     done = start(tmp_path, override)
     assert done.returncode == 1
     assert done.stdout == ""
@@ -73,13 +73,13 @@ def test_a_fault_is_one_line_and_a_status(tmp_path: Path, override: str, said: l
         assert words in done.stderr
 
 
-def test_stages_are_looked_at_before_a_dataset_that_may_take_long(tmp_path: Path) -> None:
+def test_run_checks_stages_before_dataset(tmp_path: Path) -> None:
     done = start(tmp_path, "fuser.capacity=abc", "dataset.frames=many")
     assert "'abc'" in done.stderr
     assert "'many'" not in done.stderr
 
 
-def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> None:
+def test_run_escapes_invalid_unicode_file_names(tmp_path: Path) -> None:
     camera = {"width": 4, "height": 4, "fx": 4, "fy": 4, "cx": 2, "cy": 2, "depth_scale": 1000}
     (tmp_path / "camera.json").write_text(json.dumps(camera))
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
@@ -93,7 +93,7 @@ def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> No
         assert f"frame skipped: {tmp_path}/color/\\udcff_0.png is neither a JPEG nor a PNG file" in said
 
 
-def test_a_working_folder_that_is_gone_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_removed_working_folder_exits_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
@@ -102,7 +102,7 @@ def test_a_working_folder_that_is_gone_is_one_line(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(("options", "at"), [([], None), (["--config-dir", "conf"], -1), (["-cd=conf"], -1)])
-def test_modules_are_not_looked_for_in_the_working_folder(
+def test_working_folder_is_not_in_module_search_path(
     options: list[str], at: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With --config-dir, of `python -m framework` and of the console script, they are, but last."""
@@ -120,7 +120,7 @@ def test_modules_are_not_looked_for_in_the_working_folder(
     assert sys.path == [str(CHECKOUT)], "where the project itself is"
 
 
-def test_a_place_that_cannot_be_made_is_told_in_one_line(tmp_path: Path) -> None:
+def test_run_directory_creation_error_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "outputs").touch()
     line = command("seed=0")
     done = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=120)
@@ -129,14 +129,14 @@ def test_a_place_that_cannot_be_made_is_told_in_one_line(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("sweep", [False, True])
-def test_a_place_without_a_name_is_refused(tmp_path: Path, sweep: bool) -> None:
+def test_run_empty_output_directory_is_rejected(tmp_path: Path, sweep: bool) -> None:
     done = start(tmp_path, f"hydra.{'sweep' if sweep else 'run'}.dir=", "seed=0", sweep=sweep)
     assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
     assert "dir is empty" in done.stderr
     assert not list(tmp_path.iterdir())
 
 
-def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+def test_run_debug_shows_traceback(tmp_path: Path) -> None:
     done = start(tmp_path, "dataset.frames=many", "debug=true")
     assert done.returncode == 1
     assert "Traceback (most recent call last)" in done.stderr
@@ -147,7 +147,7 @@ def words(*arguments: str, directory: Path) -> subprocess.CompletedProcess[str]:
     return completed(directory, *arguments)
 
 
-def test_help_lists_the_commands_and_each_is_there(tmp_path: Path) -> None:
+def test_help_lists_all_commands(tmp_path: Path) -> None:
     done = words("--help", directory=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     for name, says in COMMANDS.items():
@@ -155,7 +155,7 @@ def test_help_lists_the_commands_and_each_is_there(tmp_path: Path) -> None:
         assert find_spec(module_of(name))
 
 
-def test_a_misspelt_command_suggests_the_nearest(tmp_path: Path) -> None:
+def test_misspelled_command_suggests_nearest_name(tmp_path: Path) -> None:
     done = words("tabels", "outputs", directory=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "error: there is no command 'tabels'; did you mean tables?\n"
@@ -186,7 +186,7 @@ FAULTY = {
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"doctor"}))  # whose findings are no faults of its own
-def test_debug_shows_where_a_fault_of_any_command_comes_from(
+def test_debug_shows_traceback_of_any_command(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "old").mkdir()
@@ -207,7 +207,7 @@ def test_debug_shows_where_a_fault_of_any_command_comes_from(
     assert not (tmp_path / "debug=true").exists()
 
 
-def test_a_run_leaves_its_record(tmp_path: Path) -> None:
+def test_run_writes_record(tmp_path: Path) -> None:
     done = start(tmp_path, "dataset.unreadable=1", "dataset.frames=4")
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
@@ -220,7 +220,7 @@ def test_a_run_leaves_its_record(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sh closes the streams")
-def test_a_run_with_closed_streams_leaves_its_record(tmp_path: Path) -> None:
+def test_run_with_closed_streams_writes_record(tmp_path: Path) -> None:
     line = command(f"hydra.run.dir={tmp_path}")
     closed = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *line]
     assert subprocess.run(closed, cwd=tmp_path, env=environment(), check=False).returncode == 0
@@ -231,7 +231,7 @@ def test_a_run_with_closed_streams_leaves_its_record(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("words", [["--help"], ["plugins", "viewer", "none"]], ids=" ".join)
-def test_output_that_cannot_be_written_is_one_line(words: list[str], tmp_path: Path) -> None:
+def test_command_output_error_is_one_line(words: list[str], tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         line = [sys.executable, "-m", "framework", *words]
         done = subprocess.run(
@@ -241,7 +241,7 @@ def test_output_that_cannot_be_written_is_one_line(words: list[str], tmp_path: P
     assert re.fullmatch(r"error: .*No space left on device\n", done.stderr), done.stderr
 
 
-def test_a_failed_job_does_not_stop_a_sweep(tmp_path: Path) -> None:
+def test_sweep_continues_after_failed_job(tmp_path: Path) -> None:
     done = start(tmp_path, "dataset.frames=2,many,1", "seed=0", sweep=True)
     assert done.returncode == 1
     assert done.stderr.count("ERROR") == 1
@@ -254,14 +254,14 @@ def test_a_failed_job_does_not_stop_a_sweep(tmp_path: Path) -> None:
     assert done.stderr.count("overview.png, and beside it mesh.ply, instances.json") == 2, "a line a run"
 
 
-def test_a_misspelt_name_in_a_sweep_is_told_before_the_first_job(tmp_path: Path) -> None:
+def test_sweep_rejects_misspelled_name_before_first_job(tmp_path: Path) -> None:
     done = start(tmp_path, "detector=fake,fakke", sweep=True)
     assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
     assert "there is no detector=fakke" in done.stderr
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
-def test_ctrl_c_writes_what_there_is_and_marks_it(tmp_path: Path) -> None:
+def test_ctrl_c_writes_partial_record(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{}")  # of an earlier run into the same directory
     line = command(f"hydra.run.dir={tmp_path}", "dataset.frames=100000", "dataset.slow_s=0.02")
     with subprocess.Popen(line, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True) as process:
@@ -282,7 +282,7 @@ def test_ctrl_c_writes_what_there_is_and_marks_it(tmp_path: Path) -> None:
     assert 0 < metrics["frames"] < 100000
 
 
-def test_a_full_map_is_a_partial_run_and_an_error(tmp_path: Path) -> None:
+def test_full_map_writes_partial_record_and_exits_with_error(tmp_path: Path) -> None:
     done = start(tmp_path, "fuser.capacity=2")
     assert done.returncode == 3
     assert "raise fuser.capacity" in done.stderr.splitlines()[-1]

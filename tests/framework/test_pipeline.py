@@ -50,7 +50,7 @@ def mapped(result: RunResult) -> GridMap:
 
 
 @PREFETCH
-def test_maps_every_frame_in_order(room: CornerRoom, prefetch: int) -> None:
+def test_pipeline_maps_all_frames_in_order(room: CornerRoom, prefetch: int) -> None:
     result = pipeline(prefetch).run(room)
     assert (result.frames, result.frames_lost, result.frames_skipped, result.stopped_by) == (6, 0, 0, None)
     assert [frame.index for frame in result.tracked] == list(range(6))
@@ -65,7 +65,7 @@ def test_maps_every_frame_in_order(room: CornerRoom, prefetch: int) -> None:
     assert all(time.milliseconds >= 0 for time in result.timings)
 
 
-def test_timed_fuser_adds_times_of_a_stage(room: CornerRoom) -> None:
+def test_pipeline_sums_fuser_stage_times(room: CornerRoom) -> None:
     @dataclass
     class Timed(GridFuser):
         def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
@@ -83,7 +83,7 @@ def test_timed_fuser_adds_times_of_a_stage(room: CornerRoom) -> None:
 
 
 @PREFETCH
-def test_detection_interval_detects_every_nth_frame(prefetch: int) -> None:
+def test_pipeline_detection_interval_detects_every_nth_frame(prefetch: int) -> None:
     @dataclass
     class Keeps(GridFuser):
         def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
@@ -97,20 +97,20 @@ def test_detection_interval_detects_every_nth_frame(prefetch: int) -> None:
     assert len(result.tracked) == len(mapped(result).vertices) == 7
 
 
-def test_worker_threads_change_nothing(room: CornerRoom) -> None:
+def test_pipeline_map_is_independent_of_prefetch(room: CornerRoom) -> None:
     meshes = [mapped(pipeline(prefetch, fuser=GridFuser(slow_s=0.002)).run(room)).mesh() for prefetch in (0, 1, 4)]
     for mesh in meshes[1:]:
         for name in ("vertices", "triangles", "colors", "instance_ids"):
             np.testing.assert_array_equal(getattr(mesh, name), getattr(meshes[0], name))
 
 
-def test_frame_indices_are_those_of_the_sequence() -> None:
+def test_pipeline_keeps_sequence_frame_indices() -> None:
     result = pipeline().run(CornerRoom(frames=9, start=1, stop=8, stride=3))
     assert [frame.index for frame in result.tracked] == [1, 4, 7]
 
 
 @PREFETCH
-def test_an_unreadable_frame_is_skipped(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_pipeline_skips_unreadable_frame(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
     result = pipeline(prefetch).run(CornerRoom(unreadable=2))
     assert (result.frames, result.frames_skipped) == (6, 1)
     assert [frame.index for frame in result.tracked] == [0, 1, 3, 4, 5]
@@ -118,12 +118,12 @@ def test_an_unreadable_frame_is_skipped(prefetch: int, caplog: pytest.LogCapture
 
 
 @PREFETCH
-def test_a_frame_that_the_detector_refuses_is_skipped(room: CornerRoom, prefetch: int) -> None:
+def test_pipeline_skips_frame_after_detector_frame_error(room: CornerRoom, prefetch: int) -> None:
     result = pipeline(prefetch, detector=SphereDetector(broken_at=0)).run(room)
     assert (result.frames_skipped, len(result.tracked)) == (1, 5)
 
 
-def test_a_frame_that_a_later_stage_refuses_is_skipped(room: CornerRoom) -> None:
+def test_pipeline_skips_frame_after_refiner_frame_error(room: CornerRoom) -> None:
     @dataclass
     class Refuses(KeepAll):
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
@@ -135,7 +135,7 @@ def test_a_frame_that_a_later_stage_refuses_is_skipped(room: CornerRoom) -> None
     assert (result.frames, result.frames_skipped, len(mapped(result).vertices)) == (6, 1, 5)
 
 
-def test_true_masks_are_not_refined_and_made_up_pixels_end_the_run(room: CornerRoom) -> None:
+def test_pipeline_refines_only_inexact_masks_and_checks_pixels(room: CornerRoom) -> None:
     @dataclass
     class Exact(SphereDetector):
         def detect(self, frame: Frame) -> Detections:
@@ -159,7 +159,7 @@ def test_true_masks_are_not_refined_and_made_up_pixels_end_the_run(room: CornerR
         ("refiner", "refine", "a refiner must return PointClusters"),
     ],
 )
-def test_a_stage_that_forgets_to_return_is_told(
+def test_pipeline_stage_returning_none_raises(
     room: CornerRoom, monkeypatch: pytest.MonkeyPatch, stage: str, verb: str, said: str
 ) -> None:
     stages = pipeline(prefetch=0)
@@ -168,7 +168,7 @@ def test_a_stage_that_forgets_to_return_is_told(
         stages.run(room)
 
 
-def test_many_skipped_frames_do_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_pipeline_limits_log_of_skipped_frames(caplog: pytest.LogCaptureFixture) -> None:
     @dataclass
     class MostlyBroken(CornerRoom):
         def __getitem__(self, k: int) -> Frame:
@@ -182,14 +182,14 @@ def test_many_skipped_frames_do_not_flood_the_log(caplog: pytest.LogCaptureFixtu
     assert caplog.records[-1].message == "39 frames skipped in all"
 
 
-def test_a_sequence_without_a_usable_frame_is_an_error() -> None:
+def test_pipeline_without_usable_frame_raises() -> None:
     with pytest.raises(DataError, match="none of the 1 frames can be used"):
         pipeline().run(CornerRoom(frames=1, unreadable=0))
     with pytest.raises(DataError, match="no frames to map"):
         pipeline().run(CornerRoom(start=6))
 
 
-def test_lost_frames_are_counted_and_not_fused(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+def test_pipeline_counts_lost_frames_without_fusion(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
     result = pipeline(tracker=GivenPose(lost_from=2, lost_to=5)).run(room)
     assert (result.frames, result.frames_lost, len(mapped(result).vertices)) == (6, 3, 3)
     assert [frame.pose.lost for frame in result.tracked] == [False, False, True, True, True, False]
@@ -200,7 +200,7 @@ def test_lost_frames_are_counted_and_not_fused(room: CornerRoom, caplog: pytest.
     assert {time.frame for time in result.timings if time.stage == "fusion"} == {0, 1, 5}
 
 
-def test_a_run_that_maps_nothing_is_an_error_that_says_what_became_of_its_frames() -> None:
+def test_pipeline_empty_map_raises_with_frame_summary() -> None:
     fuser = assemble(BayesianTsdf, min_depth=50.0, max_depth=60.0)
     with pytest.raises(DataError) as caught:
         pipeline(tracker=GivenPose(lost_from=0, lost_to=3), fuser=fuser).run(CornerRoom(unreadable=5))
@@ -211,7 +211,7 @@ def test_a_run_that_maps_nothing_is_an_error_that_says_what_became_of_its_frames
 
 
 @PREFETCH
-def test_other_errors_surface_and_leave_no_thread(prefetch: int) -> None:
+def test_pipeline_error_leaves_no_threads(prefetch: int) -> None:
     before = threading.active_count()
     with pytest.raises(DataError, match="no true pose"):
         pipeline(prefetch, detector=_Blind()).run(CornerRoom(truth=False))
@@ -226,7 +226,7 @@ class _Blind(SphereDetector):
         return Detections.none(frame.camera.shape, self.classes)
 
 
-def test_no_detections_and_overlapping_masks_are_mapped(room: CornerRoom) -> None:
+def test_pipeline_accepts_no_detections_and_overlapping_masks(room: CornerRoom) -> None:
     @dataclass
     class Doubled(SphereDetector):
         def detect(self, frame: Frame) -> Detections:
@@ -238,7 +238,7 @@ def test_no_detections_and_overlapping_masks_are_mapped(room: CornerRoom) -> Non
     assert set(mapped(pipeline(detector=Doubled()).run(room)).instances()) == {3, 4}
 
 
-def test_a_full_map_ends_the_run_with_what_there_is(room: CornerRoom) -> None:
+def test_pipeline_full_map_returns_partial_result(room: CornerRoom) -> None:
     result = pipeline(fuser=GridFuser(capacity=4)).run(room)
     assert isinstance(result.stopped_by, MapFullError)
     assert (result.frames, len(mapped(result).vertices)) == (5, 4)
@@ -254,7 +254,7 @@ class _Fails(GridFuser):
         super().fuse(frame, pose, clusters, timer)
 
 
-def test_a_fault_is_raised_and_what_it_left_is_there_for_who_asks(room: CornerRoom) -> None:
+def test_run_to_any_end_returns_partial_result_after_error(room: CornerRoom) -> None:
     with pytest.raises(MemoryError, match="40 GiB"):
         pipeline(fuser=_Fails()).run(room)
     result = pipeline(fuser=_Fails()).run_to_any_end(room)
@@ -275,7 +275,7 @@ class ForgetsOnce(GivenPose):
         return {}
 
 
-def test_a_fault_of_the_last_place_keeps_the_map(room: CornerRoom) -> None:
+def test_run_to_any_end_keeps_map_after_keyframes_error(room: CornerRoom) -> None:
     result = pipeline(tracker=ForgetsOnce()).run_to_any_end(room)
     assert isinstance(result.stopped_by, MemoryError)
     assert (result.frames, len(result.tracked)) == (6, 6)
@@ -285,7 +285,7 @@ def test_a_fault_of_the_last_place_keeps_the_map(room: CornerRoom) -> None:
 
 
 @PREFETCH
-def test_a_fault_before_anything_is_in_the_map_is_raised(room: CornerRoom, prefetch: int) -> None:
+def test_run_to_any_end_with_empty_map_raises(room: CornerRoom, prefetch: int) -> None:
     for stages in (
         {"detector": FaultyDetector(at=0)},
         {"tracker": GivenPose(lost_to=3), "detector": FaultyDetector(at=3)},
@@ -314,7 +314,7 @@ def working_threads() -> int:
 
 
 @PREFETCH
-def test_ctrl_c_ends_the_run_after_the_frame(room: CornerRoom, prefetch: int) -> None:
+def test_ctrl_c_ends_pipeline_after_current_frame(room: CornerRoom, prefetch: int) -> None:
     handler, threads = signal.getsignal(signal.SIGINT), working_threads()
     result = pipeline(prefetch, tracker=PressesCtrlC()).run(room)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
@@ -323,13 +323,13 @@ def test_ctrl_c_ends_the_run_after_the_frame(room: CornerRoom, prefetch: int) ->
     assert working_threads() == threads
 
 
-def test_a_second_ctrl_c_ends_it_at_once(room: CornerRoom) -> None:
+def test_second_ctrl_c_ends_pipeline_immediately(room: CornerRoom) -> None:
     result = pipeline(tracker=PressesCtrlC(times=2)).run(room)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
     assert len(mapped(result).vertices) == 3
 
 
-def test_runs_outside_the_main_thread(room: CornerRoom) -> None:
+def test_pipeline_runs_outside_main_thread(room: CornerRoom) -> None:
     results: list[RunResult] = []
     thread = threading.Thread(target=lambda: results.append(pipeline().run(room)))
     thread.start()
@@ -375,9 +375,7 @@ def pretend_cores(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("prefetch", [2, 3])
-def test_a_detector_that_can_is_given_two_frames_at_once_and_they_are_read_and_mapped_in_order(
-    prefetch: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_concurrent_detector_gets_two_frames_in_order(prefetch: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pretend_cores(2, monkeypatch)
     threads = working_threads()
     result = pipeline(prefetch, detector=_InPairs()).run(_OneReader())
@@ -388,7 +386,7 @@ def test_a_detector_that_can_is_given_two_frames_at_once_and_they_are_read_and_m
     assert working_threads() == threads
 
 
-def test_a_detector_that_can_is_given_one_frame_at_a_time_where_there_are_no_cores_or_threads_for_more(
+def test_concurrent_detector_is_serial_on_one_core(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     @dataclass
@@ -405,20 +403,20 @@ def test_a_detector_that_can_is_given_one_frame_at_a_time_where_there_are_no_cor
         found.clear()
 
 
-def test_ahead_is_checked() -> None:
+def test_pipeline_parameter_out_of_range_raises() -> None:
     with pytest.raises(ConfigError, match="prefetch"):
         pipeline(prefetch=-1)
     with pytest.raises(ConfigError, match="detection_interval"):
         pipeline(detection_interval=0)
 
 
-def test_quiet_when_not_a_terminal(room: CornerRoom, capfd: pytest.CaptureFixture[str]) -> None:
+def test_pipeline_prints_no_output_without_terminal(room: CornerRoom, capfd: pytest.CaptureFixture[str]) -> None:
     logging.getLogger("framework").setLevel(logging.INFO)
     pipeline().run(room)
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_program_without_a_console_maps(room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pipeline_runs_without_stderr(room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", None)  # as under pythonw
     assert pipeline().run(room).frames == len(room)
 
@@ -445,7 +443,7 @@ class Listener(Viewer):
 
 
 @PREFETCH
-def test_a_viewer_hears_of_every_frame_in_order(prefetch: int, tmp_path: Path) -> None:
+def test_viewer_receives_all_frames_in_order(prefetch: int, tmp_path: Path) -> None:
     @dataclass
     class GetsLost(GivenPose):
         def track(self, frame: Frame, scene: SceneMap) -> Pose:
@@ -464,7 +462,7 @@ def test_a_viewer_hears_of_every_frame_in_order(prefetch: int, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("stages", [{"fuser": GridFuser(capacity=2)}, {"detector": SphereDetector(broken_at=0)}])
-def test_a_viewer_hears_of_the_end_however_it_comes(room: CornerRoom, stages: dict[str, object]) -> None:
+def test_viewer_end_is_called_once_for_any_end(room: CornerRoom, stages: dict[str, object]) -> None:
     listener = Listener()
     pipeline(viewer=listener, **stages).run_to_any_end(room)
     assert listener.heard[-1] == "end"
@@ -473,7 +471,7 @@ def test_a_viewer_hears_of_the_end_however_it_comes(room: CornerRoom, stages: di
 
 @PREFETCH
 @pytest.mark.parametrize("verb", ["show", "skip", "end"])
-def test_a_viewer_that_fails_takes_nothing_from_the_run(
+def test_failing_viewer_does_not_affect_run(
     verb: str, prefetch: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> None:
@@ -491,7 +489,7 @@ def test_a_viewer_that_fails_takes_nothing_from_the_run(
     assert verb == "end" or listener.heard[-1] == "end"
 
 
-def test_a_viewer_hears_of_the_end_of_what_cannot_be_mapped() -> None:
+def test_viewer_end_is_called_after_unusable_sequence() -> None:
     listener = Listener()
     with pytest.raises(DataError):
         pipeline(viewer=listener).run(CornerRoom(frames=1, unreadable=0))

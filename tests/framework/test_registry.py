@@ -131,7 +131,7 @@ def fault(**parameters: object) -> str:
     return message
 
 
-def test_parameters_get_the_types_of_their_fields() -> None:
+def test_build_converts_parameters_to_field_types() -> None:
     built = detector(threshold=1, storage="compact", limit="${limit}", name=3)
     assert built == Probe(Path("w.bin"), 1.0, 3, Storage.compact, "3")
     assert isinstance(built, Probe)
@@ -139,11 +139,11 @@ def test_parameters_get_the_types_of_their_fields() -> None:
     assert isinstance(built.threshold, float)
 
 
-def test_defaults_of_the_class_hold_where_the_config_is_silent() -> None:
+def test_build_uses_class_defaults_for_missing_parameters() -> None:
     assert detector() == Probe(Path("w.bin"))
 
 
-def test_the_parameters_of_a_part_are_the_plugins_own() -> None:
+def test_build_flattens_parameters_of_parts() -> None:
     expected = Assembled(Path("w.bin"), limit=4, suppression=Suppression(nms=0.25), size=5)
     assert detector(_target_=f"{HERE}.Assembled", limit=4, nms=0.25, size=5) == expected
     assert assemble(Assembled, weights=Path("w.bin"), limit=4, nms=0.25, size=5) == expected
@@ -187,23 +187,23 @@ def test_the_parameters_of_a_part_are_the_plugins_own() -> None:
     ],
     ids=str,
 )
-def test_every_fault_is_one_line(parameters: dict[str, object], said: list[str]) -> None:
+def test_build_invalid_parameters_raise_one_line_error(parameters: dict[str, object], said: list[str]) -> None:
     message = fault(**parameters)
     for words in said:
         assert words in message
 
 
-def test_the_plugins_own_error_keeps_its_type_and_gets_a_name() -> None:
+def test_build_plugin_error_keeps_type_and_adds_name() -> None:
     with pytest.raises(DataError, match=r"detector build_targets\.Probe: w\.bin is not there"):
         detector(name="absent")
 
 
-def test_a_missing_choice_is_told() -> None:
+def test_build_missing_choice_raises() -> None:
     with pytest.raises(ConfigError, match="choose detector=NAME"):
         build(Detector, OmegaConf.create({"detector": None})["detector"])
 
 
-def test_a_module_that_fails_at_import_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_find_class_import_failure_raises_one_line_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
     tracker = "class Tracker: pass\n"
     (tmp_path / "needs_more.py").write_text(f"import surely_not_installed\n{tracker}")
@@ -236,7 +236,7 @@ def talkative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 @pytest.mark.usefixtures("talkative")
-def test_what_no_option_registers_is_not_imported(
+def test_build_does_not_import_unregistered_target(
     target: str, said: str, hydra_runs: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The options are those of Hydra's search path, also where a stored config is read and no Hydra runs."""
@@ -248,12 +248,12 @@ def test_what_no_option_registers_is_not_imported(
     assert capfd.readouterr() == ("", "")
 
 
-def test_inside_of_another_program_that_uses_hydra_its_options_do_not_matter(tmp_path: Path) -> None:
+def test_build_inside_hydra_application_ignores_its_options(tmp_path: Path) -> None:
     with initialize_config_dir(str(tmp_path), version_base="1.3"):
         assert detector() == Probe(Path("w.bin"))
 
 
-def test_another_package_called_plugins_is_named(tmp_path: Path) -> None:
+def test_conflicting_plugins_package_is_reported(tmp_path: Path) -> None:
     (tmp_path / "plugins").mkdir()
     (tmp_path / "plugins" / "__init__.py").write_text("print('imported')\n")
     line = [sys.executable, "-m", "framework", "plugins"]
@@ -266,12 +266,12 @@ def test_another_package_called_plugins_is_named(tmp_path: Path) -> None:
     assert "imported" not in done.stdout
 
 
-def test_every_stage_has_its_interface() -> None:
+def test_registry_has_interface_for_each_stage() -> None:
     assert list(STAGES) == ["dataset", "detector", "tracker", "refiner", "fuser"]
     assert list(GROUPS) == [*STAGES, "viewer"]
 
 
-def test_a_video_of_the_wrong_kind_is_named() -> None:
+def test_find_class_wrong_video_kind_raises() -> None:
     """`check` and `detect` want frames in any order; a run takes a live video as well."""
     live = "tests.support.scenes.corner_room.LiveRoom"
     assert find_class(RGBDVideo, live).__name__ == "LiveRoom"

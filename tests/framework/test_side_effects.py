@@ -147,15 +147,15 @@ def changes(code: str, path: Path, before: str = "", **variables: str) -> list[s
     return list(json.loads(done.stdout.splitlines()[-1]))
 
 
-def test_library_use_changes_no_process_state(tmp_path: Path) -> None:
+def test_library_use_keeps_process_state(tmp_path: Path) -> None:
     assert changes(USE, tmp_path) == []
 
 
-def test_library_use_in_a_hydra_application_changes_nothing(tmp_path: Path) -> None:
+def test_library_use_in_hydra_application_keeps_process_state(tmp_path: Path) -> None:
     assert changes(USE, tmp_path, HYDRA_APPLICATION) == []
 
 
-def test_probe_detects_changes_of_every_kind(tmp_path: Path) -> None:
+def test_probe_detects_all_kinds_of_changes(tmp_path: Path) -> None:
     code = OTHERS + "print(json.dumps(sorted(before)))"
     assert set(changes("import hydra.core.plugins\n" + code, tmp_path)) >= {
         "environ", "random", "numpy.random", "torch.random", "numba threads", "torch threads", "cv2 threads", "pools",
@@ -195,7 +195,7 @@ def test_configure_process_after_numba_is_imported_warns(before: str) -> None:
     assert ("OMP_WAIT_POLICY" in done.stderr) == bool(before)
 
 
-def test_configure_process_with_negative_threads_is_refused() -> None:
+def test_configure_process_with_negative_threads_raises() -> None:
     with pytest.raises(ConfigError, match="threads"):
         configure_process(threads=-1)
 
@@ -212,7 +212,7 @@ print(numba.threading_layer(), stages.fuser.scene.statistics.voxels)
 """
 
 
-def test_pipeline_without_thread_safe_layer_detects_in_one_thread() -> None:
+def test_detection_without_thread_safe_layer_is_single_threaded() -> None:
     found = {}
     for layer in ("omp", "workqueue"):
         done = subprocess.run(

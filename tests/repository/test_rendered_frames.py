@@ -35,7 +35,9 @@ def test_cached_frames_equal_rendered_frames(
         assert dict(one.truth.class_names) == dict(other.truth.class_names)
 
 
-def test_different_frames_have_separate_cache_entries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sequence: Synthetic) -> None:
+def test_different_frames_have_separate_cache_entries(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sequence: Synthetic
+) -> None:
     monkeypatch.setattr(platformdirs, "user_cache_dir", lambda name: str(tmp_path))
     for index in (0, 1):
         rendered_frames(sequence, [index])

@@ -113,7 +113,9 @@ def test_damaged_recording_check_names_setting(
         ({"poses_late": -3, "depth_late": -3}, f"{POSES}-3 {DELAY}-3"),
     ],
 )
-def test_desk_with_changed_convention_check_names_setting(tmp_path: Path, damage: Mapping[str, Any], setting: str) -> None:
+def test_desk_with_changed_convention_check_names_setting(
+    tmp_path: Path, damage: Mapping[str, Any], setting: str
+) -> None:
     place = write_damaged(tmp_path / "damaged", DESK, **damage)
     assert " ".join(settings(check(RgbdFolder(place), FARTHEST).findings)) == setting
 

@@ -28,13 +28,13 @@ LINES = [line for line in catalog.LIST.read_text().splitlines() if line and not 
 
 
 @pytest.mark.parametrize("kernel", listed(DEFAULT, OTHERS), ids=lambda kernel: f"{kernel.module}.{kernel.name}")
-def test_what_is_listed_is_there(kernel: Kernel) -> None:
+def test_listed_kernels_exist(kernel: Kernel) -> None:
     assert isinstance(kernel.dispatcher, Dispatcher)
     assert line_of(kernel.dispatcher, kernel.signature) in LINES
     assert len(kernel.signature) == kernel.dispatcher.py_func.__code__.co_argcount
 
 
-def test_types_are_written_as_they_are_read() -> None:
+def test_kernel_signature_text_round_trip_is_exact() -> None:
     frozen = np.zeros((2, 2), np.float32)
     frozen.flags.writeable = False
     column = np.zeros((2, 2))[:, 1:]
@@ -48,7 +48,7 @@ def test_types_are_written_as_they_are_read() -> None:
 
 
 @pytest.mark.acceptance
-def test_runs_call_what_is_listed() -> None:
+def test_runs_call_only_listed_kernels() -> None:
     """The demo, a room, each other refiner, fuser and tracker: `python -m tests.support.kernel_calls` updates it."""
     if missing := [kernel for kernel in listed(DEFAULT, OTHERS) if not kernel.is_compiled()]:
         compile_all(missing)  # as `make test` does
@@ -99,7 +99,7 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return callee
 
 
-def test_a_kernel_is_compiled_once_and_again_when_one_that_it_calls_has_changed(small: Path) -> None:
+def test_kernel_is_recompiled_after_callee_change(small: Path) -> None:
     kernel = Kernel("kernel_caller", "small", "int64")
     assert not kernel.is_compiled()
     compile_all([kernel])
@@ -126,14 +126,14 @@ def test_index_with_renamed_class_is_deleted(small: Path, tmp_path: Path, monkey
     assert other.is_compiled()
 
 
-def test_a_kernel_that_cannot_be_compiled_is_named(small: Path) -> None:
+def test_compile_all_faulty_kernel_raises_with_name(small: Path) -> None:
     good = Kernel("kernel_caller", "small", "int64")
     with pytest.raises(DataError, match=r"kernel_caller\.faulty cannot be compiled: TypingError"):
         compile_all([Kernel("kernel_caller", "faulty", "int64"), good])
     assert good.is_compiled()
 
 
-def test_a_worker_that_ends_is_told(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compile_all_ended_worker_raises(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         catalog,
         "_worker",
@@ -143,7 +143,7 @@ def test_a_worker_that_ends_is_told(small: Path, monkeypatch: pytest.MonkeyPatch
         compile_all([Kernel("kernel_caller", "small", "int64")])
 
 
-def test_who_comes_second_waits_and_compiles_nothing(
+def test_compile_for_run_waits_for_other_process(
     small: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     kernel = Kernel("kernel_caller", "small", "int64")

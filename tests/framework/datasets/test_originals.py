@@ -88,7 +88,9 @@ def test_openni_1_records_are_complete(originals: Path) -> None:
 
 
 @pytest.mark.parametrize(("size", "end", "count"), [(2124473, 2124446, 12), (2_000_000, 1950114, 11)])
-def test_openni_1_recording_without_end_is_truncated(originals: Path, tmp_path: Path, size: int, end: int, count: int) -> None:
+def test_openni_1_recording_without_end_is_truncated(
+    originals: Path, tmp_path: Path, size: int, end: int, count: int
+) -> None:
     path = tmp_path / "cut.oni"
     path.write_bytes((originals / "oni/test.oni").read_bytes()[:size])
     contents = read_contents(path)
@@ -120,7 +122,9 @@ def test_openni_1_recording_plays_completely(originals: Path, tmp_path: Path) ->
 
 
 @played
-def test_openni_1_recording_is_converted_and_mapped(originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_openni_1_recording_is_converted_and_mapped(
+    originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     convert(originals / "oni/test.oni", tmp_path / "011")
     assert capsys.readouterr().out.startswith(f"{tmp_path / '011'}: 12 frames; left out are 0 images of color and 0")
     (tmp_path / "intrinsic").mkdir()

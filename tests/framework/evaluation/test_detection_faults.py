@@ -43,7 +43,7 @@ def counted(*frames: Detections) -> dict[str, float]:
     return faults.table()
 
 
-def test_the_truth_has_no_faults() -> None:
+def test_detection_faults_of_ground_truth_are_zero() -> None:
     table = counted(detections((CHAIR, 0, 0.8), (BED, 1, 0.6)))
     for name in (
         "found",
@@ -60,7 +60,7 @@ def test_the_truth_has_no_faults() -> None:
     assert table["score, standard deviation"] == pytest.approx(0.1)
 
 
-def test_a_mask_that_takes_in_a_neighbor() -> None:
+def test_detection_faults_of_oversized_mask_lower_iou() -> None:
     """Of the chair's 400 px 300 are covered by 500: IoU 300 / 600."""
     table = counted(detections((block(5, 0, 25, 20), 0, 0.8), (BED, 0, 0.6)))
     assert table["mask IoU"] == pytest.approx((300 / 600 + 1) / 2)
@@ -69,7 +69,7 @@ def test_a_mask_that_takes_in_a_neighbor() -> None:
     assert table["class right"] == 0.5
 
 
-def test_parts_of_an_object_are_no_false_detections() -> None:
+def test_detection_faults_split_object_is_not_false_detection() -> None:
     halves = detections((CHAIR, 0, 0.8), (block(0, 30, 20, 30), 1, 0.7), (block(20, 30, 20, 30), 1, 0.6))
     table = counted(halves)
     assert table["objects in several parts"] == 0.5
@@ -77,7 +77,7 @@ def test_parts_of_an_object_are_no_false_detections() -> None:
     assert table["found"] == 1
 
 
-def test_false_detections_on_a_thing_and_on_nothing() -> None:
+def test_detection_faults_count_false_detections() -> None:
     table = counted(detections((block(40, 0, 20, 20), 0, 0.5), (block(50, 40, 10, 10), 1, 0.2)), detections())
     assert table["false detections an image"] == 1
     assert table["false detections on one thing"] == 0.5
@@ -86,7 +86,7 @@ def test_false_detections_on_a_thing_and_on_nothing() -> None:
     assert table["found"] == 0
 
 
-def test_what_an_object_has_in_all_frames() -> None:
+def test_detection_faults_summarize_objects_over_frames() -> None:
     """The chair is always found and once another class; the bed once in eight frames."""
     frames = [detections((CHAIR, int(k == 3), 0.5), *([(BED, 1, 0.5)] if k == 0 else [])) for k in range(8)]
     table = counted(*frames)
@@ -96,7 +96,7 @@ def test_what_an_object_has_in_all_frames() -> None:
     assert table["class right"] == pytest.approx(8 / 9)
 
 
-def test_overlaps_are_those_of_whole_images() -> None:
+def test_overlaps_match_whole_image_counts() -> None:
     rng = np.random.default_rng(0)
     ids = rng.integers(0, 5, SHAPE).astype(np.int32) * 7
     masks = rng.random((4, *SHAPE)) < 0.3

@@ -43,7 +43,7 @@ def prediction(
     )
 
 
-def test_perfect_map():
+def test_evaluate_perfect_map_has_all_scores_one():
     truth = scene([(0, 50), (1, 100), (2, 200)], {1: "chair", 2: "bed"})
     metrics = evaluate(
         prediction(truth, [(0, 50), (7, 100), (4, 200)], {7: ("chair", 0.5), 4: ("bed", 0.9)}), truth
@@ -54,7 +54,7 @@ def test_perfect_map():
     assert metrics["instances.true_count"] == 2
 
 
-def test_iou_counts_points_outside_of_the_truth():
+def test_iou_counts_points_outside_true_instance():
     truth = scene([(1, 100), (0, 100)], {1: "chair"})
     half = evaluate(prediction(truth, [(5, 200)], {5: ("chair", 1.0)}), truth)
     assert half.best_ious == {1: 0.5}
@@ -64,7 +64,7 @@ def test_iou_counts_points_outside_of_the_truth():
     assert half.metrics()["instances.ap"] == pytest.approx(0.1)
 
 
-def test_ap_by_hand():
+def test_average_precision_matches_manual_result():
     """Ranked hits 1 0 1 1 0 of 5 truths: precision 1, 1/2, 2/3, 3/4, 3/5; envelope at the hits 1, 3/4, 3/4."""
     assert average_precision(np.array([1, 0, 1, 1, 0], bool), 5) == pytest.approx((1 + 0.75 + 0.75) / 5)
     assert average_precision(np.zeros(0, bool), 3) == 0.0
@@ -72,7 +72,7 @@ def test_ap_by_hand():
         average_precision(np.zeros(0, bool), 0)
 
 
-def test_false_positive_ranked_first_costs_precision():
+def test_ap_decreases_with_false_positive_ranked_first():
     truth = scene([(1, 100), (2, 100), (0, 100)], {1: "chair", 2: "chair"})
     runs = [(11, 100), (12, 100), (13, 100)]
     first = evaluate(
@@ -87,7 +87,7 @@ def test_false_positive_ranked_first_costs_precision():
     assert first["instances.pq50"] == pytest.approx(2 / 2.5)
 
 
-def test_each_truth_once():
+def test_evaluate_matches_each_true_instance_once():
     """A truth split in two equal halves: both reach IoU 0.5, the second one is a false positive."""
     truth = scene([(1, 100)], {1: "chair"})
     result = evaluate(prediction(truth, [(5, 50), (6, 50)], {5: ("chair", 0.5), 6: ("chair", 0.6)}), truth)
@@ -96,7 +96,7 @@ def test_each_truth_once():
     assert result.best_ids == {1: 6}, "of equal overlaps the more confident one"
 
 
-def test_class_must_agree_except_in_the_agnostic_score():
+def test_ap_requires_class_match_except_agnostic_ap():
     truth = scene([(1, 100), (2, 100)], {1: "chair", 2: "bed"})
     result = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("bed", 0.9), 6: ("bed", 0.8)}), truth)
     assert result.by_class[0.5]["chair"].ap == 0.0
@@ -107,7 +107,7 @@ def test_class_must_agree_except_in_the_agnostic_score():
     assert "instances.ap50.table" not in result.metrics()
 
 
-def test_a_class_that_is_not_in_the_scene_costs_precision_but_has_no_ap():
+def test_class_absent_from_scene_lowers_precision_without_ap():
     truth = scene([(1, 100), (0, 100)], {1: "chair"})
     metrics = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("chair", 0.9), 6: ("tv", 1.0)}), truth).metrics()
     assert metrics["instances.ap50"] == 1.0
@@ -118,7 +118,7 @@ def test_a_class_that_is_not_in_the_scene_costs_precision_but_has_no_ap():
 @pytest.mark.parametrize(
     ("class_name", "points"), [(None, 150), ("chair", 99)], ids=["class not known", "under 100 points"]
 )
-def test_match_with_an_ignored_instance_is_neither_right_nor_wrong(class_name, points):
+def test_match_with_ignored_instance_is_not_counted(class_name, points):
     truth = scene([(1, 100), (2, points)], {1: "chair", 2: class_name})
     metrics = evaluate(
         prediction(truth, [(5, 100), (6, points)], {5: ("chair", 0.5), 6: ("chair", 0.9)}), truth
@@ -128,7 +128,7 @@ def test_match_with_an_ignored_instance_is_neither_right_nor_wrong(class_name, p
     assert metrics["instances.true_count"] == 1
 
 
-def test_a_prediction_mostly_on_unknown_instances_is_ignored():
+def test_prediction_mostly_on_unknown_instances_is_ignored():
     """It covers several unknown instances, none of them well: IoU 0.2 with each, yet all of it is unknown."""
     runs = [(1, 100)] + [(k, 120) for k in range(2, 8)]
     truth = scene(runs, {1: "chair"} | dict.fromkeys(range(2, 8)))
@@ -139,7 +139,7 @@ def test_a_prediction_mostly_on_unknown_instances_is_ignored():
     assert (score.ignored, score.false_positives) == (0, 1), "exactly half of it is unknown: wrong"
 
 
-def test_what_nobody_looked_for_is_neither_right_nor_wrong():
+def test_prediction_of_unannotated_class_is_ignored():
     """A right chair, and a right keyboard where only chairs and beds are labeled; a wrong bed stays wrong."""
     truth = replace(scene([(1, 100), (0, 300)], {1: "chair"}), classes=("chair", "bed"))
     found = [(1, 100), (2, 100), (0, 100), (3, 100)]
@@ -152,7 +152,7 @@ def test_what_nobody_looked_for_is_neither_right_nor_wrong():
     assert called_otherwise.metrics()["instances.ap50_agnostic"] == 1.0, "the object is found, by whatever name"
 
 
-def test_an_evaluated_match_is_never_ignored():
+def test_prediction_with_evaluated_match_is_not_ignored():
     """At IoU 0.25 the prediction finds its truth although more of it lies on an unknown instance."""
     truth = scene([(1, 100), (2, 150)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 250)], {5: ("chair", 0.5)}), truth)
@@ -160,7 +160,7 @@ def test_an_evaluated_match_is_never_ignored():
     assert result.by_class[0.5]["chair"].ignored == 1
 
 
-def test_predictions_without_points_or_far_from_the_truth_are_wrong():
+def test_predictions_without_near_points_are_false_positives():
     truth = scene([(1, 100)], {1: "chair"})
     claims = {5: ("chair", 0.5), 6: ("chair", 0.9), 7: ("chair", 0.8)}
     near = prediction(truth, [(5, 100)], claims)
@@ -174,14 +174,14 @@ def test_predictions_without_points_or_far_from_the_truth_are_wrong():
 
 
 @pytest.mark.parametrize(("distance", "iou"), [(0.049, 1.0), (0.051, 0.0)])
-def test_labels_are_carried_within_5_cm(distance, iou):
+def test_labels_are_transferred_within_5_cm(distance, iou):
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     moved = replace(moved, points_world=moved.points_world + np.float32([0, distance, 0]))
     assert evaluate(moved, truth).best_ious == {1: iou}
 
 
-def test_a_nearer_vertex_of_no_instance_wins():
+def test_label_transfer_uses_nearest_background_vertex():
     truth = scene([(1, 100)], {1: "chair"})
     labeled = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     with_background = replace(
@@ -192,7 +192,7 @@ def test_a_nearer_vertex_of_no_instance_wins():
     assert evaluate(with_background, truth).best_ious == {1: 0.6}
 
 
-def test_transfer_to_the_map_counts_map_vertices():
+def test_transfer_to_map_counts_map_vertices():
     """Ten points of background are under the instance, and the map has two vertices at each of them."""
     truth = scene([(1, 100), (0, 100)], {1: "chair"})
     dense = prediction(truth, [(5, 110)], {5: ("chair", 1.0)})
@@ -205,7 +205,7 @@ def test_transfer_to_the_map_counts_map_vertices():
     assert evaluate(twice, truth, transfer=Transfer.TO_MAP).best_ious[1] == pytest.approx(100 / 120)
 
 
-def test_empty_map_and_empty_truth():
+def test_evaluate_empty_map_or_truth_is_handled():
     truth = scene([(1, 100)], {1: "chair"})
     empty = PredictedInstances(
         np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int64), np.zeros(0), ()
@@ -218,7 +218,7 @@ def test_empty_map_and_empty_truth():
     assert evaluate(empty, truth, transfer=Transfer.TO_MAP).metrics()["instances.ap50"] == 0.0
 
 
-def test_inconsistent_predictions_are_refused():
+def test_inconsistent_predictions_raise():
     truth = scene([(1, 100)], {1: "chair"})
     with pytest.raises(DataError, match="labeled 6"):
         prediction(truth, [(6, 10)], {5: ("chair", 1.0)})
@@ -226,7 +226,7 @@ def test_inconsistent_predictions_are_refused():
         prediction(truth, [(5, 10)], {5: ("chair", float("nan"))})
 
 
-def test_equally_near_vertices_give_the_same_label_in_any_order():
+def test_label_transfer_tie_is_independent_of_order():
     """Each true point lies exactly between two map vertices of different instances."""
     truth = scene([(1, 100)], {1: "chair"})
     up = np.float32([0, 0.03125, 0])
@@ -245,7 +245,7 @@ def test_equally_near_vertices_give_the_same_label_in_any_order():
     assert len(results) == 1
 
 
-def test_a_loose_match_with_an_unknown_instance_is_ignored_although_most_of_it_lies_elsewhere():
+def test_unknown_instance_match_is_ignored_only_above_threshold():
     """40 of its 100 points on an unknown instance of 40: IoU 0.4, enough at 0.25 and not at 0.5."""
     truth = scene([(1, 100), (2, 40), (0, 60)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("chair", 0.5), 6: ("chair", 0.9)}), truth)
@@ -253,7 +253,7 @@ def test_a_loose_match_with_an_unknown_instance_is_ignored_although_most_of_it_l
     assert result.by_class[0.5]["chair"].false_positives == 1
 
 
-def test_three_predictions_on_two_chairs():
+def test_three_predictions_on_two_chairs_match_manual_result():
     """All as confident: 11 with 70 of 120 points (IoU 7/12), 12 with the other 50 (5/12), 13 with the second chair.
 
     At 0.5: right, wrong, right; precision 1, 1/2, 2/3; AP (1 + 2/3) / 2 = 5/6; F1 4/5; PQ (7/12 + 1) / 2.5 = 19/30.
@@ -269,7 +269,7 @@ def test_three_predictions_on_two_chairs():
         assert metrics[f"instances.{name}"] == pytest.approx(value), name
 
 
-def test_of_equal_confidences_the_smaller_id_comes_first():
+def test_equal_confidences_are_ranked_by_id():
     """As above, but for 11 and 12: wrong, right, right at 0.5, AP 2/3. At 0.25 the small piece takes the chair: 5/6."""
     truth = scene([(1, 120), (2, 100)], {1: "chair", 2: "chair"})
     claims = {11: ("chair", 0.9), 12: ("chair", 0.9), 13: ("chair", 0.9)}
@@ -278,7 +278,7 @@ def test_of_equal_confidences_the_smaller_id_comes_first():
     assert result.ap(0.25) == pytest.approx(5 / 6)
 
 
-def test_each_class_by_hand():
+def test_metrics_by_class_match_manual_result():
     """Two chairs: one with IoU 3/4, one missed. A bed found with 3/5 behind a wrong one. A table that nobody found."""
     truth = scene(
         [(1, 100), (2, 100), (3, 150), (4, 100), (0, 200)], {1: "chair", 2: "chair", 3: "bed", 4: "dining table"}
@@ -313,7 +313,7 @@ def test_each_class_by_hand():
     assert not [name for name in metrics if name.endswith(".tv")]
 
 
-def test_both_transfers_with_different_densities():
+def test_transfers_differ_with_vertex_density():
     """80 of the chair's 100 points and 20 of the wall. The map has three vertices on each of the chair's, one else.
 
     To the truth: 80 / (100 + 20) = 2/3, a match at 4 of the 10 thresholds. To the map: 240 / (300 + 20) = 3/4, at 6.
@@ -335,7 +335,7 @@ def test_both_transfers_with_different_densities():
 
 
 @pytest.mark.parametrize("transfer", Transfer)
-def test_the_transfer_distance_itself_is_near_enough(transfer):
+def test_transfer_distance_limit_is_inclusive(transfer):
     """Distances that floats hold exactly: 5/64 m as the hypotenuse of 3/64 and 4/64."""
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
@@ -345,7 +345,7 @@ def test_the_transfer_distance_itself_is_near_enough(transfer):
     assert evaluate(moved, truth, transfer=transfer, max_distance=below).best_ious == {1: 0.0}
 
 
-def test_each_prediction_is_judged_as_it_is_counted():
+def test_judge_outcomes_match_evaluation_counts():
     """Right, taken for another class, a second one on the same object, on nothing, and where nobody knows."""
     names = {1: "chair", 2: "bed", 3: "chair", 4: None, 5: "book"}
     truth = scene([(1, 120), (2, 100), (3, 100), (4, 100), (5, 100), (0, 100)], names)

@@ -28,7 +28,7 @@ def detections(masks: Sequence[np.ndarray], labels: Sequence[int], scores: Seque
     return Detections(stack, tight_boxes(stack), np.array(scores, np.float32), probabilities, CLASSES)
 
 
-def test_what_is_found_exactly_has_an_ap_of_one() -> None:
+def test_mask_ap_of_exact_masks_is_one() -> None:
     masks = np.array([block(0, 0), block(30, 20)])
     result = mask_ap([(masks, ("chair", "bed"), detections(list(masks), (0, 1), (0.9, 0.4)))], CLASSES)
     assert result.ap == pytest.approx(1)
@@ -36,7 +36,7 @@ def test_what_is_found_exactly_has_an_ap_of_one() -> None:
     assert result.objects == 2
 
 
-def test_a_false_alarm_of_a_better_score_halves_the_precision() -> None:
+def test_mask_ap_higher_scored_false_positive_halves_ap() -> None:
     masks = np.array([block(0, 0)])
     found = detections([block(30, 20), block(0, 0)], (0, 0), (0.9, 0.4))
     result = mask_ap([(masks, ("chair",), found)], CLASSES)
@@ -44,25 +44,25 @@ def test_a_false_alarm_of_a_better_score_halves_the_precision() -> None:
     assert np.isnan(result.ap50_by_class["bed"])
 
 
-def test_one_of_two_chairs_is_half_the_recall() -> None:
+def test_mask_ap_half_recall_gives_half_ap() -> None:
     masks = np.array([block(0, 0), block(30, 20)])
     result = mask_ap([(masks, ("chair", "chair"), detections([block(0, 0)], (0,), (0.9,)))], CLASSES)
     assert result.ap50 == pytest.approx(51 / 101)  # recall is sampled at 0, 0.01, ..., 1
 
 
-def test_a_wrong_class_is_not_found() -> None:
+def test_mask_ap_wrong_class_is_zero() -> None:
     masks = np.array([block(0, 0)])
     result = mask_ap([(masks, ("chair",), detections([block(0, 0)], (1,), (0.9,)))], CLASSES)
     assert result.ap50 == 0
 
 
-def test_an_overlap_of_sixty_percent_counts_at_the_lower_thresholds_only() -> None:
+def test_mask_ap_iou_of_60_percent_counts_at_lower_thresholds() -> None:
     result = mask_ap([(np.array([block(0, 0)]), ("chair",), detections([block(0, 0, 6, 10)], (0,), (0.9,)))], CLASSES)
     assert result.ap50 == pytest.approx(1)
     assert result.ap == pytest.approx(3 / 10)  # 0.5, 0.55, 0.6
 
 
-def test_objects_too_small_to_count_and_of_other_classes_are_ignored() -> None:
+def test_mask_ap_small_and_other_class_objects_are_ignored() -> None:
     masks = np.array([block(0, 0), block(30, 20, 3, 3), block(45, 25)])
     found = detections([block(0, 0), block(30, 20, 3, 3)], (0, 0), (0.5, 0.9))
     result = mask_ap([(masks, ("chair", "chair", "tv"), found)], CLASSES, min_pixels=50)
@@ -71,7 +71,7 @@ def test_objects_too_small_to_count_and_of_other_classes_are_ignored() -> None:
 
 
 @pytest.mark.parametrize(("name", "ap50"), [(None, 1.0), ("tv", 0.5)])
-def test_what_is_found_on_an_object_of_unknown_class_is_ignored(name: str | None, ap50: float) -> None:
+def test_mask_ap_detection_on_unknown_class_is_ignored(name: str | None, ap50: float) -> None:
     masks = np.array([block(0, 0), block(30, 20)])
     found = detections([block(30, 20), block(0, 0)], (0, 0), (0.9, 0.4))
     result = mask_ap([(masks, ("chair", name), found)], CLASSES)
@@ -80,7 +80,7 @@ def test_what_is_found_on_an_object_of_unknown_class_is_ignored(name: str | None
 
 
 @pytest.mark.parametrize("names", [(), ("chair",)])
-def test_nothing_found(names: tuple[str, ...]) -> None:
+def test_mask_ap_without_detections_is_zero_or_nan(names: tuple[str, ...]) -> None:
     masks = np.array([block(0, 0)] * len(names), np.bool_).reshape(-1, *SHAPE)
     result = mask_ap([(masks, names, Detections.none(SHAPE, CLASSES))], CLASSES)
     assert result.objects == len(names)

@@ -54,7 +54,7 @@ def ids(*objects: np.ndarray) -> np.ndarray:
     return image
 
 
-def test_the_fit_is_that_with_the_best_object() -> None:
+def test_true_fit_uses_object_with_best_iou() -> None:
     # rows 2 to 7 cover 2 of 4 rows of the first object and 4 of 4 of the second: 20/80 and 40/60
     seen = frame(ids(rows(0, 4), rows(4, 8)))
     fit = true_fit(clusters(rows(2, 8), rows(9, 10), rows(0, 0)), seen, seen.truth)  # type: ignore[arg-type]
@@ -63,14 +63,14 @@ def test_the_fit_is_that_with_the_best_object() -> None:
     assert not fit.unknown.any()
 
 
-def test_pixels_without_a_reading_do_not_count() -> None:
+def test_true_fit_ignores_pixels_without_depth() -> None:
     seen = frame(ids(rows(0, 4)))
     seen.depth[:2] = 0
     fit = true_fit(clusters(rows(2, 4)), seen, seen.truth)  # type: ignore[arg-type]
     np.testing.assert_array_equal(fit.iou, [1.0])
 
 
-def test_clusters_on_objects_of_unknown_class_do_not_count() -> None:
+def test_refinement_clusters_of_unknown_class_are_not_judged() -> None:
     seen = frame(ids(rows(0, 4), rows(4, 8)), {10: None, 20: "chair"})
     before = clusters(rows(0, 5), rows(3, 8))
     refined = Refinement(seen, before, clusters(rows(4, 5), rows(4, 8)), 1.0)
@@ -81,7 +81,7 @@ def test_clusters_on_objects_of_unknown_class_do_not_count() -> None:
     np.testing.assert_array_equal(refined.judged_after, [False, True])  # the first still does not, though on the chair
 
 
-def test_nothing_is_judged_without_truth_or_objects() -> None:
+def test_refinement_without_truth_is_not_judged() -> None:
     blind = Refinement(frame(), clusters(rows(0, 3)), clusters(rows(0, 2)), 1.0)
     assert blind.fit_before is None
     assert blind.fit_after is None
@@ -92,14 +92,14 @@ def test_nothing_is_judged_without_truth_or_objects() -> None:
     np.testing.assert_array_equal(fit.iou, [0.0])
 
 
-def test_clusters_keep_their_index_where_their_number_is_kept() -> None:
+def test_refinement_equal_cluster_count_keeps_indices() -> None:
     refined = Refinement(frame(), clusters(rows(0, 5), rows(5, 9)), clusters(rows(5, 9), rows(0, 0)), 1.0)
     np.testing.assert_array_equal(refined.origin, [0, 1])
     np.testing.assert_array_equal(refined.points_before, [50, 40])
     np.testing.assert_array_equal(refined.points_after, [40, 0])
 
 
-def test_parts_are_of_the_cluster_that_they_share_most_with() -> None:
+def test_refinement_assigns_parts_by_largest_overlap() -> None:
     before = clusters(rows(0, 6), rows(6, 9), rows(1, 1))
     after = clusters(rows(0, 2), rows(2, 6), rows(9, 10), rows(5, 9))
     refined = Refinement(frame(), before, after, 1.0)
@@ -130,7 +130,7 @@ class Counting(ClusterRefiner):
 
 
 @pytest.mark.parametrize("truth", [True, False])
-def test_a_refiner_is_timed_and_sees_the_lifted_detections(truth: bool) -> None:
+def test_refinement_times_refiner_on_lifted_detections(truth: bool) -> None:
     seen = CornerRoom()[2]
     found: Detections = SphereDetector().detect(seen)
     if not truth:

@@ -22,7 +22,7 @@ def walk(count: int, seed: int = 0) -> list[np.ndarray]:
     return poses
 
 
-def test_a_rigidly_moved_trajectory_has_no_error():
+def test_trajectory_error_of_rigid_motion_is_zero():
     true = walk(20)
     S = exp_se3(np.array([3.0, -2.0, 1.0, 0.5, 1.0, -0.7]))
     error = evaluate(true, [Pose(S @ T) for T in true])
@@ -32,7 +32,7 @@ def test_a_rigidly_moved_trajectory_has_no_error():
     assert (error.frames, error.pairs) == (20, 19)
 
 
-def test_scale_is_not_corrected():
+def test_trajectory_alignment_does_not_correct_scale():
     """Points on a line at -1, 0, 1 m, estimated at -1.1, 0, 1.1: residuals 0.1, 0, 0.1 m; each step 0.1 m too long."""
     true = [exp_se3(np.array([x, 0, 0, 0, 0, 0])) for x in (-1.0, 0.0, 1.0)]
     estimated = [Pose(exp_se3(np.array([1.1 * x, 0, 0, 0, 0, 0]))) for x in (-1.0, 0.0, 1.0)]
@@ -41,21 +41,21 @@ def test_scale_is_not_corrected():
     assert error.rpe_rmse_m == pytest.approx(0.1, abs=1e-12)
 
 
-def test_rotation_drift_of_a_step():
+def test_rpe_measures_rotation_drift_per_step():
     """The camera stands still and the estimate turns by 0.02 rad a frame: no ATE, RPE 0.02 rad."""
     error = evaluate([np.eye(4)] * 10, [Pose(exp_se3(np.array([0, 0, 0, 0, 0.02 * i, 0]))) for i in range(10)])
     assert error.ate_rmse_m == 0.0
     assert error.rpe_rotation_rmse_rad == pytest.approx(0.02, abs=1e-12)
 
 
-def test_alignment_does_not_mirror():
+def test_umeyama_returns_rotation_for_mirrored_points():
     """A mirrored shape must not be matched by a reflection."""
     x = rng.normal(size=(10, 3))
     R, _ = umeyama(x, x * [1, 1, -1])
     assert np.linalg.det(R) == pytest.approx(1.0)
 
 
-def test_lost_and_unknown_poses_are_left_out():
+def test_trajectory_error_skips_lost_and_unknown_poses():
     true: list = walk(6)
     estimated = [Pose(T) for T in true]
     estimated[2] = Pose(exp_se3(np.array([9.0, 0, 0, 0, 0, 0])), lost=True, reason="test")
@@ -66,7 +66,7 @@ def test_lost_and_unknown_poses_are_left_out():
     assert error.rpe_rmse_m < 1e-12
 
 
-def test_nothing_to_compare():
+def test_trajectory_error_without_pose_pairs_is_empty():
     assert evaluate([], []).metrics() == {}
     assert evaluate([None], [Pose(np.eye(4))]).metrics() == {}
     assert evaluate([np.eye(4)], [Pose(np.eye(4))]).metrics() == {"trajectory.ate_rmse_m": 0.0}
@@ -74,7 +74,7 @@ def test_nothing_to_compare():
         evaluate([None], [])
 
 
-def test_same_numbers_as_evo():
+def test_trajectory_errors_match_evo():
     metrics = pytest.importorskip("evo.core.metrics", reason="evo is not installed: errors were not compared with it")
     from evo.core.trajectory import PosePath3D
 

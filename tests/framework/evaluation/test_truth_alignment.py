@@ -29,14 +29,14 @@ def truth(given: bool, poses: np.ndarray) -> SceneTruth:
 
 
 @pytest.mark.parametrize("turns_only", [False, True])
-def test_align_returns_the_motion_between_trajectories(turns_only: bool) -> None:
+def test_align_returns_motion_between_trajectories(turns_only: bool) -> None:
     """Also for a camera that turns on the spot, whose positions do not determine the rotation."""
     poses = path(turns_only)
     np.testing.assert_allclose(align(poses, T_MAP_TRUTH @ poses), T_MAP_TRUTH, atol=1e-12)
     np.testing.assert_allclose(align(poses[:1], T_MAP_TRUTH @ poses[:1]), T_MAP_TRUTH, atol=1e-12)
 
 
-def test_align_is_the_least_squares_solution() -> None:
+def test_align_is_least_squares_solution() -> None:
     """No nearby motion brings positions and axis points nearer."""
     P, rng = path(), np.random.default_rng(3)
     Q = np.array([T_MAP_TRUTH @ pose @ exp_se3(rng.normal(0, 0.05, 6)) for pose in P])
@@ -54,7 +54,7 @@ def test_align_is_the_least_squares_solution() -> None:
 
 
 @pytest.mark.parametrize("given", [True, False])
-def test_map_in_another_world_moves_the_truth(given: bool) -> None:
+def test_in_map_world_aligns_truth_to_map_trajectory(given: bool) -> None:
     labeled = truth(given, path())
     some = [1, 2, 5]  # the others are lost
     moved = in_map_world(labeled, TIMES[some] + 1e-7, (T_MAP_TRUTH @ path())[some])
@@ -62,7 +62,7 @@ def test_map_in_another_world_moves_the_truth(given: bool) -> None:
     assert moved == replace(labeled, points_world=moved.points_world, trajectory=None)
 
 
-def test_map_that_begins_with_a_given_pose_keeps_the_truth() -> None:
+def test_in_map_world_given_first_pose_keeps_truth() -> None:
     labeled = truth(True, path())
     drifted = np.array([pose @ exp_se3(np.full(6, 0.02 * k)) for k, pose in enumerate(path())])
     assert in_map_world(labeled, TIMES, drifted) is labeled
@@ -70,7 +70,7 @@ def test_map_that_begins_with_a_given_pose_keeps_the_truth() -> None:
     assert in_map_world(truth(False, path()), TIMES, drifted).trajectory is None
 
 
-def test_first_frame_without_a_given_pose_is_aligned() -> None:
+def test_in_map_world_without_given_first_pose_aligns_truth() -> None:
     """The tracker then begins with the identity, which is no pose of the recording."""
     labeled = truth(True, path())
     labeled = replace(labeled, trajectory=ReferenceTrajectory(TIMES[1:], path()[1:], given=True))
@@ -79,14 +79,14 @@ def test_first_frame_without_a_given_pose_is_aligned() -> None:
     np.testing.assert_allclose(moved.points_world, transform(T_map_truth, labeled.points_world), atol=1e-5)
 
 
-def test_trajectories_without_a_common_time_raise() -> None:
+def test_in_map_world_without_common_timestamps_raises() -> None:
     with pytest.raises(DataError, match="none with the time of a pose"):
         in_map_world(truth(False, path()), TIMES + 0.01, path())
     with pytest.raises(DataError, match="none with the time of a pose"):
         in_map_world(truth(False, path()), TIMES[:0], path()[:0])
 
 
-def test_reference_finds_the_pose_of_each_time() -> None:
+def test_reference_trajectory_finds_poses_by_timestamp() -> None:
     reference = ReferenceTrajectory(TIMES, path(), given=True)
     asked = np.array([TIMES[0] - 1, TIMES[0], TIMES[2] - 5e-6, TIMES[2] + 5e-6, TIMES[5] + 1e-3])
     assert reference.at(asked).tolist() == [-1, 0, 2, 2, -1]

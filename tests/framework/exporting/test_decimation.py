@@ -31,7 +31,7 @@ def areas(vertices: np.ndarray, triangles: Int32) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("n", "most"), [(120, 8000), (120, 300), (420, 9000)])  # the last is clustered before
-def test_surface_colors_and_labels_are_kept(n: int, most: int) -> None:
+def test_decimation_keeps_surface_colors_and_labels(n: int, most: int) -> None:
     mesh = wavy_plane(n)
     light = with_finer_objects(mesh, most)
     assert 0.6 * most < len(light.triangles) <= most
@@ -48,7 +48,7 @@ def test_surface_colors_and_labels_are_kept(n: int, most: int) -> None:
     assert areas(light.vertices, light.triangles[corners]).sum() == pytest.approx(0.16, rel=0.12)
 
 
-def test_objects_stay_finer_than_what_is_around_them() -> None:
+def test_decimation_keeps_objects_finer_than_background() -> None:
     mesh = wavy_plane()
     light = with_finer_objects(mesh, 3000)
     of_object = (light.instance_ids[light.triangles] == 7).all(axis=1)
@@ -56,14 +56,14 @@ def test_objects_stay_finer_than_what_is_around_them() -> None:
     assert np.median(sizes[of_object]) < 0.5 * np.median(sizes[~of_object])
 
 
-def test_what_is_small_enough_stays_as_it_is() -> None:
+def test_decimation_keeps_small_mesh_unchanged() -> None:
     mesh = wavy_plane(20)
     light = with_finer_objects(mesh, 1000)
     assert len(light.triangles) == len(mesh.triangles)
     assert areas(light.vertices, light.triangles).sum() == areas(mesh.vertices, mesh.triangles).sum()
 
 
-def test_triangles_that_share_no_vertex_become_few_enough_all_the_same() -> None:
+def test_clustered_reduces_triangle_soup_to_size_limit() -> None:
     mesh = wavy_plane()
     corners = mesh.triangles.ravel()
     triangles = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
@@ -81,7 +81,7 @@ def test_triangles_that_share_no_vertex_become_few_enough_all_the_same() -> None
     assert clustered(soup, 10**9, 24, 12) is soup
 
 
-def test_a_flat_picture_stays_one() -> None:
+def test_decimation_of_flat_surface_keeps_color_pattern() -> None:
     """A chequerboard on a plane: for the surface alone two triangles would do, and 0.85 of the area would be right."""
     mesh = wavy_plane(101)
     x, y, _ = mesh.vertices.T
@@ -102,7 +102,7 @@ def test_a_flat_picture_stays_one() -> None:
 
 
 @pytest.mark.parametrize("asked", [1, 4, 12])
-def test_something_is_left_of_an_object_that_is_to_have_a_few_triangles(asked: int) -> None:
+def test_decimation_to_few_triangles_keeps_object_volume(asked: int) -> None:
     """Clustered for so few, all of it would be in one cube."""
     ball = trimesh.creation.icosphere(6, 0.1)
     n = len(ball.vertices)

@@ -56,7 +56,7 @@ def bounds(low: tuple[float, ...], high: tuple[float, ...]) -> Any:
     return pytest.approx(np.array([low, high]), abs=1e-5)
 
 
-def test_the_room_stands_on_its_floor(room: UprightRoom) -> None:
+def test_read_room_places_floor_at_zero(room: UprightRoom) -> None:
     assert room.up_known
     assert room.floor_known
     assert room.mesh.vertices[:, 2].min() == pytest.approx(0, abs=1e-5)
@@ -69,7 +69,7 @@ def test_the_room_stands_on_its_floor(room: UprightRoom) -> None:
     assert table.probability == pytest.approx(0.9)
 
 
-def test_where_z_is_up_the_room_has_the_worlds_x_and_y(tmp_path: Path) -> None:
+def test_read_room_with_z_up_keeps_world_xy(tmp_path: Path) -> None:
     scene = ExportedRoom(shift=(1.0, -2.0, 0.5))
     room = read_room(scene.write(tmp_path / "run"))
     expected = np.eye(4)
@@ -80,7 +80,9 @@ def test_where_z_is_up_the_room_has_the_worlds_x_and_y(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "ending"), [(ExportFormat.PLY, "ply"), (ExportFormat.OBJ, "obj"), (ExportFormat.GLB, "glb")]
 )
-def test_objects_stand_on_the_origin_in_meters(kind: ExportFormat, ending: str, run: Path, tmp_path: Path) -> None:
+def test_exported_objects_are_centered_on_origin_in_meters(
+    kind: ExportFormat, ending: str, run: Path, tmp_path: Path
+) -> None:
     written = export(run, [kind], tmp_path, Chosen(("cube", "1")))
     assert sorted(path.name for path in written) == [f"cube_2.{ending}", f"dining_table_1.{ending}"]
     for name, (x, y, z) in (("dining_table_1", TABLE_SIZE), ("cube_2", CUBE_SIZE)):
@@ -91,7 +93,7 @@ def test_objects_stand_on_the_origin_in_meters(kind: ExportFormat, ending: str, 
             assert found == bounds((-x / 2, -y / 2, 0), (x / 2, y / 2, z))
 
 
-def test_the_scene_has_everything_and_each_object_where_it_stands(run: Path, tmp_path: Path) -> None:
+def test_exported_scene_contains_all_objects_in_place(run: Path, tmp_path: Path) -> None:
     export(run, [ExportFormat.GLB, ExportFormat.PLY, ExportFormat.OBJ], tmp_path)
     whole = read_mesh(run / "mesh.ply")
     scene = trimesh.load(tmp_path / "scene.glb", process=False)
@@ -110,7 +112,7 @@ def test_the_scene_has_everything_and_each_object_where_it_stands(run: Path, tmp
         assert found.area == pytest.approx(original.area, rel=1e-4)
 
 
-def test_triangles_between_objects_are_of_the_room(room: UprightRoom) -> None:
+def test_triangles_between_objects_belong_to_room(room: UprightRoom) -> None:
     ids = np.where(room.mesh.vertices[:, 0] > 2.02, 1, 2).astype(np.int32)
     mesh = replace(room.mesh, instance_ids=ids)
     box = room.objects[0].box
@@ -124,7 +126,7 @@ def test_triangles_between_objects_are_of_the_room(room: UprightRoom) -> None:
 
 
 @pytest.mark.parametrize(("degrees", "yaw", "swapped"), [(80, -10, True), (10, 10, False), (190, 10, False)])
-def test_boxes_face_the_rooms_x_axis(degrees: float, yaw: float, swapped: bool) -> None:
+def test_facing_aligns_box_with_room_x_axis(degrees: float, yaw: float, swapped: bool) -> None:
     angle = np.radians(degrees)
     rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     found = facing(Box(np.zeros(3), np.array([1.0, 2.0, 3.0]), rotation))
@@ -132,7 +134,7 @@ def test_boxes_face_the_rooms_x_axis(degrees: float, yaw: float, swapped: bool) 
     assert np.degrees(np.arctan2(found.rotation[1, 0], found.rotation[0, 0])) == pytest.approx(yaw)
 
 
-def test_glb_nodes_say_what_objects_are(room: UprightRoom) -> None:
+def test_glb_nodes_have_object_metadata(room: UprightRoom) -> None:
     found = header(glb(parts(room)))
     said = {node["name"]: node.get("extras") for node in found["nodes"]}
     assert said["cube_2"] == {"id": 2, "class": "cube", "probability": pytest.approx(0.9), "confidence": 0.8}
@@ -160,7 +162,7 @@ def test_glb_colors_are_linear_with_16_bits(room: UprightRoom) -> None:
 
 
 @pytest.mark.parametrize("coloring", [Coloring.INSTANCE, Coloring.CLASS])
-def test_colors_tell_objects_or_classes(coloring: Coloring, tmp_path: Path) -> None:
+def test_export_coloring_by_instance_or_class(coloring: Coloring, tmp_path: Path) -> None:
     two = ExportedRoom(things={"cube": [(1, 1, 0, 1.2, 1.2, 0.2)], "other": [(2, 2, 0, 2.2, 2.2, 0.2)]})
     run = two.write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
@@ -175,7 +177,7 @@ def test_colors_tell_objects_or_classes(coloring: Coloring, tmp_path: Path) -> N
     assert sorted(path.stem for path in (tmp_path / "objects").glob("*.glb")) == ["cube_1", "cube_2"]
 
 
-def test_open3d_and_trimesh_read_colors_and_labels(run: Path, tmp_path: Path) -> None:
+def test_exported_meshes_are_readable_by_open3d_and_trimesh(run: Path, tmp_path: Path) -> None:
     """Of the run's own mesh.ply and of what is exported: the same properties, by the same writer."""
     export(run, [ExportFormat.PLY, ExportFormat.OBJ], tmp_path)
     for path in (run / "mesh.ply", tmp_path / "scene.ply"):
@@ -198,7 +200,7 @@ def test_open3d_and_trimesh_read_colors_and_labels(run: Path, tmp_path: Path) ->
     assert named == ["o room", "o dining_table_1", "o cube_2", "o picture_3"]
 
 
-def test_usd_is_a_stage_that_a_simulator_takes(run: Path, tmp_path: Path) -> None:
+def test_usd_stage_has_semantics_and_collision_shapes(run: Path, tmp_path: Path) -> None:
     from pxr import Usd, UsdGeom, UsdPhysics, UsdSemantics
 
     export(run, [ExportFormat.USD], tmp_path)
@@ -233,14 +235,16 @@ def test_usd_is_a_stage_that_a_simulator_takes(run: Path, tmp_path: Path) -> Non
     np.testing.assert_allclose((low, high), ((-0.1, -0.1, 0), (0.1, 0.1, 0.2)), atol=1e-5)
 
 
-def test_without_usd_core_it_says_what_to_install(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_usd_export_without_usd_core_raises_install_hint(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(DataError, match=r"pip install instancemap\[usd\]"):
         export(run, [ExportFormat.GLB, ExportFormat.USD], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_hulls_face_out() -> None:
+def test_convex_hull_faces_outward() -> None:
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
     found = convex_hull(np.concatenate([corners, np.full((5, 3), 0.5, np.float32)]))
     assert found is not None
@@ -249,7 +253,7 @@ def test_hulls_face_out() -> None:
     assert convex_hull(corners[corners[:, 2] == 0]) is None
 
 
-def test_normals_of_lit_colors_have_length_1(room: UprightRoom) -> None:
+def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom) -> None:
     """Also where triangles have no area, which Khronos' validator calls an error."""
     mesh = replace(room.mesh, vertices=room.mesh.vertices.copy())
     own = room.objects[1].vertices
@@ -263,7 +267,7 @@ def test_normals_of_lit_colors_have_length_1(room: UprightRoom) -> None:
         np.testing.assert_allclose(np.linalg.norm(part.vertex_normals, axis=1), 1, atol=1e-5)
 
 
-def test_specks_are_of_the_room_and_not_of_the_object(tmp_path: Path) -> None:
+def test_small_fragments_belong_to_room_instead_of_object(tmp_path: Path) -> None:
     """Labels leak through edges of depth; a leg is no speck."""
     table = [(0.8, 1.0, 0.7, 2.0, 1.8, 0.75), (0.8, 1.0, 0, 0.85, 1.05, 0.65)]
     speck = (3.5, 2.5, 0.9, 3.51, 2.51, 0.91)
@@ -276,7 +280,7 @@ def test_specks_are_of_the_room_and_not_of_the_object(tmp_path: Path) -> None:
     assert len(read_mesh(whole).triangles) == len(read_mesh(run / "mesh.ply").triangles)
 
 
-def test_fewer_triangles_keep_shape_colors_and_labels(room: UprightRoom) -> None:
+def test_decimated_parts_keep_shape_colors_and_labels(room: UprightRoom) -> None:
     fewer = parts(room, 400)
     assert 200 < sum(len(part.mesh.triangles) for part in fewer) <= 420
     for full, part in zip(parts(room), fewer, strict=True):
@@ -287,7 +291,7 @@ def test_fewer_triangles_keep_shape_colors_and_labels(room: UprightRoom) -> None
     assert decimated(room.mesh, len(room.mesh.triangles)) is room.mesh
 
 
-def test_a_terminal_sees_how_many_triangles_are_decimated(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decimation_shows_progress_bar_in_terminal(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
     monkeypatch.delenv("TQDM_DISABLE", raising=False)
@@ -301,7 +305,7 @@ def test_a_terminal_sees_how_many_triangles_are_decimated(room: UprightRoom, mon
         assert f"decimating {one.name}: " in shown
 
 
-def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
+def test_export_is_deterministic(run: Path, tmp_path: Path) -> None:
     formats = [ExportFormat.GLB, ExportFormat.PLY, ExportFormat.USD, ExportFormat.OBJ]
     first = export(run, formats, tmp_path / "a", Chosen(triangles=300))
     second = export(run, formats, tmp_path / "b", Chosen(triangles=300))
@@ -309,7 +313,7 @@ def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
 
 
-def test_names_are_identifiers_whatever_the_class(tmp_path: Path) -> None:
+def test_export_converts_class_names_to_identifiers(tmp_path: Path) -> None:
     scene = ExportedRoom(things={"cube": [(1, 1, 0, 1.2, 1.2, 0.2)], "other": [(2, 2, 0, 2.2, 2.2, 0.2)]})
     run = scene.write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
@@ -328,7 +332,7 @@ def test_names_are_identifiers_whatever_the_class(tmp_path: Path) -> None:
     ]
 
 
-def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> None:
+def test_export_escapes_invalid_unicode_class_names(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     path = run / "instances.json"
     path.write_text(path.read_text().replace('"class": "cube"', '"class": "cube \\ud800"'))
@@ -337,7 +341,7 @@ def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> No
     assert "cube \\ud800" in [node.get("extras", {}).get("class") for node in nodes]
 
 
-def test_an_object_has_the_color_of_overview_png_in_all_files(tmp_path: Path) -> None:
+def test_exported_instance_colors_match_overview(tmp_path: Path) -> None:
     """Also in its own file, and where another one is unlikely, or is not exported."""
     run = ExportedRoom().write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
@@ -355,7 +359,7 @@ def test_an_object_has_the_color_of_overview_png_in_all_files(tmp_path: Path) ->
                 np.testing.assert_array_equal(np.unique(colors, axis=0), [expected[key]])
 
 
-def test_an_object_of_three_vertices_is_exported(tmp_path: Path) -> None:
+def test_export_object_with_three_vertices(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     mesh = read_mesh(run / "mesh.ply")
     ids = np.where(mesh.instance_ids == 2, 0, mesh.instance_ids).astype(np.int32)
@@ -371,7 +375,7 @@ def test_an_object_of_three_vertices_is_exported(tmp_path: Path) -> None:
     assert len(read_mesh(tmp_path / "out/objects/cube_2.ply").vertices) == 3
 
 
-def test_loose_vertices_are_objects_too(tmp_path: Path) -> None:
+def test_export_mesh_without_triangles_writes_object_vertices(tmp_path: Path) -> None:
     """Of a mesh without triangles: every vertex would be a speck."""
     run = ExportedRoom().write(tmp_path / "run")
     mesh = read_mesh(run / "mesh.ply")
@@ -388,7 +392,7 @@ def test_loose_vertices_are_objects_too(tmp_path: Path) -> None:
         export(run, [ExportFormat.GLB], tmp_path / "out")
 
 
-def test_runs_that_ended_early_or_have_no_objects_are_exported(tmp_path: Path) -> None:
+def test_export_partial_run_without_objects_writes_scene(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     (run / "metrics.json").rename(run / "metrics.partial.json")
     (run / "instances.json").unlink()
@@ -400,7 +404,7 @@ def test_runs_that_ended_early_or_have_no_objects_are_exported(tmp_path: Path) -
         export(run, [ExportFormat.PLY], chosen=Chosen(("chair",)))
 
 
-def test_what_is_asked_for_and_not_there_is_told(run: Path, tmp_path: Path) -> None:
+def test_export_invalid_selection_raises(run: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected the directory of a run"):
         export(tmp_path, [ExportFormat.GLB])
     with pytest.raises(DataError, match="there is no object 'cub' in this run; did you mean 'cube'"):
@@ -415,7 +419,7 @@ def test_what_is_asked_for_and_not_there_is_told(run: Path, tmp_path: Path) -> N
         Chosen(triangles=0)
 
 
-def test_up_may_be_told_where_the_run_does_not_know(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_export_up_option_replaces_missing_up_direction(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = TURNED.write(tmp_path / "run", figures=False)
     export(run, [ExportFormat.PLY], tmp_path / "as_it_is")
     assert "no up direction" in caplog.text

@@ -63,7 +63,7 @@ def told(found: list, source: int) -> list[tuple[str, int | str]]:
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
-def test_pieces_of_a_triangle_are_equal(n: int) -> None:
+def test_triangle_sample_weights_are_evenly_distributed(n: int) -> None:
     weights = middles(n)
     assert weights.shape == (n * n, 3)
     np.testing.assert_allclose(weights.sum(axis=1), 1)
@@ -71,7 +71,7 @@ def test_pieces_of_a_triangle_are_equal(n: int) -> None:
     assert weights.min() > 0
 
 
-def test_surface_points_are_of_their_objects_and_as_near_as_asked(room: UprightRoom) -> None:
+def test_surface_points_have_owner_and_given_spacing(room: UprightRoom) -> None:
     found = surface_points(room, 0.02)
     cube = found.points[found.owner == 2]
     np.testing.assert_allclose(cube.min(axis=0), (1.25, 1.25, 0.75), atol=0.01)
@@ -82,7 +82,7 @@ def test_surface_points_are_of_their_objects_and_as_near_as_asked(room: UprightR
         surface_points(room, 1e-5)
 
 
-def test_cells_are_occupied_where_something_stands(low: Plan, high: Plan) -> None:
+def test_plan_cells_are_occupied_at_object_footprints(low: Plan, high: Plan) -> None:
     inside = (slice(2, -2),) * 2
     assert low.shape == (33, 43)  # 3 x 4 m, and a margin
     assert at(low, 0.825, 1.025) == (True, False)  # a leg
@@ -97,12 +97,12 @@ def test_cells_are_occupied_where_something_stands(low: Plan, high: Plan) -> Non
     assert not low.occupied[0].any()
 
 
-def test_who_looks_under_the_table_knows_that_it_is_free_there(tmp_path: Path) -> None:
+def test_plan_observed_space_under_table_is_free(tmp_path: Path) -> None:
     low = plan(stored(tmp_path, shift=(OFF, OFF, 0.0), eyes=((3.5, 1.4, 0.3), (0.3, 1.4, 0.3))), RESOLUTION, 0.5)
     assert at(low, 1.4, 1.4) == (False, True)
 
 
-def test_the_highest_object_of_a_cell_is_what_is_seen_from_above(low: Plan, tmp_path: Path) -> None:
+def test_plan_highest_object_per_cell_is_order_independent(low: Plan, tmp_path: Path) -> None:
     """In whichever order they are."""
     turned = plan(stored(tmp_path, things={"cube": CUBE, "table": TABLE}, shift=(OFF, OFF, 0.0)), RESOLUTION, 0.5)
     for (x, y), key in (((1.3, 1.3), 2), ((1.0, 1.2), 1), ((3.5, 1.0), 0)):
@@ -111,13 +111,13 @@ def test_the_highest_object_of_a_cell_is_what_is_seen_from_above(low: Plan, tmp_
         assert turned.highest[row, column] == (0, 2, 1)[key]
 
 
-def test_walls_are_where_they_stand(low: Plan) -> None:
+def test_plan_wall_cells_match_room_walls(low: Plan) -> None:
     assert low.wall[1:-1, [1, -2]].all()
     assert low.wall[[1, -2], 1:-1].sum() >= 76  # but behind the picture
     assert low.wall.sum() == low.wall[1:-1, [1, -2]].sum() + low.wall[[1, -2], 2:-2].sum()
 
 
-def test_free_is_what_was_looked_through_above_a_floor_that_was_seen(room: UprightRoom, low: Plan) -> None:
+def test_plan_free_cells_are_observed_floor(room: UprightRoom, low: Plan) -> None:
     open_floor = low.floor & ~low.occupied
     assert low.free[open_floor].mean() > 0.95
     assert not (low.free & ~open_floor).any()
@@ -126,7 +126,7 @@ def test_free_is_what_was_looked_through_above_a_floor_that_was_seen(room: Uprig
     np.testing.assert_array_equal(blind.occupied, low.occupied)
 
 
-def test_places_behind_a_surface_were_not_looked_through(room: UprightRoom) -> None:
+def test_looked_through_excludes_occluded_points(room: UprightRoom) -> None:
     """From one camera before a wall of the table's height, exactly on its optical axis and beyond."""
     pose = np.eye(4)
     pose[:3, :3] = looking(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
@@ -136,7 +136,7 @@ def test_places_behind_a_surface_were_not_looked_through(room: UprightRoom) -> N
     assert seen.tolist() == [True, True, False, False, False]  # before the cube; in it, behind it, behind the camera
 
 
-def test_what_the_ros_map_says_is_what_map_server_reads(run: Path, low: Plan, tmp_path: Path) -> None:
+def test_ros_map_matches_map_server_thresholds(run: Path, low: Plan, tmp_path: Path) -> None:
     written = export(run, [ExportFormat.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION, robot_height=0.5))
     assert [path.name for path in written] == ["floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"]
     said = yaml.safe_load((tmp_path / "map.yaml").read_text())
@@ -160,7 +160,7 @@ def test_what_the_ros_map_says_is_what_map_server_reads(run: Path, low: Plan, tm
     assert gray[len(gray) - 1 - row, column] == OCCUPIED
 
 
-def test_footprints_are_polygons_in_meters(run: Path, tmp_path: Path) -> None:
+def test_floor_plan_geojson_has_polygons_in_meters(run: Path, tmp_path: Path) -> None:
     export(run, [ExportFormat.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION))
     found = json.loads((tmp_path / "floor_plan.geojson").read_text())
     assert found["type"] == "FeatureCollection"
@@ -176,7 +176,7 @@ def test_footprints_are_polygons_in_meters(run: Path, tmp_path: Path) -> None:
     assert (table["properties"]["base"], table["properties"]["top"]) == pytest.approx((0, 0.75), abs=1e-4)
 
 
-def test_the_plan_is_a_picture_of_the_room(run: Path, tmp_path: Path) -> None:
+def test_floor_plan_image_is_deterministic_and_not_blank(run: Path, tmp_path: Path) -> None:
     export(run, [ExportFormat.FLOORPLAN], tmp_path / "a", Chosen(resolution=RESOLUTION))
     export(run, [ExportFormat.FLOORPLAN, ExportFormat.GRAPH], tmp_path / "b", Chosen(resolution=RESOLUTION))
     for name in ("floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"):
@@ -187,7 +187,7 @@ def test_the_plan_is_a_picture_of_the_room(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_any_name_can_be_written_on_a_plan(tmp_path: Path) -> None:
+def test_floor_plan_accepts_any_class_name(tmp_path: Path) -> None:
     names = ("日本 $x_1$", "a" * 3000, "")
     run = ExportedRoom().write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
@@ -200,7 +200,7 @@ def test_any_name_can_be_written_on_a_plan(tmp_path: Path) -> None:
     assert tuple(node["class"] for node in found["nodes"][:3]) == names
 
 
-def test_a_room_without_objects_has_a_plan(tmp_path: Path) -> None:
+def test_floor_plan_of_room_without_objects_is_written(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     (run / "instances.json").unlink()
     assert len(export(run, [ExportFormat.FLOORPLAN, ExportFormat.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))) == 5
@@ -209,7 +209,7 @@ def test_a_room_without_objects_has_a_plan(tmp_path: Path) -> None:
     assert found["edges"] == []
 
 
-def test_a_cube_is_on_the_table_and_the_table_on_the_floor(room: UprightRoom, low: Plan) -> None:
+def test_relations_cube_is_on_table_and_table_on_floor(room: UprightRoom, low: Plan) -> None:
     found = relations(room, low)
     assert told(found, 2) == [("on", 1)]
     assert told(found, 1) == [("on", "floor")]
@@ -220,7 +220,7 @@ def test_a_cube_is_on_the_table_and_the_table_on_the_floor(room: UprightRoom, lo
     assert told(without, 1) == told(without, 3) == []
 
 
-def test_what_is_stacked_is_on_the_upper_one(tmp_path: Path) -> None:
+def test_relations_stacked_object_is_on_upper_object(tmp_path: Path) -> None:
     """The lower one's top is not seen: it has none in the mesh."""
     lower, upper = (1.2, 1.2, 0.75, 1.4, 1.4, 0.85), (1.2, 1.2, 0.85, 1.4, 1.4, 0.95)
     room = stored(tmp_path, things={"dining table": TABLE, "book": [lower], "other": [upper]})
@@ -229,7 +229,7 @@ def test_what_is_stacked_is_on_the_upper_one(tmp_path: Path) -> None:
     assert told(found, 3) == [("on", 2)]
 
 
-def test_things_on_one_table_are_next_to_each_other(tmp_path: Path) -> None:
+def test_relations_objects_on_same_table_are_next_to(tmp_path: Path) -> None:
     things = {
         "dining table": TABLE,
         "book": [(1.0, 1.2, 0.75, 1.2, 1.4, 0.79)],
@@ -252,7 +252,7 @@ CUPBOARD: list[Block] = [
 ]
 
 
-def test_what_a_cupboard_or_a_box_holds_is_in_it(tmp_path: Path) -> None:
+def test_relations_objects_inside_container_are_in(tmp_path: Path) -> None:
     box: list[Block] = [
         (2.6, 0.6, 0.0, 3.2, 1.2, 0.02),
         (2.6, 0.6, 0.0, 2.62, 1.2, 0.5),
@@ -278,19 +278,19 @@ ARMS: list[Block] = [(1.0, 1.0, 0.4, 1.1, 1.7, 0.7), (1.9, 1.0, 0.4, 2.0, 1.7, 0
 
 
 @pytest.mark.parametrize("seat", [SEAT, SEAT + ARMS])
-def test_a_pillow_is_on_a_chair_and_not_in_it(seat: list[Block], tmp_path: Path) -> None:
+def test_relations_pillow_is_on_couch(seat: list[Block], tmp_path: Path) -> None:
     """Whose top is not what it stands on."""
     things = {"couch": seat, "pillow": [(1.3, 1.3, 0.4, 1.7, 1.6, 0.6)]}
     assert told(relations(stored(tmp_path, things=things), None), 2) == [("on", 1)]
 
 
-def test_a_bag_under_a_table_is_not_in_it(tmp_path: Path) -> None:
+def test_relations_bag_under_table_is_on_floor(tmp_path: Path) -> None:
     things = {"dining table": TABLE, "bag": [(1.2, 1.2, 0.0, 1.5, 1.5, 0.3)]}
     room = stored(tmp_path, things=things)
     assert told(relations(room, plan(room, RESOLUTION, 0.5)), 2) == [("on", "floor")]
 
 
-def test_the_graph_keeps_its_schema(run: Path, tmp_path: Path) -> None:
+def test_scene_graph_matches_schema(run: Path, tmp_path: Path) -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     [path] = export(run, [ExportFormat.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))
     graph = json.loads(path.read_text())
@@ -318,7 +318,7 @@ TWO_ROOMS = {
 }
 
 
-def test_a_door_separates_two_rooms(tmp_path: Path) -> None:
+def test_scene_graph_door_separates_two_rooms(tmp_path: Path) -> None:
     run = ExportedRoom(**TWO_ROOMS, blocks=divided(0.9), R_world_room=Y_UP).write(tmp_path / "run")  # type: ignore[arg-type]
     [path] = export(run, [ExportFormat.GRAPH])
     graph = json.loads(path.read_text())
@@ -333,7 +333,7 @@ def test_a_door_separates_two_rooms(tmp_path: Path) -> None:
     assert areas == pytest.approx([12, 12], rel=0.1)
 
 
-def test_a_wide_opening_does_not(tmp_path: Path) -> None:
+def test_rooms_wide_opening_does_not_separate(tmp_path: Path) -> None:
     room = stored(tmp_path, **TWO_ROOMS, blocks=divided(1.6))
     assert rooms(plan(room, RESOLUTION, 1.0)).count == 1
 
@@ -345,7 +345,7 @@ def by_hand(text: str) -> Plan:
     return Plan(0.5, np.zeros(2), occupied | wall, free, free, wall, np.zeros(rows.shape, np.int32))
 
 
-def test_furniture_and_gaps_do_not_separate_rooms() -> None:
+def test_rooms_are_separated_only_by_walls_with_door() -> None:
     one = by_hand(
         "##############\n#......o.....#\n#......o.....#\n#......o.....#\n#............#\n#.. .........#\n##############"
     )
@@ -361,7 +361,7 @@ def test_furniture_and_gaps_do_not_separate_rooms() -> None:
     assert rooms(by_hand("    \n    ")).count == 0
 
 
-def test_what_a_plan_needs_to_know_is_asked_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_plan_export_without_up_or_floor_raises(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = ExportedRoom().write(tmp_path / "run", figures=False)
     for kind in (ExportFormat.FLOORPLAN, ExportFormat.GRAPH):
         with pytest.raises(DataError, match=f"no up direction.* {kind.value} .*--up X Y Z"):
@@ -374,7 +374,7 @@ def test_what_a_plan_needs_to_know_is_asked_for(tmp_path: Path, caplog: pytest.L
     assert len(export(run, [ExportFormat.FLOORPLAN], up=(0, 0, 1), floor=0)) == 4
 
 
-def test_plans_have_bounds(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plan_parameters_out_of_range_raise(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     for wrong in ({"resolution": 0.0}, {"robot_height": 9.0}, {"min_confidence": float("nan")}):
         with pytest.raises(Exception, match=f"{next(iter(wrong))}"):
             Chosen(**wrong)

@@ -95,7 +95,7 @@ def maps(tmp_path: Path) -> Path:
     return root
 
 
-def test_both_files_are_written_whole_and_the_same_each_time(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_write_figure_output_files_are_deterministic(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     paths = write_figure(maps)
     assert [path.name for path in paths] == ["figure.png", "figure.pdf"]
@@ -117,7 +117,7 @@ def test_both_files_are_written_whole_and_the_same_each_time(maps: Path, caplog:
     assert [path.read_bytes() for path in paths] == first
 
 
-def test_a_line_is_a_sequence_and_a_column_a_row(maps: Path) -> None:
+def test_map_figure_has_sequences_as_lines_and_rows_as_columns(maps: Path) -> None:
     found = texts(maps)
     for text in ("in progress", "whole", "ground truth", "011", "206", "8 frames, 2 instances, AP50 0.50"):
         assert found.count(text) == 1
@@ -129,7 +129,7 @@ def test_a_line_is_a_sequence_and_a_column_a_row(maps: Path) -> None:
         assert said in " ".join(note.split())
 
 
-def test_a_map_that_is_damaged_or_without_truth_is_left_out(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_map_figure_omits_damaged_maps_and_missing_truth(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
     (maps / "dataset.scene=011,row=part,seed=0" / "mesh.ply").write_bytes(b"ply\n")
     run(maps, "whole", "gone")
     found = texts(maps)
@@ -141,7 +141,7 @@ def test_a_map_that_is_damaged_or_without_truth_is_left_out(maps: Path, caplog: 
 
 
 @pytest.mark.parametrize("vertices", [[1538], [1538, 7]])
-def test_objects_of_another_run_are_not_drawn(
+def test_map_figure_inconsistent_objects_are_not_drawn(
     maps: Path, caplog: pytest.LogCaptureFixture, vertices: list[int]
 ) -> None:
     list_objects(maps / "dataset.scene=011,row=part,seed=0", "bed", vertices)
@@ -149,7 +149,7 @@ def test_objects_of_another_run_are_not_drawn(
     assert "they are not of one run; run it again" in caplog.text
 
 
-def test_several_seeds_are_lines_of_their_own(tmp_path: Path) -> None:
+def test_map_figure_has_one_line_per_seed(tmp_path: Path) -> None:
     root = experiment(tmp_path / "figure4", kind="maps", sequences="seed")
     run(root, "whole", "011")
     assert "0" in texts(root)
@@ -166,7 +166,7 @@ def test_several_seeds_are_lines_of_their_own(tmp_path: Path) -> None:
     assert {"011, seed 0", "011, seed 1"} <= set(texts(root))
 
 
-def test_the_zoomed_line_is_below(tmp_path: Path) -> None:
+def test_map_figure_zoom_adds_second_line(tmp_path: Path) -> None:
     root = experiment(tmp_path / "figure5", kind="maps", zoom=True)
     directory = run(root, "part", "011")
     list_objects(directory, "chair", [1538])
@@ -181,7 +181,7 @@ def test_the_zoomed_line_is_below(tmp_path: Path) -> None:
     assert all("chair" in one for one in names[1:])
 
 
-def test_stage_times_are_averaged_over_the_sequences(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_stage_times_figure_averages_sequences(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     root = experiment(tmp_path / "figure3", kind="stage_times", names={"whole": "ours"})
     run(root, "whole", "011")
     run(root, "whole", "206", frames=12)
@@ -207,13 +207,13 @@ def test_stage_times_are_averaged_over_the_sequences(tmp_path: Path, caplog: pyt
         ("maps", "figure must have keys and values"),
     ],
 )
-def test_a_choice_that_is_nonsense_is_one_line(figure: Any, said: str) -> None:
+def test_figure_choice_invalid_settings_raise_one_line_error(figure: Any, said: str) -> None:
     with pytest.raises(ConfigError, match=said) as caught:
         FigureChoice.of(figure)
     assert "\n" not in str(caught.value)
 
 
-def test_nothing_to_draw_is_one_line(tmp_path: Path) -> None:
+def test_write_figure_without_data_raises_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is not a folder"):
         write_figure(tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"has no multirun.yaml: pictures are of experiments"):
@@ -231,7 +231,9 @@ def test_nothing_to_draw_is_one_line(tmp_path: Path) -> None:
         assert not list(root.glob("figure.*"))
 
 
-def test_the_command(maps: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_command_prints_paths_and_errors(
+    maps: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(sys, "argv", ["figures", str(maps), str(maps / "nowhere")])
     with pytest.raises(SystemExit) as ended:
         figures.main()
@@ -242,7 +244,7 @@ def test_the_command(maps: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError("a worker died"), KeyboardInterrupt()])
-def test_a_sweep_ends_with_the_picture_but_for_ctrl_c(
+def test_sweep_writes_figure_except_after_ctrl_c(
     maps: Path, error: BaseException | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("signal.signal", lambda *_: None)  # what a sweep changes for its process
@@ -253,7 +255,7 @@ def test_a_sweep_ends_with_the_picture_but_for_ctrl_c(
     assert len(list(maps.glob("figure.*"))) == (0 if isinstance(error, KeyboardInterrupt) else 2)
 
 
-def test_nothing_written_is_cut_off_with_one_line_and_a_long_name(tmp_path: Path) -> None:
+def test_map_figure_long_names_fit_on_page(tmp_path: Path) -> None:
     root = experiment(tmp_path / "figure4", kind="maps", names={"part": "in progress"})
     name = "rgbd_dataset_freiburg3_long_office_household_validation"
     for row in ROWS:

@@ -45,7 +45,7 @@ def line(truth: SceneTruth) -> PanelLine:
     return panel_line([stored({1: 7, 2: 3}), None, stored({1: 5}), stored({1: 2, 2: 1})], truth, SIZE, zoom=True)
 
 
-def test_an_object_has_the_same_color_in_all_columns(line: PanelLine) -> None:
+def test_panel_line_uses_same_object_color_in_all_columns(line: PanelLine) -> None:
     assert line.truth is not None
     assert line.true_count == 2
     saturation = np.ptp(line.truth.image.astype(int), axis=2)
@@ -73,7 +73,7 @@ def shown(panel: Panel) -> set[str]:
     return {panel.names[key] for key in np.unique(panel.objects).tolist() if key in panel.names}
 
 
-def test_the_window_holds_the_box_that_only_some_columns_have(line: PanelLine) -> None:
+def test_zoom_window_contains_object_missing_in_some_maps(line: PanelLine) -> None:
     window = line.window
     assert window is not None
     assert (window.width, window.height) == (64, 48)
@@ -90,13 +90,13 @@ def test_the_window_holds_the_box_that_only_some_columns_have(line: PanelLine) -
     assert shown(larger) >= {"couch"}
 
 
-def test_equal_maps_have_no_window_and_no_paths(truth: SceneTruth) -> None:
+def test_panel_line_of_equal_maps_has_no_window_or_paths(truth: SceneTruth) -> None:
     line = panel_line([stored({1: 7, 2: 3}), stored({1: 1, 2: 2})], truth, SIZE, zoom=True)
     assert (line.window, line.zoomed) == (None, ())
     assert [panel.path for panel in line.maps if panel] == [None, None]
 
 
-def test_what_only_a_map_has_does_not_draw_the_window(truth: SceneTruth) -> None:
+def test_zoom_window_ignores_false_objects(truth: SceneTruth) -> None:
     line = panel_line([stored({0: 9, 1: 7}), stored({1: 1, 2: 2})], truth, SIZE, zoom=True)
     assert line.truth is not None
     assert line.window is not None
@@ -105,7 +105,7 @@ def test_what_only_a_map_has_does_not_draw_the_window(truth: SceneTruth) -> None
     assert 0 < v - line.window.top < line.window.height
 
 
-def test_maps_of_different_lengths_show_the_path_inside_of_the_picture(truth: SceneTruth) -> None:
+def test_panel_paths_are_clipped_to_image(truth: SceneTruth) -> None:
     poses = walk()
     poses[10:, 2, 3] = 9  # far above the room
     maps = [stored({1: 7}), stored({1: 1, 2: 2})]
@@ -121,7 +121,7 @@ def test_maps_of_different_lengths_show_the_path_inside_of_the_picture(truth: Sc
     assert line.truth.path is None
 
 
-def test_without_truth_the_last_map_says_which_object_is_which() -> None:
+def test_panel_line_without_truth_uses_last_map_as_reference() -> None:
     line = panel_line([stored({1: 7, 2: 3}), stored({1: 2, 2: 1})], None, SIZE, zoom=False)
     assert line.truth is None
     first, last = line.maps
@@ -131,7 +131,7 @@ def test_without_truth_the_last_map_says_which_object_is_which() -> None:
     assert shown(last) == {"thing 1", "thing 2"}
 
 
-def test_a_windows_camera_sees_what_is_in_it() -> None:
+def test_zoom_window_camera_projects_window_area() -> None:
     camera, window = Camera(160, 120, 150.0, 140.0, 80.0, 59.0), Window(32, 24, 64, 48)
     larger = window.seen_by(camera)
     points = np.array([[0.1, -0.2, 2.0], [-0.4, 0.3, 1.5]])

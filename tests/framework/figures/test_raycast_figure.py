@@ -69,7 +69,7 @@ def test_raycast_texts_are_on_the_page() -> None:
         assert box.y1 <= height
 
 
-def test_raycast_colors_are_those_of_the_geometry() -> None:
+def test_raycast_colors_match_geometry() -> None:
     view = wall()
     mapped = view.depth > 0
     assert np.abs(normal_colors(view)[mapped].astype(int) - (128, 128, 255)).max() <= 1, "towards the camera"
@@ -81,7 +81,7 @@ def test_raycast_colors_are_those_of_the_geometry() -> None:
     assert not np.array_equal(indices[20, 20], indices[20, 60])
 
 
-def test_unmapped_pixels_are_white(tmp_path: Path) -> None:
+def test_raycast_unmapped_pixels_are_white(tmp_path: Path) -> None:
     write_raycast(tmp_path / "view.png", wall(), NAMES, CENTERS, "")
     write_raycast(tmp_path / "again.png", wall(), NAMES, CENTERS, "")
     assert (tmp_path / "view.png").read_bytes() == (tmp_path / "again.png").read_bytes()

@@ -75,7 +75,7 @@ def picture(refinement: Refinement, title: str, refiner: str) -> np.ndarray:
     return pixels(refinement_figure(refinement, title, refiner))
 
 
-def test_a_pixel_shows_the_smallest_cluster_over_it() -> None:
+def test_cluster_marks_owner_is_smallest_cluster() -> None:
     frame = two_walls()
     large, small = box(frame, 5, 40, 5, 40), box(frame, 10, 20, 10, 20)
     for masks, at in (([large, small], 1), ([small, large], 0)):
@@ -85,7 +85,7 @@ def test_a_pixel_shows_the_smallest_cluster_over_it() -> None:
         np.testing.assert_array_equal(owner[~large], -1)
 
 
-def test_dropped_is_what_no_cluster_holds_and_added_what_its_own_did_not() -> None:
+def test_cluster_marks_separate_dropped_and_added_pixels() -> None:
     frame = two_walls()
     a, b = box(frame, 0, 10, 0, 20), box(frame, 0, 10, 15, 30)
     grown = box(frame, 0, 14, 0, 15)
@@ -97,7 +97,7 @@ def test_dropped_is_what_no_cluster_holds_and_added_what_its_own_did_not() -> No
     assert not marks.added.any()
 
 
-def test_points_of_no_cluster_are_dropped() -> None:
+def test_cluster_marks_unassigned_points_are_dropped() -> None:
     frame = two_walls()
     change = refined(frame, [box(frame, 0, 10, 0, 20)], [box(frame, 0, 10, 0, 20)])
     loose = np.where(change.after.pixels[:, 0] < 8, -1, change.after.cluster).astype(np.int32)
@@ -106,7 +106,7 @@ def test_points_of_no_cluster_are_dropped() -> None:
     assert not marks.added.any()
 
 
-def test_colors_stay_and_further_parts_get_their_own() -> None:
+def test_cluster_marks_keep_colors_and_add_colors_for_parts() -> None:
     frame = two_walls()
     a, b = box(frame, 0, 10, 0, 20), box(frame, 20, 30, 0, 20)
     change = refined(frame, [a, b], [box(frame, 0, 10, 0, 5), box(frame, 0, 10, 5, 20), b])
@@ -119,7 +119,7 @@ def test_colors_stay_and_further_parts_get_their_own() -> None:
     assert apart.min() > 100, "nothing looks like what was dropped"
 
 
-def test_image_is_tinted_and_hatched() -> None:
+def test_refinement_image_is_tinted_and_hatched() -> None:
     frame = two_walls()
     change = refined(frame, [box(frame, 16, 40, 16, 48)], [box(frame, 16, 40, 16, 32)])
     before, after = ClusterMarks.before(change), ClusterMarks.after(change)
@@ -140,7 +140,7 @@ def test_image_is_tinted_and_hatched() -> None:
     assert 0.1 < hatched[1] < 0.6, "stripes"
 
 
-def test_side_view_shows_distances_in_depth() -> None:
+def test_side_view_shows_depth_distances() -> None:
     frame = two_walls()
     mask = box(frame, 16, 32, 24, 40)  # bleeds from the near wall to the far one
     change = refined(frame, [mask], [mask & (frame.depth < 2.5)])
@@ -164,7 +164,7 @@ def test_side_view_shows_distances_in_depth() -> None:
 
 
 @pytest.mark.parametrize("tilt", [-0.8, -0.5, -0.2, 0.0])
-def test_the_floor_says_what_is_up(tilt: float) -> None:
+def test_side_view_up_direction_is_floor_normal(tilt: float) -> None:
     room = CornerRoom()[0]
     camera, T = room.camera, exp_se3(np.array([0, 0, 0, tilt, 0, 0.1]))
     v, u = np.mgrid[: camera.height, : camera.width]
@@ -180,7 +180,7 @@ def test_the_floor_says_what_is_up(tilt: float) -> None:
     assert axes[:, 0] @ up == pytest.approx(0, abs=1e-9)
 
 
-def test_the_picture_of_a_room() -> None:
+def test_refinement_figure_of_room_is_deterministic() -> None:
     frame = CornerRoom()[0]
     before = lift(SphereDetector().detect(frame), frame, Pose(np.eye(4)))
     after = keep_points(before, before.pixels[:, 0] % 3 > 0)
@@ -204,7 +204,7 @@ def odd_frames() -> dict[str, Frame]:
 
 
 @pytest.mark.parametrize("name", odd_frames())
-def test_whatever_the_frame_there_is_a_picture(name: str) -> None:
+def test_refinement_figure_of_unusual_frames_is_drawn(name: str) -> None:
     frame = odd_frames()[name]
     held = frame.depth > 0
     some = held & (np.indices(held.shape)[1] % 8 < 5)
@@ -214,13 +214,13 @@ def test_whatever_the_frame_there_is_a_picture(name: str) -> None:
 
 @pytest.mark.parametrize("after", [0, 1, 2])
 @pytest.mark.parametrize("before", [0, 1])
-def test_clusters_may_be_none_come_and_go(before: int, after: int) -> None:
+def test_refinement_figure_accepts_changed_cluster_counts(before: int, after: int) -> None:
     frame = two_walls()
     image = picture(refined(frame, [box(frame, 5, 9, 0, 30)] * before, [box(frame, 7, 9, 0, 30)] * after), "", "")
     assert image.shape[1] == round(WIDTH_IN * DPI)
 
 
-def test_many_clusters_and_parts_fit_on_the_picture() -> None:
+def test_refinement_figure_height_is_limited_for_many_clusters() -> None:
     frame = two_walls()
     stripes = [box(frame, k, k + 1, 4, 20) for k in range(30)]
     few = picture(refined(frame, stripes[:24], stripes[:24]), "all", "refiner=identity")
@@ -228,7 +228,7 @@ def test_many_clusters_and_parts_fit_on_the_picture() -> None:
     assert many.shape == few.shape, "the table has an end"
 
 
-def test_it_is_written_whole(tmp_path: Path) -> None:
+def test_write_refinement_creates_complete_image(tmp_path: Path) -> None:
     frame = two_walls()
     mask = box(frame, 10, 30, 10, 50)
     write_refinement(tmp_path / "refinement.png", refined(frame, [mask], [mask]), "title", "refiner=identity")

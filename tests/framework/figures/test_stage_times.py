@@ -22,7 +22,7 @@ def run(frames: list[int], **milliseconds: list[float]) -> StageTimes:
     st.lists(st.one_of(st.floats(0, 1e4), st.just(np.nan)), min_size=1, max_size=30),
     st.sampled_from([1, 3, 9]),
 )
-def test_the_running_median_is_that_of_the_neighbors_that_there_are(values: list[float], window: int) -> None:
+def test_running_median_matches_slow_reference(values: list[float], window: int) -> None:
     slow = []
     for k, value in enumerate(values):
         around = [one for one in values[max(0, k - window // 2) : k + window // 2 + 1] if not np.isnan(one)]
@@ -32,7 +32,7 @@ def test_the_running_median_is_that_of_the_neighbors_that_there_are(values: list
 
 @settings(derandomize=True, deadline=None, max_examples=100)
 @given(st.lists(st.floats(-5, 5), max_size=8), st.floats(0.01, 1))
-def test_labels_keep_their_order_and_their_distance_and_their_mean(places: list[float], gap: float) -> None:
+def test_spread_keeps_label_order_distance_and_mean(places: list[float], gap: float) -> None:
     found = spread(places, gap)
     order = np.argsort(places, kind="stable")
     assert (np.diff(np.array(found)[order]) >= gap - 1e-9).all()
@@ -41,11 +41,11 @@ def test_labels_keep_their_order_and_their_distance_and_their_mean(places: list[
     assert np.abs(np.array(spread(found, gap)) - found).max(initial=0) < 1e-9, "what is apart stays"
 
 
-def test_two_labels_that_touch_move_by_the_same() -> None:
+def test_spread_moves_overlapping_labels_equally() -> None:
     assert spread([1.0, 5.0, 1.2], 1.0) == pytest.approx([0.6, 5.0, 1.6])
 
 
-def test_the_mean_over_sequences_ends_with_the_shortest() -> None:
+def test_mean_times_end_with_shortest_sequence() -> None:
     short = run([0, 2, 4], detection=[1, 1, 1], update=[4, 4, 4], integration=[6, 6, 6], tracking=[9, 9, 9])
     last = {"update": [5, 5, 5, 99, 99], "integration": [15, 15, 15, 99, 99]}
     long = run([0, 2, 4, 6, 8], detection=[3, 3, 3, 99, 99], **last)
@@ -57,7 +57,7 @@ def test_the_mean_over_sequences_ends_with_the_shortest() -> None:
     assert (times.count, times.longest, times.columns) == (2, 8, ["Mask R-CNN", "map integration"])
 
 
-def test_a_frame_that_one_sequence_lost_is_the_mean_of_the_others() -> None:
+def test_mean_times_skip_missing_frames() -> None:
     full = {stage: [10.0, 10.0, 10.0] for stage in STAGES}
     lost = run([0, 1, 2], **(full | {"association": [10, np.nan, 10]}))
     double = run([0, 2], **{stage: [20.0, 20.0] for stage in STAGES})  # frame 1 could not be read
@@ -67,7 +67,7 @@ def test_a_frame_that_one_sequence_lost_is_the_mean_of_the_others() -> None:
     np.testing.assert_array_equal(times.mean["data association"], [30, np.nan, 30])
 
 
-def test_single_slow_frames_are_no_trend_and_growth_is_last_by_first() -> None:
+def test_mean_times_growth_ignores_single_slow_frames() -> None:
     frames = list(range(90))
     slow = [10.0] * 90
     slow[0], slow[50] = 4000.0, 900.0
@@ -79,7 +79,7 @@ def test_single_slow_frames_are_no_trend_and_growth_is_last_by_first() -> None:
     assert np.isnan(times.growth("map integration"))
 
 
-def test_a_row_without_runs_leaves_an_empty_diagram_that_says_so() -> None:
+def test_stage_times_figure_row_without_runs_is_empty() -> None:
     times = MeanTimes.of([run([0], refinement=[1.0], fusion=[2.0])])
     page = stage_times_figure({"ours": times, "rival": None}, "a note")
     first, second = page.figure.axes

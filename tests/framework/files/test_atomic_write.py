@@ -46,9 +46,7 @@ from framework.vocabulary.label_spaces import COCO, read_labels
         (read_uint16, 2**28),
     ],
 )
-def test_oversized_file_raises_before_reading(
-    tmp_path: Path, read: Callable[[Path], object], most: int
-) -> None:
+def test_oversized_file_raises_before_reading(tmp_path: Path, read: Callable[[Path], object], most: int) -> None:
     with (tmp_path / "large").open("wb") as file:
         file.truncate(most + 1)
     with pytest.raises(DataError, match=rf"large has {most + 1} bytes, more than the {most} that") as caught:
@@ -140,9 +138,7 @@ def test_write_follows_symbolic_link(tmp_path: Path) -> None:
         assert not target.is_symlink()
 
 
-def test_failed_write_error_names_requested_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_write_error_names_requested_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not its temporary name: on a disk that is only to be read it cannot be removed either."""
 
     def refused(*_: object, **__: object) -> None:

@@ -52,7 +52,9 @@ def test_invalid_gravity_line_raises_one_line(tmp_path: Path, line: str, said: s
 
 @examples(max_examples=EXAMPLES, deadline=None)
 @given(damaged(CONTENT, (b"nan", b"inf", b"1e-320", b"#")))
-def test_fuzzed_gravity_file_is_read_or_raises_one_line(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+def test_fuzzed_gravity_file_is_read_or_raises_one_line(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes
+) -> None:
     path = tmp_path_factory.mktemp("gravity") / "gravity.txt"
     path.write_bytes(content)
     try:

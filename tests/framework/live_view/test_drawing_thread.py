@@ -59,7 +59,7 @@ def mapped(room: CornerRoom) -> GridMap:
     return result.scene
 
 
-def test_all_is_told_and_the_last_map_is_whole(room: CornerRoom) -> None:
+def test_drawing_thread_draws_all_frames_and_final_map(room: CornerRoom) -> None:
     scene, book = mapped(room), Notebook()
     background = DrawingThread(scene, book, frame_interval=1, map_interval=3600)
     for frame in room:
@@ -78,7 +78,7 @@ def test_all_is_told_and_the_last_map_is_whole(room: CornerRoom) -> None:
     assert book.closed
 
 
-def test_the_loop_does_not_wait_and_only_the_newest_picture_is_drawn(room: CornerRoom) -> None:
+def test_drawing_thread_does_not_block_and_draws_newest_image(room: CornerRoom) -> None:
     going_on, book = threading.Event(), Notebook()
     book.waits_for = going_on
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
@@ -95,7 +95,7 @@ def test_the_loop_does_not_wait_and_only_the_newest_picture_is_drawn(room: Corne
 
 
 @pytest.mark.parametrize("every", [2, 4])
-def test_pictures_are_of_every_so_many_frames(room: CornerRoom, every: int) -> None:
+def test_drawing_thread_draws_images_at_frame_interval(room: CornerRoom, every: int) -> None:
     book = Notebook()
     background = DrawingThread(mapped(room), book, every, map_interval=3600)
     for frame in room:
@@ -104,7 +104,7 @@ def test_pictures_are_of_every_so_many_frames(room: CornerRoom, every: int) -> N
     assert {picture.frame.index % every for picture in book.pictures} == {0}
 
 
-def test_a_drawing_that_fails_is_told_once_and_ends_nothing(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+def test_drawing_thread_draw_error_is_logged_once(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
     book = Notebook(fails=True)
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     for frame in room:
@@ -118,7 +118,7 @@ def test_a_drawing_that_fails_is_told_once_and_ends_nothing(room: CornerRoom, ca
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_drawing_that_cannot_be_closed_is_told_once(
+def test_drawing_thread_close_error_is_logged_once(
     fails: bool, room: CornerRoom, caplog: pytest.LogCaptureFixture
 ) -> None:
     background = DrawingThread(
@@ -130,7 +130,7 @@ def test_a_drawing_that_cannot_be_closed_is_told_once(
     assert ("No space left" if fails else "the writer's thread has ended") in told
 
 
-def test_a_map_that_cannot_be_shown_ends_nothing(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+def test_drawing_thread_map_error_does_not_end_run(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
     class Broken(GridMap):
         def mesh(self) -> None:  # type: ignore[override]
             raise MemoryError("Unable to allocate 40 GiB")
@@ -143,7 +143,7 @@ def test_a_map_that_cannot_be_shown_ends_nothing(room: CornerRoom, caplog: pytes
     assert not book.maps
 
 
-def test_what_came_last_is_drawn_although_no_frame_follows(room: CornerRoom) -> None:
+def test_drawing_thread_draws_last_frame_without_successor(room: CornerRoom) -> None:
     """A live video that stands still."""
     book = Notebook()
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
@@ -173,7 +173,7 @@ def did(paced: Pace, clock: Clock, seconds: float) -> None:
 
 
 @pytest.mark.parametrize(("seconds", "next_after"), [(0.001, 1.0), (0.2, 4.0)])
-def test_it_waits_for_its_time_and_for_its_share(clock: Clock, seconds: float, next_after: float) -> None:
+def test_pace_waits_for_interval_and_time_share(clock: Clock, seconds: float, next_after: float) -> None:
     paced = Pace(1.0, 0.05, lambda: clock.now)
     assert paced.due()
     did(paced, clock, seconds)
@@ -183,7 +183,7 @@ def test_it_waits_for_its_time_and_for_its_share(clock: Clock, seconds: float, n
     assert paced.due()
 
 
-def test_it_is_not_due_while_it_is_done(clock: Clock) -> None:
+def test_pace_is_not_due_during_work(clock: Clock) -> None:
     paced = Pace(1.0, 0.05, lambda: clock.now)
     with paced.kept():
         assert not paced.due()

@@ -11,7 +11,7 @@ from framework.rendering.palette import instance_colors
 from tests.support.scenes.corner_room import CAMERA, CLASSES, CornerRoom, look, pose_at
 
 
-def test_those_that_come_later_change_no_color() -> None:
+def test_instance_colors_are_unchanged_by_new_instances() -> None:
     centroids = {key: np.random.default_rng(key).uniform(0, 2, 3) for key in (3, 5, 9, 12)}
     colors = InstanceColors()
     colors.add({key: centroids[key] for key in (5, 3)})
@@ -22,7 +22,7 @@ def test_those_that_come_later_change_no_color() -> None:
     assert [colors[key].tolist() for key in (3, 5)] == instance_colors(np.array([centroids[3], centroids[5]])).tolist()
 
 
-def test_a_mesh_is_painted_where_instances_are() -> None:
+def test_instance_colors_paint_only_instance_vertices() -> None:
     mesh, colors = room_mesh(), InstanceColors()
     colors.add({1: np.zeros(3), 2: np.ones(3)})
     painted = colors.painted(mesh)
@@ -48,19 +48,19 @@ def masks_of(frame: Frame) -> np.ndarray:
     return np.stack([ids == 2, ids == 1, ids == 0, np.zeros_like(ids, bool)])
 
 
-def test_masks_have_the_instances_that_are_seen_there() -> None:
+def test_seen_instances_match_masks_to_visible_instances() -> None:
     frame = CornerRoom()[5]
     found = seen_instances(masks_of(frame), frame, pose_at(5), room_mesh())
     assert found.tolist() == [2, 1, 0, 0]
 
 
-def test_what_lies_behind_what_is_seen_does_not_count() -> None:
+def test_seen_instances_ignore_occluded_vertices() -> None:
     frame = CornerRoom()[5]
     near = Frame(5, 0.0, frame.color, np.full(frame.depth.shape, 0.5, np.float32), CAMERA)
     assert seen_instances(masks_of(frame), near, pose_at(5), room_mesh()).tolist() == [0, 0, 0, 0]
 
 
-def test_an_empty_map_and_no_masks_are_taken() -> None:
+def test_seen_instances_accept_empty_map_and_no_masks() -> None:
     frame, mesh = CornerRoom()[0], room_mesh()
     nothing = InstanceMesh(
         mesh.vertices[:0], mesh.triangles, mesh.colors[:0], mesh.instance_ids[:0], mesh.class_ids[:0], CLASSES

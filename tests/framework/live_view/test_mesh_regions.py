@@ -28,7 +28,7 @@ def changed(regions: MeshRegions, *mesh: np.ndarray) -> dict[Region, MeshPart]:
 
 
 @pytest.mark.parametrize("side", [0.35, 1.0, 50.0])
-def test_the_parts_together_are_the_mesh(side: float) -> None:
+def test_mesh_regions_together_equal_mesh(side: float) -> None:
     mesh = sheet(40, 25)
     parts = changed(MeshRegions(side), *mesh)
     found = [corners(part.vertices, part.triangles, part.colors) for part in parts.values()]
@@ -41,7 +41,7 @@ def test_the_parts_together_are_the_mesh(side: float) -> None:
         assert np.unique(part.triangles).tolist() == list(range(len(part.vertices))), "no vertex is idle"
 
 
-def test_many_regions_are_told_apart_as_few_are() -> None:
+def test_mesh_regions_support_more_than_16_bit_numbers() -> None:
     """More of them than 16 bits can number."""
     vertices, triangles, colors = sheet(40, 40, spacing=10.0)
     parts = changed(MeshRegions(1.0), vertices, triangles, colors)
@@ -49,7 +49,7 @@ def test_many_regions_are_told_apart_as_few_are() -> None:
     assert sum(len(part.triangles) for part in parts.values()) == len(triangles)
 
 
-def test_only_what_has_changed_is_told() -> None:
+def test_mesh_regions_return_only_changed_parts() -> None:
     regions = MeshRegions(1.0)
     vertices, triangles, colors = sheet(40, 40)
     assert len(changed(regions, vertices, triangles, colors)) == 16
@@ -58,7 +58,7 @@ def test_only_what_has_changed_is_told() -> None:
     assert list(changed(regions, vertices, triangles, colors)) == [(-2, -2, 0)]
 
 
-def test_what_is_gone_is_told_once() -> None:
+def test_mesh_regions_return_removed_parts_once() -> None:
     regions = MeshRegions(1.0)
     vertices, triangles, colors = sheet(40, 40)
     changed(regions, vertices, triangles, colors)

@@ -68,12 +68,12 @@ def told(found: list, kind: Kind) -> list[str]:
     return sorted(change.name for change in found if change.kind is kind)
 
 
-def test_the_room_has_what_the_tests_take_from_it() -> None:
+def test_office_contains_expected_objects() -> None:
     names = office().class_names
     assert (names[CHAIR], names[TABLE]) == ("chair", "dining table")
 
 
-def test_two_visits_of_one_room_differ_in_nothing(before: Visit) -> None:
+def test_changes_of_unchanged_room_are_empty(before: Visit) -> None:
     found = changes(before, visit(changed_room(1), "detector=ground_truth"))
     assert {change.kind for change in found} <= {Kind.STAYED, Kind.NOT_SEEN}
     assert len(told(found, Kind.STAYED)) >= 7
@@ -81,7 +81,7 @@ def test_two_visits_of_one_room_differ_in_nothing(before: Visit) -> None:
     assert all(0 <= change.probability <= 1 for change in found)
 
 
-def test_what_was_taken_has_vanished_and_the_other_way_round_has_appeared(before: Visit) -> None:
+def test_changes_removed_objects_vanish_or_appear_reversed(before: Visit) -> None:
     after = visit(changed_room(1, without=(CHAIR, TABLE)), "detector=ground_truth")
     found = changes(before, after)
     assert told(found, Kind.VANISHED) == ["chair", "dining table"]
@@ -93,7 +93,7 @@ def test_what_was_taken_has_vanished_and_the_other_way_round_has_appeared(before
     assert told(back, Kind.VANISHED) == told(back, Kind.MOVED) == []
 
 
-def test_what_stands_elsewhere_has_moved(before: Visit) -> None:
+def test_changes_displaced_object_has_moved(before: Visit) -> None:
     found = changes(before, visit(changed_room(1, moved={CHAIR: (-0.9, 0.6)}), "detector=ground_truth"))
     [moved] = [change for change in found if change.kind is Kind.MOVED]
     assert moved.name == "chair"
@@ -103,14 +103,14 @@ def test_what_stands_elsewhere_has_moved(before: Visit) -> None:
 
 
 @pytest.mark.acceptance
-def test_a_noisy_detector_makes_up_no_changes() -> None:
+def test_changes_with_noisy_detector_are_empty() -> None:
     one, other = (visit(changed_room(k), "detector=simulated", f"seed={k}") for k in (0, 1))
     found = changes(one, other)
     assert not [change for change in found if change.kind in (Kind.VANISHED, Kind.MOVED) and change.probability > 0.3]
     assert len(told(found, Kind.STAYED)) >= 5
 
 
-def test_halves_of_a_real_recording_differ_in_nothing(shared_data: Path) -> None:
+def test_changes_between_halves_of_real_recording_are_empty(shared_data: Path) -> None:
     """A flat, by 2Go: every other frame each; what one half found and the other did not, stands where it stood."""
     halves = [
         visit(RgbdFolder(shared_data / "replica_floor2", start=k, stop=40, stride=2), "fuser.voxel_size=0.04")
@@ -124,7 +124,7 @@ def bits(there: int, through: int, of: int = 10) -> tuple[Bool, Bool]:
     return np.arange(of) < there, np.arange(of) >= of - through
 
 
-def test_probabilities_follow_the_evidence() -> None:
+def test_probability_gone_follows_evidence() -> None:
     def gone(there: int, through: int, matched: bool, confidence: float = 0.8) -> float:
         return probability_gone(confidence, *bits(there, through), matched)
 
@@ -136,7 +136,7 @@ def test_probabilities_follow_the_evidence() -> None:
     assert gone(0, 10, False, confidence=0.1) < gone(0, 10, False, confidence=0.9), "it was seldom found before, too"
 
 
-def test_a_point_is_there_where_a_surface_is_and_seen_through_before_it(before: Visit) -> None:
+def test_look_for_separates_surface_from_free_space(before: Visit) -> None:
     vertices = before.scene.mesh().vertices[::500]
     there, through = look_for(before, vertices)
     assert there.mean() > 0.8
@@ -149,12 +149,12 @@ def test_a_point_is_there_where_a_surface_is_and_seen_through_before_it(before: 
     assert not np.logical_or(*look_for(before, outside)).any(), "what is behind walls is not known"
 
 
-def test_a_visit_has_poses(before: Visit) -> None:
+def test_visit_without_poses_raises(before: Visit) -> None:
     with pytest.raises(DataError, match="without any pose"):
         Visit(before.scene, np.zeros((0, 4, 4)))
 
 
-def test_the_command_lists_changes(
+def test_diff_command_lists_changes(
     tmp_path: Path, before: Visit, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     after = visit(changed_room(1, without=(CHAIR,)), "detector=ground_truth")

@@ -41,7 +41,7 @@ def asked(request: pytest.FixtureRequest, mapper: Mapper, stored: Map) -> Map:
     return mapper if request.param == "growing" else stored
 
 
-def test_objects_are_found_by_their_class(asked: Map) -> None:
+def test_map_instances_are_filtered_by_class(asked: Map) -> None:
     names = {asked.name(instance) for instance in asked.instances().values()}
     assert len(names) >= 1
     for name in names:
@@ -54,7 +54,7 @@ def test_objects_are_found_by_their_class(asked: Map) -> None:
         asked.instances(f"{absent}x")
 
 
-def test_the_nearest_object_is_that_whose_surface_is_nearest(asked: Map) -> None:
+def test_map_nearest_returns_object_with_nearest_surface(asked: Map) -> None:
     vertices = asked.mesh().vertices
     for instance in asked.instances().values():
         on_it = vertices[instance.vertices[0]]
@@ -69,7 +69,7 @@ def test_the_nearest_object_is_that_whose_surface_is_nearest(asked: Map) -> None
             asked.nearest(wrong)
 
 
-def test_an_object_is_where_a_view_shows_it(asked: Map) -> None:
+def test_map_at_pixel_matches_view(asked: Map) -> None:
     """And nothing is shown that nobody can ask for."""
     frame = CornerRoom()[3]
     assert frame.T_world_camera is not None
@@ -89,7 +89,7 @@ def test_an_object_is_where_a_view_shows_it(asked: Map) -> None:
         asked.at_pixel(-1, 0, frame.camera, frame.T_world_camera)
 
 
-def test_a_view_does_not_show_what_does_not_count_yet() -> None:
+def test_map_view_hides_unconfirmed_instances() -> None:
     """After one frame the map holds objects that a single detection has made."""
     mapper = Mapper(*STAGES, "fuser.min_observations=3")
     frame = CornerRoom()[0]
@@ -100,7 +100,7 @@ def test_a_view_does_not_show_what_does_not_count_yet() -> None:
     assert not mapper.view(frame.camera, frame.T_world_camera).instance_ids.any()
 
 
-def test_the_last_frame_is_what_a_pixel_is_asked_of(mapper: Mapper) -> None:
+def test_mapper_at_pixel_uses_last_frame_by_default(mapper: Mapper) -> None:
     last = CornerRoom()[len(CornerRoom()) - 1]
     assert last.T_world_camera is not None
     for u, v in ((10, 10), (last.camera.width // 2, last.camera.height // 2)):
@@ -111,7 +111,7 @@ def test_the_last_frame_is_what_a_pixel_is_asked_of(mapper: Mapper) -> None:
         Mapper(*STAGES).at_pixel(0, 0)
 
 
-def test_an_object_has_a_mesh_of_its_own(asked: Map) -> None:
+def test_map_mesh_of_instance_contains_only_its_vertices(asked: Map) -> None:
     for instance in asked.instances().values():
         own = asked.mesh(instance)
         assert len(own.vertices) == len(instance.vertices)
@@ -121,7 +121,7 @@ def test_an_object_has_a_mesh_of_its_own(asked: Map) -> None:
         asked.mesh(999)
 
 
-def test_what_changed_is_told_with_each_frame() -> None:
+def test_mapper_add_reports_new_and_removed_instances() -> None:
     mapper = Mapper(*STAGES)
     known: set[int] = set()
     for frame in CornerRoom():
@@ -134,7 +134,7 @@ def test_what_changed_is_told_with_each_frame() -> None:
     assert known
 
 
-def test_frames_by_hand_are_frames() -> None:
+def test_mapper_add_arrays_equals_add_frame() -> None:
     """Color, depth, pose and camera make the map that the frames of a sequence make."""
     by_hand, by_frame = Mapper(*STAGES, "detector=none"), Mapper(*STAGES, "detector=none")
     for k, frame in enumerate(CornerRoom()):
@@ -145,7 +145,7 @@ def test_frames_by_hand_are_frames() -> None:
     np.testing.assert_array_equal(by_hand.mesh().vertices, by_frame.mesh().vertices)
 
 
-def test_frames_that_are_none_are_told() -> None:
+def test_mapper_add_incomplete_frame_raises() -> None:
     frame = CornerRoom()[0]
     mapper = Mapper(*STAGES)
     with pytest.raises(DataError, match="takes a Frame, or color and depth, found ndarray alone"):
@@ -158,7 +158,7 @@ def test_frames_that_are_none_are_told() -> None:
 
 
 @pytest.mark.parametrize("value", ["a b", "it's", r"C:\x\new", "x=1,2", "[1]", "{a: b}", "null", "é", "a\\"])
-def test_stages_and_parameters_go_by_name(value: str) -> None:
+def test_mapper_accepts_keyword_parameters(value: str) -> None:
     named = Mapper(
         detector="none", tracker="ground_truth", threads=1, detection_cache_dir=value, debug=False, resume_from=None
     )
@@ -168,7 +168,7 @@ def test_stages_and_parameters_go_by_name(value: str) -> None:
         Mapper(detector=["none"])
 
 
-def test_by_hand_and_by_the_command_line_it_is_the_same_map_to_the_byte(tmp_path: Path) -> None:
+def test_mapper_and_command_line_maps_are_identical(tmp_path: Path) -> None:
     """The beginning of the demo, tracked and labeled by the network."""
     asked = ("fuser.voxel_size=0.02", "seed=3")
     line = [sys.executable, "-m", "framework", "dataset=desk", "dataset.stop=6", *asked, "hydra.run.dir=run"]

@@ -57,7 +57,7 @@ def run_without(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_object_with_the_nearest_embedding_is_first(embedded: Map) -> None:
+def test_by_embedding_ranks_by_similarity(embedded: Map) -> None:
     found = by_embedding(embedded, np.float32([0, 1]))
     assert [(one.instance.id, round(one.similarity, 4)) for one in found] == [(2, 0.8), (1, 0.0)]
     assert found[0].name == "bed"
@@ -67,14 +67,14 @@ def test_the_object_with_the_nearest_embedding_is_first(embedded: Map) -> None:
         by_embedding(embedded, np.float32([0, 1, 0]))
 
 
-def test_names_rank_by_the_probability_of_the_class(embedded: Map) -> None:
+def test_by_names_ranks_by_class_probability(embedded: Map) -> None:
     found = by_names(embedded, "the chairs")
     assert [one.instance.id for one in found] == [1, 3]
     assert found[0].similarity > found[1].similarity
     assert by_names(embedded, "a bed")[0].instance.id == 2
 
 
-def test_a_color_fits_the_share_of_the_surface_that_has_it(embedded: Map) -> None:
+def test_color_fit_is_surface_share(embedded: Map) -> None:
     whole, instance = embedded.mesh(), embedded.instances()[1]
     half = len(instance.vertices) // 2
     colors = np.full_like(whole.colors, 255)
@@ -87,7 +87,7 @@ def test_a_color_fits_the_share_of_the_surface_that_has_it(embedded: Map) -> Non
     assert color_fit(painted, instance, ["yellow"]) == pytest.approx(0, abs=1e-3)
 
 
-def test_a_color_alone_is_a_query(embedded: Map) -> None:
+def test_by_names_accepts_color_without_class(embedded: Map) -> None:
     for color in {one.color for one in by_names(embedded, "beds or chairs")}:
         found = by_names(embedded, color)
         assert [one.similarity for one in found] == sorted((one.similarity for one in found), reverse=True)
@@ -95,7 +95,7 @@ def test_a_color_alone_is_a_query(embedded: Map) -> None:
 
 
 @pytest.mark.parametrize("query", ["a blob", "a wooden chair", "the"])
-def test_words_that_nobody_knows_are_named(embedded: Map, query: str) -> None:
+def test_by_names_unknown_words_raise(embedded: Map, query: str) -> None:
     with pytest.raises(DataError, match="its objects are bed, chair; colors are black, gray") as refused:
         by_names(embedded, query)
     assert "'chair'" not in str(refused.value)
@@ -112,7 +112,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *
     return status, captured.out, captured.err
 
 
-def test_the_command_says_by_what_it_answers(
+def test_query_command_prints_method_and_matches(
     embedded: Map, run_without: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     absent = next(color for color in COLOR_NAMES if not by_names(embedded, f"a {color} bed"))
@@ -137,7 +137,7 @@ def test_the_command_says_by_what_it_answers(
         (["flying saucer"], "no class of this map and no color is called 'flying', 'saucer'"),
     ],
 )
-def test_what_cannot_be_answered_is_one_line(
+def test_query_command_error_is_one_line(
     words: list[str], fault: str, run_without: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, out, err = asked(monkeypatch, capsys, str(run_without), *words)
@@ -146,7 +146,7 @@ def test_what_cannot_be_answered_is_one_line(
     assert len(err.splitlines()) == 1
 
 
-def test_embeddings_need_the_model_that_they_are_of(
+def test_query_command_with_embeddings_requires_model(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The fixture's are of no model that there is."""
@@ -187,7 +187,7 @@ def test_query_with_embeddings_uses_model_of_run(
         query(scene, "red chair", model=clip)
 
 
-def test_a_map_is_asked_as_its_run_is(embedded: Map, run: Path, run_without: Path) -> None:
+def test_query_accepts_directory_name_and_map(embedded: Map, run: Path, run_without: Path) -> None:
     """A directory, its name, or a map; by names where there are no embeddings, and that is told."""
     assert query is instancemap.query
     answers = [query(run_without, "chairs"), query(str(run_without), "chairs"), query(embedded, "chairs", by="names")]
@@ -199,7 +199,7 @@ def test_a_map_is_asked_as_its_run_is(embedded: Map, run: Path, run_without: Pat
     assert query(run, f"a {absent} bed", by="names").objects == ()
 
 
-def test_a_run_that_does_not_say_its_model_is_told(embedded: Map, tmp_path: Path) -> None:
+def test_query_run_without_model_in_config_raises(embedded: Map, tmp_path: Path) -> None:
     embedded.save(tmp_path / "map.npz")
     for config in ("detector: null", "detector: 3", "detector: ${hydra:x}", "detector: {model: 4}", "seed: 0"):
         (tmp_path / "config.yaml").write_text(f"{config}\n")
@@ -217,12 +217,12 @@ def test_a_run_that_does_not_say_its_model_is_told(embedded: Map, tmp_path: Path
         ({"words": "bed", "by": "names", "model": "clip"}, r"a model is of embeddings, and by names none is asked"),
     ],
 )
-def test_what_is_no_question_is_said_before_anything_is_read(question: dict[str, Any], fault: str) -> None:
+def test_query_invalid_arguments_raise_before_reading(question: dict[str, Any], fault: str) -> None:
     with pytest.raises(ConfigError, match=fault):
         query("nowhere", **question)
 
 
-def test_a_question_that_cannot_be_answered_is_refused(embedded: Map, run_without: Path) -> None:
+def test_query_unanswerable_request_raises(embedded: Map, run_without: Path) -> None:
     with pytest.raises(DataError, match=r"query: there is no nowhere/map.npz: expected the directory of a run"):
         query("nowhere", "bed")
     with pytest.raises(DataError, match="has no embeddings: run with detector=with_embeddings"):

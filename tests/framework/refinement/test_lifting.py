@@ -12,7 +12,7 @@ from framework.refinement.lifting import lift
 from tests.support.scenes.corner_room import CornerRoom, pose_at
 
 
-def test_lift_places_readings_in_the_world(room: CornerRoom) -> None:
+def test_lift_back_projects_depth_to_world_points(room: CornerRoom) -> None:
     frame = room[3]
     assert frame.truth is not None
     masks = np.stack([frame.truth.instance_ids == 1, frame.truth.instance_ids > 0])  # the second covers the first
@@ -43,7 +43,7 @@ def test_lift_skips_pixels_without_depth(room: CornerRoom) -> None:
     assert len(lift(Detections.none(frame.camera.shape, ("a",)), frame, Pose(np.eye(4)))) == 0
 
 
-def test_lift_rejects_masks_of_another_size(room: CornerRoom) -> None:
+def test_lift_mask_size_mismatch_raises(room: CornerRoom) -> None:
     frame, shape = room[0], (1, 1)  # numpy would broadcast it over the image
     masks = np.ones((1, *shape), np.bool_)
     one = np.ones((1, 1), np.float32)

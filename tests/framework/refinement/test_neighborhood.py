@@ -57,7 +57,7 @@ def test_grouped_is_a_stable_sort(make):
 
 
 @pytest.mark.parametrize("make", [np.asarray, np.sort])
-def test_the_members_of_sorted_clusters_are_found_without_an_index(make):
+def test_members_of_sorted_clusters_is_slice(make):
     masks, frame = random_scene(0)
     whole = clusters_of(masks, frame)
     cluster = make(np.where(np.arange(len(whole.cluster)) % 7 == 0, -1, whole.cluster).astype(np.int32))
@@ -68,7 +68,7 @@ def test_the_members_of_sorted_clusters_are_found_without_an_index(make):
     np.testing.assert_array_equal(firsts, expected_firsts)
 
 
-def test_threads_share_the_clusters_evenly():
+def test_thread_schedule_balances_costs():
     threads = numba.get_num_threads()
     for costs in ([5, 1, 9, 4, 3, 2], [7], [0, 0, 0], []):
         order, starts = thread_schedule(np.array(costs, np.int64))
@@ -79,7 +79,7 @@ def test_threads_share_the_clusters_evenly():
         assert max(loads) <= sum(costs) / threads + max(costs, default=0), "Graham's bound"
 
 
-def test_known_structure_is_no_border_and_in_no_ring_but_may_be_in_a_mask():
+def test_structure_pixels_are_excluded_from_ring_and_border():
     """As if it had no reading, except for the clusters' own points."""
     masks, frame = random_scene(0)
     structure = np.random.default_rng(1).random((40, 60)) < 0.5
@@ -98,7 +98,7 @@ def test_known_structure_is_no_border_and_in_no_ring_but_may_be_in_a_mask():
     assert (structure & in_a_mask & (frame.depth > 0)).any(), "there was something to tell apart"
 
 
-def test_depth_in_mask_is_the_chamfer_distance():
+def test_depth_in_mask_equals_chamfer_distance():
     """To the nearest reading outside of the cluster inside of it, to the cluster around it; exactly."""
     for seed in range(5):
         masks, frame = random_scene(seed)
@@ -113,7 +113,7 @@ def test_depth_in_mask_is_the_chamfer_distance():
             assert around.mask_radii[k] == found.max(initial=0)
 
 
-def test_without_ring_only_the_mask_has_points():
+def test_neighborhood_without_ring_has_only_mask_points():
     masks, frame = random_scene(0)
     clusters = clusters_of(masks, frame)
     around = neighborhoods(clusters, frame, ring_fraction=0.0, min_ring=6, max_ring=8)
@@ -124,7 +124,7 @@ def test_without_ring_only_the_mask_has_points():
     np.testing.assert_array_equal(around.depth_in_mask, with_ring.depth_in_mask[~with_ring.of_ring])
 
 
-def test_points_are_those_of_back_project_and_rings_those_of_a_distance_transform():
+def test_neighborhood_matches_back_projection_and_distances():
     for seed in range(5):
         masks, frame = random_scene(seed)
         clusters = clusters_of(masks, frame)
@@ -163,7 +163,7 @@ def _chamfer_reference(mask: np.ndarray) -> np.ndarray:
         distance = relaxed
 
 
-def test_depth_in_mask_ignores_pixels_without_a_reading():
+def test_depth_in_mask_ignores_pixels_without_depth():
     mask = np.zeros((1, 40, 60), bool)
     mask[0, 10:31, 20:41] = True
     depth = np.ones((40, 60))
@@ -177,7 +177,7 @@ def test_depth_in_mask_ignores_pixels_without_a_reading():
     assert around.depth_in_mask.min() == -around.ring_widths[0]
 
 
-def test_thinned_keeps_every_nth_point():
+def test_sampled_keeps_every_nth_point():
     masks, frame = random_scene(1)
     around = neighborhoods(clusters_of(masks, frame), frame, 0.25, 4, 12)
     thin = surroundings(clusters_of(masks, frame), frame, Ring()).sampled(50)
@@ -191,7 +191,7 @@ def test_thinned_keeps_every_nth_point():
         assert is_mask.sum() == thin.mask_counts[k]
 
 
-def test_nothing_at_all():
+def test_neighborhood_without_clusters_or_depth_is_empty():
     frame = frame_of(np.zeros((40, 60)))
     around = neighborhoods(clusters_of(np.zeros((0, 40, 60), bool), frame), frame, 0.25, 4, 12)
     assert len(around) == 0
@@ -199,6 +199,6 @@ def test_nothing_at_all():
     assert around.mask_counts.tolist() == around.ring_counts.tolist() == [0, 0]
 
 
-def test_a_ring_is_checked() -> None:
+def test_ring_out_of_range_raises() -> None:
     with pytest.raises(ConfigError, match=r"Ring.max_ring must be in \[20, 80\], found 12"):
         Ring(min_ring=20)

@@ -36,20 +36,20 @@ def whole_image(exact: bool = False) -> PointClusters:
     return lift(Detections(masks, np.zeros((1, 4), np.float32), one[0], one, ("wall",), exact), FRAME, Pose(np.eye(4)))
 
 
-def test_true_masks_pass_as_they_are() -> None:
+def test_refine_exact_masks_are_unchanged() -> None:
     exact = whole_image(exact=True)
     assert refine(Moving((0, 0)), exact, FRAME) is exact
     assert refine(Moving((0, 0)), whole_image(), FRAME).pixels[-1].tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
-def test_a_refiner_that_makes_a_pixel_up_is_refused(pixel: tuple[int, int]) -> None:
+def test_refine_pixel_outside_image_raises(pixel: tuple[int, int]) -> None:
     with pytest.raises(DataError, match=r"pixels must lie in the image of 5x4, found u in .*, v in ") as caught:
         refine(Moving(pixel), whole_image(), FRAME)
     assert "\n" not in str(caught.value)
 
 
-def test_a_refiner_may_leave_nothing() -> None:
+def test_refine_accepts_empty_result() -> None:
     @dataclass
     class Dropping(ClusterRefiner):
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
@@ -61,7 +61,7 @@ def test_a_refiner_may_leave_nothing() -> None:
 
 @pytest.mark.parametrize("points", [0, 1, PART - 1, PART, PART + 1, 3 * PART + 100])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_keep_points_is_boolean_indexing(points, share):
+def test_keep_points_equals_boolean_indexing(points, share):
     rng = np.random.default_rng(0)
     ones = np.ones(3, np.float32)
     clusters = PointClusters(

@@ -22,13 +22,13 @@ def plane(normal: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.6, -0.9])
-def test_a_plane_takes_no_light_from_itself(angle: float) -> None:
+def test_openness_of_plane_is_one(angle: float) -> None:
     depth, normals = plane(np.array([0.2, np.sin(angle), -np.cos(angle)]) / np.hypot(1, 0.2), 1.5)
     assert (depth > 0).all()
     np.testing.assert_array_equal(openness(CAMERA, depth, normals), 1)
 
 
-def test_a_corner_takes_what_rays_say() -> None:
+def test_openness_in_corner_matches_ray_casting() -> None:
     """Two planes at right angles that meet 2 m before the camera: a ray meets the other one or nothing."""
     depth = np.float32(2 / (1 + np.abs(Y)))
     normals = np.stack([np.zeros_like(Y), -np.sign(Y), -np.ones_like(Y)], axis=-1).astype(np.float32) / np.sqrt(2)
@@ -45,7 +45,7 @@ def test_a_corner_takes_what_rays_say() -> None:
 
 
 @pytest.mark.parametrize(("gap", "darkens"), [(0.6 * THICKNESS_M, True), (2 * RANGE_M, False)])
-def test_a_pole_darkens_only_what_is_near_behind_it(gap: float, darkens: bool) -> None:
+def test_openness_pole_darkens_only_near_background(gap: float, darkens: bool) -> None:
     depth, normals = plane(np.array([0, 0, -1.0]), 3.0)
     pole = np.abs(X) < 0.02
     depth = np.where(pole, np.float32(3 - gap), depth)
@@ -53,7 +53,7 @@ def test_a_pole_darkens_only_what_is_near_behind_it(gap: float, darkens: bool) -
     assert (openness(CAMERA, depth, normals)[:, TILE + 1 : 40] == 1).all()
 
 
-def test_where_nothing_is_nothing_shades() -> None:
+def test_openness_around_missing_depth_is_one() -> None:
     depth, normals = plane(np.array([0, 0, -1.0]), 3.0)
     depth[40:80, 50:90] = 0
     np.testing.assert_array_equal(openness(CAMERA, depth, normals), 1)

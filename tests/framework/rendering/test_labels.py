@@ -20,7 +20,7 @@ def placed(labels: list[Label]) -> dict[str, Label]:
     return {label.text: label for label in labels}
 
 
-def test_a_large_object_carries_its_name_where_it_is_widest_and_a_small_one_has_it_beside() -> None:
+def test_labels_are_on_large_objects_and_beside_small_objects() -> None:
     ids = np.zeros((300, 400), np.int32)
     ids[50:250, 20:220] = 1
     ids[50:250, 20:100] = 0  # what is left of the table is 120 px wide: its middle is at 159.5
@@ -35,7 +35,7 @@ def test_a_large_object_carries_its_name_where_it_is_widest_and_a_small_one_has_
     assert not ids[top:bottom, left:right].any()
 
 
-def test_a_name_of_the_table_does_not_cover_what_lies_on_it() -> None:
+def test_label_of_large_object_does_not_cover_other_objects() -> None:
     ids = np.zeros((400, 400), np.int32)
     ids[100:300, 100:300] = 1
     ids[150:160, 195:205] = 2
@@ -48,7 +48,7 @@ def test_a_name_of_the_table_does_not_cover_what_lies_on_it() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_names_of_a_crowd_stay_inside_and_apart(seed: int) -> None:
+def test_labels_of_many_objects_stay_inside_without_overlap(seed: int) -> None:
     rng = np.random.default_rng(seed)
     ids = np.zeros((500, 600), np.int32)
     for key in range(1, 31):
@@ -70,14 +70,14 @@ def test_names_of_a_crowd_stay_inside_and_apart(seed: int) -> None:
             assert names[int(ids[v, u])] == label.text, "the line ends on the object"
 
 
-def test_nothing_to_name_is_no_fault() -> None:
+def test_place_labels_without_placeable_names_is_empty() -> None:
     assert place_labels(np.zeros((20, 30), np.int32), {}, size) == []
     assert place_labels(np.zeros((20, 30), np.int32), {4: "chair"}, size) == []
     ids = np.full((20, 30), 4, np.int32)
     assert place_labels(ids, {4: "a name that is wider than the picture"}, size) == []
 
 
-def test_a_line_is_drawn_from_the_name_to_the_object() -> None:
+def test_draw_labels_connects_label_to_object() -> None:
     image = Image.new("RGB", (300, 100), "red")
     draw_labels(image, [Label("cup", 60.0, 50.0, (200.0, 50.0))], _font(LABEL_PX))
     drawn = (np.asarray(image) != (255, 0, 0)).any(axis=2)

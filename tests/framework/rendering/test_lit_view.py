@@ -29,7 +29,7 @@ def view() -> LitView:
 COLORS = np.repeat([[90, 120, 150], [200, 100, 0]], 4, axis=0).astype(np.uint8)
 
 
-def test_own_colors_are_lit_and_stand_on_paper(view: LitView) -> None:
+def test_lit_view_in_colors_is_shaded_on_paper_background(view: LitView) -> None:
     image = view.in_colors(COLORS)
     assert image.dtype == np.uint8
     assert image.shape == (20, 40, 3)
@@ -39,7 +39,7 @@ def test_own_colors_are_lit_and_stand_on_paper(view: LitView) -> None:
     np.testing.assert_allclose(image[:, 21:29].astype(float), np.tile(COLORS[4] * 1.08 * LIGHT, (20, 8, 1)), atol=1)
 
 
-def test_instances_have_their_color_and_a_dark_border(view: LitView) -> None:
+def test_lit_view_in_instances_has_colors_and_dark_borders(view: LitView) -> None:
     ids = np.repeat([1, 0], 4).astype(np.int32)
     image = view.in_instances(COLORS, ids, {1: np.array([10, 200, 90], np.uint8)}).astype(float)
     painted = np.array([10, 200, 90]) * (0.84 + 0.16 * 120 / 140) * LIGHT
@@ -53,7 +53,7 @@ def test_instances_have_their_color_and_a_dark_border(view: LitView) -> None:
     np.testing.assert_allclose(image[:, 29], pale, atol=1)  # where the map ends is no border of what has no id
 
 
-def test_light_is_the_same_from_all_sides_of_the_world() -> None:
+def test_lit_view_is_invariant_to_world_rotation() -> None:
     rng = np.random.default_rng(0)
     vertices = rng.uniform(-0.4, 0.4, (60, 3)).astype(np.float32) + np.float32([0, 0, 1.2])
     triangles = rng.integers(0, 60, (40, 3), np.int32)

@@ -20,31 +20,31 @@ def ids(*runs: tuple[int, int]) -> np.ndarray:
     return np.repeat([label for label, _ in runs], [count for _, count in runs]).astype(np.int32)
 
 
-def test_each_instance_is_at_most_one_true_object_and_the_reverse() -> None:
+def test_same_objects_is_one_to_one() -> None:
     # 5 has most of the bed, 6 a part of it; 7 has the chair and half of the third; 8 is on the wall
     found = ids((0, 30), (8, 10), (5, 30), (6, 10), (7, 30), (0, 10))
     assert same_objects(found, TRUE) == {5: 900000, 7: 20}  # IoU 0.75, 20 / 30; 6 could only be the bed, too
 
 
-def test_the_largest_sum_of_overlaps_decides_not_the_first_choice() -> None:
+def test_same_objects_maximizes_total_overlap() -> None:
     true = ids((1, 50), (2, 30))
     found = ids((5, 20), (6, 30), (5, 30))  # 5 is a little of 1 and all of 2; 6 most of 1
     assert same_objects(found, true) == {5: 2, 6: 1}
 
 
-def test_a_small_overlap_is_no_match() -> None:
+def test_same_objects_requires_minimum_iou() -> None:
     assert same_objects(ids((0, 40), (5, 9), (0, 71)), TRUE) == {}
     assert same_objects(ids((0, 40), (5, 10), (0, 70)), TRUE) == {5: 900000}  # 10 / 40: from here on
 
 
-def test_no_points_or_no_instances_match_nothing() -> None:
+def test_same_objects_without_points_or_instances_is_empty() -> None:
     nothing = np.zeros(0, np.int32)
     assert same_objects(nothing, nothing) == {}
     assert same_objects(np.zeros_like(TRUE), TRUE) == {}
     assert same_objects(TRUE, np.zeros_like(TRUE)) == {}
 
 
-def test_an_object_has_one_color_and_what_only_a_map_has_none_of_the_truths() -> None:
+def test_object_colors_are_shared_only_by_matched_objects() -> None:
     colors = ObjectColors(truth())
     first = colors.objects(ids((8, 40), (5, 40), (7, 20), (0, 20)), TRUE)
     second = colors.objects(ids((0, 10), (3, 30), (1, 40), (9, 20), (2, 20)), TRUE)
@@ -59,5 +59,5 @@ def test_an_object_has_one_color_and_what_only_a_map_has_none_of_the_truths() ->
     assert colors.name_of == {first[5]: "bed", first[7]: "chair"}
 
 
-def test_relabeled_ids_of_nothing_known_are_none() -> None:
+def test_relabeled_maps_unknown_ids_to_zero() -> None:
     np.testing.assert_array_equal(relabeled(ids((4, 2), (0, 1), (9, 1)), {4: 1}), [1, 1, 0, 0])

@@ -24,7 +24,7 @@ Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 @pytest.mark.parametrize("R", [Z_UP, Y_UP, Y_DOWN], ids=["z-up", "y-up", "y-down"])
 @pytest.mark.parametrize("flipped", [False, True])
-def test_up_is_found_whatever_the_world(R: np.ndarray, flipped: bool) -> None:
+def test_upward_is_found_for_any_world_axis(R: np.ndarray, flipped: bool) -> None:
     mesh, poses = furnished(R), walk(R)
     triangles = mesh.triangles[:, ::-1] if flipped else mesh.triangles
     surface = Surface.seen_from(mesh.vertices, triangles, poses)
@@ -32,7 +32,7 @@ def test_up_is_found_whatever_the_world(R: np.ndarray, flipped: bool) -> None:
     np.testing.assert_array_equal(surface.face_normals, Surface(mesh.vertices, mesh.triangles).face_normals)
 
 
-def test_up_of_a_camera_that_only_looks_down_is_straightened_by_the_floor() -> None:
+def test_upward_of_tilted_camera_is_corrected_by_floor() -> None:
     mesh, poses = furnished(), walk()
     surface = Surface(mesh.vertices, mesh.triangles)
     one_way = np.repeat(poses[:1], 5, axis=0)  # tilted by 22 degrees
@@ -40,7 +40,7 @@ def test_up_of_a_camera_that_only_looks_down_is_straightened_by_the_floor() -> N
     np.testing.assert_allclose(upward(one_way, surface), [0, 0, 1], atol=1e-3)
 
 
-def test_a_ray_sees_the_nearest_front_at_its_exact_depth() -> None:
+def test_front_sides_depth_is_exact() -> None:
     mesh = furnished()
     camera, R = Camera(33, 25, 30.0, 30.0, 16.0, 12.0), looking(np.array([-1.0, 0, 0]), np.array([0.0, 0, 1]))
     eye = np.array([0.5, 0.0, 0.4])
@@ -55,14 +55,14 @@ def test_a_ray_sees_the_nearest_front_at_its_exact_depth() -> None:
     np.testing.assert_allclose(pixels, np.stack([u, v], axis=-1), atol=1e-3)
 
 
-def test_walls_and_ceiling_between_the_eye_and_the_room_are_looked_through() -> None:
+def test_front_sides_ignore_back_faces_of_walls_and_ceiling() -> None:
     mesh = furnished()
     camera, R = Camera(9, 9, 60.0, 60.0, 4.0, 4.0), looking(np.array([0.0, 0.1, -1.0]), np.array([0.0, 0, 1]))
     hits = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([0.0, -0.5, 5.0])).seen_by(camera, R)
     np.testing.assert_allclose(hits.points_world[..., 2], 0, atol=1e-4)  # the floor, through the ceiling at 2.5 m
 
 
-def test_corners_are_darker_than_open_floor() -> None:
+def test_openness_near_objects_is_below_open_floor() -> None:
     mesh = furnished()
     camera, R = Camera(128, 128, 80.0, 80.0, 63.5, 63.5), looking(np.array([-1.0, 0, -1.0]), np.array([0.0, 0, 1]))
     hits = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([2.5, 0.0, 3.0])).seen_by(camera, R)
@@ -76,7 +76,7 @@ def test_corners_are_darker_than_open_floor() -> None:
     assert light[near_box].mean() < 0.85
 
 
-def test_fitted_is_as_near_as_it_can_be() -> None:
+def test_fitted_camera_view_encloses_points_tightly() -> None:
     points = RNG.uniform(-1, 1, (4000, 3)).astype(np.float32) * [2, 1, 0.5]
     R = looking(np.array([1.0, 2.0, -1.0]), np.array([0.0, 0, 1]))
     camera, T = fitted(R, points.astype(np.float32), 400, 300)
@@ -87,7 +87,7 @@ def test_fitted_is_as_near_as_it_can_be() -> None:
     assert spread.max() > 0.9
 
 
-def test_small_pictures_show_the_nearest_fronts() -> None:
+def test_visible_points_match_painters_algorithm() -> None:
     camera, T = Camera(30, 20, 25.0, 25.0, 14.5, 9.5), np.eye(4)
     T[:3, :3], T[:3, 3] = looking(np.array([1.0, 0.5, -0.2]), np.array([0.0, 0, 1])), [-3, -1.5, 0.5]
     points, normals = RNG.uniform(-2, 2, (3000, 3)).astype(np.float32), RNG.normal(0, 1, (3000, 3)).astype(np.float32)
@@ -103,7 +103,7 @@ def test_small_pictures_show_the_nearest_fronts() -> None:
     assert shown.tolist() == [expected[pixel] for pixel in sorted(expected)]
 
 
-def test_the_best_view_looks_down_into_the_room_and_sees_the_objects() -> None:
+def test_best_view_looks_down_and_shows_objects() -> None:
     mesh, poses = furnished(), walk()
     surface = Surface(mesh.vertices, mesh.triangles)
     camera, T = best_view(surface, mesh.instance_ids, poses, 200, 150)
@@ -114,7 +114,7 @@ def test_the_best_view_looks_down_into_the_room_and_sees_the_objects() -> None:
     assert (ids == 2).sum() > 200
 
 
-def test_the_picture_shows_the_colors_left_and_the_instances_right(tmp_path: Path) -> None:
+def test_overview_shows_colors_left_and_instances_right(tmp_path: Path) -> None:
     mesh, instances = furnished(), {1: ("chair", 0.9), 2: ("couch", 0.6)}
     overview.write_overview(tmp_path / "overview.png", mesh, instances, walk(), "two boxes")
     assert [path.name for path in tmp_path.iterdir()] == ["overview.png"]
@@ -134,14 +134,14 @@ def test_the_picture_shows_the_colors_left_and_the_instances_right(tmp_path: Pat
     assert np.ptp(np.median(right[~red & ~blue], axis=0)) < 12, "the background is gray"
 
 
-def test_ids_that_are_no_instances_are_background() -> None:
+def test_overview_unlisted_ids_are_background() -> None:
     image = overview.overview(furnished(), {1: ("chair", 0.9)}, walk(), "one of them").astype(int)
     right = image[overview.TITLE_HEIGHT :][: overview.PANEL_HEIGHT, overview.PANEL_WIDTH :]
     colorful = np.ptp(right, axis=2) > 60
     assert 5000 < colorful.sum() < 0.2 * colorful.size
 
 
-def test_an_empty_map_gets_a_picture_that_says_so() -> None:
+def test_overview_of_empty_map_has_notice() -> None:
     nothing = InstanceMesh(
         *(np.zeros((0, 3), dtype) for dtype in (np.float32, np.int32, np.uint8)),
         np.zeros(0, np.int32),
@@ -152,7 +152,7 @@ def test_an_empty_map_gets_a_picture_that_says_so() -> None:
     assert (image != overview.PAPER).any()
 
 
-def test_neighbors_have_colors_that_can_be_told_apart() -> None:
+def test_instance_colors_of_neighbors_are_distinct() -> None:
     centroids = RNG.uniform(0, 6, (40, 3))
     colors = instance_colors(centroids).astype(float)
     np.testing.assert_array_equal(colors, instance_colors(centroids))

@@ -51,7 +51,7 @@ def confetti(rng: np.random.Generator, size: float, count: int) -> tuple[np.ndar
 
 @pytest.mark.parametrize(("size", "count"), [(0.02, 40 * CHUNK + 7), (0.2, 500), (3.0, 6)])
 @pytest.mark.parametrize("seed", range(3))
-def test_confetti_is_seen_as_rays_meet_it(size: float, count: int, seed: int) -> None:
+def test_rasterizer_matches_ray_casting(size: float, count: int, seed: int) -> None:
     """Small triangles and such as reach from before the camera to behind it, from any pose among them."""
     rng = np.random.default_rng([seed, count])
     vertices, triangles = confetti(rng, size, count)
@@ -59,7 +59,7 @@ def test_confetti_is_seen_as_rays_meet_it(size: float, count: int, seed: int) ->
 
 
 @pytest.mark.parametrize("size", [0.2, 3.0])
-def test_depth_and_weights_are_those_of_rays(size: float) -> None:
+def test_rasterizer_depth_and_weights_match_ray_casting(size: float) -> None:
     rng = np.random.default_rng(7)
     vertices, triangles = confetti(rng, size, 400)
     T = exp_se3(rng.normal(0, 1, 6))
@@ -80,7 +80,7 @@ def test_depth_and_weights_are_those_of_rays(size: float) -> None:
     assert (buffer.depth[~nothing] > 0).all()
 
 
-def test_a_closed_surface_has_no_gap() -> None:
+def test_rasterized_closed_surface_has_no_gaps() -> None:
     """A ball of triangles about the camera: each pixel sees one, even where rays fall on edges and corners."""
     side = 40
     theta, phi = np.meshgrid(
@@ -95,7 +95,7 @@ def test_a_closed_surface_has_no_gap() -> None:
             assert (drawn(ball.astype(np.float32), faces, T) >= 0).all()
 
 
-def test_pixels_on_edges_and_corners() -> None:
+def test_rasterizer_includes_pixels_on_edges_and_corners() -> None:
     """The square from (1, 1) to (5, 4) px at 2 m, in two triangles: its border belongs to it, exactly."""
     camera = Camera(8, 6, 4.0, 4.0, 0.0, 0.0)
     vertices = np.array([[1, 1], [5, 1], [5, 4], [1, 4]], np.float32) / 4 * 2
@@ -108,7 +108,7 @@ def test_pixels_on_edges_and_corners() -> None:
     assert [seen[1, 1], seen[1, 5], seen[4, 5], seen[4, 1]] == [0, 1, 2, 3]
 
 
-def test_the_nearer_surface_is_seen_whatever_the_order() -> None:
+def test_rasterizer_draws_nearest_surface_in_any_order() -> None:
     near = np.array([[-9, -9, 1], [9, -9, 1], [0, 9, 1]], np.float32)
     vertices = np.concatenate([near, 2 * near])
     for order in ([0, 1], [1, 0]):
@@ -118,7 +118,7 @@ def test_the_nearer_surface_is_seen_whatever_the_order() -> None:
         assert (drawn(vertices, triangles, behind) == -1).all()
 
 
-def test_nothing_to_see() -> None:
+def test_rasterizer_ignores_degenerate_triangles() -> None:
     nothing = np.zeros((0, 3), np.float32)
     assert (drawn(nothing, np.zeros((0, 3), np.int32), np.eye(4)) == -1).all()
     edge_on = np.array([[0, 0, 1], [0, 0, 2], [0, 1, 1]], np.float32)
@@ -126,7 +126,7 @@ def test_nothing_to_see() -> None:
     assert (drawn(edge_on, flat, np.eye(4)) == -1).all()
 
 
-def test_several_threads_draw_at_once() -> None:
+def test_rasterizer_is_thread_safe() -> None:
     vertices, triangles = confetti(np.random.default_rng(0), 0.1, 3000)
     rasterizer = Rasterizer(vertices, triangles)
     poses = [exp_se3(np.random.default_rng(k).normal(0, 1, 6)) for k in range(8)]

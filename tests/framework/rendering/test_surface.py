@@ -27,7 +27,7 @@ def hits(surface: Surface) -> Hits:
     return FrontSides(surface, EYE).seen_by(CAMERA, R)
 
 
-def test_normals_are_cross_products_and_their_means(surface: Surface) -> None:
+def test_surface_normals_match_cross_products(surface: Surface) -> None:
     a, b, c = surface.vertices[surface.triangles.T]
     np.testing.assert_allclose(surface.face_normals, np.cross(b - a, c - a), atol=1e-6)
     for i, normal in enumerate(surface.vertex_normals):
@@ -35,7 +35,7 @@ def test_normals_are_cross_products_and_their_means(surface: Surface) -> None:
         np.testing.assert_allclose(normal, around / max(np.linalg.norm(around), 1e-12), atol=1e-5)
 
 
-def test_a_picture_is_of_fronts_and_interpolates_exactly(surface: Surface, hits: Hits) -> None:
+def test_hits_show_front_faces_with_exact_interpolation(surface: Surface, hits: Hits) -> None:
     assert 0.05 < hits.seen.mean() < 0.95
     labels = np.arange(100, 100 + len(surface.vertices), dtype=np.int32)
     nearest, points = hits.nearest(labels), hits.points_world
@@ -56,7 +56,7 @@ def test_a_picture_is_of_fronts_and_interpolates_exactly(surface: Surface, hits:
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_every_nth_pixel_is_what_its_camera_sees(hits: Hits, n: int) -> None:
+def test_subsampled_hits_match_subsampled_camera(hits: Hits, n: int) -> None:
     some = hits.subsampled(n)
     np.testing.assert_array_equal(some.depth, hits.depth[::n, ::n])
     np.testing.assert_array_equal(some.points_world, hits.points_world[::n, ::n])
@@ -68,7 +68,7 @@ def test_every_nth_pixel_is_what_its_camera_sees(hits: Hits, n: int) -> None:
     np.testing.assert_allclose(local[:, 2], some.depth[some.seen], atol=1e-5)
 
 
-def test_nothing_is_seen_of_backs() -> None:
+def test_front_sides_hide_back_faces() -> None:
     front = Surface(np.array([[-9, -9, 0], [0, 9, 0], [9, -9, 0]], np.float32), np.array([[0, 1, 2]], np.int32))
     back = Surface(front.vertices, front.triangles[:, ::-1])
     shown = [FrontSides(one, EYE).seen_by(CAMERA, np.eye(3)).buffer.triangle for one in (front, back)]

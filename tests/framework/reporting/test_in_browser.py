@@ -91,7 +91,7 @@ def colored(image: np.ndarray) -> float:
     return float((np.ptp(image, axis=2) > 60).mean())
 
 
-def test_a_click_on_an_object_shows_its_numbers(pages: list[Path], opened: Any, tmp_path: Path) -> None:
+def test_report_click_on_object_shows_details(pages: list[Path], opened: Any, tmp_path: Path) -> None:
     page = opened(pages[0])
     before = canvas(page)
     assert len(np.unique(before.reshape(-1, 3), axis=0)) > 200, "the canvas is blank"
@@ -118,7 +118,7 @@ def test_a_click_on_an_object_shows_its_numbers(pages: list[Path], opened: Any, 
     assert page.locator("#panel .details").count() == 0
 
 
-def test_the_views_color_the_map_otherwise(pages: list[Path], opened: Any) -> None:
+def test_report_view_buttons_change_map_colors(pages: list[Path], opened: Any) -> None:
     page = opened(pages[0])
     own = canvas(page)
     page.get_by_role("button", name="Instances").click()
@@ -134,7 +134,7 @@ def test_the_views_color_the_map_otherwise(pages: list[Path], opened: Any) -> No
     assert page.locator("#legend button").count() > 0
 
 
-def test_the_map_grows_with_the_slider(pages: list[Path], opened: Any) -> None:
+def test_report_time_slider_grows_map(pages: list[Path], opened: Any) -> None:
     page = opened(pages[0])
     page.locator("#path").uncheck()
     void = np.array(Image.new("RGB", (1, 1), "#e5e8ec"))[0, 0]
@@ -146,7 +146,7 @@ def test_the_map_grows_with_the_slider(pages: list[Path], opened: Any) -> None:
     assert page.inner_text("#time-value") == "frame 5"
 
 
-def test_rows_are_sorted_searched_and_chosen_by_keys(pages: list[Path], opened: Any) -> None:
+def test_report_table_is_sorted_searched_and_selected_by_keys(pages: list[Path], opened: Any) -> None:
     page = opened(pages[0])
     rows = page.locator("#objects-table tbody tr:not([hidden])")
     ids = [row.get_attribute("data-id") for row in rows.all()]
@@ -178,21 +178,21 @@ def test_rows_are_sorted_searched_and_chosen_by_keys(pages: list[Path], opened: 
     assert page.inner_text("#count").startswith("0 of")
 
 
-def test_it_fits_a_phone_and_the_dark(pages: list[Path], opened: Any) -> None:
+def test_report_fits_phone_screen_and_dark_mode(pages: list[Path], opened: Any) -> None:
     page = opened(pages[0], viewport={"width": 390, "height": 844}, color_scheme="dark")
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     assert max(page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")) < 60
     assert np.median(canvas(page)) < 120
 
 
-def test_a_hostile_name_is_text(pages: list[Path], opened: Any) -> None:
+def test_report_hostile_class_name_is_escaped(pages: list[Path], opened: Any) -> None:
     page = opened(pages[1])
     page.locator("#objects-table tbody tr").filter(has_text="<img").click()
     assert HOSTILE in page.inner_text("#panel h3")
     assert page.locator("img[src='x']").count() == 0
 
 
-def test_runs_are_switched_and_the_view_stays(pages: list[Path], opened: Any) -> None:
+def test_report_comparison_switches_runs_and_keeps_view(pages: list[Path], opened: Any) -> None:
     page = opened(pages[2])
     page.locator("#canvas").focus()
     page.keyboard.press("ArrowLeft")
@@ -207,7 +207,7 @@ def test_runs_are_switched_and_the_view_stays(pages: list[Path], opened: Any) ->
     assert page.url == pages[0].as_uri()
 
 
-def test_without_webgl_there_is_the_picture(pages: list[Path], browser: Any) -> None:
+def test_report_without_webgl_shows_still_image(pages: list[Path], browser: Any) -> None:
     context = browser.new_context(offline=True)
     context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
     page = context.new_page()

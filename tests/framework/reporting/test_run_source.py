@@ -43,7 +43,7 @@ def change_config(directory: Path, **dataset: Any) -> None:
     (directory / "metrics.json").write_text(json.dumps(metrics))
 
 
-def test_each_pose_gets_its_frame_also_after_one_that_was_skipped(tmp_path: Path) -> None:
+def test_run_source_frames_match_poses_after_skipped_frame(tmp_path: Path) -> None:
     contents = RunContents.read(write_run(tmp_path / "run", unreadable=2, frames=6))
     assert contents.tracked_frames == (0, 1, 3, 4, 5)
     recording = RunSource.of(contents)
@@ -52,7 +52,7 @@ def test_each_pose_gets_its_frame_also_after_one_that_was_skipped(tmp_path: Path
     assert [frame.index for frame in frames if frame is not None] == [0, 1, 3, 4, 5]
 
 
-def test_frames_without_a_pose_are_lost_ones(directory: Path) -> None:
+def test_run_contents_frames_without_pose_are_lost(directory: Path) -> None:
     lines = (directory / "timings.csv").read_text().splitlines()
     after_tracking = tuple(f"2,{stage}" for stage in STAGES[STAGES.index("lifting") :])
     stopped = [line for line in lines if not line.startswith(after_tracking)]
@@ -75,7 +75,7 @@ def test_frames_without_a_pose_are_lost_ones(directory: Path) -> None:
         ({"_target_": "tests.support.scenes.corner_room.CornerRoom", "scene": "${oc.env:HOME}"}, "not resolved"),
     ],
 )
-def test_what_is_not_the_recording_is_none_and_it_says_why(directory: Path, dataset: dict, said: str) -> None:
+def test_run_source_other_dataset_is_rejected_with_reason(directory: Path, dataset: dict, said: str) -> None:
     change_config(directory, **dataset)
     recording = RunSource.of(RunContents.read(directory))
     assert said in recording.why_not
@@ -86,7 +86,7 @@ def test_what_is_not_the_recording_is_none_and_it_says_why(directory: Path, data
     assert said in why
 
 
-def test_another_truth_is_not_taken_for_the_one_of_the_run(directory: Path) -> None:
+def test_run_source_changed_truth_is_rejected_with_reason(directory: Path) -> None:
     contents = RunContents.read(directory)
     assert RunSource.of(contents).scene_truth()[0] is not None
     metrics = json.loads((directory / "metrics.json").read_text()) | {"truth_sha256": "0" * 64}
@@ -96,7 +96,7 @@ def test_another_truth_is_not_taken_for_the_one_of_the_run(directory: Path) -> N
     assert "no longer those" in why
 
 
-def test_footage_has_pictures_true_places_and_how_sharp_they_are(mapped: Path) -> None:
+def test_footage_has_images_true_positions_and_clarity(mapped: Path) -> None:
     recording = RunSource.of(RunContents.read(mapped))
     assert recording.camera is not None
     footage = Footage.of(recording, [0, 3], recording.camera)
@@ -107,7 +107,7 @@ def test_footage_has_pictures_true_places_and_how_sharp_they_are(mapped: Path) -
     assert footage.images[0].shape == (*footage.camera.shape, 3)
 
 
-def test_the_true_path_is_moved_onto_the_trajectory() -> None:
+def test_true_path_is_aligned_to_trajectory() -> None:
     true = np.array([pose_at(20 * k) for k in range(6)])
     T_map_world = pose_at(77)
     poses = np.array([T_map_world @ T for T in true])

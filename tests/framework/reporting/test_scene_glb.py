@@ -32,7 +32,7 @@ def tree_of(content: bytes) -> tuple[dict, bytes]:
     return json.loads(content[20 : 20 + length]), content[20 + length + 8 :]
 
 
-def test_each_object_is_a_node_with_its_class() -> None:
+def test_scene_glb_has_one_node_with_class_per_object() -> None:
     mesh = two_squares()
     content = scene_glb(mesh, np.linspace(0, 1, 8, dtype=np.float32), {5: "<b>cup</b>"}, UP)
     scene = trimesh.load_scene(io.BytesIO(content), file_type="glb")
@@ -44,7 +44,7 @@ def test_each_object_is_a_node_with_its_class() -> None:
     assert content == scene_glb(mesh, np.linspace(0, 1, 8, dtype=np.float32), {5: "<b>cup</b>"}, UP)
 
 
-def test_colors_are_linear_and_first_sights_are_there() -> None:
+def test_scene_glb_has_linear_colors_and_first_seen_times() -> None:
     first_seen = np.linspace(0, 1, 8, dtype=np.float32)
     tree, binary = tree_of(scene_glb(two_squares(), first_seen, {5: "cup"}, UP))
     [attributes] = [m["primitives"][0]["attributes"] for m in tree["meshes"] if m["name"] == "cup_5"]
@@ -60,7 +60,7 @@ def test_colors_are_linear_and_first_sights_are_there() -> None:
     np.testing.assert_array_equal(values("_FIRST_SEEN", np.float32, 1)[:, 0], first_seen[4:])
 
 
-def test_a_saved_map_stands_upright_in_other_programs() -> None:
+def test_scene_glb_is_y_up() -> None:
     """Whatever is up in the map: glTF's y."""
     up = np.array([0.6, 0.0, -0.8])
     content = scene_glb(two_squares(), np.zeros(8, np.float32), {}, up)
@@ -69,14 +69,14 @@ def test_a_saved_map_stands_upright_in_other_programs() -> None:
     np.testing.assert_allclose(T[:3, :3] @ up, (0, 1, 0), atol=1e-6)
 
 
-def test_labels_without_a_name_are_no_objects() -> None:
+def test_scene_glb_unnamed_labels_belong_to_room() -> None:
     scene = trimesh.load_scene(io.BytesIO(scene_glb(two_squares(), np.zeros(8, np.float32), {}, UP)), file_type="glb")
     assert set(scene.geometry) == {"room"}
     assert len(scene.geometry["room"].faces) == 4
 
 
 @pytest.mark.parametrize("shared_vertices", [True, False])
-def test_a_huge_map_is_no_file_of_ten_megabytes(shared_vertices: bool) -> None:
+def test_scene_glb_size_of_large_map_is_limited(shared_vertices: bool) -> None:
     n = 500
     x, y = np.meshgrid(np.arange(n, dtype=np.float32), np.arange(n, dtype=np.float32), indexing="ij")
     vertices = 0.01 * np.stack([x, y, np.sin(x / 30) * np.cos(y / 20)], axis=-1).reshape(-1, 3)

@@ -29,7 +29,7 @@ def at(x: float) -> np.ndarray:
     return T_world_camera
 
 
-def test_each_place_is_known_when_it_comes_into_sight() -> None:
+def test_sightings_first_seen_is_first_visible_pose() -> None:
     mesh = wall()
     found = sightings(mesh, mesh.instance_ids, np.array([at(-1.0), at(-0.2), at(0.2)]), CAMERA, {})
     half = 2 * 100 / 150  # m, that the camera sees to either side
@@ -42,7 +42,7 @@ def test_each_place_is_known_when_it_comes_into_sight() -> None:
     assert (np.diff(found.growth) > 0).all()
 
 
-def test_an_object_is_seen_best_where_none_of_it_is_cut_off() -> None:
+def test_sightings_best_pose_shows_whole_object() -> None:
     mesh = wall()
     near = at(-1.0)
     near[2, 3] = 1.0  # it sees more of the object's pixels, but 0.59 of the object
@@ -50,14 +50,14 @@ def test_an_object_is_seen_best_where_none_of_it_is_cut_off() -> None:
     assert sightings(mesh, mesh.instance_ids, poses, CAMERA, {}).best == {3: 2, 4: 4}
 
 
-def test_a_blurred_picture_is_not_the_best_one() -> None:
+def test_sightings_best_pose_avoids_blurred_image() -> None:
     mesh = wall()
     poses = np.array([at(-1.4), at(-1.5), at(1.7)])
     both = [sightings(mesh, mesh.instance_ids, poses, CAMERA, {k: 0.4}).best[3] for k in (0, 1)]
     assert both == [1, 0]
 
 
-def test_what_stands_behind_something_is_not_seen() -> None:
+def test_sightings_exclude_occluded_objects() -> None:
     mesh = wall()
     nearer = replace(
         mesh,
@@ -70,7 +70,7 @@ def test_what_stands_behind_something_is_not_seen() -> None:
     assert 3 not in found.best
 
 
-def test_poses_are_spread_over_the_video() -> None:
+def test_spread_out_poses_cover_video_evenly() -> None:
     assert spread_out(0) == []
     assert spread_out(1) == [0]
     assert spread_out(5) == [0, 1, 2, 3, 4]

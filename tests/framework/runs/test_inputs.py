@@ -10,7 +10,9 @@ from framework.runs.inputs import inputs_sha256
 
 
 @pytest.mark.parametrize("where", ["{home}/weights.bin", "~/weights.bin"])
-def test_other_weights_at_the_same_path_are_others(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inputs_sha256_changes_with_weights_content(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     config = {"detector": {"weights": where.format(home=tmp_path)}}
     seen = []
@@ -21,7 +23,7 @@ def test_other_weights_at_the_same_path_are_others(where: str, tmp_path: Path, m
     assert seen[0] == seen[2]
 
 
-def test_a_recording_is_seen_through_linked_folders(tmp_path: Path) -> None:
+def test_inputs_sha256_follows_symlinked_folders(tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     (tmp_path / "root" / "scene").mkdir(parents=True)
     (tmp_path / "root" / "scene" / "depth").symlink_to(tmp_path / "disk")
@@ -34,7 +36,7 @@ def test_a_recording_is_seen_through_linked_folders(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("scene", ["", "scene0000_00"])
-def test_label_tables_above_a_scene_are_seen(scene: str, tmp_path: Path) -> None:
+def test_inputs_sha256_includes_label_tables_above_scene(scene: str, tmp_path: Path) -> None:
     root = tmp_path / "scans"
     (root / scene).mkdir(parents=True)
     config = {"dataset": {"root": str(root), "scene": scene}}

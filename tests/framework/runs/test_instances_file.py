@@ -43,7 +43,7 @@ def nearly_equal(found: dict[int, Instance]) -> dict[int, Instance]:
     }
 
 
-def test_what_is_written_reads_back_exactly(tmp_path: Path) -> None:
+def test_instances_file_round_trip_is_exact(tmp_path: Path) -> None:
     scene = mapped()
     mesh, found = scene.mesh(), nearly_equal(dict(scene.instances()))
     write_instances(tmp_path / "instances.json", mesh, found, CLASSES)
@@ -67,7 +67,7 @@ def test_what_is_written_reads_back_exactly(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(again, name), getattr(direct, name))
 
 
-def test_probabilities_are_written_with_the_digits_of_float32(tmp_path: Path) -> None:
+def test_class_probabilities_are_written_with_float32_digits(tmp_path: Path) -> None:
     scene = mapped()
     found = nearly_equal(dict(scene.instances()))
     write_instances(tmp_path / "instances.json", scene.mesh(), found, CLASSES)
@@ -116,7 +116,7 @@ def test_probabilities_are_written_with_the_digits_of_float32(tmp_path: Path) ->
         ([ENTRY, ENTRY], "lists 2 instances with 1 different ids"),
     ],
 )
-def test_anything_else_is_refused_in_one_line(tmp_path: Path, content: object, said: str) -> None:
+def test_read_instances_invalid_content_raises_one_line_error(tmp_path: Path, content: object, said: str) -> None:
     path = tmp_path / "instances.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(DataError, match=said) as caught:
@@ -125,7 +125,7 @@ def test_anything_else_is_refused_in_one_line(tmp_path: Path, content: object, s
     assert "\n" not in str(caught.value)
 
 
-def test_an_object_without_a_class_is_an_object(tmp_path: Path) -> None:
+def test_read_instances_null_class_is_named_object(tmp_path: Path) -> None:
     """That of a map that knows no classes; the number of a frame may be a time."""
     path = tmp_path / "instances.json"
     last = 1_700_000_000_000
@@ -135,7 +135,7 @@ def test_an_object_without_a_class_is_an_object(tmp_path: Path) -> None:
     assert (one.class_name, one.probability, one.last_frame, one.centroid) == ("object", None, last, None)
 
 
-def test_no_instances_are_an_empty_list(tmp_path: Path) -> None:
+def test_instances_file_without_instances_is_empty_list(tmp_path: Path) -> None:
     write_instances(tmp_path / "instances.json", GridMap().mesh(), {}, CLASSES)
     assert read_instances(tmp_path / "instances.json") == []
 
@@ -143,7 +143,7 @@ def test_no_instances_are_an_empty_list(tmp_path: Path) -> None:
 SCHEMA = json.loads((Path(instances_file.__file__).parent / "instances.schema.json").read_text())
 
 
-def test_the_schema_describes_what_is_written(tmp_path: Path, room: CornerRoom) -> None:
+def test_instances_schema_accepts_written_files(tmp_path: Path, room: CornerRoom) -> None:
     """Of a map with objects, whose boxes stand upright, and of one that knows no classes."""
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     mapper = Mapper("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
@@ -166,7 +166,7 @@ def test_the_schema_describes_what_is_written(tmp_path: Path, room: CornerRoom) 
     "damage",
     [{"id": 0}, {"confidence": 2}, {"centroid": [1, 2]}, {"obb": {}}, {"more": 1}, {"class_probabilities": {"a": 2}}],
 )
-def test_the_schema_refuses_what_is_never_written(tmp_path: Path, damage: dict[str, object]) -> None:
+def test_instances_schema_rejects_invalid_entries(tmp_path: Path, damage: dict[str, object]) -> None:
     scene = mapped()
     write_instances(tmp_path / "instances.json", scene.mesh(), dict(scene.instances()), CLASSES)
     [entry, *_] = json.loads((tmp_path / "instances.json").read_text())

@@ -27,7 +27,7 @@ TETRAHEDRON = InstanceMesh(
 @pytest.mark.parametrize(
     "mesh", [TETRAHEDRON, GridMap().mesh(), replace(TETRAHEDRON, classes=())], ids=["some", "empty", "no classes"]
 )
-def test_what_was_written_reads_back_exactly(tmp_path: Path, mesh: InstanceMesh) -> None:
+def test_mesh_file_round_trip_is_exact(tmp_path: Path, mesh: InstanceMesh) -> None:
     write_mesh(tmp_path / "mesh.ply", mesh)
     read = read_mesh(tmp_path / "mesh.ply")
     for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
@@ -35,7 +35,7 @@ def test_what_was_written_reads_back_exactly(tmp_path: Path, mesh: InstanceMesh)
     assert read.classes == mesh.classes
 
 
-def test_a_mesh_of_something_else_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_read_mesh_foreign_ply_raises_one_line_error(tmp_path: Path) -> None:
     path = tmp_path / "mesh.ply"
     mesh = TETRAHEDRON
     shades = dict.fromkeys(("red", "green", "blue"), mesh.colors[:, 0])

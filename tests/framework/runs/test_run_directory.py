@@ -63,7 +63,7 @@ def metrics_of(record: RunRecord, name: str = "metrics.json") -> dict[str, Any]:
     return metrics
 
 
-def test_every_file_of_the_design_is_there(record: RunRecord, room: CornerRoom) -> None:
+def test_record_contains_all_documented_files(record: RunRecord, room: CornerRoom) -> None:
     record.write(room, mapped(room))
     assert sorted(path.name for path in record.directory.iterdir()) == [
         "config.yaml",
@@ -77,7 +77,7 @@ def test_every_file_of_the_design_is_there(record: RunRecord, room: CornerRoom) 
     ]
 
 
-def test_metrics_have_the_keys_of_the_design(record: RunRecord, room: CornerRoom) -> None:
+def test_metrics_contain_all_documented_keys(record: RunRecord, room: CornerRoom) -> None:
     record.write(room, mapped(room))
     metrics = metrics_of(record)
     assert set(metrics) >= {
@@ -105,7 +105,9 @@ def test_metrics_have_the_keys_of_the_design(record: RunRecord, room: CornerRoom
 
 
 @pytest.mark.parametrize(("annotation", "release"), [("second", "second"), ("", None)])
-def test_both_transfers_and_the_release_of_the_truth_are_told(room: CornerRoom, annotation: str, release: str) -> None:
+def test_instance_metrics_have_both_transfers_and_truth_release(
+    room: CornerRoom, annotation: str, release: str
+) -> None:
     scene = mapped(room).scene
     room.annotation = annotation
     metrics = instance_metrics(room, scene.mesh(), scene.instances(), CLASSES, (np.zeros(0), np.zeros((0, 4, 4))))
@@ -120,7 +122,7 @@ def test_both_transfers_and_the_release_of_the_truth_are_told(room: CornerRoom, 
     assert metrics == to_truth
 
 
-def test_without_ground_truth_there_is_no_evaluation(record: RunRecord, room: CornerRoom) -> None:
+def test_record_without_ground_truth_has_no_evaluation(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room)
     untrue = [type(frame)(frame.index, frame.position, frame.timestamp, frame.pose, None) for frame in result.tracked]
     blind = RunResult(result.scene, 6, 0, tuple(untrue), result.timings, result.seconds)
@@ -130,7 +132,9 @@ def test_without_ground_truth_there_is_no_evaluation(record: RunRecord, room: Co
     assert not [key for key in metrics if key.startswith(("trajectory.", "instances.ap"))]
 
 
-def test_metrics_come_last(record: RunRecord, room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_record_failed_write_leaves_only_partial_metrics(
+    record: RunRecord, room: CornerRoom, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full_disk(path: Path, *_: object) -> None:
         raise DataError(f"{path} could not be written: no space left on device")
 
@@ -140,7 +144,7 @@ def test_metrics_come_last(record: RunRecord, room: CornerRoom, monkeypatch: pyt
     assert "no space" in metrics_of(record, "metrics.partial.json")["partial"]
 
 
-def test_what_was_mapped_stays_where_the_truth_is_unusable(record: RunRecord, room: CornerRoom) -> None:
+def test_record_with_unusable_truth_keeps_map_files(record: RunRecord, room: CornerRoom) -> None:
     def far_off() -> SceneTruth:
         raise DataError("ground truth: a point lies far off")
 
@@ -155,7 +159,7 @@ def test_what_was_mapped_stays_where_the_truth_is_unusable(record: RunRecord, ro
 
 
 @pytest.mark.parametrize("name", MAPPED)
-def test_a_folder_in_a_files_place_costs_that_file_alone(record: RunRecord, room: CornerRoom, name: str) -> None:
+def test_record_blocked_file_leaves_other_files_written(record: RunRecord, room: CornerRoom, name: str) -> None:
     (record.directory / name).mkdir()
     fault = record.write(room, mapped(room))
     assert name in str(fault)
@@ -163,7 +167,7 @@ def test_a_folder_in_a_files_place_costs_that_file_alone(record: RunRecord, room
     assert name in metrics_of(record, "metrics.partial.json")["partial"]
 
 
-def test_a_record_whose_directory_was_removed_meanwhile_is_whole(record: RunRecord, room: CornerRoom) -> None:
+def test_record_recreates_removed_directory(record: RunRecord, room: CornerRoom) -> None:
     config = (record.directory / "config.yaml").read_bytes()
     shutil.rmtree(record.directory)
     assert record.write(room, mapped(room)) is None
@@ -171,7 +175,7 @@ def test_a_record_whose_directory_was_removed_meanwhile_is_whole(record: RunReco
     assert read_record(record.directory).metrics["frames"] == 6
 
 
-def test_a_step_over_a_skipped_frame_is_no_step_of_one_frame(room: CornerRoom) -> None:
+def test_rpe_ignores_steps_over_skipped_frames(room: CornerRoom) -> None:
     """1 cm of drift a frame, of which frame 2 was skipped: RPE is 1 cm, and not that of steps of 1, 2 and 1 cm."""
     true = np.eye(4)
     tracked = []
@@ -184,7 +188,7 @@ def test_a_step_over_a_skipped_frame_is_no_step_of_one_frame(room: CornerRoom) -
     assert metrics["trajectory.rpe_rmse_m"] == pytest.approx(0.01)
 
 
-def test_a_partial_run_is_marked(record: RunRecord, room: CornerRoom) -> None:
+def test_record_of_stopped_run_has_partial_metrics(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room, capacity=2)
     assert isinstance(result.stopped_by, MapFullError)
     record.write(room, result)
@@ -194,30 +198,30 @@ def test_a_partial_run_is_marked(record: RunRecord, room: CornerRoom) -> None:
     assert metrics["frames"] == 3
 
 
-def test_a_new_run_takes_the_old_ones_metrics_away(record: RunRecord) -> None:
+def test_record_begin_removes_old_metrics(record: RunRecord) -> None:
     for name in ("metrics.json", "metrics.partial.json"):
         (record.directory / name).write_text("{}")
     RunRecord.begin(record.directory, CONFIG, CHOICES)
     assert [path.name for path in record.directory.iterdir()] == ["config.yaml"]
 
 
-def test_the_config_is_resolved(record: RunRecord) -> None:
+def test_record_config_is_resolved(record: RunRecord) -> None:
     assert OmegaConf.load(record.directory / "config.yaml").fuser.seed == 3
     assert "${" not in (record.directory / "config.yaml").read_text()
 
 
-def test_the_mesh_file_holds_the_mesh(record: RunRecord, room: CornerRoom) -> None:
+def test_record_mesh_file_matches_map_mesh(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room)
     record.write(room, result)
     assert_same(read_ply(record.directory / "mesh.ply"), result.scene.mesh())
 
 
-def test_an_empty_mesh_can_be_written(tmp_path: Path) -> None:
+def test_write_mesh_accepts_empty_mesh(tmp_path: Path) -> None:
     write_mesh(tmp_path / "mesh.ply", GridMap().mesh())
     assert len(read_ply(tmp_path / "mesh.ply").vertices) == 0
 
 
-def test_others_can_read_the_mesh(tmp_path: Path) -> None:
+def test_mesh_file_is_readable_by_open3d(tmp_path: Path) -> None:
     import open3d as o3d
 
     mesh = mapped(CornerRoom(frames=1)).scene.mesh()
@@ -228,7 +232,7 @@ def test_others_can_read_the_mesh(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.asarray(read.vertex_colors) * 255, mesh.colors, atol=1e-3)
 
 
-def test_instances_say_what_and_where(record: RunRecord, room: CornerRoom) -> None:
+def test_record_instances_contain_class_and_geometry(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room)
     record.write(room, result)
     first, second = json.loads((record.directory / "instances.json").read_text())
@@ -244,12 +248,12 @@ def test_instances_say_what_and_where(record: RunRecord, room: CornerRoom) -> No
     assert set(first["obb"]) == {"center", "extent", "rotation"}
 
 
-def test_no_instances_are_an_empty_list(tmp_path: Path) -> None:
+def test_write_instances_without_instances_is_empty_list(tmp_path: Path) -> None:
     write_instances(tmp_path / "instances.json", GridMap().mesh(), {}, CLASSES)
     assert json.loads((tmp_path / "instances.json").read_text()) == []
 
 
-def test_lost_frames_are_not_in_the_trajectory(record: RunRecord, room: CornerRoom) -> None:
+def test_trajectory_file_omits_lost_frames(record: RunRecord, room: CornerRoom) -> None:
     record.write(room, mapped(room, lost_from=1, lost_to=3))
     timestamps, poses = read_tum(record.directory / "trajectory.txt")
     np.testing.assert_allclose(timestamps * 30, [0, 3, 4, 5], atol=1e-6)
@@ -257,12 +261,12 @@ def test_lost_frames_are_not_in_the_trajectory(record: RunRecord, room: CornerRo
     assert metrics_of(record)["frames_lost"] == 2
 
 
-def test_a_run_that_tracked_its_first_frame_alone_leaves_a_record(record: RunRecord, room: CornerRoom) -> None:
+def test_record_with_one_tracked_frame_is_written(record: RunRecord, room: CornerRoom) -> None:
     record.write(room, mapped(room, lost_from=1, lost_to=6))
     assert (metrics_of(record)["frames_lost"], metrics_of(record)["trajectory.ate_rmse_m"]) == (5, 0.0)
 
 
-def test_timings_are_a_table(record: RunRecord, room: CornerRoom) -> None:
+def test_timings_csv_matches_stage_metrics(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room)
     record.write(room, result)
     with (record.directory / "timings.csv").open() as file:
@@ -274,7 +278,7 @@ def test_timings_are_a_table(record: RunRecord, room: CornerRoom) -> None:
     assert metrics_of(record)["stage_ms.fusion.p95"] == pytest.approx(np.percentile(fuse, 95), abs=1e-3)
 
 
-def test_the_tracker_says_where_poses_come_from(room: CornerRoom) -> None:
+def test_pose_source_comes_from_tracker(room: CornerRoom) -> None:
     """Whatever the poses are: a tracker's first one is the true one, and lost ones are no one's."""
     one_frame = CornerRoom(frames=1)
     given = [mapped(room), mapped(room, lost_from=1, lost_to=99), mapped(one_frame)]
@@ -290,14 +294,14 @@ def test_the_tracker_says_where_poses_come_from(room: CornerRoom) -> None:
 
 
 @pytest.mark.parametrize("tracker", registered.names("tracker"))
-def test_only_the_true_poses_are_not_tracked(tracker: str, tmp_path: Path) -> None:
+def test_tracker_pose_source_is_tracked_except_ground_truth(tracker: str, tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
     needs = [f"tracker.path={tmp_path / 'poses.txt'}"] if tracker == "trajectory_file" else []
     source = registered.built("tracker", tracker, *needs).pose_source
     assert source == ("ground_truth" if tracker == "ground_truth" else "tracked")
 
 
-def test_the_headline_tells_what_matters() -> None:
+def test_headline_contains_key_metrics() -> None:
     metrics = {"sequence": "room0", "frames": 9, "fps": 3.21, "frames_lost": 2, "frames_skipped": 0}
     metrics |= {"instances.count": 4, "trajectory.ate_rmse_m": 0.0123, "instances.ap50": 0.5, "instances.ap25": None}
     told = headline(metrics | {"pose_source": "tracked"})
@@ -309,7 +313,7 @@ def test_the_headline_tells_what_matters() -> None:
 # Provenance
 
 
-def test_the_config_hash_is_of_what_changes_results() -> None:
+def test_config_hash_ignores_settings_without_effect() -> None:
     config = {"seed": 0, "fuser": {"voxel_size": 0.01, "block_limit": 9}}
     same = {
         "debug": True,
@@ -322,7 +326,7 @@ def test_the_config_hash_is_of_what_changes_results() -> None:
     assert len(provenance.config_hash(config)) == 64
 
 
-def test_the_commit_is_that_of_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_version_reports_checkout_commit_and_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / "framework"
     package.mkdir()
     (package / "__init__.py").write_text("")
@@ -339,9 +343,7 @@ def test_the_commit_is_that_of_the_checkout(tmp_path: Path, monkeypatch: pytest.
     assert provenance.code_version() == {**clean, "git_dirty": True}
 
 
-def test_another_repository_around_an_installed_package_is_not_ours(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_code_version_of_installed_package_is_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     subprocess.run(["git", "-C", tmp_path, "init", "-q"], check=True)
     installed = tmp_path / "venv" / "site-packages" / "framework"
     installed.mkdir(parents=True)

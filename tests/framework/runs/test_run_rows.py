@@ -29,14 +29,14 @@ def names(records: list[Record], *order: str, over: tuple[str, ...] = ("seed",))
     return {row.name: list(row.records) for row in rows_of(records, over, dict.fromkeys(order, ()))}
 
 
-def test_mean_and_sample_standard_deviation() -> None:
+def test_mean_has_sample_deviation_and_standard_error() -> None:
     mean = Mean.of([1.0, 2.0, 6.0])
     assert (mean.value, mean.count) == (3.0, 3)
     assert mean.deviation == pytest.approx(math.sqrt((4 + 1 + 9) / 2))
     assert mean.error == pytest.approx(mean.deviation / math.sqrt(3))
 
 
-def test_what_one_run_or_none_cannot_say_is_nan() -> None:
+def test_mean_of_fewer_than_two_values_has_nan_deviation() -> None:
     one, none = Mean.of([4.0]), Mean.of([])
     assert (one.value, one.count, none.count) == (4.0, 1, 0)
     assert all(map(math.isnan, (one.deviation, one.error, none.value, none.deviation, none.error)))
@@ -44,7 +44,7 @@ def test_what_one_run_or_none_cannot_say_is_nan() -> None:
     assert not none.is_not_zero
 
 
-def test_differences_are_paired() -> None:
+def test_row_differences_are_paired() -> None:
     """Rooms differ by 0.5, rows by 0.1: only the pairs can tell."""
     base, other = row("a", seed0=0.1, seed1=0.6, seed2=0.9), row("b", seed0=0.2, seed1=0.7, seed3=0.0)
     difference = Mean.of(other.differences(base, AP).values())
@@ -54,14 +54,14 @@ def test_differences_are_paired() -> None:
     assert other.mean(AP).value == pytest.approx(0.3)
 
 
-def test_figures_that_are_not_defined_are_left_out() -> None:
+def test_row_values_skip_undefined_metrics() -> None:
     told = row("a", seed0=0.4, seed1=None, seed2="many", seed3=True, seed4=math.nan, seed5=1, seed6=10**400)
     assert told.values(AP) == {("0",): 0.4, ("5",): 1.0}
     assert told.mean("no.such.key").count == 0
     assert told.differences(row("b", seed0=None), AP) == {}
 
 
-def test_the_star_is_the_paired_t_test() -> None:
+def test_is_not_zero_matches_paired_t_test() -> None:
     rng = np.random.default_rng(0)
     stars = []
     for _ in range(40):
@@ -73,33 +73,33 @@ def test_the_star_is_the_paired_t_test() -> None:
     assert 5 < sum(stars) < 35
 
 
-def test_equal_differences_are_no_evidence() -> None:
+def test_is_not_zero_is_false_for_equal_differences() -> None:
     """Two instances more in each of two rooms: a count, without a spread by which the next room could be told."""
     assert not Mean.of([2.0, 2.0]).is_not_zero
     assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, "they differ in the last digit only"
 
 
-def test_rows_are_the_experiments_and_runs_are_seeds_in_order() -> None:
+def test_rows_keep_experiment_order_and_sort_seeds() -> None:
     records = [record({"row": name, "seed": seed}) for name in ("b", "a") for seed in (10, 9, 1)]
     runs = [("1",), ("9",), ("10",)]
     assert names(records, "b", "none", "a") == {"b": runs, "a": runs}
     assert list(names(records, "b", "none", "a")) == ["b", "a"]
 
 
-def test_what_follows_the_seed_makes_no_row() -> None:
+def test_rows_ignore_parameters_equal_to_seed() -> None:
     records = [
         record({"seed": seed, "dataset": {"seed": seed}, "detector": {"seed": seed, "shift": 1.5}}) for seed in range(3)
     ]
     assert names(records) == {"all runs": [("0",), ("1",), ("2",)]}
 
 
-def test_a_parameter_that_only_looks_like_the_seed_makes_rows() -> None:
+def test_rows_split_by_parameter_independent_of_seed() -> None:
     records = [record({"seed": seed, "dataset": {"start": start}}) for seed in (0, 1) for start in (0, 1)]
     runs = [("0",), ("1",)]
     assert names(records) == {"dataset.start=0": runs, "dataset.start=1": runs}
 
 
-def test_without_an_experiment_rows_are_what_was_chosen() -> None:
+def test_rows_without_experiment_are_named_by_choices() -> None:
     """A refiner's own parameters differ from another's, and are no row of their own."""
     parameters: dict[str, dict[str, Any]] = {"kmeans": {"centers": 5}, "gmm": {"steps": 8, "floor": 0.1}}
     records = [
@@ -115,13 +115,13 @@ def test_without_an_experiment_rows_are_what_was_chosen() -> None:
     }
 
 
-def test_an_experiments_row_is_split_where_the_command_line_changed_more() -> None:
+def test_rows_split_by_command_line_overrides() -> None:
     records = [record({"row": name, "seed": 0, "fuser": {"voxel": voxel}}) for name in "ba" for voxel in (0.02, 0.05)]
     split = [f"{name}, fuser.voxel={voxel}" for name in "ba" for voxel in (0.02, 0.05)]
     assert list(names(records, "b", "a")) == split
 
 
-def test_rows_that_differ_in_what_no_row_changes_are_told_apart() -> None:
+def test_row_names_include_undeclared_choice_differences() -> None:
     """One row was tracked and the other was not: that is no difference between the rows, and is in their names."""
     records = [
         record({"row": "a", "seed": 0}, tracker="icp", fuser="bayes"),
@@ -133,7 +133,7 @@ def test_rows_that_differ_in_what_no_row_changes_are_told_apart() -> None:
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
 
 
-def test_rows_with_other_parameters_are_told_apart_though_each_has_but_one() -> None:
+def test_row_names_include_undeclared_parameter_differences() -> None:
     """They differ in what no row's overrides say: that is no difference between the rows, and is in their names."""
     frames = {"a": 8, "b": 16}
     records = [
@@ -147,7 +147,7 @@ def test_rows_with_other_parameters_are_told_apart_though_each_has_but_one() -> 
     assert [row.name for row in rows_of(records, ["seed"])] == ["a", "b"], "nobody knows what they change"
 
 
-def test_without_an_experiment_other_scenes_are_told_apart() -> None:
+def test_rows_without_experiment_are_split_by_scene() -> None:
     records = [
         record({"seed": 0, "dataset": {"scene": scene}}, refiner=name)
         for name, scene in (("chain", "011"), ("identity", "016"))
@@ -155,12 +155,12 @@ def test_without_an_experiment_other_scenes_are_told_apart() -> None:
     assert list(names(records)) == ["refiner=chain, dataset.scene=011", "refiner=identity, dataset.scene=016"]
 
 
-def test_a_row_may_be_called_by_a_number() -> None:
+def test_rows_accept_numeric_names() -> None:
     records = [record({"row": row, "seed": 0}) for row in (0, 20)]
     assert list(names(records, "0", "20")) == ["0", "20"]
 
 
-def test_what_may_follow_the_seed_by_chance_is_told() -> None:
+def test_following_lists_parameters_varying_with_seed() -> None:
     records = [
         record({"seed": seed, "dataset": {"seed": seed, "stride": seed, "start": 1}, "fuser": {"voxel": 1}})
         for seed in (1, 2)
@@ -169,13 +169,13 @@ def test_what_may_follow_the_seed_by_chance_is_told() -> None:
     assert following(records[:1], ["seed"]) == []
 
 
-def test_rows_of_other_data_are_told_apart_though_each_has_but_one() -> None:
+def test_row_names_include_dataset_root_differences() -> None:
     records = [record({"row": row, "seed": 0, "dataset": {"root": f"/{row}", "stride": 1}}) for row in "ab"]
     changes = {"a": [], "b": ["dataset.stride=2"]}
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.root=/a", "b, dataset.root=/b"]
 
 
-def test_a_row_tells_its_poses_in_words() -> None:
+def test_row_poses_describe_pose_source() -> None:
     given = record({}, tracker="ground_truth")
     given = Record(given.directory, {**given.metrics, "pose_source": "ground_truth"}, {}, 0.0)
     assert RunRow("a", {("0",): given}).poses == "ground truth"
@@ -183,20 +183,20 @@ def test_a_row_tells_its_poses_in_words() -> None:
     assert RunRow("b", tracked).poses == "tracked (icp/pnp)"
 
 
-def test_rows_can_be_averaged_over_anything() -> None:
+def test_rows_average_over_any_parameter() -> None:
     records = [record({"seed": seed, "dataset": {"scene": scene}}) for seed in (0, 1) for scene in "xy"]
     assert names(records, over=("dataset.scene",)) == {"seed=0": [("x",), ("y",)], "seed=1": [("x",), ("y",)]}
     assert len(names(records, over=("dataset.scene", "seed"))["all runs"]) == 4
 
 
 @pytest.mark.parametrize("backwards", [False, True])
-def test_of_two_records_of_one_run_the_later_counts(backwards: bool) -> None:
+def test_rows_use_latest_record_of_run(backwards: bool) -> None:
     records = [record({"seed": 0}, ap, written) for ap, written in ((0.1, 1.0), (0.9, 2.0))]
     [one] = rows_of(records[::-1] if backwards else records, ["seed"])
     assert one.mean(AP).value == 0.9
 
 
-def test_what_an_experiment_says_about_itself_makes_no_row() -> None:
+def test_rows_ignore_table_and_debug_settings() -> None:
     records = [record({"seed": seed, "debug": bool(seed), "table": {"base": str(seed)}}) for seed in (0, 1)]
     assert list(names(records)) == ["all runs"]
 

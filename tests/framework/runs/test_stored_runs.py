@@ -41,7 +41,7 @@ def write(directory: Path, **metrics: object) -> None:
     (directory / "metrics.json").write_text(json.dumps(told | metrics))
 
 
-def test_the_config_comes_back_with_the_hash_that_it_was_written_with(directory: Path) -> None:
+def test_read_record_returns_config_and_metrics(directory: Path) -> None:
     record = read_record(directory)
     assert record.config == CONFIG
     assert record.metrics["instances.ap50"] == 0.5
@@ -70,7 +70,7 @@ def test_the_config_comes_back_with_the_hash_that_it_was_written_with(directory:
         ("config.yaml", "fuser: {true: 1, voxel_size: 2}", "is not of the config beside it"),
     ],
 )
-def test_a_broken_record_is_one_line(directory: Path, name: str, content: str, said: str) -> None:
+def test_read_record_invalid_file_raises_one_line_error(directory: Path, name: str, content: str, said: str) -> None:
     (directory / name).write_text(content, encoding="latin-1")
     with pytest.raises(DataError, match=said) as caught:
         read_record(directory)
@@ -81,7 +81,7 @@ def test_a_broken_record_is_one_line(directory: Path, name: str, content: str, s
     assert not is_recorded(directory, OmegaConf.create(CONFIG))
 
 
-def test_a_record_without_config_is_told(directory: Path) -> None:
+def test_read_record_without_config_raises(directory: Path) -> None:
     (directory / "config.yaml").unlink()
     with pytest.raises(DataError, match=r"config.yaml is missing"):
         read_record(directory)
@@ -104,7 +104,7 @@ def test_a_record_without_config_is_told(directory: Path) -> None:
         ({"metrics.partial.json": "{"}, r"cannot be read"),
     ],
 )
-def test_why_a_run_is_not_complete(directory: Path, files: dict[str, str], reason: str) -> None:
+def test_find_records_gives_reason_for_incomplete_run(directory: Path, files: dict[str, str], reason: str) -> None:
     (directory / "metrics.json").unlink()
     (directory / "instancemap.log").write_text("")
     for name, content in files.items():
@@ -114,7 +114,7 @@ def test_why_a_run_is_not_complete(directory: Path, files: dict[str, str], reaso
     assert reason in other.reason
 
 
-def test_what_is_no_run_is_not_looked_at(directory: Path) -> None:
+def test_find_records_ignores_other_files(directory: Path) -> None:
     (directory.parent / "table.md").write_text("")
     (directory.parent / ".hydra").mkdir()
     (directory.parent / ".hydra" / "metrics.json").write_text("{}")
@@ -123,13 +123,13 @@ def test_what_is_no_run_is_not_looked_at(directory: Path) -> None:
     assert others == []
 
 
-def test_a_record_of_the_same_config_is_kept(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_is_recorded_same_config_is_true(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     assert is_recorded(directory, OmegaConf.create(CONFIG | {"debug": True}))
     assert caplog.messages == [f"kept: the complete record in {directory}"]
 
 
-def test_what_a_record_has_lost_is_named(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_is_recorded_logs_missing_map_files(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Who needs the disk may have removed it, and the figures are still those of the run."""
     (directory / "map.npz").unlink()
     (directory / "mesh.ply").unlink()
@@ -137,14 +137,14 @@ def test_what_a_record_has_lost_is_named(directory: Path, caplog: pytest.LogCapt
     assert f"{directory} has lost mesh.ply, map.npz; skip_completed=false would make it again" in caplog.messages
 
 
-def test_a_record_of_another_config_is_not(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_is_recorded_other_config_is_false(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     assert not is_recorded(directory, OmegaConf.create(CONFIG | {"seed": 4}))
     assert caplog.messages == [f"run again: the record in {directory} is of another config"]
 
 
 @pytest.mark.parametrize("theirs", [{"git_commit": "1234567890"}, {"git_dirty": True}])
-def test_a_record_of_other_code_is_kept_with_a_warning(
+def test_is_recorded_other_code_is_true_with_warning(
     directory: Path, caplog: pytest.LogCaptureFixture, theirs: dict[str, object]
 ) -> None:
     write(directory, config_hash=config_hash(CONFIG), **theirs)
@@ -166,7 +166,7 @@ def record_of(directory: Path, config: dict[str, object], monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("changed", [{"threads": 1}, {"prefetch": 0}, {"detection_cache": "read_write"}])
-def test_times_of_other_settings_are_no_record_of_an_experiment_about_speed(
+def test_is_recorded_speed_experiment_needs_same_settings(
     directory: Path, changed: dict[str, object], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -185,9 +185,7 @@ def test_times_of_other_settings_are_no_record_of_an_experiment_about_speed(
     ]
 
 
-def test_times_of_another_machine_are_no_record_of_an_experiment_about_speed(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_is_recorded_speed_experiment_needs_same_machine(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = CONFIG | SETTINGS | {"table": {"columns": ["fps"]}}
     record_of(directory, config, monkeypatch)
     assert is_recorded(directory, OmegaConf.create(config))
@@ -195,7 +193,7 @@ def test_times_of_another_machine_are_no_record_of_an_experiment_about_speed(
     assert not is_recorded(directory, OmegaConf.create(config))
 
 
-def test_other_weights_or_data_in_the_same_place_are_another_run(
+def test_is_recorded_changed_weights_or_data_is_false(
     directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -227,13 +225,13 @@ def test_other_weights_or_data_in_the_same_place_are_another_run(
     assert is_recorded(directory, OmegaConf.create(config)), "neither concerns this run"
 
 
-def test_a_record_from_before_inputs_were_told_is_kept(directory: Path, tmp_path: Path) -> None:
+def test_is_recorded_without_inputs_hash_is_true(directory: Path, tmp_path: Path) -> None:
     config = CONFIG | {"dataset": {"root": str(tmp_path), "scene": ""}}
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     write(directory, config_hash=config_hash(config))
     assert is_recorded(directory, OmegaConf.create(config))
 
 
-def test_no_record_is_none(tmp_path: Path) -> None:
+def test_is_recorded_empty_folder_is_false(tmp_path: Path) -> None:
     assert not is_recorded(tmp_path, OmegaConf.create(CONFIG))
     assert find_records(tmp_path) == ([], [])

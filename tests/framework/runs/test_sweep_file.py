@@ -14,13 +14,13 @@ def sweep(params: Any, task: Any) -> dict[str, Any]:
     return {"hydra": {"sweeper": {"params": params}, "overrides": {"task": task}}}
 
 
-def test_the_command_line_wins_over_the_experiment() -> None:
+def test_asked_runs_command_line_overrides_experiment() -> None:
     asked = sweep({"row": "${all_of:${rows}}", "dataset.scene": "011,016", "seed": 0}, ["seed=0,1", "launcher=joblib"])
     expected = [("0", "011"), ("0", "016"), ("1", "011"), ("1", "016")]
     assert asked_runs(asked, ["seed", "dataset.scene"]) == expected
 
 
-def test_rows_say_what_was_run() -> None:
+def test_sweep_rows_resolves_interpolations() -> None:
     config = {"rows": {"third": ["dataset.stop=${sequences.in_progress}"], "whole": []}, "hydra": {"x": "${hydra:y}"}}
     assert sweep_rows(config | {"sequences": {"in_progress": 80}}) == {"third": ["dataset.stop=80"], "whole": []}
     assert sweep_rows(config) == config["rows"], "as it stands there, where nobody knows"
@@ -29,7 +29,7 @@ def test_rows_say_what_was_run() -> None:
         sweep_rows({"rows": ["a"]})
 
 
-def test_a_stored_sweep_asks_for_nothing_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sweep_file_does_not_resolve_environment_variables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SECRET", "hunter2")
     config = {"rows": {"a": ["x=${oc.env:SECRET}"], "b": ["x=${c}"]}, "c": "${oc.env:SECRET}"}
     assert "hunter2" not in repr(sweep_rows(config))
@@ -37,7 +37,7 @@ def test_a_stored_sweep_asks_for_nothing_of_this_machine(monkeypatch: pytest.Mon
     assert asked_runs(asked, ["seed"]) == asked_runs(asked, ["other"]) == []
 
 
-def test_the_sequences_are_those_that_the_experiment_names() -> None:
+def test_asked_runs_resolves_sequence_interpolation() -> None:
     asked = {"sequences": {"all": "a,b"}} | sweep({"dataset.scene": "${sequences.all}", "seed": 0, "x": "${y}"}, [])
     assert asked_runs(asked, ["seed", "dataset.scene"]) == [("0", "a"), ("0", "b")]
 
@@ -52,11 +52,11 @@ def test_the_sequences_are_those_that_the_experiment_names() -> None:
         ("seed=0.01,1e-3", ["0.01", "0.001"]),
     ],
 )
-def test_values_are_those_that_the_config_will_hold(override: str, values: list[str]) -> None:
+def test_asked_runs_expands_hydra_override_values(override: str, values: list[str]) -> None:
     assert asked_runs(sweep({}, [override]), ["seed"]) == [(value,) for value in values]
 
 
-def test_a_range_cannot_claim_the_memory() -> None:
+def test_asked_runs_limits_large_ranges() -> None:
     assert len(asked_runs(sweep({}, ["seed=range(0,100000000)"]), ["seed"])) == 1000
     both = sweep({}, ["seed=range(0,100000000)", "frames=range(0,100000000)"])
     assert len(asked_runs(both, ["seed", "frames"])) == 100_000
@@ -75,5 +75,5 @@ def test_a_range_cannot_claim_the_memory() -> None:
         sweep({}, ["other=1,2"]),
     ],
 )
-def test_what_is_not_said_in_plain_words_is_not_asked(config: dict[str, Any]) -> None:
+def test_asked_runs_unresolvable_sweep_is_empty(config: dict[str, Any]) -> None:
     assert asked_runs(config, ["seed"]) == []

@@ -14,7 +14,7 @@ from framework.runtime.run_log import RunResult, StageTime
 from tests.support.scenes.corner_room import GridMap
 
 
-def test_what_a_run_wrote_is_read_back_with_gaps_where_a_stage_did_not_run(tmp_path: Path) -> None:
+def test_timings_file_round_trip_has_nan_for_missing_stages(tmp_path: Path) -> None:
     times = (
         *(StageTime(4, "tracking", 2.5), StageTime(4, "fusion", 20.0)),
         StageTime(6, "tracking", 3.0),  # lost: not fused
@@ -52,7 +52,7 @@ def test_read_timings_old_stage_gets_current_name(tmp_path: Path) -> None:
         ("frame,stage,milliseconds\n0,\x00,1\n0,fusion\n", "line 3: "),
     ],
 )
-def test_a_fault_is_one_line_that_names_the_place(tmp_path: Path, content: str, said: str) -> None:
+def test_read_timings_invalid_line_raises_with_line_number(tmp_path: Path, content: str, said: str) -> None:
     path = tmp_path / "timings.csv"
     path.write_text(content)
     with pytest.raises(DataError, match=said) as caught:
@@ -62,7 +62,7 @@ def test_a_fault_is_one_line_that_names_the_place(tmp_path: Path, content: str, 
     assert len(str(caught.value)) < 200 + len(str(path))
 
 
-def test_a_file_that_is_not_there_or_not_text_is_told(tmp_path: Path) -> None:
+def test_read_timings_unreadable_file_raises(tmp_path: Path) -> None:
     (tmp_path / "timings.csv").write_bytes(b"\xff\xfe")
     for name in ("timings.csv", "none.csv"):
         with pytest.raises(DataError, match=f"{name} could not be read"):

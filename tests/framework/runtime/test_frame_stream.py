@@ -66,7 +66,7 @@ def taken(stream: LiveFrames) -> object:
     return reader and reader()
 
 
-def test_the_newest_is_taken_once_and_the_others_are_counted() -> None:
+def test_live_frames_return_newest_and_count_dropped() -> None:
     video = Handed()
     with LiveFrames(video, lambda: False) as stream:
         video.come(0)
@@ -81,7 +81,7 @@ def test_the_newest_is_taken_once_and_the_others_are_counted() -> None:
         assert taken(stream) is None
 
 
-def test_who_waits_gets_what_comes_and_is_let_go_when_it_shall_end() -> None:
+def test_live_frames_take_waits_for_frame_or_end() -> None:
     video, ended = Handed(), threading.Event()
     found: list[object] = []
     with LiveFrames(video, ended.is_set) as stream:
@@ -95,7 +95,7 @@ def test_who_waits_gets_what_comes_and_is_let_go_when_it_shall_end() -> None:
         assert taken(stream) is None, "what comes after the end is not mapped"
 
 
-def test_what_the_video_raises_is_raised_after_its_last_frame() -> None:
+def test_live_frames_raise_video_error_after_last_frame() -> None:
     video = LiveRoom(fails_after=1)
     with LiveFrames(video, lambda: False) as stream:
         assert isinstance(taken(stream), Frame)
@@ -105,7 +105,7 @@ def test_what_the_video_raises_is_raised_after_its_last_frame() -> None:
     assert video.closed
 
 
-def test_whoever_leaves_gives_the_device_back() -> None:
+def test_live_frames_exit_closes_device() -> None:
     video, before = LiveRoom(frames_sent=1000), threading.active_count()
     with LiveFrames(video, lambda: False) as stream:
         taken(stream)
@@ -113,7 +113,7 @@ def test_whoever_leaves_gives_the_device_back() -> None:
     assert threading.active_count() == before
 
 
-def test_what_is_neither_recorded_nor_live_is_refused() -> None:
+def test_stream_of_unsupported_video_raises() -> None:
     class Neither(RGBDVideo):
         name = "neither"
 
@@ -122,7 +122,7 @@ def test_what_is_neither_recorded_nor_live_is_refused() -> None:
 
 
 @PREFETCH
-def test_a_live_video_that_is_slow_enough_is_mapped_whole(prefetch: int) -> None:
+def test_slow_live_video_is_mapped_without_drops(prefetch: int) -> None:
     threads, video = working_threads(), LiveRoom(unreadable=2)
     result = pipeline(prefetch).run(video)
     assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
@@ -144,7 +144,7 @@ def test_live_video_detects_every_nth_mapped_frame(prefetch: int) -> None:
 
 
 @PREFETCH
-def test_when_mapping_is_behind_frames_are_dropped_and_counted(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_fast_live_video_drops_and_counts_frames(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
     video = LiveRoom(frames_sent=60, period_s=SLOW_S / 6)
     result = pipeline(prefetch, fuser=GridFuser(slow_s=SLOW_S)).run(video)
     assert result.live is not None
@@ -156,7 +156,7 @@ def test_when_mapping_is_behind_frames_are_dropped_and_counted(prefetch: int, ca
     assert caplog.messages == [f"{result.live.frames_dropped} frames dropped: they came while others were mapped"]
 
 
-def test_no_frame_waits_behind_another() -> None:
+def test_live_video_frames_are_not_queued() -> None:
     """However far the loop may look prefetch in a recording: a queue would add its length to each latency."""
     video, waiting = LiveRoom(frames_sent=200, period_s=0.002), []
 
@@ -170,7 +170,7 @@ def test_no_frame_waits_behind_another() -> None:
     assert max(waiting) == 1
 
 
-def test_the_figures_of_a_live_run() -> None:
+def test_live_run_metrics_have_drops_and_latency() -> None:
     result = pipeline(fuser=GridFuser(slow_s=SLOW_S)).run(LiveRoom(frames_sent=30, period_s=0.005))
     assert result.live is not None
     metrics = run_metrics(result)
@@ -181,14 +181,14 @@ def test_the_figures_of_a_live_run() -> None:
     assert f"latency {metrics['latency_ms']:.0f} ms" in title
 
 
-def test_a_recording_has_none_of_these_figures_and_drops_nothing(room: CornerRoom) -> None:
+def test_recorded_run_has_no_live_metrics(room: CornerRoom) -> None:
     result = pipeline(fuser=GridFuser(slow_s=SLOW_S)).run(room)
     assert (result.frames, result.live) == (6, None)
     assert not {"frames_dropped", "latency_ms"} & run_metrics(result).keys()
 
 
 @PREFETCH
-def test_ctrl_c_is_the_end_of_a_live_video(prefetch: int) -> None:
+def test_ctrl_c_ends_live_video_normally(prefetch: int) -> None:
     video, threads = LiveRoom(frames_sent=1000), working_threads()
     result = pipeline(prefetch, tracker=PressesCtrlC(at=0)).run(video)
     assert result.stopped_by is None
@@ -197,7 +197,7 @@ def test_ctrl_c_is_the_end_of_a_live_video(prefetch: int) -> None:
     assert working_threads() == threads
 
 
-def test_a_second_ctrl_c_ends_it_at_once() -> None:
+def test_second_ctrl_c_interrupts_live_video() -> None:
     """In the middle of a frame: what is left is not whole."""
     video = LiveRoom(frames_sent=1000)
     result = pipeline(tracker=PressesCtrlC(at=2, times=2)).run(video)
@@ -206,7 +206,7 @@ def test_a_second_ctrl_c_ends_it_at_once() -> None:
     assert video.closed
 
 
-def test_ctrl_c_before_anything_came_is_what_it_is_elsewhere() -> None:
+def test_ctrl_c_before_first_live_frame_raises() -> None:
     """The worker waits for a first frame that never comes."""
 
     @dataclass
@@ -221,7 +221,7 @@ def test_ctrl_c_before_anything_came_is_what_it_is_elsewhere() -> None:
         pipeline().run(Silent())
 
 
-def test_a_video_that_breaks_down_leaves_what_was_mapped() -> None:
+def test_failed_live_video_keeps_partial_map() -> None:
     result = pipeline().run_to_any_end(LiveRoom(fails_after=3))
     assert isinstance(result.stopped_by, DataError)
     assert result.frames == 3
@@ -229,7 +229,7 @@ def test_a_video_that_breaks_down_leaves_what_was_mapped() -> None:
         pipeline().run_to_any_end(LiveRoom(fails_after=0))
 
 
-def test_a_live_video_without_a_usable_frame_is_an_error() -> None:
+def test_live_video_without_usable_frame_raises() -> None:
     with pytest.raises(DataError, match="live_room: no frame came"):
         pipeline().run(LiveRoom(frames_sent=0))
     with pytest.raises(DataError, match="none of the 1 frames can be used"):
@@ -239,7 +239,7 @@ def test_a_live_video_without_a_usable_frame_is_an_error() -> None:
 
 
 @PREFETCH
-def test_a_fault_of_a_stage_leaves_no_thread(prefetch: int) -> None:
+def test_live_stage_exception_leaves_no_threads(prefetch: int) -> None:
     """The worker may be waiting for a frame, and the listener for the video."""
     video, threads = LiveRoom(frames_sent=1000), working_threads()
     with pytest.raises(OSError, match="Input/output error"):
@@ -250,7 +250,7 @@ def test_a_fault_of_a_stage_leaves_no_thread(prefetch: int) -> None:
     assert working_threads() == threads
 
 
-def test_detections_come_from_frames_that_were_taken_only() -> None:
+def test_live_detector_runs_only_on_mapped_frames() -> None:
     seen: list[int] = []
 
     @dataclass

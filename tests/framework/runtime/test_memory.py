@@ -28,7 +28,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc can be told")
 @pytest.mark.parametrize(("way", "said"), [("kept", {}), ("as ever", {}), ("kept", {"GLIBC_TUNABLES": ""})])
-def test_allocation_after_free_needs_no_new_pages(way: str, said: dict[str, str]) -> None:
+def test_keep_freed_memory_avoids_page_faults(way: str, said: dict[str, str]) -> None:
     """Ten times 24 MiB are 61,000 pages of 4 KiB, or 120 huge ones."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "GLIBC_"))}
     answer = subprocess.run(

@@ -33,7 +33,7 @@ main()
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system lacks some of it anyway")
-def test_a_run_and_its_table_without_what_other_systems_lack(tmp_path: Path) -> None:
+def test_commands_run_without_linux_specific_modules(tmp_path: Path) -> None:
     def start(*arguments: str) -> str:
         done = subprocess.run(
             [sys.executable, "-c", ELSEWHERE, *arguments],

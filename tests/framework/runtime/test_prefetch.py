@@ -26,7 +26,7 @@ def test_map_ahead_is_bounded_and_ordered() -> None:
     assert begun == list(range(10))
 
 
-def test_detection_of_the_next_frame_overlaps_with_this_one() -> None:
+def test_map_ahead_overlaps_with_consumer() -> None:
     """Each side waits for the other: without a worker thread this would never end."""
     fusing, detected = threading.Event(), threading.Event()
 
@@ -43,7 +43,7 @@ def test_detection_of_the_next_frame_overlaps_with_this_one() -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
-def test_outcomes_come_in_order_whoever_is_done_first(workers: int) -> None:
+def test_map_ahead_results_keep_order(workers: int) -> None:
     def sleep(k: int) -> int:
         time.sleep(0.002 * (k % 3))
         return k
@@ -52,7 +52,7 @@ def test_outcomes_come_in_order_whoever_is_done_first(workers: int) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_what_a_worker_raises_comes_in_its_place_and_ends_all(workers: int) -> None:
+def test_map_ahead_worker_exception_is_raised_in_order(workers: int) -> None:
     def fail(k: int) -> int:
         if k == 3:
             raise OSError("the disk is gone")
@@ -65,7 +65,7 @@ def test_what_a_worker_raises_comes_in_its_place_and_ends_all(workers: int) -> N
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("detect-ahead")]
 
 
-def test_turns_are_taken_in_order_and_a_fault_ends_one() -> None:
+def test_turns_run_in_order_despite_exceptions() -> None:
     turns, taken, inside = Turns(), [], threading.Lock()
 
     def work(number: int) -> None:

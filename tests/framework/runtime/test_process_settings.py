@@ -25,7 +25,7 @@ pytestmark = pytest.mark.integration
 CHECKOUT = Path(__file__).resolve().parents[3]
 
 
-def test_threads_limit_what_is_loaded_and_what_is_loaded_later() -> None:
+def test_thread_limit_applies_to_libraries_loaded_later() -> None:
     """The setting does not import torch and applies when torch is imported later."""
     code = """
 import sys
@@ -43,7 +43,7 @@ print(torch.get_num_threads())
     assert done.stdout.split() == ["1", "1", "1", "3"]
 
 
-def test_libraries_that_are_told_their_threads_at_each_call_obey(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_thread_limit_is_passed_to_scipy_and_open3d(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
     class Tree(cKDTree):
@@ -85,7 +85,7 @@ print(torch.initial_seed())
     assert done.stdout.split() == ["5"]
 
 
-def test_frozen_collector_skips_older_objects_and_is_restored() -> None:
+def test_frozen_garbage_collector_is_restored() -> None:
     with frozen_garbage_collector():
         assert gc.get_freeze_count() > 10_000, "what was imported"
         circle: list[object] = []
@@ -112,7 +112,7 @@ from framework import geometry
 """
 
 
-def test_kernels_are_kept_for_a_process_where_nothing_else_can_be_written(tmp_path: Path) -> None:
+def test_numba_cache_is_temporary_without_writable_folder(tmp_path: Path) -> None:
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
     environment["PYTHONPATH"] = str(CHECKOUT)
     line = [sys.executable, "-c", WITHOUT_A_PLACE]
@@ -127,7 +127,7 @@ def test_kernels_are_kept_for_a_process_where_nothing_else_can_be_written(tmp_pa
     assert given.stdout.split()[0] == "given"
 
 
-def test_where_the_system_tells_no_affinity_all_cores_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_available_cores_without_affinity_is_cpu_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity")
     assert available_cores() == os.cpu_count()
 
@@ -141,7 +141,7 @@ def test_where_the_system_tells_no_affinity_all_cores_count(monkeypatch: pytest.
         *[("seed", wrong, 2**63 - 1) for wrong in (2**63, 10**400, "x" * 100_000)],
     ],
 )
-def test_settings_are_within_bounds_that_the_message_says(name: str, value: object, most: int) -> None:
+def test_settings_out_of_range_raise_with_bounds(name: str, value: object, most: int) -> None:
     config = OmegaConf.create({"seed": 0, "device": "cpu", "threads": 0, "prefetch": 2})
     least = 1 if name == "detection_interval" else 0
     config[name] = value
@@ -153,7 +153,7 @@ def test_settings_are_within_bounds_that_the_message_says(name: str, value: obje
 
 
 @pytest.mark.parametrize("threads", [-1, 1.0, True])
-def test_threads_are_a_number_of_threads(threads: object) -> None:
+def test_settings_invalid_threads_raise(threads: object) -> None:
     with pytest.raises(ConfigError, match="threads must be a whole number, 0 or more and at most 4096, found"):
         Settings(seed=0, device="cpu", threads=threads)  # type: ignore[arg-type]
 
@@ -172,7 +172,7 @@ print(time.process_time() - done)
 """
 
 
-def test_threads_of_products_do_not_spin_when_they_are_done() -> None:
+def test_matrix_product_threads_do_not_spin_when_idle() -> None:
     """They would take 0.02 s and more of the CPU time of a process that sleeps."""
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_THREAD_TIMEOUT"}
     line = [sys.executable, "-c", IDLE_AFTER_A_PRODUCT]

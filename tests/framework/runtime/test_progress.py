@@ -36,9 +36,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return clock
 
 
-def test_lines_come_every_few_seconds_and_more_rarely_the_longer_it_takes(
-    clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_line_interval_grows_with_time(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", io.StringIO())
     lines = []
     with Progress(None, " frames") as bar:
@@ -53,7 +51,7 @@ def test_lines_come_every_few_seconds_and_more_rarely_the_longer_it_takes(
 
 
 @pytest.mark.parametrize("columns", [80, 0])
-def test_a_terminal_sees_a_bar_also_one_that_does_not_say_how_wide_it_is(
+def test_progress_bar_is_shown_in_terminal_of_any_width(
     columns: int, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours, theirs = pty.openpty()
@@ -68,14 +66,14 @@ def test_a_terminal_sees_a_bar_also_one_that_does_not_say_how_wide_it_is(
     assert "0/7" in shown
 
 
-def test_who_wants_no_bars_gets_no_lines(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_with_tqdm_disable_has_no_lines(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TQDM_DISABLE", "1")
     with Progress(7, " frames") as bar:
         clock.now += 100
         assert not bar.line_is_due()
 
 
-def test_without_a_terminal_mapping_says_how_far_it_is(
+def test_mapping_progress_without_terminal_is_logged(
     clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(sys, "stderr", io.StringIO())

@@ -22,9 +22,7 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", ENDING)
-def test_the_first_is_noted_and_the_second_raises_where_it_may(
-    number: signal.Signals, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_first_signal_is_deferred_and_second_raises(number: signal.Signals, capfd: pytest.CaptureFixture[str]) -> None:
     signal.signal(number, signal.SIG_DFL)
     with signals_deferred(*ENDING) as interruption:
         interruption.check()
@@ -54,7 +52,7 @@ def nobody_else_handles_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def test_one_inside_of_another_is_the_same() -> None:
+def test_nested_signals_deferred_returns_outer_context() -> None:
     with signals_deferred(signal.SIGINT, signal.SIGTERM) as outer:
         with signals_deferred(signal.SIGINT) as inner:
             assert inner is outer
@@ -64,7 +62,7 @@ def test_one_inside_of_another_is_the_same() -> None:
         assert later.asked is None
 
 
-def test_who_ignores_or_handles_a_signal_goes_on_to_do_so() -> None:
+def test_existing_signal_handlers_are_kept() -> None:
     """Scripts start what is in the background with Ctrl-C ignored; submitit handles SIGTERM in its jobs."""
     heard: list[int] = []
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -76,7 +74,7 @@ def test_who_ignores_or_handles_a_signal_goes_on_to_do_so() -> None:
     assert (interruption.asked, heard) == (None, [signal.SIGTERM])
 
 
-def test_every_signal_raises_in_a_process_that_asks_for_it() -> None:
+def test_raise_on_signals_raises_for_each_signal() -> None:
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL)
     raise_on_signals()
@@ -87,12 +85,12 @@ def test_every_signal_raises_in_a_process_that_asks_for_it() -> None:
         assert ended.value.number == number
 
 
-def test_it_reaches_the_process_that_began_a_sweep() -> None:
+def test_interrupted_exception_is_picklable() -> None:
     copy = pickle.loads(pickle.dumps(Interrupted(signal.SIGTERM)))
     assert (copy.number, str(copy)) == (signal.SIGTERM, "ended by SIGTERM")
 
 
-def test_other_threads_are_left_alone() -> None:
+def test_signals_deferred_in_other_thread_has_no_effect() -> None:
     before = signal.getsignal(signal.SIGINT)
     seen: list[object] = []
 

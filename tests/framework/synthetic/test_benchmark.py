@@ -38,7 +38,7 @@ def classes_of(pieces) -> Counter:
     return Counter(piece.class_name for piece in pieces)
 
 
-def test_the_scenes_have_names_of_their_own_and_each_class_is_promised_by_at_least_two() -> None:
+def test_scenes_have_unique_names_and_repeated_classes() -> None:
     assert list(SCENES) == ROOMS
     assert not any(name.isdigit() for name in SCENES), "a number would be taken for a sequence of SceneNN"
     promised = Counter(name for spec in SCENES.values() for name in spec.holds)
@@ -55,7 +55,7 @@ def test_scene_has_declared_objects(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", ROOMS)
-def test_a_scene_finds_room_for_everything(name: str) -> None:
+def test_furnish_scene_places_all_declared_objects(name: str) -> None:
     spec = SCENES[name]
     room = furnish_scene(spec, np.random.default_rng([ROOMS.index(name) % len(SEEDS), 1]))
     assert room.layout.free.max() > 1.0, "room to walk"
@@ -66,7 +66,7 @@ def test_a_scene_finds_room_for_everything(name: str) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("make", [cluttered_bed_group, cluttered_couch])
-def test_things_lie_on_what_they_clutter(make, seed: int) -> None:
+def test_cluttered_groups_place_objects_on_furniture(make, seed: int) -> None:
     support, *others = make(np.random.default_rng(seed)).pieces
     low, high = support.bounds()
     middles = [sum(piece.bounds()) / 2 for piece in others]
@@ -87,7 +87,7 @@ def points(piece) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_things_in_a_row_are_equal_and_touch(seed: int) -> None:
+def test_row_groups_place_identical_pieces_in_contact(seed: int) -> None:
     chairs = [piece for piece in chair_row(np.random.default_rng(seed), 4).pieces if piece.kind == "chair"]
     desks = [piece for piece in desk_row(np.random.default_rng(seed), 3).pieces if piece.kind == "desk"]
     assert (len(chairs), len(desks)) == (4, 3)
@@ -100,7 +100,7 @@ def test_things_in_a_row_are_equal_and_touch(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("make", [laid_table_group, lambda rng: desk_row(rng, 1)], ids=["table", "desk"])
-def test_chairs_stand_under_tables_as_far_as_they_go(make, seed: int) -> None:
+def test_chairs_are_pushed_under_tables_without_intersection(make, seed: int) -> None:
     table, *others = make(np.random.default_rng(seed)).pieces
     chairs = [piece for piece in others if piece.class_name == "chair"]
     under = [chair for chair in chairs if gap(chair, table) < 0]
@@ -120,7 +120,7 @@ def test_chairs_stand_under_tables_as_far_as_they_go(make, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_couch_touches_its_table_and_a_bag_its_bed(seed: int) -> None:
+def test_cluttered_groups_place_neighbors_in_contact(seed: int) -> None:
     couch, *others = cluttered_couch_group(np.random.default_rng(seed)).pieces
     [table] = [piece for piece in others if piece.class_name == "dining table"]
     assert 0 < gap(couch, table) <= TOUCHING[1]
@@ -130,7 +130,7 @@ def test_a_couch_touches_its_table_and_a_bag_its_bed(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_things_on_a_table_stand_on_its_top_beside_each_other(seed: int) -> None:
+def test_laid_table_objects_stand_on_top_without_overlap(seed: int) -> None:
     table, *others = laid_table_group(np.random.default_rng(seed)).pieces
     low, high = table.bounds()
     things = [piece for piece in others if piece.class_name != "chair"]
@@ -143,7 +143,7 @@ def test_things_on_a_table_stand_on_its_top_beside_each_other(seed: int) -> None
     assert all(gap(thing, other) >= 0 for thing, other in combinations(things, 2))
 
 
-def test_books_in_a_row_stand_one_beside_the_other() -> None:
+def test_book_row_places_upright_books_side_by_side() -> None:
     row = book_row(np.random.default_rng(0))
     low, high = row.bounds()
     assert row.class_name == "book"
@@ -156,7 +156,7 @@ def test_books_in_a_row_stand_one_beside_the_other() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_what_is_strewn_touches_furniture_and_bars_no_walk(seed: int) -> None:
+def test_strew_places_objects_in_contact_and_keeps_walkway(seed: int) -> None:
     rng = np.random.default_rng(seed)
     layout = arrange([cluttered_couch_group(rng), chair_row(rng, 3), single("bag", backpack(rng))], 4.8, 4.2, rng)
     strewn = strew(layout, some(rng, ON_FLOORS, 9), rng)
@@ -174,7 +174,7 @@ def test_what_is_strewn_touches_furniture_and_bars_no_walk(seed: int) -> None:
         assert (np.abs(np.stack(thing.bounds())[:, :2]) < half).all()
 
 
-def test_the_walk_shows_the_class_that_the_room_is_for() -> None:
+def test_planned_walk_views_target_class() -> None:
     scene = plan_scene(SceneSpec("bathroom", (toilet_group,), {"toilet": 1}), [0, 0], 60, 1.0)
     toilet = next(piece for _, piece in scene.room.objects if piece.class_name == "toilet")
     middle = sum(toilet.bounds()) / 2

@@ -25,7 +25,7 @@ def test_furniture_does_not_collide(kind, seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_studio_holds_all_nine_classes_and_chairs_that_nearly_touch(seed):
+def test_studio_contains_all_classes_and_adjacent_chairs(seed):
     room = furnish(RoomKind.STUDIO, np.random.default_rng(seed))
     assert {piece.class_name for _, piece in room.objects} >= set(LABELED)
     chairs = [piece.bounds() for _, piece in room.objects if piece.class_name == "chair"]
@@ -36,7 +36,7 @@ def test_a_studio_holds_all_nine_classes_and_chairs_that_nearly_touch(seed):
     assert 0 < min(gaps) < 0.06
 
 
-def test_instances_are_numbered_and_the_shell_has_none():
+def test_room_instance_ids_exclude_room_shell():
     surfaces = furnish(RoomKind.BEDROOM, np.random.default_rng(0)).surfaces
     assert set(np.unique(surfaces.instance_ids)) == {0, *surfaces.class_names}
     assert np.isfinite(surfaces.vertices).all()

@@ -30,12 +30,12 @@ def noise():
     return np.random.default_rng(0).integers(0, 256, (*CAMERA.shape, 3)).astype(np.uint8)
 
 
-def test_a_still_camera_takes_the_same_picture():
+def test_motion_blur_of_still_camera_is_identity():
     np.testing.assert_array_equal(exposed(noise(), np.full(CAMERA.shape, 2.0), POSE, POSE), noise())
 
 
 @pytest.mark.parametrize("path", [3, 6])
-def test_an_edge_is_spread_over_as_many_pixels_as_it_moves(path):
+def test_motion_blur_width_equals_pixel_displacement(path):
     color = np.zeros((*CAMERA.shape, 3), np.uint8)
     color[:, 48:] = 200
     half = path / 2 * 2.0 / CAMERA.fx  # m, at a depth of 2 m
@@ -47,7 +47,7 @@ def test_an_edge_is_spread_over_as_many_pixels_as_it_moves(path):
     assert np.diff(row).max() < 1.5 * 200 / path, "evenly"
 
 
-def test_what_is_far_away_is_blurred_less():
+def test_motion_blur_decreases_with_distance():
     color = noise()
     color[..., 1:] = color[..., :1]
     depth = np.full(CAMERA.shape, 1.0)
@@ -59,7 +59,7 @@ def test_what_is_far_away_is_blurred_less():
     assert picture[8:-8, 8:40].std() < 0.6 * picture[8:-8, 60:88].std()
 
 
-def test_a_pixel_is_the_mean_of_samples_along_its_path():
+def test_motion_blur_averages_samples_along_pixel_path():
     """Against the projection of each pixel's point into the poses at the shutter's ends, one pixel at a time."""
     rng = np.random.default_rng(1)
     color, depth = noise(), rng.uniform(0.8, 4, CAMERA.shape)

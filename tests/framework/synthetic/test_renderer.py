@@ -33,7 +33,7 @@ def scene(*solids):
     return assemble(objects)
 
 
-def test_depth_of_a_slanted_plane_is_exact():
+def test_rendered_depth_of_slanted_plane_is_exact():
     wall = panel(60.0, 60.0, 5.0).moved(z=-30).turned("x", 0.5).turned("z", 0.4)
     renderer = Renderer(scene(wall), [globe(np.array([0.0, 2.0, 0.0]), 0.1, (1, 1, 1))])
     T = look(np.array([0.3, 2.0, 0.2]), -1.9, -0.2, 0.1)
@@ -50,7 +50,7 @@ def test_depth_of_a_slanted_plane_is_exact():
     np.testing.assert_allclose(picture.incidence, cosine, atol=1e-5)
 
 
-def test_ids_and_nothing():
+def test_renderer_background_has_zero_depth_and_id():
     box = rounded_box(1.0, 1.0, 1.0, 0.01)
     floor = panel(3.0, 3.0).turned("x", np.pi / 2).moved(y=1.5, z=-0.5)
     renderer = Renderer(scene(floor, box), [globe(np.array([2.0, 2.0, 3.0]), 0.1, (1, 1, 1))])
@@ -65,7 +65,7 @@ def test_ids_and_nothing():
     assert picture.depth[6, 0] > 0  # the floor
 
 
-def test_a_lamp_casts_a_shadow():
+def test_renderer_lamp_casts_shadow():
     plate = rounded_box(1.0, 1.0, 0.02, 0.004).moved(z=1.0)
     floor = panel(6.0, 6.0).turned("x", np.pi / 2).moved(y=3.0)
     renderer = Renderer(scene(floor, plate), [globe(np.array([0.0, 0.0, 2.0]), 0.05, (1, 1, 1))])
@@ -96,7 +96,7 @@ def furnished():
     )
 
 
-def test_rays_are_those_of_the_arithmetic_on_whole_images_to_the_bit():
+def test_image_rays_equal_vectorized_reference():
     T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
     x, y = (np.arange(64)[None, :] - CAMERA.cx) / CAMERA.fx, (np.arange(48)[:, None] - CAMERA.cy) / CAMERA.fy
     expected = np.empty((48, 64, 6), np.float32)
@@ -128,7 +128,7 @@ def light_along(renderer, rays):
     return light, cosines
 
 
-def test_a_picture_is_that_of_rays_shaded_one_by_one():
+def test_rendered_image_matches_per_ray_shading():
     renderer = furnished()
     T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
     picture = renderer.render(CAMERA, T)
@@ -167,7 +167,7 @@ def test_a_picture_is_that_of_rays_shaded_one_by_one():
     np.testing.assert_array_equal(cast_ids(renderer.surfaces, renderer.caster, CAMERA, T), picture.instance_ids)
 
 
-def test_other_materials_change_the_colors_and_nothing_else():
+def test_material_table_changes_only_colors():
     renderer = furnished()
     T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
     table = renderer.surfaces.material_table.copy()
@@ -179,7 +179,7 @@ def test_other_materials_change_the_colors_and_nothing_else():
     assert (other.color[seen][:, 0] < picture.color[seen][:, 0]).all()
 
 
-def test_dark_materials_lose_their_share_and_shiny_ones_at_a_slant():
+def test_unread_share_depends_on_darkness_and_incidence():
     wall = panel(60.0, 60.0, 5.0).moved(z=-30).turned("x", 0.5).turned("z", 0.4)
     T = look(np.array([0.3, 2.0, 0.2]), -1.9, -0.2, 0.1)
     lamp = [globe(np.array([0.0, 2.0, 0.0]), 0.1, (1, 1, 1))]

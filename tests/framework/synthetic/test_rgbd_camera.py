@@ -24,7 +24,7 @@ def measure(depth, incidence=FRONT, noise=1.0, seed=0, max_range=8.0):
 
 
 @pytest.mark.parametrize("z", [0.8, 1.5, 2.5, 4.0])
-def test_the_deviation_on_a_wall_is_that_of_nguyen_et_al(z):
+def test_depth_noise_deviation_matches_nguyen_model(z):
     # Spread over two depth steps, so that the wall's place among the steps does not matter.
     depth = z + np.linspace(-1, 1, FRONT.size).reshape(FRONT.shape) * float(depth_step(np.float32(z)))
     error = (measure(depth) - depth)[measure(depth) > 0]
@@ -33,7 +33,7 @@ def test_the_deviation_on_a_wall_is_that_of_nguyen_et_al(z):
     assert abs(error.mean()) < 0.05 * expected
 
 
-def test_grazing_surfaces_are_noisier():
+def test_depth_noise_increases_at_grazing_angles():
     wall = np.full(FRONT.shape, 2.0)
     slanted = measure(wall, np.full(FRONT.shape, np.cos(np.deg2rad(72)), np.float32))
     theta = np.float32(np.deg2rad(72))
@@ -41,14 +41,14 @@ def test_grazing_surfaces_are_noisier():
     assert slanted[slanted > 0].std() > 1.05 * measure(wall).std()
 
 
-def test_depth_comes_in_steps_of_an_eighth_of_a_disparity():
+def test_depth_is_quantized_to_eighth_disparity_steps():
     reading = measure(np.full(FRONT.shape, 3.0))
     inverse = np.unique(1 / reading[reading > 0].astype(np.float64))
     np.testing.assert_allclose(np.diff(inverse) * 8 * 580 * 0.075, np.rint(np.diff(inverse) * 348), atol=0.02)
     assert depth_step(np.float32(3.0)) == pytest.approx(9 / 348)
 
 
-def test_a_box_casts_the_projectors_shadow_to_its_left():
+def test_depth_sensor_box_casts_projector_shadow_on_left():
     depth = np.full(FRONT.shape, 3.0)
     depth[:, 150:200] = 1.0
     missing = np.mean([measure(depth, seed=s) == 0 for s in range(20)], axis=(0, 1))
@@ -59,28 +59,28 @@ def test_a_box_casts_the_projectors_shadow_to_its_left():
     assert 0.2 < missing[199:201].mean() < 0.8  # the right edge drops readings by chance
 
 
-def test_what_is_seen_edge_on_is_not_read():
+def test_depth_sensor_edge_on_surface_has_no_reading():
     assert not measure(np.full(FRONT.shape, 2.0), np.full(FRONT.shape, 0.01, np.float32)).any()
 
 
-def test_range():
+def test_depth_sensor_out_of_range_has_no_reading():
     assert not measure(np.full(FRONT.shape, 0.3)).any()
     assert not measure(np.full(FRONT.shape, 5.0), max_range=4.5).any()
     assert not measure(np.full(FRONT.shape, 5.0), noise=0.0, max_range=4.5).any()
 
 
-def test_no_noise_is_exact():
+def test_depth_sensor_without_noise_is_exact():
     depth = np.random.default_rng(0).uniform(0.1, 4, FRONT.shape).astype(np.float32)
     np.testing.assert_array_equal(measure(depth, noise=0.0), depth)
 
 
-def test_half_the_noise_has_about_half_the_deviation():
+def test_depth_noise_deviation_scales_with_noise_parameter():
     wall = 3.0 + np.linspace(-1, 1, FRONT.size).reshape(FRONT.shape) * 0.05
     half, full = ((measure(wall, noise=n) - wall).std() for n in (0.6, 1.0))
     assert half == pytest.approx(0.6 * full, rel=0.2)
 
 
-def test_quantiles_are_normal_and_bits_are_even():
+def test_normal_quantiles_and_random_bits_are_unbiased():
     quantiles = normal_quantiles().astype(float)
     assert quantiles.mean() == pytest.approx(0, abs=1e-6)
     assert quantiles.std() == pytest.approx(1, abs=1e-6)
@@ -144,7 +144,7 @@ def slow_measure(depth, incidence, noise, max_range, rng):
 
 
 @pytest.mark.parametrize("noise", [0.3, 1.0, 1.7])
-def test_readings_are_those_of_the_arithmetic_on_whole_images_to_the_bit(noise):
+def test_depth_sensor_equals_vectorized_reference(noise):
     for seed in range(3):
         depth, cosine = jagged(seed)
         expected = slow_measure(depth, cosine, noise, 6.0, np.random.default_rng([seed]))
@@ -152,7 +152,7 @@ def test_readings_are_those_of_the_arithmetic_on_whole_images_to_the_bit(noise):
         np.testing.assert_array_equal(measure(depth, cosine, noise, seed, 6.0), expected)
 
 
-def test_the_grain_of_color_is_rounded_and_clipped():
+def test_color_noise_is_rounded_and_clipped():
     color = np.random.default_rng(0).integers(0, 256, (24, 32, 3)).astype(np.uint8)
     grain = normal_quantiles()[random_bits(color.shape, np.random.default_rng(1)) >> 4]
     for noise in (1.0, 40.0):  # gray levels beyond both ends
@@ -186,7 +186,7 @@ def slow_loss(unread, noise, seed):
 
 
 @pytest.mark.parametrize("noise", [0.5, 1.0])
-def test_materials_lose_the_readings_that_a_slow_reference_loses(noise):
+def test_material_dropout_matches_slow_reference(noise):
     unread = np.random.default_rng(7).uniform(-0.3, 1.2, FRONT.shape).clip(0, 1).astype(np.float32)
     for seed in range(2):
         without = measure(np.full(FRONT.shape, 2.0), noise=noise, seed=seed)
@@ -197,14 +197,14 @@ def test_materials_lose_the_readings_that_a_slow_reference_loses(noise):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_the_share_of_readings_lost_is_the_one_asked_for_and_comes_in_patches(share):
+def test_material_dropout_has_given_share_and_forms_patches(share):
     lost = np.array([measure_unread(share, seed=seed) == 0 for seed in range(20)])
     assert lost.mean() == pytest.approx(share, abs=0.02)
     beside = (lost[:, :, 1:] == lost[:, :, :-1]).mean()
     assert beside > 1 - 0.3 * 2 * share * (1 - share), "neighbors are lost together"
 
 
-def test_a_screen_has_no_reading_and_other_surfaces_keep_all_theirs():
+def test_material_dropout_removes_only_unreadable_surfaces():
     assert not measure_unread(1.0).any()
     np.testing.assert_array_equal(measure_unread(0.0), measure(np.full(FRONT.shape, 2.0)))
     assert measure_unread(1.0, noise=0.0).all(), "without noise readings are exact"

@@ -50,7 +50,7 @@ def area(corners) -> float:
 
 
 @pytest.mark.parametrize("longest", [0.02, 0.05])
-def test_edges_are_short_and_the_surface_is_the_same(longest):
+def test_tessellate_limits_edge_length_and_keeps_surface(longest):
     surfaces = scene(rounded_box(0.5, 0.3, 0.2, 0.01, 2), rounded_box(0.1, 0.2, 0.3, 0.02, 3).moved(x=1.0))
     mesh = tessellate(surfaces, longest)
     assert edge_lengths(mesh).max() <= longest * (1 + 1e-5)
@@ -60,7 +60,7 @@ def test_edges_are_short_and_the_surface_is_the_same(longest):
     assert volume > 0, "triangles still turn counter-clockwise seen from outside"
 
 
-def test_there_are_no_gaps():
+def test_tessellate_closed_body_stays_watertight():
     """Each edge of a closed body belongs to two triangles, in opposite directions."""
     mesh = tessellate(scene(rounded_box(0.5, 0.3, 0.2, 0.02, 3)), 0.02)
     directed = np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)])
@@ -68,7 +68,7 @@ def test_there_are_no_gaps():
     assert np.array_equal(np.unique(directed, axis=0), np.unique(directed[:, ::-1], axis=0))
 
 
-def test_vertices_at_one_place_are_one_but_for_two_instances():
+def test_tessellate_merges_duplicate_vertices_per_instance():
     half = rounded_box(0.1, 0.1, 0.1, 0.01)
     mesh = tessellate(scene(wall(5.0), half, half), 0.02)
     rows = np.column_stack([mesh.vertices, mesh.instance_ids])
@@ -78,7 +78,7 @@ def test_vertices_at_one_place_are_one_but_for_two_instances():
     assert (of_triangle == of_triangle[:, :1]).all()
 
 
-def test_only_what_the_camera_sees_remains():
+def test_visible_mesh_excludes_occluded_surface():
     box = rounded_box(1.0, 1.0, 1.0, 1e-3)
     surfaces = scene(wall(4.0), box.moved(x=2.5))
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
@@ -97,7 +97,7 @@ def test_only_what_the_camera_sees_remains():
     assert area(corners_of(mesh)[mesh.instance_ids[mesh.triangles[:, 0]] == 1]) == pytest.approx(1.0, rel=3e-3)
 
 
-def test_nothing_is_seen_beyond_the_reach_or_too_near():
+def test_seen_from_excludes_points_out_of_depth_range():
     surfaces = scene(wall(4.0))
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
     assert seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (0.4, 6.0), surfaces.unreadable).any()
@@ -105,7 +105,7 @@ def test_nothing_is_seen_beyond_the_reach_or_too_near():
     assert not seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (4.1, 6.0), surfaces.unreadable).any()
 
 
-def test_one_view_after_the_other_adds_what_it_sees():
+def test_seen_from_multiple_views_is_union():
     surfaces = scene(wall(4.0))
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
     aside = look(np.zeros(3), 0.3, 0.0, 0.0)
@@ -115,13 +115,13 @@ def test_one_view_after_the_other_adds_what_it_sees():
     assert (alone[0] != alone[1]).any()
 
 
-def test_negative_zero_is_zero():
+def test_tessellate_treats_negative_zero_as_zero():
     surfaces = scene(wall(4.0))
     signed = np.where(surfaces.vertices == 0, np.float32(-0.0), surfaces.vertices)
     assert len(tessellate(replace(surfaces, vertices=signed), 0.1).vertices) == len(tessellate(surfaces, 0.1).vertices)
 
 
-def test_a_screen_is_not_in_the_mesh_nor_what_lies_closely_behind_it():
+def test_visible_mesh_excludes_screen_and_surface_behind_it():
     objects = []
     for instance, (side, x, dark) in enumerate(((3.0, 3.0, 0.9), (1.0, 2.998, 1.0))):
         piece = Furniture("thing", None)

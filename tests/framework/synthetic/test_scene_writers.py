@@ -40,7 +40,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.acceptance
-def test_two_processes_write_what_one_writes(root: Path, tmp_path: Path) -> None:
+def test_write_scenes_two_processes_equal_single_process(root: Path, tmp_path: Path) -> None:
     alone = SceneNNScene(tmp_path / "008", SPEC, RECORDING)
     alone.write_walk()
     for index in reversed(range(RECORDING.frames)):
@@ -53,12 +53,12 @@ def test_two_processes_write_what_one_writes(root: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.acceptance
-def test_two_scenes_of_one_spec_differ(root: Path) -> None:
+def test_write_scenes_same_spec_gives_different_scenes(root: Path) -> None:
     assert trajectory_file(root / "007").read_bytes() != trajectory_file(root / "008").read_bytes()
 
 
 @pytest.mark.acceptance
-def test_what_is_complete_is_kept_and_what_is_missing_is_written_again(root: Path) -> None:
+def test_write_scenes_rewrites_only_missing_files(root: Path) -> None:
     before, written = times(root), contents(root)
     color_file, _ = frame_files(root / "007", 4)
     for path in (trajectory_file(root / "007"), color_file):
@@ -75,7 +75,7 @@ def test_what_is_complete_is_kept_and_what_is_missing_is_written_again(root: Pat
 
 
 @pytest.mark.acceptance
-def test_what_all_scenes_share(root: Path) -> None:
+def test_write_scenes_writes_common_files(root: Path) -> None:
     assert (root / "release.txt").read_text() == f"synthetic {GENERATION}, seed 1, 10 frames\n"
     assert json.loads((root / "synthesize.json").read_text())["generation"] == GENERATION
     assert SceneNN(root, scene="007").domain == RENDERED_ROOMS
@@ -87,14 +87,14 @@ def test_what_all_scenes_share(root: Path) -> None:
 @pytest.mark.parametrize(
     "other", [BenchmarkSettings(seed=2, frames=10, width=64), BenchmarkSettings(seed=1, frames=9, width=64)]
 )
-def test_rooms_of_other_parameters_are_not_mixed(root: Path, other: BenchmarkSettings) -> None:
+def test_write_scenes_other_parameters_raise(root: Path, other: BenchmarkSettings) -> None:
     before = times(root)
     with pytest.raises(ConfigError, match=r"other parameters.*choose another folder"):
         write_scenes(root, SPECS, other, jobs=1)
     assert times(root) == before
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_write_scenes_foreign_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "011.ply").write_text("a scan")
     with pytest.raises(ConfigError, match="new or empty folder"):
         write_scenes(tmp_path, SPECS, RECORDING, jobs=1)
@@ -110,13 +110,13 @@ def killed(status: int, rng: object) -> None:
     os._exit(status)
 
 
-def test_a_process_that_dies_is_one_line(tmp_path: Path) -> None:
+def test_write_scenes_killed_process_raises_one_line_error(tmp_path: Path) -> None:
     deadly = SceneSpec("trap", (partial(killed, 9),), {})
     with pytest.raises(DataError, match=r"rooms/666 was ended from outside.*run the same command again"):
         write_scenes(tmp_path / "rooms", {"666": deadly}, RECORDING, jobs=1)
 
 
-def test_a_process_stays_with_its_scene_then_takes_an_untouched_one_then_helps(tmp_path: Path) -> None:
+def test_choose_prefers_own_scene_then_untouched_scene(tmp_path: Path) -> None:
     recording = BenchmarkSettings(frames=3 * FRAMES_AT_ONCE, width=64)
     first, second = (_Scene(tmp_path / name, SPEC, recording) for name in ("007", "008"))
     scenes = [first, second]

@@ -37,7 +37,7 @@ def digest(frame):
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
 
-def test_frames_carry_everything(bedroom):
+def test_synthetic_frames_are_complete(bedroom):
     frame = bedroom[5]
     assert len(bedroom) == 240
     assert (frame.index, frame.timestamp) == (5, pytest.approx(5 / 30))
@@ -47,7 +47,7 @@ def test_frames_carry_everything(bedroom):
     assert set(np.unique(frame.truth.instance_ids)) <= {0, *frame.truth.class_names}
 
 
-def test_every_surface_has_gradient(bedroom):
+def test_synthetic_images_have_gradient_on_all_surfaces(bedroom):
     """Photometric alignment needs texture in every part of the image, walls and floor included."""
     for k in (0, 80, 160):
         gray = bedroom[k].color.astype(float).mean(axis=2)
@@ -55,7 +55,7 @@ def test_every_surface_has_gradient(bedroom):
         assert np.median(tiles.std(axis=1)) > 3
 
 
-def test_frames_do_not_depend_on_order_or_threads(bedroom):
+def test_synthetic_frames_are_independent_of_order_and_threads(bedroom):
     picked = [3, 40, 77, 110]
     one_by_one = [digest(bedroom[k]) for k in picked]
     with ThreadPoolExecutor(4) as pool:
@@ -63,7 +63,7 @@ def test_frames_do_not_depend_on_order_or_threads(bedroom):
     assert one_by_one == at_once
 
 
-def test_a_share_leaves_frames_out_and_the_others_as_they_are(bedroom):
+def test_frame_fraction_skips_frames_without_changing_others(bedroom):
     share = Synthetic(seed=1, frame_fraction=0.1, **SMALL)
     assert len(share) == 24
     indices = [share[k].index for k in (0, 9, 23)]
@@ -72,7 +72,7 @@ def test_a_share_leaves_frames_out_and_the_others_as_they_are(bedroom):
     assert len(share.scene_truth().points_world) > 0
 
 
-def test_another_process_with_one_thread_renders_the_same_bytes(bedroom):
+def test_synthetic_frames_are_identical_in_other_process(bedroom):
     program = (
         "from tests_digest import digest, Synthetic, SMALL\nprint(digest(Synthetic(seed=1, start=70, **SMALL)[7]))"
     )
@@ -87,7 +87,7 @@ def test_another_process_with_one_thread_renders_the_same_bytes(bedroom):
     assert answer.stdout.split()[-1] == digest(bedroom[77])
 
 
-def test_seed_and_scene_each_give_another_room(bedroom):
+def test_synthetic_room_depends_on_seed_and_scene(bedroom):
     from framework.synthetic.room import furnish
 
     stream = bedroom._stream
@@ -100,7 +100,7 @@ def test_seed_and_scene_each_give_another_room(bedroom):
     assert same.shape != other_scene.shape or not np.array_equal(same, other_scene)
 
 
-def test_points_of_one_frame_are_found_in_another(exact):
+def test_synthetic_frames_agree_after_reprojection(exact):
     """Exact poses and pixel convention: a surface point lies in both pictures at its depth and in its color."""
     a, b = exact[60], exact[72]
     v, u = np.nonzero(a.depth > 0)
@@ -127,7 +127,7 @@ def test_points_of_one_frame_are_found_in_another(exact):
     assert np.median(difference) < 4
 
 
-def test_the_walk_is_that_of_a_hand_held_camera(bedroom, exact):
+def test_walk_has_hand_held_camera_motion(bedroom, exact):
     for sequence in (bedroom, exact):
         poses = [sequence.path.pose(k) for k in range(len(sequence))]
         position = np.array([T[:3, 3] for T in poses])
@@ -141,7 +141,7 @@ def test_the_walk_is_that_of_a_hand_held_camera(bedroom, exact):
         assert np.abs(np.diff(position, n=3, axis=0)).max() < 1e-4  # smooth: no jerk
 
 
-def test_the_walk_keeps_its_distance(bedroom, exact):
+def test_walk_keeps_distance_from_walls_and_furniture(bedroom, exact):
     for sequence in (bedroom, exact):
         layout = sequence.room.layout
         position = np.array([sequence.path.pose(k)[:2, 3] for k in range(len(sequence))])
@@ -154,7 +154,7 @@ def test_the_walk_keeps_its_distance(bedroom, exact):
                 assert np.linalg.norm(outside, axis=1).min() >= 0.5, piece.kind
 
 
-def test_scene_truth_lies_on_the_exact_surface(exact):
+def test_scene_truth_lies_on_exact_surface(exact):
     truth = Synthetic(seed=1, noise=0.0, kind=RoomKind.KITCHEN, width=160, height=120, stride=60).scene_truth()
     assert truth.class_names == exact.class_names
     import open3d as o3d
@@ -186,6 +186,6 @@ def test_scene_truth_lies_on_the_exact_surface(exact):
         ({"frame_fraction": 0.0}, "dataset.frame_fraction"),
     ],
 )
-def test_parameters_are_checked_before_any_work(values, name):
+def test_synthetic_parameter_out_of_range_raises(values, name):
     with pytest.raises(ConfigError, match=name):
         Synthetic(**values)

@@ -42,7 +42,7 @@ from framework.tables.comparison import TableChoice
         ("fps", "table must have keys and values"),
     ],
 )
-def test_a_choice_checks_itself(node: object, said: str) -> None:
+def test_table_choice_invalid_settings_raise(node: object, said: str) -> None:
     with pytest.raises(ConfigError, match=said) as caught:
         TableChoice.of(node)
     assert "\n" not in str(caught.value)

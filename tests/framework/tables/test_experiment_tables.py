@@ -50,7 +50,7 @@ def sweep(tmp_path: Path) -> Path:
     return root
 
 
-def test_every_figure_by_hand(sweep: Path) -> None:
+def test_write_tables_figures_match_manual_result(sweep: Path) -> None:
     text = write_tables(sweep)
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[0] == "# ablation_x"
@@ -78,7 +78,7 @@ def test_every_figure_by_hand(sweep: Path) -> None:
     assert first["instances.ap50.pairs"] == "3"
 
 
-def test_seeds_of_a_scene_are_no_independent_evidence(tmp_path: Path) -> None:
+def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
     """By scene the differences are 0.3 and 0.1: mean 0.2, error 0.1, whatever the number of seeds."""
     table = {"average_over": ["seed", "scene"], "columns": ["instances.ap50"]}
     rows = {"chain": [], "other": ["refiner=other"]}
@@ -96,7 +96,7 @@ def test_seeds_of_a_scene_are_no_independent_evidence(tmp_path: Path) -> None:
     assert other["instances.ap50.pairs"] == "6"
 
 
-def test_what_is_missing_is_said(sweep: Path) -> None:
+def test_table_notes_list_missing_runs(sweep: Path) -> None:
     (sweep / "row=chain,seed=1" / "metrics.json").unlink()
     (sweep / "row=chain,seed=1" / "instancemap.log").write_text("12:00:00 ERROR   the map is full.\n")
     (sweep / "row=identity,seed=2" / "metrics.json").write_text("{")
@@ -112,7 +112,7 @@ def test_what_is_missing_is_said(sweep: Path) -> None:
     assert "- Code: 1234567 (4 runs), 89abcde (1 run)." in lines
 
 
-def test_seeds_that_were_asked_for_and_have_not_begun_are_said(sweep: Path) -> None:
+def test_table_notes_list_requested_runs_without_record(sweep: Path) -> None:
     asked = {"sweeper": {"params": {"row": "${all_of:${rows}}", "seed": 0}}, "overrides": {"task": ["seed=range(0,5)"]}}
     config = {"table": TABLE, "rows": ROWS, "hydra": asked}
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
@@ -121,7 +121,7 @@ def test_seeds_that_were_asked_for_and_have_not_begun_are_said(sweep: Path) -> N
     assert "- Missing in chain: seed=3,4." in lines
 
 
-def test_what_evaluated_anew_is_named_beside_what_ran(sweep: Path) -> None:
+def test_table_code_note_names_later_evaluation_commit(sweep: Path) -> None:
     """A table of two evaluators must say so."""
     path = sweep / "row=chain,seed=1" / "metrics.json"
     anew = {"evaluation.git_commit": "fedcba9876", "evaluation.git_dirty": True}
@@ -130,7 +130,7 @@ def test_what_evaluated_anew_is_named_beside_what_ran(sweep: Path) -> None:
     assert told in write_tables(sweep).splitlines()
 
 
-def test_a_note_is_one_line_whatever_a_run_says(sweep: Path) -> None:
+def test_table_notes_replace_line_breaks(sweep: Path) -> None:
     (sweep / "row=chain,seed=1" / "metrics.json").unlink()
     partial = {"partial": "the map\nis\r\nfull"}
     (sweep / "row=chain,seed=1" / "metrics.partial.json").write_text(json.dumps(partial))
@@ -138,7 +138,7 @@ def test_a_note_is_one_line_whatever_a_run_says(sweep: Path) -> None:
     assert "% Not complete: row=chain,seed=1: partial: the map is full." in (sweep / "table.tex").read_text()
 
 
-def test_what_has_the_seeds_value_by_chance_is_told(tmp_path: Path) -> None:
+def test_table_notes_list_parameters_equal_to_seed(tmp_path: Path) -> None:
     for seed in (1, 2):
         config = {"seed": seed, "dataset": {"stride": seed}}
         directory = run(tmp_path, "x", seed, 0.5, 1.0)
@@ -148,7 +148,7 @@ def test_what_has_the_seeds_value_by_chance_is_told(tmp_path: Path) -> None:
     assert "- Averaged over with seed, whose value they have in every run: dataset.stride." in write_tables(tmp_path)
 
 
-def test_no_differences_without_the_base(sweep: Path) -> None:
+def test_table_without_baseline_has_no_differences(sweep: Path) -> None:
     for path in sweep.glob("row=chain*/metrics.json"):
         path.unlink()
     text = write_tables(sweep)
@@ -157,7 +157,7 @@ def test_no_differences_without_the_base(sweep: Path) -> None:
     assert text.count("| identity ") == 1
 
 
-def test_rows_go_by_the_names_that_they_are_given(sweep: Path) -> None:
+def test_table_rows_use_configured_names(sweep: Path) -> None:
     table = TABLE | {"names": {"chain": "all of it"}}
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
     text = write_tables(sweep)
@@ -180,7 +180,7 @@ def of_dataset(sweep: Path, dataset: str, annotation: str | None = None, only: s
 
 
 @pytest.mark.parametrize("annotation", ["not named", None])
-def test_published_run_times_stand_below_those_on_scenenn(sweep: Path, annotation: str | None) -> None:
+def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str | None) -> None:
     of_dataset(sweep, "scenenn", annotation)
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": RUN_TIMES, "rows": ROWS})))
     text = write_tables(sweep)
@@ -206,7 +206,7 @@ def test_published_run_times_stand_below_those_on_scenenn(sweep: Path, annotatio
         ("synthetic", None, ""),
     ],
 )
-def test_published_numbers_do_not_stand_below_other_data(
+def test_table_on_other_data_has_no_published_numbers(
     sweep: Path, dataset: str, annotation: str | None, only: str
 ) -> None:
     of_dataset(sweep, "scenenn", "2016")
@@ -219,7 +219,7 @@ def test_published_numbers_do_not_stand_below_other_data(
     assert "- Published numbers are of the real SceneNN (sequences=scenenn): none stand below" in text
 
 
-def test_a_published_row_without_a_number_of_the_columns_is_only_named(sweep: Path) -> None:
+def test_published_row_without_column_values_is_only_named(sweep: Path) -> None:
     """The paper's own is known in Hz, not here by stage, and it has no word about lost frames."""
     of_dataset(sweep, "scenenn")
     for columns, named in ((["stage_ms.refinement.median"], True), (["frames_lost"], False)):
@@ -230,7 +230,7 @@ def test_a_published_row_without_a_number_of_the_columns_is_only_named(sweep: Pa
         assert ("looked the numbers up: the paper (DDNS 2020" in text) is named
 
 
-def test_a_split_row_is_compared_with_the_base_of_its_kind(tmp_path: Path) -> None:
+def test_split_row_is_compared_with_matching_baseline(tmp_path: Path) -> None:
     """Rows that the command line split in two: voxels of one size are compared with each other."""
     root = tmp_path / "x"
     root.mkdir()
@@ -250,14 +250,14 @@ def test_a_split_row_is_compared_with_the_base_of_its_kind(tmp_path: Path) -> No
     assert "| identity, fuser.voxel=2 | 1 | -0.125 | +0.000 |" in lines
 
 
-def test_a_figure_that_nobody_knows_is_a_dash(sweep: Path) -> None:
+def test_table_unknown_metric_is_dash(sweep: Path) -> None:
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": TABLE | {"columns": ["no.such"]}, "rows": ROWS}))
     text = write_tables(sweep)
     assert "| identity |    3 |       – | ground_truth |" in text
     assert "- No run has a figure of this name: no.such." in text, "it may be misspelt"
 
 
-def test_records_without_an_experiment_make_a_table_too(tmp_path: Path) -> None:
+def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
     """With the columns that there are figures for: recordings of one's own have no true instances."""
     poses = {"trajectory.ate_rmse_m": 0.012, "frames_lost": 2, "fps": 21.5}
     for name in ("a", "b"):
@@ -273,7 +273,7 @@ def test_records_without_an_experiment_make_a_table_too(tmp_path: Path) -> None:
     assert "ap50" not in (tmp_path / "table.csv").read_text()
 
 
-def test_a_figure_of_a_single_run_has_its_column(tmp_path: Path) -> None:
+def test_table_without_experiment_has_column_for_single_value(tmp_path: Path) -> None:
     run(tmp_path, "a", 0, None, 1.0, **{"instances.mean_iou": 0.0})
     run(tmp_path, "b", 0, 0.5, 1.0)
     lines = [" ".join(line.split()) for line in write_tables(tmp_path).splitlines()]
@@ -285,14 +285,14 @@ def test_a_figure_of_a_single_run_has_its_column(tmp_path: Path) -> None:
     ]
 
 
-def test_records_without_any_figure_make_a_table_of_dashes(tmp_path: Path) -> None:
+def test_table_without_metrics_has_all_columns(tmp_path: Path) -> None:
     run(tmp_path, "a", 0, None, 1.0, **{"stage_ms.refinement.median": None})
     text = write_tables(tmp_path)
     assert text.splitlines()[2].count("|") == 18  # row, runs, poses, and all 14 figures
     assert "Left out" not in text
 
 
-def test_the_columns_of_an_experiment_stay_without_a_figure(sweep: Path) -> None:
+def test_experiment_table_keeps_columns_without_values(sweep: Path) -> None:
     for path in sweep.glob("*/metrics.json"):
         path.write_text(json.dumps(json.loads(path.read_text()) | {"instances.ap50": None}))
     text = write_tables(sweep)
@@ -300,7 +300,7 @@ def test_the_columns_of_an_experiment_stay_without_a_figure(sweep: Path) -> None
     assert "Left out" not in text
 
 
-def test_an_older_record_of_the_same_run_is_counted(sweep: Path) -> None:
+def test_table_notes_count_older_records(sweep: Path) -> None:
     (sweep / "again").mkdir()
     run(sweep / "again", "chain", 0, 0.0, 1.0)
     assert "- Left out, older records of the same runs: 1." in write_tables(sweep)
@@ -310,14 +310,14 @@ def test_an_older_record_of_the_same_run_is_counted(sweep: Path) -> None:
     ("content", "said"),
     [("table: [", "cannot be read"), ("table: {columns: [], average_over: [seed]}", "table.columns must name")],
 )
-def test_a_broken_experiment_is_one_line(sweep: Path, content: str, said: str) -> None:
+def test_write_tables_invalid_experiment_raises_one_line_error(sweep: Path, content: str, said: str) -> None:
     (sweep / "multirun.yaml").write_text(content)
     with pytest.raises(Exception, match=said) as caught:
         write_tables(sweep)
     assert "\n" not in str(caught.value)
 
 
-def test_no_complete_run_is_told_with_the_reason(tmp_path: Path) -> None:
+def test_write_tables_without_complete_run_raises_reason(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="there is no complete run below"):
         write_tables(tmp_path)
     with pytest.raises(DataError, match="is not a folder"):
@@ -329,7 +329,7 @@ def test_no_complete_run_is_told_with_the_reason(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("table.*"))
 
 
-def test_latex_and_markdown_escape(sweep: Path) -> None:
+def test_latex_and_markdown_tables_escape_special_characters(sweep: Path) -> None:
     run(sweep, r"50%_{a}|b\c", 0, 0.5, 1.0)
     assert r"50%_{a}\|b\c" in write_tables(sweep)
     latex = (sweep / "table.tex").read_text()
@@ -341,7 +341,7 @@ def test_latex_and_markdown_escape(sweep: Path) -> None:
     assert all(line.startswith(("%", "\\")) or "&" in line or not line for line in latex.splitlines())
 
 
-def test_old_stage_names_in_runs_and_sweep_are_current(sweep: Path) -> None:
+def test_table_old_stage_names_are_renamed(sweep: Path) -> None:
     old = TABLE | {"columns": ["stage_ms.fuse.median"]}
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": old, "rows": ROWS})))
     run(sweep, "chain", 7, 0.5, 1.0, **{"stage_ms.fuse.median": 31.0})
@@ -350,18 +350,18 @@ def test_old_stage_names_in_runs_and_sweep_are_current(sweep: Path) -> None:
     assert "| chain | 4 | 31.0 (1 of 4) | ground_truth |" in lines
 
 
-def test_notes_name_data_without_evaluation(tmp_path: Path) -> None:
+def test_table_notes_name_data_without_evaluation(tmp_path: Path) -> None:
     for seed, frames in enumerate((600, 90)):
         run(tmp_path, "a", seed, None, 1.0, frames=frames, **{"choice.dataset": "desk"})
     assert "- Data: dataset=desk; 90 to 600 frames a run.\n" in write_tables(tmp_path)
 
 
-def test_heads_have_units() -> None:
+def test_table_heads_have_units() -> None:
     keys = ("instances.ap50_agnostic", "stage_ms.update.median", "stage_ms.update.p95", "trajectory.ate_rmse_m", "x.y")
     assert [head(key) for key in keys] == ["AP50 agnostic", "update (ms)", "update (ms, p95)", "ATE (m)", "x.y"]
 
 
-def test_the_command(sweep: Path) -> None:
+def test_tables_command_prints_table_or_error(sweep: Path) -> None:
     done = completed(CHECKOUT, "tables", str(sweep))
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("# ablation_x")

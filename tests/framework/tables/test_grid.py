@@ -17,7 +17,7 @@ GRID = TextTable(
 )
 
 
-def test_markdown_is_padded_and_words_stand_left() -> None:
+def test_markdown_grid_is_padded_and_aligned() -> None:
     assert markdown_grid(GRID).splitlines() == [
         "| scene | a_b  |             x |",
         "| ----- | ---- | ------------: |",
@@ -27,18 +27,18 @@ def test_markdown_is_padded_and_words_stand_left() -> None:
 
 
 @pytest.mark.parametrize("name", ["*star", "[optional]"])
-def test_latex_takes_no_cell_for_an_argument(name: str) -> None:
+def test_latex_grid_protects_leading_star_and_bracket(name: str) -> None:
     """LaTeX reads a star or bracket after a line break or a rule as its argument."""
     assert f"{{}}{name} & 1 \\\\" in latex_grid(TextTable(["row", "x"], [[name, "1"]]))
 
 
-def test_a_line_break_ends_no_line_of_a_table() -> None:
+def test_grid_replaces_line_breaks_in_cells() -> None:
     grid = TextTable(["row", "x"], [["a\nb", "1"]])
     assert "a b & 1 \\\\" in latex_grid(grid)
     assert "| a b | 1 |" in markdown_grid(grid)
 
 
-def test_latex_escapes_and_has_a_rule_between_groups() -> None:
+def test_latex_grid_escapes_cells_and_separates_groups() -> None:
     assert latex_grid(GRID) == [
         "\\begin{tabular}{llr}",
         "\\toprule",
@@ -53,12 +53,12 @@ def test_latex_escapes_and_has_a_rule_between_groups() -> None:
     ]
 
 
-def test_decimals_follow_the_largest() -> None:
+def test_decimals_depend_on_largest_value() -> None:
     assert [decimals([value, 0.1, math.nan]) for value in (-1.9, 2.0, 199.0, 200.0)] == [3, 2, 1, 0]
     assert decimals([math.nan]) == 3
 
 
-def test_a_figure_has_its_spread_where_there_is_one() -> None:
+def test_figure_includes_known_spread_and_sign() -> None:
     assert figure(0.25, 0.0625, 2) == "0.25 ± 0.06"
     assert figure(0.25, math.nan, 3, signed=True) == "+0.250"
     assert figure(-1e-9, math.nan, 3, signed=True) == "+0.000"

@@ -111,13 +111,13 @@ are averaged first; * where the 95% interval of Student's t is without 0.
 """
 
 
-def test_the_papers_table_3_word_by_word(sweep: Path) -> None:
+def test_sequence_columns_table_matches_golden_text(sweep: Path) -> None:
     text = write_tables(sweep)
     [line] = [line for line in text.splitlines() if "SHA-256" in line]
     assert text.replace(line.rpartition(" ")[2], "DIGEST.") == GOLDEN
 
 
-def test_published_numbers_stand_below_with_their_source(sweep: Path) -> None:
+def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
     experiment(sweep, ACROSS | {"published": "table3"})
     text = write_tables(sweep)
     first, _ = grids(text)
@@ -138,7 +138,7 @@ def test_published_numbers_stand_below_with_their_source(sweep: Path) -> None:
 
 
 @pytest.mark.parametrize("table", [ACROSS | {"published": "table3"}, BY | {"published": "table2"}])
-def test_rooms_in_scenenns_format_have_no_published_numbers(sweep: Path, table: dict[str, Any]) -> None:
+def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: dict[str, Any]) -> None:
     """Nor columns or groups for sequences that only the publication has."""
     experiment(sweep, table)
     run(sweep, "ours", "016", 2, release="synthetic 1, seed 0, 240 frames", **{AP50: 0.5})
@@ -148,7 +148,7 @@ def test_rooms_in_scenenns_format_have_no_published_numbers(sweep: Path, table: 
     assert "- Published numbers are of the real SceneNN" in text
 
 
-def test_pose_sources_are_compared_apart(sweep: Path) -> None:
+def test_table_compares_rows_of_same_pose_source(sweep: Path) -> None:
     """Better poses make no better system: the base of a tracked row is tracked, too, and so is who it competes with."""
     for row, value in (("ours", 0.2), ("rival", 0.3)):
         run(sweep, row, "011", 0, tracker="icp", **{AP50: value})
@@ -167,7 +167,7 @@ def test_pose_sources_are_compared_apart(sweep: Path) -> None:
     assert second[-1] == "| Rival (re-implementation) | tracked (icp) | made up | -0.100 | missing | -0.100 | 1 |"
 
 
-def test_a_row_that_alone_is_tracked_is_not_compared_with_given_poses(sweep: Path) -> None:
+def test_tracked_row_without_tracked_baseline_is_not_compared(sweep: Path) -> None:
     for path in sweep.glob("*row=other*/metrics.json"):
         path.unlink()
     run(sweep, "other", "078", 0, tracker="icp", **{AP50: 0.9})
@@ -185,7 +185,7 @@ def test_a_row_that_alone_is_tracked_is_not_compared_with_given_poses(sweep: Pat
         ({"release": None}, "annotation=made up", "annotation=unknown", "–"),
     ],
 )
-def test_other_data_and_annotations_are_never_averaged_or_compared(
+def test_table_separates_other_data_and_annotations(
     sweep: Path, changed: dict[str, Any], usual: str, other: str, annotation: str
 ) -> None:
     """Neither inside of a row nor between rows."""
@@ -202,7 +202,7 @@ def test_other_data_and_annotations_are_never_averaged_or_compared(
     assert len([line for line in second if line.startswith(rival)]) == 1
 
 
-def test_the_csv_has_a_line_a_run_with_all_digits(sweep: Path) -> None:
+def test_table_csv_has_one_full_precision_line_per_run(sweep: Path) -> None:
     run(sweep, "ours", "078", 0, **{AP50: 1 / 3})
     write_tables(sweep)
     with (sweep / "table.csv").open() as file:
@@ -214,7 +214,7 @@ def test_the_csv_has_a_line_a_run_with_all_digits(sweep: Path) -> None:
     assert (line["poses"], line["annotation"], line["code"]) == ("ground_truth", "made up", "1234567")
 
 
-def test_the_papers_table_2_in_groups(sweep: Path) -> None:
+def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
     experiment(sweep, BY)
     first, second = grids(write_tables(sweep))
     assert first[0] == "| scene | system | poses | annotation | sofa | television | AP50 |"
@@ -227,7 +227,7 @@ def test_the_papers_table_2_in_groups(sweep: Path) -> None:
     assert second[2] == "| Rival (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
 
-def test_the_highest_mean_is_among_those_of_as_many_sequences(sweep: Path) -> None:
+def test_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
     """The tracked row with the most sequences has fewer than those with given poses, and wins all the same."""
     experiment(sweep, BY)
     for row, scene, value in (("ours", "011", 0.2), ("rival", "011", 0.3), ("other", "078", 0.9), ("ours", "016", 0.2)):
@@ -242,7 +242,7 @@ def test_the_highest_mean_is_among_those_of_as_many_sequences(sweep: Path) -> No
 
 
 @pytest.mark.parametrize("table", [ACROSS, BY])
-def test_one_lucky_seed_does_not_beat_the_mean_of_two(sweep: Path, table: dict[str, Any]) -> None:
+def test_bold_mean_is_among_equal_run_counts(sweep: Path, table: dict[str, Any]) -> None:
     """A mean of fewer runs says so, also where no sequence is missing."""
     experiment(sweep, table)
     for path in sweep.glob("*row=other,seed=1*/metrics.json"):
@@ -256,7 +256,7 @@ def test_one_lucky_seed_does_not_beat_the_mean_of_two(sweep: Path, table: dict[s
     assert "**0.75" not in "".join(lines)
 
 
-def test_published_numbers_stand_in_their_sequences_group(sweep: Path) -> None:
+def test_sequence_groups_table_has_published_rows_in_group(sweep: Path) -> None:
     experiment(sweep, BY | {"published": "table2"})
     first, _ = grids(write_tables(sweep))
     han = "Voxblox++ with Detectron2 panoptic (published) | ground truth"
@@ -267,7 +267,7 @@ def test_published_numbers_stand_in_their_sequences_group(sweep: Path) -> None:
 
 
 @pytest.mark.parametrize("table", [ACROSS | {"published": "table3"}, BY | {"published": "table2"}])
-def test_every_line_of_the_latex_has_as_many_cells_as_its_tabular(sweep: Path, table: dict[str, Any]) -> None:
+def test_latex_rows_match_tabular_column_count(sweep: Path, table: dict[str, Any]) -> None:
     experiment(sweep, table)
     write_tables(sweep)
     latex = (sweep / "table.tex").read_text()

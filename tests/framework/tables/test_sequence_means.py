@@ -12,31 +12,31 @@ from framework.tables.comparison import mean_by_sequence, mean_difference, mean_
 FIGURES: dict[Run, float] = {("0", "a"): 0.2, ("1", "a"): 0.4, ("0", "b"): 0.9, ("1", "b"): 0.7}
 
 
-def test_the_mean_of_each_sequence_is_over_its_seeds() -> None:
+def test_mean_by_sequence_is_over_seeds() -> None:
     means = mean_by_sequence(FIGURES)
     assert {sequence: mean.value for sequence, mean in means.items()} == pytest.approx({"a": 0.3, "b": 0.8})
     assert means["a"].deviation == pytest.approx(math.sqrt(2 * 0.1**2))
 
 
-def test_the_spread_is_that_of_the_seeds_means() -> None:
+def test_mean_over_sequences_deviation_is_over_seed_means() -> None:
     """Both seeds have the mean 0.55: however much sequences differ, this mean is known exactly."""
     mean = mean_over_sequences(FIGURES)
     assert (mean.value, mean.count) == (pytest.approx(0.55), 2)
     assert mean.deviation == pytest.approx(0, abs=1e-12)
 
 
-def test_every_sequence_counts_as_one_and_an_incomplete_seed_makes_no_spread() -> None:
+def test_mean_over_sequences_weights_sequences_equally() -> None:
     mean = mean_over_sequences({run: value for run, value in FIGURES.items() if run != ("1", "b")})
     assert mean.value == pytest.approx((0.3 + 0.9) / 2)  # not 0.5, the mean of three runs
     assert math.isnan(mean.deviation)
 
 
-def test_the_mean_of_no_sequence_is_not_known() -> None:
+def test_mean_over_sequences_without_values_is_nan() -> None:
     mean = mean_over_sequences({})
     assert (mean.count, math.isnan(mean.value), math.isnan(mean.deviation)) == (0, True, True)
 
 
-def test_the_error_of_a_difference_is_over_sequences() -> None:
+def test_mean_difference_error_is_over_sequences() -> None:
     """0.3 and 0.8: mean 0.55, deviation sqrt(2 * 0.25^2), by sqrt(2); a hundred equal seeds would change nothing."""
     difference = mean_difference(FIGURES)
     assert (difference.value, difference.count) == (pytest.approx(0.55), 2)

@@ -108,7 +108,7 @@ class Backwards(CornerRoom):
         (SequenceContract, Backwards(), "test_dataset_is_in_order"),
     ],
 )
-def test_a_broken_plugin_is_found(contract: type[Any], plugin: object, test: str) -> None:
+def test_contract_detects_broken_plugin(contract: type[Any], plugin: object, test: str) -> None:
     tests = contract()
     tests.plugin = lambda: plugin
     with pytest.raises((AssertionError, FrozenInstanceError)):
@@ -144,7 +144,7 @@ class Painting(Viewer):
         (Late(), ViewerContract.test_viewer_writes_only_to_run_directory),
     ],
 )
-def test_a_broken_viewer_is_found(
+def test_viewer_contract_detects_broken_viewer(
     viewer: Viewer,
     test: Callable[..., None],
     request: pytest.FixtureRequest,
@@ -182,7 +182,7 @@ OWN = "_target_: plugins.refiners.largest_component.LargestComponent\nmax_gap: {
         (OWN.format(0.03), False, True),
     ],
 )
-def test_a_yaml_that_differs_from_its_class_is_found(
+def test_option_contract_detects_inconsistent_yaml(
     text: str, listed: bool, defaults: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(composition, "_added", [tmp_path])

@@ -22,7 +22,7 @@ def matches(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return project(CAMERA, points), transform(T_WORLD_CAMERA, points), points[:, 2]
 
 
-def test_exact_matches_give_the_exact_pose() -> None:
+def test_absolute_pose_from_exact_matches_is_exact() -> None:
     """With the half-pixel convention mixed up, the camera would be turned by a milliradian."""
     pixels, points_world, depth = matches(100)
     found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, depth)
@@ -31,7 +31,7 @@ def test_exact_matches_give_the_exact_pose() -> None:
     np.testing.assert_allclose(found.T_world_camera, T_WORLD_CAMERA, atol=1e-6)
 
 
-def test_outliers_are_told_apart() -> None:
+def test_absolute_pose_rejects_outliers() -> None:
     rng = np.random.default_rng(1)
     pixels, points_world, _ = matches(200)
     pixels += rng.normal(0, 0.5, pixels.shape)
@@ -45,7 +45,7 @@ def test_outliers_are_told_apart() -> None:
     assert rotation_angle(error[:3, :3]) < 0.002
 
 
-def test_the_same_matches_give_the_same_pose_whatever_was_estimated_before() -> None:
+def test_absolute_pose_is_deterministic_for_given_seed() -> None:
     """Matches so noisy that other random samples lead to other inliers."""
     rng = np.random.default_rng(2)
     pixels, points_world, _ = matches(120)
@@ -63,13 +63,13 @@ def test_the_same_matches_give_the_same_pose_whatever_was_estimated_before() -> 
 
 
 @pytest.mark.parametrize("count", [0, 3, 4, 30, 300])
-def test_garbage_has_no_pose(count: int) -> None:
+def test_absolute_pose_of_random_matches_is_none(count: int) -> None:
     rng = np.random.default_rng(count)
     pixels, points_world = rng.uniform((0, 0), (640, 480), (count, 2)), rng.uniform(-2, 2, (count, 3))
     assert AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world) is None
 
 
-def test_too_few_or_too_rare_inliers_are_no_pose() -> None:
+def test_absolute_pose_with_too_few_inliers_is_none() -> None:
     pixels, points_world, _ = matches(100)
     assert AbsolutePoseEstimator(min_inliers=101).estimate(CAMERA, pixels, points_world) is None
     pixels[:60] = np.random.default_rng(0).uniform((0, 0), (640, 480), (60, 2))
@@ -77,7 +77,7 @@ def test_too_few_or_too_rare_inliers_are_no_pose() -> None:
     assert AbsolutePoseEstimator(min_inlier_ratio=0.5).estimate(CAMERA, pixels, points_world) is None
 
 
-def test_what_is_not_finite_is_no_inlier() -> None:
+def test_absolute_pose_ignores_non_finite_matches() -> None:
     pixels, points_world, depth = matches(100)
     pixels[:10], points_world[10:20], points_world[20:30] = np.nan, np.nan, np.inf
     found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, depth)
@@ -86,7 +86,7 @@ def test_what_is_not_finite_is_no_inlier() -> None:
     assert AbsolutePoseEstimator().estimate(CAMERA, pixels * np.nan, points_world) is None
 
 
-def test_readings_that_contradict_the_pose_are_no_inliers() -> None:
+def test_absolute_pose_rejects_matches_with_inconsistent_depth() -> None:
     pixels, points_world, depth = matches(100)
     depth[:30] *= 1.2
     depth[30:50] = 0  # no reading: neither for nor against
@@ -97,7 +97,7 @@ def test_readings_that_contradict_the_pose_are_no_inliers() -> None:
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (0.01, 0.02, 0.01)], ids=["point", "line"])
-def test_points_that_do_not_determine_the_pose_raise_nothing(direction: tuple[float, float, float]) -> None:
+def test_absolute_pose_of_degenerate_points_does_not_raise(direction: tuple[float, float, float]) -> None:
     points = np.array([0.1, 0.2, 2.0]) + np.outer(np.arange(50), direction)
     pixels = project(CAMERA, points)
     found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points)
@@ -105,6 +105,6 @@ def test_points_that_do_not_determine_the_pose_raise_nothing(direction: tuple[fl
 
 
 @pytest.mark.parametrize("bound", [{"max_error": 0.0}, {"min_inliers": 3}, {"min_inlier_ratio": 1.5}, {"seed": -1}])
-def test_bounds(bound: dict[str, float]) -> None:
+def test_absolute_pose_parameter_out_of_range_raises(bound: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=rf"AbsolutePoseEstimator\.{next(iter(bound))}"):
         AbsolutePoseEstimator(**bound)

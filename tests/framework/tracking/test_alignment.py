@@ -54,7 +54,7 @@ def model_of(scene: Scene) -> tuple[ModelView, list[np.ndarray]]:
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_color_at_the_true_pose_asks_for_no_step(level: int) -> None:
+def test_color_alignment_at_true_pose_has_zero_step(level: int) -> None:
     """A shift of half a pixel between the levels of frame and model would be a step of several millimeters."""
     T = pose(0.03, -0.02, 0.01, (0.01, 0.02, -0.01))
     xi, equations = step(WALL, WALL.frame(T), level, inverse(T_VIEW) @ T, COLOR)
@@ -63,7 +63,7 @@ def test_color_at_the_true_pose_asks_for_no_step(level: int) -> None:
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_one_step_of_color_finds_a_small_motion(level: int) -> None:
+def test_color_alignment_step_recovers_small_motion(level: int) -> None:
     T = pose(0.026, -0.026, 0.01, (0.01, 0.02, -0.01))
     truth = inverse(T_VIEW) @ T
     xi, _ = step(WALL, WALL.frame(T), level, np.eye(4), COLOR)
@@ -72,7 +72,7 @@ def test_one_step_of_color_finds_a_small_motion(level: int) -> None:
     assert np.linalg.norm(error[:2]) < 0.3 * np.linalg.norm(before[:2])
 
 
-def test_a_change_of_exposure_is_told_and_taken_out() -> None:
+def test_color_alignment_compensates_exposure_change() -> None:
     T = pose(0.03, -0.02, 0.01, (0.01, 0.02, -0.01))
     frame = WALL.frame(T)
     brighter = dataclasses.replace(frame, color=np.clip(frame.color * 0.8 + 40.0, 0, 255).astype(np.uint8))
@@ -89,7 +89,7 @@ def test_a_change_of_exposure_is_told_and_taken_out() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_one_step_of_depth_finds_a_motion_between_planes(level: int) -> None:
+def test_depth_alignment_step_recovers_motion_between_planes(level: int) -> None:
     corner = Scene(
         planes=[(np.array([0, 0, -1.0]), -1.8), (np.array([0, -0.8, -0.6]), -1.2), (np.array([0.8, 0, -0.6]), -1.4)]
     )
@@ -101,7 +101,7 @@ def test_one_step_of_depth_finds_a_motion_between_planes(level: int) -> None:
     assert equations.matched > 0.8 * equations.visible
 
 
-def test_points_whose_normals_differ_do_not_match() -> None:
+def test_depth_alignment_rejects_points_with_different_normals() -> None:
     """A wall against the same wall turned by 60 degrees: near each other along the axis, and not one surface."""
     n = np.array([np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)])
     turned = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.5]))])
@@ -120,7 +120,7 @@ def with_noisy_normals(model: ModelView) -> ModelView:
 
 
 @pytest.mark.parametrize("level", [1, 2])
-def test_noisy_normals_do_not_resist_a_motion_along_a_wall(level: int) -> None:
+def test_smoothed_normals_allow_motion_along_wall(level: int) -> None:
     """A wall says nothing about motions along it, a slanted one at the border of the picture says it all."""
     room = Scene(planes=[(np.array([0, 0, -1.0]), -2.0), (np.array([-0.8, 0, -0.6]), -1.95)])
     T = T_VIEW @ exp_se3(np.array([0.02, 0, 0, 0, 0, 0]))
@@ -135,7 +135,7 @@ def test_noisy_normals_do_not_resist_a_motion_along_a_wall(level: int) -> None:
     assert share_found(lambda model: smoothed(with_noisy_normals(model), level)) == pytest.approx(1, abs=0.1)
 
 
-def test_smoothed_normals_are_means_of_squares_without_what_is_not_mapped() -> None:
+def test_smoothed_normals_are_box_means_without_unmapped_pixels() -> None:
     rng = np.random.default_rng(1)
     normals = rng.normal(0, 1, (3, 12, 17)).astype(np.float32)
     normals /= np.linalg.norm(normals, axis=0)
@@ -227,7 +227,7 @@ def test_linear_weights_match_slow_reference(level: int, dropped: dict[str, int]
     np.testing.assert_allclose(found.b, expected.b, rtol=2e-3, atol=2e-3 * np.abs(expected.b).max())
 
 
-def test_linear_weight_is_zero_at_its_maxima() -> None:
+def test_linear_weight_is_zero_at_maximum_depth() -> None:
     """On a wall 1.5 m away, seen from its true pose, the distance is 0 and all depths are nearly equal."""
     frame = WALL.frame(T_VIEW)
     model, intensities = model_of(WALL)
@@ -242,7 +242,7 @@ def test_linear_weight_is_zero_at_its_maxima() -> None:
     assert sums[0.7] == 0
 
 
-def test_linear_weights_compare_colors_of_matching_normals_only() -> None:
+def test_linear_weights_require_matching_normals_for_color() -> None:
     n = np.array([np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)])
     frame = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.5]))]).frame(T_VIEW)
     model, intensities = model_of(WALL)

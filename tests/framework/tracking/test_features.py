@@ -23,7 +23,7 @@ def blobs(camera: Camera, centers: np.ndarray, sigma: float) -> Frame:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, CAMERA.scaled(0.5), CAMERA.scaled(2)], ids=["640", "320", "1280"])
-def test_a_feature_lies_where_the_image_has_it(camera: Camera) -> None:
+def test_feature_positions_have_subpixel_accuracy(camera: Camera) -> None:
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.arange(1, 6), np.arange(1, 5)), axis=-1).reshape(-1, 2)
     centers = grid * (camera.width / 6, camera.height / 5) + rng.uniform(-3, 3, grid.shape)
@@ -36,7 +36,7 @@ def test_a_feature_lies_where_the_image_has_it(camera: Camera) -> None:
     assert (features.depth[distance.argmin(axis=0)] == 2).all()
 
 
-def test_the_same_frame_gives_the_same_features_with_any_number_of_threads() -> None:
+def test_features_are_independent_of_thread_count() -> None:
     rng = np.random.default_rng(1)
     noise = cv2.GaussianBlur(rng.integers(0, 255, CAMERA.shape).astype(np.uint8), (0, 0), 2)
     noise = cv2.equalizeHist(noise)
@@ -56,14 +56,14 @@ def test_the_same_frame_gives_the_same_features_with_any_number_of_threads() -> 
             np.testing.assert_array_equal(getattr(features, name), getattr(found[0], name))
 
 
-def test_a_blank_image_has_no_features() -> None:
+def test_features_of_blank_image_are_empty() -> None:
     blank = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), np.zeros(CAMERA.shape, np.float32), CAMERA)
     features = FeatureExtractor().extract(blank)
     assert (len(features), features.descriptors.shape) == (0, (0, DESCRIPTOR_LENGTH))
     assert match(features.descriptors, features.descriptors, 0.8).shape == (0, 2)
 
 
-def test_depth_is_that_of_a_whole_surface() -> None:
+def test_surface_depth_is_zero_at_edges_and_holes() -> None:
     depth = np.full((40, 60), 2.0, np.float32)
     depth[:, 30:] = 1.0  # a step
     depth[20:, :10] = 0  # a hole
@@ -74,7 +74,7 @@ def test_depth_is_that_of_a_whole_surface() -> None:
     np.testing.assert_allclose(surface_depth(depth, pixels), expected, atol=0.0011)
 
 
-def test_matching_agrees_with_its_definition() -> None:
+def test_feature_matching_matches_brute_force_reference() -> None:
     rng = np.random.default_rng(2)
     reference = rng.integers(0, 120, (60, DESCRIPTOR_LENGTH)).astype(np.uint8)
     query = np.concatenate([reference[:40], rng.integers(0, 120, (20, DESCRIPTOR_LENGTH)).astype(np.uint8)])
@@ -92,6 +92,6 @@ def test_matching_agrees_with_its_definition() -> None:
     assert len(match(query, reference[:1], 0.8)) == 0, "nothing to compare the one candidate with"
 
 
-def test_bounds() -> None:
+def test_feature_extractor_parameter_out_of_range_raises() -> None:
     with pytest.raises(ConfigError, match=r"FeatureExtractor\.max_features"):
         FeatureExtractor(max_features=0)

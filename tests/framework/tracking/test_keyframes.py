@@ -50,7 +50,7 @@ def blanked(frame: Frame) -> Frame:
     return replace(frame, color=np.zeros_like(frame.color))
 
 
-def test_only_what_is_new_becomes_a_keyframe() -> None:
+def test_keyframe_is_added_only_beyond_minimum_distance() -> None:
     keyframes = Keyframes(min_distance=0.2, min_angle=0.3)
     added = [
         has_become_one(keyframes, papered_frame(T), T)
@@ -61,14 +61,14 @@ def test_only_what_is_new_becomes_a_keyframe() -> None:
     assert has_become_one(keyframes, papered_frame(half_of_each), half_of_each)
 
 
-def test_a_frame_that_is_not_new_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keyframes_skip_feature_extraction_for_near_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     keyframes = Keyframes()
     assert has_become_one(keyframes, papered_frame(pose(0)), pose(0))
     monkeypatch.setattr(FeatureExtractor, "extract", None)
     assert not has_become_one(keyframes, papered_frame(pose(0.05)), pose(0.05))
 
 
-def test_a_frame_without_features_is_not_looked_at_again_and_again() -> None:
+def test_keyframes_skip_near_frames_after_featureless_frame() -> None:
     keyframes = Keyframes(min_distance=0.2)
     seen = []
     extract = keyframes.extractor.extract
@@ -94,7 +94,7 @@ def slowed(keyframes: Keyframes, seconds: float) -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.05])
-def test_keyframes_are_those_of_features_found_at_once(seconds: float) -> None:
+def test_keyframes_are_independent_of_extraction_time(seconds: float) -> None:
     """A walk in steps of all sizes, half of it before nothing to be seen, through more places than are remembered."""
     rng = np.random.default_rng(3)
     at_once, later = (Keyframes(max_keyframes=4, min_distance=0.2) for _ in range(2))
@@ -115,7 +115,7 @@ def test_keyframes_are_those_of_features_found_at_once(seconds: float) -> None:
         np.testing.assert_array_equal(later.saved()[name], array, err_msg=name)
 
 
-def test_nobody_waits_for_a_frame_whose_outcome_does_not_matter() -> None:
+def test_keyframes_add_waits_only_for_relevant_features() -> None:
     keyframes = Keyframes(min_distance=0.2)
     extract, may_end = keyframes.extractor.extract, threading.Event()
 
@@ -133,7 +133,7 @@ def test_nobody_waits_for_a_frame_whose_outcome_does_not_matter() -> None:
     assert len(keyframes) == 1
 
 
-def test_what_goes_wrong_in_the_thread_is_raised_once() -> None:
+def test_keyframes_thread_exception_is_raised_once() -> None:
     keyframes = Keyframes(min_distance=0.2)
     found = keyframes.extractor.extract
     keyframes.extractor.extract = lambda frame: {}[frame.index]
@@ -146,7 +146,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_once() -> None:
     assert has_become_one(keyframes, frame, pose(0))
 
 
-def test_keyframes_are_pickled_with_the_last_one() -> None:
+def test_keyframes_pickle_includes_pending_keyframe() -> None:
     keyframes = Keyframes()
     keyframes.add(papered_frame(pose(0)), pose(0))
     copied = pickle.loads(pickle.dumps(keyframes))
@@ -155,7 +155,7 @@ def test_keyframes_are_pickled_with_the_last_one() -> None:
     assert has_become_one(copied, papered_frame(pose(0.5)), pose(0.5))
 
 
-def test_no_thread_is_left() -> None:
+def test_keyframes_leave_no_threads() -> None:
     keyframes = Keyframes()
     keyframes.add(papered_frame(pose(0)), pose(0))
     assert [thread for thread in threading.enumerate() if thread.name.startswith("keyframe")]
@@ -166,7 +166,7 @@ def test_no_thread_is_left() -> None:
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("keyframe")]
 
 
-def test_a_camera_is_found_wherever_it_is(keyframes: Keyframes) -> None:
+def test_relocalize_finds_camera_at_new_poses(keyframes: Keyframes) -> None:
     for k, yaw in enumerate(np.linspace(0.1, 6, 7)):
         T_world_camera = exp_se3(np.array([0.1 - 0.03 * k, 0.05, 0.1, 0.05, yaw, 0.1]))
         found = keyframes.relocalize(papered_frame(T_world_camera))
@@ -177,13 +177,13 @@ def test_a_camera_is_found_wherever_it_is(keyframes: Keyframes) -> None:
         assert found.inliers.sum() >= keyframes.min_inliers
 
 
-def test_the_same_frame_is_found_at_the_same_place(keyframes: Keyframes) -> None:
+def test_relocalize_is_deterministic(keyframes: Keyframes) -> None:
     frame = papered_frame(pose(0.1, 0.4))
     found = [keyframes.relocalize(frame) for _ in range(2)]
     np.testing.assert_array_equal(found[0].T_world_camera, found[1].T_world_camera)
 
 
-def test_what_was_never_seen_is_not_found(keyframes: Keyframes) -> None:
+def test_relocalize_unknown_place_returns_none(keyframes: Keyframes) -> None:
     rng = np.random.default_rng(0)
     frame = papered_frame(pose(0))
     noise = rng.integers(0, 255, (*CAMERA.shape, 3)).astype(np.uint8)
@@ -195,7 +195,7 @@ def test_what_was_never_seen_is_not_found(keyframes: Keyframes) -> None:
     assert Keyframes().relocalize(frame) is None
 
 
-def test_the_database_is_bounded_and_keeps_what_is_apart() -> None:
+def test_keyframes_are_bounded_and_keep_distant_frames() -> None:
     keyframes = Keyframes(max_keyframes=5, min_distance=0.01, min_angle=0.01, candidates=5)
     for yaw in (0, 0.48, 0.5, 1.0, 2.0, 2.5, 2.52):
         keyframes.add(papered_frame(pose(0, yaw)), pose(0, yaw))
@@ -205,13 +205,13 @@ def test_the_database_is_bounded_and_keeps_what_is_apart() -> None:
     assert sum(array.nbytes for array in keyframes.saved().values()) < 5 * 200_000
 
 
-def test_the_nearest_keyframes_come_first(keyframes: Keyframes) -> None:
+def test_nearest_keyframes_are_sorted_by_distance(keyframes: Keyframes) -> None:
     angles = [apart(k.T_world_camera, pose(0, 1.0))[1] for k in keyframes.nearest(pose(0, 1.0))]
     assert angles == sorted(angles)
     assert angles[0] < 0.17
 
 
-def test_words_are_drawn_from_the_seed() -> None:
+def test_visual_words_depend_on_seed() -> None:
     descriptors = np.random.default_rng(0).integers(0, 100, (50, 128)).astype(np.uint8)
     bag = VisualWords(1).bag(descriptors)
     assert (bag**2).sum() == pytest.approx(50)
@@ -222,13 +222,13 @@ def test_words_are_drawn_from_the_seed() -> None:
 
 
 @pytest.mark.parametrize("bound", [{"max_keyframes": 0}, {"min_distance": 0.0}, {"min_inliers": 3}, {"max_ratio": 1.2}])
-def test_bounds(bound: dict[str, float]) -> None:
+def test_keyframes_parameter_out_of_range_raises(bound: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(bound))):
         Keyframes(**bound)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/data")
-def test_real_video_is_found_and_other_places_are_not() -> None:
+def test_relocalize_real_video_finds_only_known_places() -> None:
     kitchen = RgbdFolder(SHARED / "redkitchen")
     keyframes = Keyframes()
     for k in range(0, 150, 10):

@@ -10,14 +10,14 @@ from framework.geometry import back_project
 from framework.tracking.pyramid import build_pyramid, is_coarse, model_intensities
 
 
-def test_halving_does_not_mix_two_surfaces_or_holes_into_the_depth() -> None:
+def test_pyramid_depth_does_not_mix_surfaces_or_holes() -> None:
     depth = np.float32([[1.0, 1.02, 1.0, 3.0], [0.0, 1.01, 3.0, 3.0], [0.0, 0.0, 2.0, 2.0], [0.0, 0.0, 2.0, 2.0]])
     color = np.zeros((4, 4, 3), np.uint8)
     _, half, _ = build_pyramid(Camera(4, 4, 4.0, 4.0, 1.5, 1.5), depth, color, 1.0, 3)
     np.testing.assert_allclose(half.depth, [[1.01, 1.0], [0.0, 2.0]], rtol=1e-6)
 
 
-def test_a_halved_pixel_looks_between_its_four() -> None:
+def test_pyramid_pixel_center_is_mean_of_four_pixels() -> None:
     camera = Camera(9, 7, 8.0, 8.5, 3.7, 3.1)  # odd: the last row and column are dropped
     depth = np.ones(camera.shape, np.float32)
     color = np.zeros((*camera.shape, 3), np.uint8)
@@ -31,7 +31,7 @@ def test_a_halved_pixel_looks_between_its_four() -> None:
         np.testing.assert_allclose(one, four, atol=1e-6)
 
 
-def test_finest_chooses_the_first_level() -> None:
+def test_pyramid_finest_scale_selects_first_level() -> None:
     camera = Camera(16, 8, 8.0, 8.0, 7.5, 3.5)
     images = np.ones(camera.shape, np.float32), np.full((*camera.shape, 3), 255, np.uint8)
     levels = build_pyramid(camera, *images, 0.5, 3)
@@ -39,7 +39,7 @@ def test_finest_chooses_the_first_level() -> None:
     np.testing.assert_allclose(levels[2].intensity, 1, atol=1e-6)
 
 
-def test_a_halved_view_of_the_map_closes_holes_of_a_pixel() -> None:
+def test_model_intensities_close_single_pixel_holes() -> None:
     gray = np.array([[10, 20, 30, 0], [30, 40, 50, 0], [0, 0, 0, 0], [0, 70, 0, 0]], np.uint8)
     view = SimpleNamespace(color=np.repeat(gray[..., None], 3, axis=2), depth=(gray > 0).astype(np.float32))
     full, half, quarter = model_intensities(view, 3)
@@ -55,7 +55,7 @@ def slope(step: float, nearest: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("nearest", [0.6, 1.0, 2.0])
-def test_steps_of_eight_bits_are_too_coarse_for_normals_and_those_of_depth_cameras_are_not(nearest: float) -> None:
+def test_is_coarse_detects_eight_bit_depth(nearest: float) -> None:
     assert is_coarse(slope(0.0392, nearest), otherwise=False)
     disparity = 8 * 580 * 0.075 / slope(0, nearest)  # of a Kinect, in eighths of a pixel
     kinect = (8 * 580 * 0.075 / np.rint(disparity)).astype(np.float32)
@@ -64,6 +64,6 @@ def test_steps_of_eight_bits_are_too_coarse_for_normals_and_those_of_depth_camer
 
 
 @pytest.mark.parametrize("otherwise", [True, False])
-def test_a_wall_does_not_tell_how_coarse_depth_is(otherwise: bool) -> None:
+def test_is_coarse_of_constant_depth_returns_default(otherwise: bool) -> None:
     assert is_coarse(np.full((120, 160), 1.0, np.float32), otherwise) == otherwise
     assert is_coarse(np.zeros((120, 160), np.float32), otherwise) == otherwise

@@ -15,7 +15,7 @@ def example() -> Example:
     return Example(np.where(mask[0][..., None], 200, 10).astype(np.uint8).repeat(3, axis=-1), mask, ("chair",))
 
 
-def test_masks_follow_the_picture() -> None:
+def test_augmented_masks_match_image() -> None:
     for seed in range(40):
         changed = augmented(example(), np.random.default_rng(seed))
         assert changed.color.shape == (60, 80, 3)
@@ -26,12 +26,12 @@ def test_masks_follow_the_picture() -> None:
             assert ((bright > middle) == mask).mean() > 0.95, seed
 
 
-def test_the_same_generator_gives_the_same_picture() -> None:
+def test_augmentation_is_deterministic_for_given_seed() -> None:
     a, b = (augmented(example(), np.random.default_rng(7)) for _ in range(2))
     assert np.array_equal(a.color, b.color)
     assert np.array_equal(a.masks, b.masks)
 
 
-def test_what_a_cut_leaves_of_an_object_must_be_enough() -> None:
+def test_augmentation_drops_objects_with_few_pixels() -> None:
     few = Example(example().color, np.eye(60, 80, dtype=np.bool_)[None] & (np.arange(80) < 5), ("chair",))
     assert len(augmented(few, np.random.default_rng(0)).masks) == 0

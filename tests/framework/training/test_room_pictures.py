@@ -20,7 +20,7 @@ def seen() -> list[tuple[np.ndarray, np.ndarray, dict[int, str]]]:
     return list(pictures(2, 3))
 
 
-def test_a_room_shows_known_objects_under_varied_colors(seen: list) -> None:
+def test_room_pictures_show_known_classes_in_varied_colors(seen: list) -> None:
     for color, ids, names in seen:
         assert color.shape == (*ids.shape, 3)
         assert set(names.values()) <= set(SCENENN_TO_COCO.values())
@@ -28,7 +28,7 @@ def test_a_room_shows_known_objects_under_varied_colors(seen: list) -> None:
     assert not np.array_equal(seen[0][0], seen[1][0])
 
 
-def test_written_and_read_again(seen: list, tmp_path: Path) -> None:
+def test_room_pictures_round_trip_keeps_masks_and_classes(seen: list, tmp_path: Path) -> None:
     render_room(tmp_path, 3, 2)
     assert [path.name for path in tmp_path.iterdir()] == ["room_000002"], "nothing unfinished is left"
     stored = RoomPictures(tmp_path, 2, 1)
@@ -41,7 +41,7 @@ def test_written_and_read_again(seen: list, tmp_path: Path) -> None:
         assert example.class_names == tuple(names[i] for i in visible)
 
 
-def test_rooms_that_are_there_are_kept(tmp_path: Path) -> None:
+def test_render_rooms_keeps_existing_rooms(tmp_path: Path) -> None:
     kept = room_folder(tmp_path, 0)
     kept.mkdir()
     room_pictures.render_rooms(tmp_path, 0, 1, 3, 1)

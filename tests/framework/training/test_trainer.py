@@ -40,7 +40,7 @@ def network() -> MaskRCNN:
 
 
 @pytest.mark.integration
-def test_it_learns(pictures: RoomPictures, tmp_path: Path) -> None:
+def test_trainer_reduces_loss(pictures: RoomPictures, tmp_path: Path) -> None:
     schedule = Schedule(
         steps=40, batch=2, learning_rate=3e-3, warmup=5, checkpoint_interval=40, budget=Budget(50, 30, 16)
     )
@@ -55,7 +55,7 @@ def test_it_learns(pictures: RoomPictures, tmp_path: Path) -> None:
 
 
 @pytest.mark.integration
-def test_a_stopped_run_goes_on_as_if_it_had_not_been(
+def test_trainer_resumed_run_equals_uninterrupted_run(
     pictures: RoomPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = Trainer(network(), pictures, SHORT, tmp_path / "whole", "cpu")
@@ -79,7 +79,7 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been(
     assert all(torch.equal(resumed.averaged[name], whole.averaged[name]) for name in whole.averaged)
 
 
-def test_a_checkpoint_that_is_damaged_or_of_another_network_is_told(pictures: RoomPictures, tmp_path: Path) -> None:
+def test_trainer_invalid_checkpoint_raises(pictures: RoomPictures, tmp_path: Path) -> None:
     Trainer(network(), pictures, Schedule(steps=1, batch=1, budget=SHORT.budget), tmp_path, "cpu").run()
     wider = MaskRCNN(Architecture(**{**vars(TINY), "fpn_channels": 16}))
     with pytest.raises(DataError, match=r"checkpoint\.pt is damaged, or of another network"):
@@ -91,7 +91,7 @@ def test_a_checkpoint_that_is_damaged_or_of_another_network_is_told(pictures: Ro
             Trainer(network(), pictures, SHORT, tmp_path, "cpu")
 
 
-def test_another_seed_learns_otherwise(pictures: RoomPictures, tmp_path: Path) -> None:
+def test_trainer_loss_depends_on_seed(pictures: RoomPictures, tmp_path: Path) -> None:
     histories = []
     for seed in (0, 1):
         schedule = Schedule(steps=1, batch=2, seed=seed, budget=SHORT.budget)
@@ -101,13 +101,13 @@ def test_another_seed_learns_otherwise(pictures: RoomPictures, tmp_path: Path) -
     assert histories[0] != histories[1]
 
 
-def test_pictures_of_classes_that_the_network_does_not_have(pictures: RoomPictures, tmp_path: Path) -> None:
+def test_trainer_unknown_picture_classes_raise(pictures: RoomPictures, tmp_path: Path) -> None:
     only_chairs = MaskRCNN(Architecture(**{**vars(TINY), "classes": ("chair",)}))
     with pytest.raises(DataError, match="does not have: bed"):
         Trainer(only_chairs, pictures, SHORT, tmp_path, "cpu").run()
 
 
-def test_rooms_that_were_not_rendered(tmp_path: Path) -> None:
+def test_room_pictures_missing_room_raises(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="room_000003 is missing"):
         RoomPictures(tmp_path, 3, 1)
 
@@ -115,6 +115,6 @@ def test_rooms_that_were_not_rendered(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong", [{"steps": 0}, {"batch": 0}, {"learning_rate": 0.0}, {"ema_decay": 1.0}, {"checkpoint_interval": 0}]
 )
-def test_senseless_schedules_are_refused(wrong: dict[str, float]) -> None:
+def test_schedule_out_of_range_raises(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         Schedule(**wrong)  # type: ignore[arg-type]

@@ -33,7 +33,7 @@ def config(folder: Path, *overrides: str) -> DictConfig:
         )  # fmt: skip
 
 
-def test_it_leaves_a_network_that_goes_on_and_is_told_what_it_is(tmp_path: Path) -> None:
+def test_train_writes_network_usable_for_further_training(tmp_path: Path) -> None:
     for number in (0, HELD_OUT):
         write_room(tmp_path / "rooms", number)
     first = train(config(tmp_path / "rooms", "schedule.steps=2"), tmp_path / "run")
@@ -57,12 +57,12 @@ def test_it_leaves_a_network_that_goes_on_and_is_told_what_it_is(tmp_path: Path)
     ("wrong", "said"),
     [("schedule.steps=0", "steps must be at least 1"), (f"network.start_from={ROOMS}", "is not of the architecture")],
 )
-def test_what_is_wrong_is_told_before_rooms_are_rendered(tmp_path: Path, wrong: str, said: str) -> None:
+def test_train_invalid_config_raises_before_rendering(tmp_path: Path, wrong: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         train(config(tmp_path / "rooms", wrong), tmp_path / "run")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_backbone_that_there_is_not(tmp_path: Path) -> None:
+def test_architecture_unknown_backbone_raises(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"network\.backbone"):
         architecture(config(tmp_path, "network.backbone=vgg16").network)

@@ -19,14 +19,14 @@ from framework.vocabulary.label_spaces import _SECTIONS, COCO, MEANINGS, SCENENN
         ("scannet200", 200, "wall", "mattress"),
     ],
 )
-def test_every_space_is_complete(space, size, first, last):
+def test_label_spaces_are_complete(space, size, first, last):
     names = read_labels(space)
     assert len(set(names)) == len(names) == size
     assert (names[0], names[-1]) == (first, last)
     assert set(SPACES) == {"coco", "nyu40", "scenenn", "ade20k", "coco_panoptic", "scannet20", "scannet200"}
 
 
-def test_orders_are_those_of_the_published_lists():
+def test_label_order_matches_published_lists():
     assert [COCO.index(name) for name in ("chair", "couch", "bed", "tv", "book")] == [56, 57, 59, 62, 73]
     ade = read_labels("ade20k")
     assert [ade.index(name) for name in ("bed", "chair", "sofa", "toilet", "crt screen")] == [7, 19, 23, 65, 141]
@@ -37,7 +37,7 @@ def test_orders_are_those_of_the_published_lists():
     assert [scannet.index(name) for name in ("floor", "couch", "paper towel dispenser", "object")] == [2, 5, 71, 172]
 
 
-def test_a_name_means_the_same_in_every_section_and_only_what_coco_has():
+def test_label_meanings_are_consistent_coco_classes():
     for section, names in _SECTIONS.items():
         for name, coco in names.items():
             assert MEANINGS[name] == coco, f"{section}: {name}"
@@ -47,20 +47,20 @@ def test_a_name_means_the_same_in_every_section_and_only_what_coco_has():
             assert name not in COCO or coco == name
 
 
-def test_the_nine_of_scenenn():
+def test_scenenn_labels_map_to_nine_coco_classes():
     assert SCENENN_TO_COCO["sofa"] == "couch"
     assert len(SCENENN_TO_COCO) == len(set(SCENENN_TO_COCO.values())) == 9
     assert set(to_coco(read_labels("scenenn")).classes) == set(SCENENN_TO_COCO.values())
 
 
-def test_coco_is_left_as_it_is():
+def test_to_coco_of_coco_labels_is_identity():
     mapping = to_coco(COCO)
     assert mapping.classes == COCO
     np.testing.assert_array_equal(mapping.meaning, np.arange(80))
     assert to_coco(read_labels("coco_panoptic")).classes == COCO
 
 
-def test_columns_of_one_meaning_add_up_and_the_rest_is_renormalized():
+def test_to_coco_sums_equal_classes_and_renormalizes():
     mapping = to_coco(["wall", "swivel chair", "sofa", "armchair", "person"])
     assert mapping.classes == ("person", "chair", "couch")
     rows = np.array([[0.5, 0.125, 0.125, 0.125, 0.125], [0, 0.3, 0.4, 0.3, 0], [0.2, 0.1, 0.5, 0.1, 0.1]], np.float32)
@@ -72,19 +72,19 @@ def test_columns_of_one_meaning_add_up_and_the_rest_is_renormalized():
     np.testing.assert_array_equal(known, [False, True, True])
 
 
-def test_a_row_without_any_class_is_uniform_and_not_known():
+def test_to_coco_row_without_class_is_uniform_and_unknown():
     mapping = to_coco(["chair", "wall", "bed"])
     rows, known = mapping.apply(np.array([[0, 1, 0], [0, 0, 0]], np.float32))
     np.testing.assert_array_equal(rows, np.full((2, 2), 0.5))
     assert not known.any()
 
 
-def test_no_rows():
+def test_to_coco_without_rows_is_empty():
     rows, known = to_coco(COCO).apply(np.zeros((0, 80), np.float32))
     assert (rows.shape, known.shape) == ((0, 80), (0,))
 
 
-def test_agrees_with_a_loop_over_labels():
+def test_to_coco_matches_loop_over_labels():
     labels = read_labels("ade20k")
     mapping = to_coco(labels)
     rows = np.random.default_rng(0).dirichlet(np.full(150, 0.1), 20).astype(np.float32)
@@ -99,25 +99,25 @@ def test_agrees_with_a_loop_over_labels():
     assert 0 < known.sum() < 20
 
 
-def test_spellings_of_published_lists():
+def test_to_coco_accepts_published_spellings():
     assert to_coco(["Sofa, couch, lounge", "bed ", "N/A", "windowpane, window"]).classes == ("couch", "bed")
     assert to_coco(["tvmonitor", "plane"]).classes == ("airplane", "tv")
 
 
-def test_unknown_names_are_all_listed():
+def test_to_coco_unknown_labels_raise_with_full_list():
     with pytest.raises(ConfigError, match=r"2 of 3 labels .*'chiar', 'Flux, capacitor'") as caught:
         to_coco(["chiar", "bed", "Flux, capacitor"])
     assert "\n" not in str(caught.value)
 
 
-def test_labels_without_an_object_class_are_refused():
+def test_to_coco_without_object_class_raises():
     with pytest.raises(ConfigError, match="none of the 2 labels"):
         to_coco(["wall", "floor"])
     with pytest.raises(ConfigError, match="none of the 0 labels"):
         to_coco([])
 
 
-def test_labels_from_a_text_file(tmp_path):
+def test_read_labels_from_text_file_checks_lines(tmp_path):
     path = tmp_path / "names.txt"
     path.write_text("chair\ndining table \n\n")
     assert read_labels(str(path)) == ("chair", "dining table")

@@ -34,19 +34,19 @@ from framework.vocabulary.text_queries import ObjectWords, object_words
         ("wine glasses", ("wine glass",), (), ()),
     ],
 )
-def test_a_query_is_classes_colors_and_what_is_neither(
+def test_object_words_splits_classes_colors_and_unknown(
     query: str, classes: tuple[str, ...], colors: tuple[str, ...], unknown: tuple[str, ...]
 ) -> None:
     assert object_words(query, COCO) == ObjectWords(classes, colors, unknown)
 
 
-def test_only_classes_that_are_offered_are_found_with_whatever_case_they_have() -> None:
+def test_object_words_finds_only_given_classes_in_any_case() -> None:
     assert object_words("a Red Mug", ("Red mug", "Mug")).classes == ("Red mug",)
     assert object_words("a chair", ("couch",)) == ObjectWords((), (), ("chair",))
 
 
 @pytest.mark.parametrize("name", COLOR_NAMES)
-def test_what_stands_for_a_color_has_its_name_and_fits_it_best(name: str) -> None:
+def test_typical_color_has_its_name_and_best_fit(name: str) -> None:
     plain = {"black": (0, 0, 0), "gray": (128, 128, 128), "white": (255, 255, 255), "red": (220, 20, 30),
              "orange": (250, 130, 20), "yellow": (250, 220, 40), "green": (30, 150, 50), "blue": (30, 60, 220),
              "purple": (120, 30, 160), "pink": (250, 140, 190), "brown": (100, 60, 30),

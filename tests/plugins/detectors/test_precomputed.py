@@ -84,7 +84,9 @@ def test_label_and_score_give_class_distribution(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("spread", "score", "own"), [(0.0, 0.6, 1.0), (0.5, 0.6, 0.8), (1.0, 1.0, 1.0), (1.0, 0, 1 / 80)]
 )
-def test_class_spread_sets_probability_of_other_classes(tmp_path: Path, spread: float, score: float, own: float) -> None:
+def test_class_spread_sets_probability_of_other_classes(
+    tmp_path: Path, spread: float, score: float, own: float
+) -> None:
     """Never so much that the label is no longer the best."""
     [row] = detected(tmp_path, entry(score=score), class_spread=spread).class_probabilities
     assert row[CHAIR] == pytest.approx(own)
@@ -318,9 +320,7 @@ def test_result_file_of_other_sequence_raises(tmp_path: Path) -> None:
     assert [len(fitting.detect(frame(k))) for k in (2, 6, 900)] == [1, 0, 0]
 
 
-def test_possible_sequence_mismatch_warns_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_possible_sequence_mismatch_warns_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     detector = Precomputed(write(tmp_path, entry(image_id=5000)))
     for index in range(100):
         detector.detect(frame(index))

@@ -119,9 +119,7 @@ def test_only_voxels_in_band_under_mask_vote(frames: list[Frame]) -> None:
 
 
 @pytest.mark.parametrize(("scores", "winner"), [([0.9, 0.6], 1), ([0.6, 0.9], 2)])
-def test_shared_pixels_go_to_higher_score(
-    frames: list[Frame], scores: list[float], winner: int
-) -> None:
+def test_shared_pixels_go_to_higher_score(frames: list[Frame], scores: list[float], winner: int) -> None:
     first, second, _ = masks_of(frames[0])
     v = np.arange(CAMERA.height)[:, None]
     shared = first & (v > np.quantile(np.nonzero(first)[0], 0.7))
@@ -198,7 +196,9 @@ def test_low_resolution_image_leaves_no_holes() -> None:
     assert (scene.render(coarse, np.eye(4)).depth > 0)[2:-2, 2:-2].all()
 
 
-def test_close_view_of_large_map_is_complete_without_output(mapped: Open3DMap, capfd: pytest.CaptureFixture[str]) -> None:
+def test_close_view_of_large_map_is_complete_without_output(
+    mapped: Open3DMap, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Open3D sizes its map of ranges by the first view, prints a warning in a later one and leaves holes there."""
     scene = Open3DMap(mapped.grid.settings, CONFIRMATION)
     for T in walk(3):

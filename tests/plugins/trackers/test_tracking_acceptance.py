@@ -182,14 +182,18 @@ def there_and_back(frames: list[Frame], begin: int, bad: list[Frame], end: int) 
         (garbage, 5),
     ],
 )
-def test_bad_frames_are_lost_and_leave_map_accurate(spoilt, count: int, frames: list[Frame], surface, clean_error) -> None:
+def test_bad_frames_are_lost_and_leave_map_accurate(
+    spoilt, count: int, frames: list[Frame], surface, clean_error
+) -> None:
     shown = there_and_back(frames, 25, [spoilt(f) for f in frames[25 : 25 + count]], 25 + count)
     poses, scene = run(VoxelHashingIcp(), shown)
     assert all(p.lost for p in poses[25 : 25 + count])
     assert_unharmed(poses, shown, surface.error(scene), clean_error)
 
 
-def test_cut_to_other_room_is_lost_and_leaves_map_accurate(frames: list[Frame], elsewhere, surface, clean_error) -> None:
+def test_cut_to_other_room_is_lost_and_leaves_map_accurate(
+    frames: list[Frame], elsewhere, surface, clean_error
+) -> None:
     bad = [dataclasses.replace(f, depth=e.depth, color=e.color) for f, e in zip(frames[25:28], elsewhere, strict=True)]
     shown = there_and_back(frames, 25, bad, 28)
     poses, scene = run(VoxelHashingIcp(), shown)

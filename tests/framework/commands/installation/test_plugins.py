@@ -189,9 +189,7 @@ FAULTY_OPTIONS = {
 }
 
 
-def test_plugins_faulty_options_are_listed_with_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plugins_faulty_options_are_listed_with_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     group = tmp_path / "detector"
     group.mkdir()
     for name, (text, _) in FAULTY_OPTIONS.items():

@@ -74,7 +74,9 @@ def test_import_existing_output_raises_before_reading(
 
 
 @pytest.mark.acceptance
-def test_import_of_phone_recording_is_mappable(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_import_of_phone_recording_is_mappable(
+    shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """256x192 depth, a video and ARKit's poses, made of a real kitchen: no fault, no frame lost."""
     kitchen = RgbdFolder(shared_data / "redkitchen", stride=3, stop=180)
     write_stray_scanner(tmp_path / "export", list(seen_by_phone(list(kitchen))))

@@ -220,9 +220,7 @@ def test_evaluate_folder_without_runs_is_refused(stored: Path, tmp_path: Path, c
     assert err == f"refused: {tmp_path / 'nothing'}: there is no run at or below it\n"
 
 
-def test_evaluate_runs_with_same_truth_load_it_once(
-    stored: Path, command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evaluate_runs_with_same_truth_load_it_once(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(stored, stored.parent / "second")
     _with_dataset(Path(shutil.copytree(stored, stored.parent / "other")), stop=3)
     made = []
@@ -234,9 +232,7 @@ def test_evaluate_runs_with_same_truth_load_it_once(
     assert sorted(made) == [3, 4]
 
 
-def test_evaluate_run_restarted_meanwhile_is_unchanged(
-    stored: Path, command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evaluate_run_restarted_meanwhile_is_unchanged(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
     def begins_again(self: CornerRoom) -> None:
         (stored / "metrics.json").unlink()
         return scene_truth(self)
@@ -309,9 +305,7 @@ def test_evaluate_does_not_execute_code_in_record(started: list[str], stored: Pa
     assert "dataset brought.Brought: no registered option of dataset has this _target_" in done.stderr
 
 
-def test_evaluate_stored_config_cannot_read_environment(
-    stored: Path, command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evaluate_stored_config_cannot_read_environment(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SECRET", "hunter2")
     _with_dataset(stored, scene="${oc.env:SECRET}")
     status, out, err = command(stored)

@@ -83,9 +83,7 @@ def test_report_escapes_html_in_class_names(stored: Path, command) -> None:
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
 
 
-def test_report_without_recording_shows_map_images(
-    stored: Path, command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_report_without_recording_shows_map_images(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(composition, "_added", [])
     assert command(stored)[0] == 0
     page = (stored / "report.html").read_text()
@@ -95,9 +93,7 @@ def test_report_without_recording_shows_map_images(
     assert "Individual objects cannot be compared" in texts(page)
 
 
-def test_report_top_view_alone_omits_enlarged_path(
-    stored: Path, command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_report_top_view_alone_omits_enlarged_path(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(composition, "_added", [])  # no recording, and so no true way
     monkeypatch.setattr(run_page, "SMALL_PATH", 0.0)  # the way is large enough among the objects
     assert command(stored)[0] == 0

@@ -40,9 +40,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return tables(directory)
 
 
-def test_slurm_sweep_resumes_preempted_and_killed_jobs(
-    tmp_path: Path, undisturbed: dict[str, bytes]
-) -> None:
+def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
     """By submitit's own queue, with the signal that SLURM sends before it takes a job's node, and with `kill -9`."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     arguments = ("launcher=submitit_local", *THREE)
@@ -79,9 +77,7 @@ def ray_cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     cluster.shutdown()
 
 
-def test_ray_sweep_replaces_dead_node(
-    tmp_path: Path, undisturbed: dict[str, bytes], ray_cluster: object
-) -> None:
+def test_ray_sweep_replaces_dead_node(tmp_path: Path, undisturbed: dict[str, bytes], ray_cluster: object) -> None:
     nodes = [ray_cluster.add_node(num_cpus=1) for _ in range(2)]
     sweep = begin(tmp_path, "launcher=ray", f"hydra.launcher.ray.init.address={ray_cluster.address}", *THREE)
     wait_until(lambda: len(mapping(tmp_path)) == 2, sweep)

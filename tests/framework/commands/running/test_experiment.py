@@ -264,9 +264,7 @@ def test_experiment_unknown_row_raises() -> None:
         (["seed=range(0,0)"], "error: seed=range(0,0) has no value: the sweep would be empty"),
     ],
 )
-def test_sweep_errors_are_reported_before_first_run(
-    tmp_path: Path, arguments: list[str], said: str
-) -> None:
+def test_sweep_errors_are_reported_before_first_run(tmp_path: Path, arguments: list[str], said: str) -> None:
     done = start(tmp_path, *arguments)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith(said)

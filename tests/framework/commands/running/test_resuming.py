@@ -122,7 +122,9 @@ def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
         (("tracker=open3d_odometry",), "Open3dOdometry cannot relocalize"),
     ],
 )
-def test_resume_with_incompatible_config_raises(tmp_path: Path, room: CornerRoom, overrides: tuple[str, ...], said: str) -> None:
+def test_resume_with_incompatible_config_raises(
+    tmp_path: Path, room: CornerRoom, overrides: tuple[str, ...], said: str
+) -> None:
     first, _ = mapped([room[0]], *GIVEN)
     before = put_away(first, tmp_path / "first")
     with pytest.raises(ConfigError, match=said):

@@ -135,7 +135,9 @@ def test_unsupported_device_request_raises_one_line(
     assert not device.running
 
 
-def test_disconnected_device_raises_and_stops(brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disconnected_device_raises_and_stops(
+    brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
     device.unplugged_at = 2
     with pytest.raises(DataError, match="Device disconnected"):
         list(sent(brand.video(), 3))

@@ -90,9 +90,7 @@ def test_sens_and_exported_frames_are_equal(tmp_path: Path) -> None:
         np.testing.assert_allclose(one.T_world_camera, other.T_world_camera, atol=1e-6)
 
 
-def test_sens_file_takes_precedence_over_exported_images(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_sens_file_takes_precedence_over_exported_images(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     as_sens(tmp_path / SCENE, shots(3))
     write_exported(tmp_path / SCENE, shots(2))
     with caplog.at_level(logging.INFO):

@@ -90,9 +90,7 @@ def test_single_file_of_bag_folder_is_imported(tmp_path: Path, folder: str, suff
 @pytest.mark.parametrize(
     ("child", "T_camera_child"), [("camera_color_optical_frame", np.eye(4)), ("base", T_CAMERA_ROS)]
 )
-def test_odometry_is_read_in_axes_of_its_child_frame(
-    tmp_path: Path, child: str, T_camera_child: np.ndarray
-) -> None:
+def test_odometry_is_read_in_axes_of_its_child_frame(tmp_path: Path, child: str, T_camera_child: np.ndarray) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     for k in range(COUNT):

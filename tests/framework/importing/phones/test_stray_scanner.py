@@ -114,7 +114,9 @@ def test_short_video_keeps_decoded_frames(folder: Path, tmp_path: Path) -> None:
         ("camera_matrix.csv", b"1, 0, 2\n0, x, 2\n0, 0, 1\n", r"camera_matrix\.csv, line 2: .* found ' x'"),
     ],
 )
-def test_invalid_export_raises_and_leaves_no_folder(folder: Path, tmp_path: Path, name: str, content: bytes | None, said: str) -> None:
+def test_invalid_export_raises_and_leaves_no_folder(
+    folder: Path, tmp_path: Path, name: str, content: bytes | None, said: str
+) -> None:
     (folder / name).unlink()
     if content is not None:
         (folder / name).write_bytes(content)

@@ -77,9 +77,7 @@ def test_integration_of_one_frame_matches_reference() -> None:
 
 
 @pytest.mark.parametrize("promised", [100_000, 10], ids=["reserved", "memory is counted by what is asked for"])
-def test_integration_reuses_reserved_memory_for_more_blocks(
-    monkeypatch: pytest.MonkeyPatch, promised: int
-) -> None:
+def test_integration_reuses_reserved_memory_for_more_blocks(monkeypatch: pytest.MonkeyPatch, promised: int) -> None:
     monkeypatch.setattr(integration, "reserved", lambda most, make: make(min(most, promised)))
     integrator, T = new_integrator(), walk(1)[0]
     frame = room().frame(T, 0)

@@ -15,7 +15,7 @@ from framework.refinement.neighborhood import Neighborhoods
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize("iterations", [2, 300])
-def test_same_labels_as_scikit_learn(iterations):
+def test_lloyd_cluster_labels_match_scikit_learn(iterations):
     rng = np.random.default_rng(0)
     counts = [500, 800, 1200]
     points = rng.normal([0, 0, 2], [0.5, 0.3, 0.2], (sum(counts), 3)).astype(np.float32)
@@ -30,7 +30,7 @@ def test_same_labels_as_scikit_learn(iterations):
         np.testing.assert_allclose(ours[k], reference.cluster_centers_, atol=1e-6)
 
 
-def test_depth_groups():
+def test_depth_groups_are_means_of_equal_parts():
     points = np.array([[0, 0, 4], [1, 0, 1], [2, 0, 2], [3, 0, 3], [0, 5, 7]], np.float32)
     groups = lloyd_iterations.depth_groups(points, np.array([0, 4, 4, 5]), 2)
     np.testing.assert_allclose(groups[0], [[1.5, 0, 1.5], [1.5, 0, 3.5]])
@@ -38,14 +38,14 @@ def test_depth_groups():
     np.testing.assert_array_equal(groups[2], [[0, 5, 7], [0, 5, 7]])
 
 
-def test_a_center_without_points_stays():
+def test_lloyd_cluster_empty_center_is_unchanged():
     points = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
     labels, centers = lloyd_iterations.cluster(points, np.array([0, 2]), np.array([[[0.5, 0, 0], [9.0, 9, 9]]]), 10)
     assert labels.tolist() == [0, 0]
     np.testing.assert_array_equal(centers[0], [[0.5, 0, 0], [9, 9, 9]])
 
 
-def test_of_equally_near_centers_the_first():
+def test_nearest_centers_tie_returns_first_center():
     points = np.array([[0, 0, 0]], np.float32)
     centers = np.array([[[1.0, 0, 0], [-1.0, 0, 0]]])
     assert lloyd_iterations.nearest_centers(points, np.array([0]), np.array([1]), centers).tolist() == [0]
@@ -87,7 +87,7 @@ def nearest(points: np.ndarray, centers: np.ndarray) -> np.ndarray:
 
 @pytest.mark.integration
 @pytest.mark.parametrize("iterations", [1, 5])
-def test_core_and_ring_are_cut_by_place_and_the_border_starts_in_the_ring(iterations):
+def test_start_labels_match_reference_for_core_ring_and_border(iterations):
     sets, log_odds = around([(400, 300), (150, 600)])
     labels = start_labels(sets, log_odds, 2, 5, iterations)
     for k in range(2):
@@ -104,14 +104,14 @@ def test_core_and_ring_are_cut_by_place_and_the_border_starts_in_the_ring(iterat
 
 
 @pytest.mark.integration
-def test_sets_without_mask_ring_or_anything():
+def test_start_labels_of_sets_without_mask_or_ring_are_valid():
     sets, log_odds = around([(0, 50), (50, 0), (0, 0), (1, 1)])
     labels = start_labels(sets, log_odds, 2, 6, 5)
     assert ((labels >= 0) & (labels < 8)).all()
     assert (labels[:50] >= 2).all()
 
 
-def test_without_background_components_every_point_of_a_mask_starts_in_the_object():
+def test_start_labels_without_background_are_all_object():
     sets, log_odds = around([(400, 0), (150, 0)])
     labels = start_labels(sets, log_odds, 3, 0, 5)
     for k in range(2):

@@ -38,7 +38,7 @@ def sklearn_from(points: np.ndarray, labels: np.ndarray, iterations: int, floor:
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize("iterations", [1, 8])
-def test_same_as_scikit_learn(iterations):
+def test_mixture_fit_matches_scikit_learn(iterations):
     sets = [blobs(seed, 2000 + 500 * seed) for seed in range(3)]
     points, labels = np.concatenate([p for p, _ in sets]), np.concatenate([label for _, label in sets])
     starts = np.cumsum([0] + [len(p) for p, _ in sets])
@@ -60,7 +60,7 @@ def test_same_as_scikit_learn(iterations):
 
 
 @pytest.mark.parametrize("bound", [0.1, 0.5, 0.9])
-def test_posterior_with_prior_and_outliers_by_hand(bound):
+def test_likely_members_match_analytic_posterior(bound):
     """One object and one background Gaussian in 1D at -1 and 1, unit covariance, and a uniform density."""
     ours = Mixtures(
         weights=np.array([[0.3, 0.6]]),
@@ -86,7 +86,7 @@ def test_posterior_with_prior_and_outliers_by_hand(bound):
 
 
 @pytest.mark.parametrize("components", [1, 3, 8])
-def test_who_claims_a_point_is_decided_as_by_the_full_posterior(components):
+def test_likely_members_match_full_posterior(components):
     """Near the border and far from it: the points that are decided without a sum, and those that are not."""
     rng = np.random.default_rng(components)
     n = components + 2
@@ -117,7 +117,7 @@ def test_who_claims_a_point_is_decided_as_by_the_full_posterior(components):
         np.testing.assert_array_equal(claimed[own][clear], posterior[clear] > 0.4)
 
 
-def test_likelihood_never_falls_and_the_stopping_rule_stops():
+def test_mixture_fit_likelihood_increases_until_tolerance():
     points, labels = blobs(5)
     starts = np.array([0, len(points)])
     fits = [
@@ -133,7 +133,7 @@ def test_likelihood_never_falls_and_the_stopping_rule_stops():
     assert total == pytest.approx(1.0)
 
 
-def test_eigenvalues_are_floored_and_the_others_left():
+def test_mixture_fit_floors_only_small_eigenvalues():
     """Points on a slanted plane: the eigenvalue along the normal rises to the floor, the rest stays."""
     rng = np.random.default_rng(0)
     plane = rng.normal(size=(5000, 2)) * [0.5, 0.3]
@@ -148,7 +148,7 @@ def test_eigenvalues_are_floored_and_the_others_left():
     assert abs(axes[2] @ fitted.covariances[0, 0] @ axes[2] - 0.02**2) < 1e-9
 
 
-def test_outliers_go_to_the_uniform_component():
+def test_mixture_fit_assigns_outliers_to_uniform_component():
     rng = np.random.default_rng(1)
     cluster, noise = rng.normal(0, 0.02, (2000, 3)), rng.uniform(-1, 1, (200, 3))
     points = np.concatenate([cluster, noise]).astype(np.float32)
@@ -161,7 +161,7 @@ def test_outliers_go_to_the_uniform_component():
     assert claimed[2000:].mean() < 0.02
 
 
-def test_sets_too_small_for_a_component():
+def test_mixture_fit_small_sets_stay_finite():
     points = np.ones((6, 3), np.float32)
     fitted = mixture.fit(
         points, np.array([0, 0, 2, 6]), np.zeros(6, np.int32), 2, EmSettings(5, 0.0, 1e-4, 0.0),
@@ -172,7 +172,7 @@ def test_sets_too_small_for_a_component():
     assert mixture.likely_members(points, starts[:-1], starts[1:], fitted, own_components=1, min_posterior=0.5).all()
 
 
-def test_prior_moves_the_fit():
+def test_mixture_fit_prior_separates_equal_components():
     """Two equal components cannot tell the points apart; the prior alone does, to the first M-step's exact means."""
     points = np.zeros((200, 3), np.float32)
     points[:, 0] = np.linspace(-1, 1, 200)

@@ -90,7 +90,7 @@ def slow_children(points: np.ndarray, weight: float, children: int, iterations: 
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_same_as_the_slow_recursion(seed):
+def test_mixture_tree_matches_slow_recursion(seed):
     points = surface(seed, 700).astype(np.float64)
     nodes, outlier = slow_children(points, 1.0, 4, 6)
     below = [slow_children(node.points, node.weight, 4, 6) for node in nodes]
@@ -105,7 +105,7 @@ def test_same_as_the_slow_recursion(seed):
     np.testing.assert_array_equal(tree.levels[1].parents, np.repeat(np.arange(4), [len(c) for c, _ in below]))
 
 
-def test_one_level_is_a_flat_mixture():
+def test_mixture_tree_single_level_equals_flat_mixture():
     points, starts = surface(2, 3000), np.array([0, 1000, 3000])
     tree = grown(points, starts, levels=1, min_support=0.0)
     flat = mixture.fit(
@@ -136,7 +136,7 @@ def masses(tree: MixtureTree, depth: int, sets: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("min_support", [0.0, 0.001])
-def test_weights_add_up(min_support):
+def test_mixture_tree_weights_sum_to_one(min_support):
     points, starts = surface(3, 6000), np.array([0, 2000, 6000])
     tree = grown(points, starts, min_support=min_support)
     assert len(tree.levels) == 3
@@ -152,14 +152,14 @@ def test_weights_add_up(min_support):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_level_more_never_fits_the_training_points_worse(seed):
+def test_mixture_tree_likelihood_increases_with_depth(seed):
     points, starts = surface(seed, 6000), np.array([0, 2000, 6000])
     tree = grown(points, starts)
     by_depth = np.array([log_likelihoods(tree, points, starts, depth) for depth in (1, 2, 3)])
     assert (np.diff(by_depth, axis=0) > 0).all(), by_depth
 
 
-def test_points_go_to_their_best_child_and_strays_to_none():
+def test_mixture_tree_assigns_points_to_best_child():
     """Two tight blobs and a far point: the blob's own node for each, -1 for the stray; shares by hand."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0.5, 5, 5], [0.4, 0, 0]], np.float32)
     level = Level(
@@ -178,7 +178,7 @@ def test_points_go_to_their_best_child_and_strays_to_none():
     np.testing.assert_allclose(share, ours / (ours + theirs), atol=1e-5)
 
 
-def test_own_ratios_are_the_likeliest():
+def test_own_ratios_maximize_likelihood():
     rng = np.random.default_rng(0)
     odds = rng.normal(0.4, 1.5, 60).astype(np.float32)
     starts = np.array([0, 60, 60, 63, 66])
@@ -197,7 +197,7 @@ def test_own_ratios_are_the_likeliest():
     assert shares[2] + shares[3] == pytest.approx(1.0, abs=1e-5), "the two sides are alike"
 
 
-def test_cut_is_that_of_the_slow_one():
+def test_mixture_tree_cut_matches_slow_reference():
     points = surface(5, 500)
     starts = np.array([0, 300, 300, 500])
     for groups in (2, 8, 13):
@@ -207,7 +207,7 @@ def test_cut_is_that_of_the_slow_one():
     assert not mixture_tree.cut(np.ones((50, 3), np.float32), np.array([0, 50]), 8).any(), "equal points stay together"
 
 
-def test_too_little_for_a_tree():
+def test_mixture_tree_degenerate_sets_are_handled():
     points = np.concatenate([np.ones((40, 3)), surface(0, 200), np.zeros((1, 3))]).astype(np.float32)
     starts = np.array([0, 0, 40, 240, 241])
     tree = grown(points, starts, levels=2)
@@ -221,7 +221,7 @@ def test_too_little_for_a_tree():
     assert len(log_likelihoods(nothing, np.zeros((0, 3), np.float32), np.array([0]))) == 0
 
 
-def test_same_result_with_one_thread_and_with_two():
+def test_mixture_tree_is_independent_of_thread_count():
     points, starts = surface(3, 6000), np.array([0, 2000, 6000])
 
     def grow():

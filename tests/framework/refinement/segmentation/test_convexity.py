@@ -61,7 +61,7 @@ def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, fl
 
 @pytest.mark.parametrize("cell", [1, 2])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_boxes_that_touch_in_the_image_come_apart(cell, noise):
+def test_segments_separate_boxes_adjacent_in_image(cell, noise):
     """The nearer box's edge hides the other's: in the image they share a border of 60 px, 0.4 m apart in depth."""
     boxes = np.array([[-0.5, -0.3, 1.2, 0.0, 0.3, 1.5], [-0.1, -0.4, 1.6, 0.6, 0.4, 2.0]])
     depth, ids = rendered(boxes, None, 0.0)
@@ -76,7 +76,7 @@ def test_boxes_that_touch_in_the_image_come_apart(cell, noise):
 
 @pytest.mark.parametrize("cell", [1, 2])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_a_box_comes_off_the_table_and_stays_whole(cell, noise):
+def test_segments_separate_box_from_table_and_keep_it_whole(cell, noise):
     """The camera looks down on it from aside: it sees the front, the top and the left face."""
     camera = Camera(160, 120, 90.0, 90.0, 79.5, 59.5).scaled(cell)
     boxes = np.array([[0.35, 0.3, 0.9, 0.65, 0.6, 1.3]])
@@ -103,7 +103,7 @@ def faces_of(box: np.ndarray, pitch: float, camera: Camera, depth: np.ndarray, i
 
 
 @pytest.mark.parametrize("cell", [1, 2])
-def test_a_step_between_parallel_planes_is_cut(cell):
+def test_segments_split_at_depth_step_but_not_at_slope(cell):
     """2.5 cm, as a book on a table: a slope may rise by more from pixel to pixel, but is no step."""
     depth = np.full(CAMERA.shape, 1.025)
     depth[30:90, 40:100] = 1.0
@@ -116,7 +116,7 @@ def test_a_step_between_parallel_planes_is_cut(cell):
     assert cut(sloped, Camera(130, 120, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), cell=cell)[1] == 1
 
 
-def test_a_ball_is_one_segment():
+def test_segments_ball_is_one_segment():
     """However much a surface bends away from the camera."""
     v, u = np.mgrid[:120, :160]
     x, y = (u - 79.5) / 135, (v - 59.5) / 135
@@ -130,7 +130,7 @@ def test_a_ball_is_one_segment():
     assert covered > 0.95
 
 
-def test_planes_are_exact_on_a_plane():
+def test_fit_planes_on_plane_is_exact():
     """In inverse depth a plane is linear: every window of it, at the image's border too, gives the same one."""
     v, u = np.mgrid[:12, :20]
     inverse = (0.5 + 0.004 * u - 0.003 * v).astype(np.float32)
@@ -141,7 +141,7 @@ def test_planes_are_exact_on_a_plane():
     np.testing.assert_allclose(fits[3], 0, atol=1e-10)
 
 
-def test_fits_are_those_of_lstsq_on_the_neighbors_of_like_depth():
+def test_fit_planes_matches_lstsq_on_similar_depth():
     rng = np.random.default_rng(0)
     inverse = (0.5 + rng.normal(0, 0.002, (9, 11))).astype(np.float32)
     inverse[:, 6:] += 0.4  # another surface, in front
@@ -162,7 +162,7 @@ def test_fits_are_those_of_lstsq_on_the_neighbors_of_like_depth():
     assert found > 50
 
 
-def test_at_a_crease_a_cell_takes_the_plane_of_its_own_side():
+def test_best_planes_at_crease_use_own_side():
     u = np.arange(31)
     inverse = np.tile(np.where(u < 15, 0.5, 0.5 + 0.02 * (u - 14.5)), (15, 1)).astype(np.float32)
     planes = convexity_kernels.best_planes(
@@ -172,7 +172,7 @@ def test_at_a_crease_a_cell_takes_the_plane_of_its_own_side():
     np.testing.assert_allclose(planes[0, 5, 15:], 0.02, atol=1e-4)
 
 
-def test_normal_sigma_is_the_spread_of_fitted_normals():
+def test_normal_sigma_matches_spread_of_fitted_normals():
     """A wall 1 m away with noise in a thousand windows: the angle between the normals of two windows."""
     rng = np.random.default_rng(0)
     cell, window, sigma = 1, 3, 0.002
@@ -183,7 +183,7 @@ def test_normal_sigma_is_the_spread_of_fitted_normals():
     assert np.sqrt(2) * slopes.std() == pytest.approx(normal_sigma(sigma, window, cell, camera), rel=0.1)
 
 
-def test_pieces_are_those_of_scipy():
+def test_connected_components_match_scipy():
     rng = np.random.default_rng(0)
     inverse = np.ones((70, 41), np.float32)
     for density in (0.2, 0.4):
@@ -198,7 +198,7 @@ def test_pieces_are_those_of_scipy():
         assert large_count == (sizes[1:] >= 5).sum()
 
 
-def test_depth_cuts_pieces():
+def test_connected_components_split_at_depth_step():
     inverse = np.ones((4, 10), np.float32)
     inverse[:, 5:] = 0.5
     labels, count = convexity_kernels.connected(inverse, np.zeros((4, 10), bool), NOISE, np.float32(0.01), 1)
@@ -207,7 +207,7 @@ def test_depth_cuts_pieces():
 
 
 @pytest.mark.parametrize("radius", [0, 1, 2])
-def test_edges_are_closed_as_by_scipy(radius):
+def test_edge_closing_matches_scipy(radius):
     edges = np.random.default_rng(0).random((30, 43)) < 0.1
     square = np.ones((2 * radius + 1, 2 * radius + 1))
     spread = ndimage.binary_dilation(edges, square)
@@ -217,7 +217,7 @@ def test_edges_are_closed_as_by_scipy(radius):
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (2, 3), (17, 33)])
 @pytest.mark.parametrize("cell", [1, 2, 3])
-def test_degenerate_images(shape, cell):
+def test_segments_of_degenerate_images_are_valid(shape, cell):
     height, width = shape
     camera = Camera(width, height, 50.0, 60.0, width / 2, height / 2)
     for depth in (np.zeros(shape), np.full(shape, 2.0), np.random.default_rng(0).uniform(0.3, 9, shape)):
@@ -230,7 +230,7 @@ def test_degenerate_images(shape, cell):
     assert labels[0, 0] >= 0
 
 
-def test_a_scratch_of_missing_readings_cuts_nothing():
+def test_segments_missing_depth_line_does_not_split():
     depth = np.full(CAMERA.shape, 2.0)
     depth[60, :100] = 0
     labels, count = cut(depth)
@@ -238,7 +238,7 @@ def test_a_scratch_of_missing_readings_cuts_nothing():
     assert ((labels == 0) == (depth > 0)).all()
 
 
-def test_same_segments_with_one_thread_and_with_two():
+def test_segments_are_independent_of_thread_count():
     boxes = np.array([[0.15, 0.3, 1.1, 0.55, 0.6, 1.5], [-0.5, 0.4, 1.0, -0.2, 0.6, 1.2]])
     depth = noisy(rendered(boxes, 0.6, 0.5)[0], 1.0)
     np.testing.assert_array_equal(*by_one_thread_and_two(lambda: cut(depth)[0]))

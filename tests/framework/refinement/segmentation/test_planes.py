@@ -16,7 +16,7 @@ FLOOR, WALL = np.array([0.0, 1 / 1.2, 0.0]), np.array([0.1, 0.05, 0.3])  # 1/m, 
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 10, 257])
-def test_order_is_that_of_sorted_values(count):
+def test_order_statistic_matches_sorted_values(count):
     values = np.random.default_rng(count).integers(0, 40, count).astype(np.float64)  # with equal ones
     for k in range(count):
         assert _order(values.copy(), k) == np.sort(values)[k]
@@ -46,7 +46,7 @@ def nearest(planes: Planes, m: np.ndarray) -> int:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, Camera(75, 41, 50.0, 60.0, 30.0, 22.0)])
-def test_an_exact_plane_comes_back_exactly(camera):
+def test_find_planes_recovers_exact_plane(camera):
     planes = found(depth_of(WALL, camera=camera), camera)
     assert len(planes) == 1
     np.testing.assert_allclose(planes.m[0], WALL, atol=1e-6)
@@ -56,7 +56,7 @@ def test_an_exact_plane_comes_back_exactly(camera):
     assert planes.behind[0] == 0
 
 
-def test_area_is_that_of_the_triangles_between_the_pixels():
+def test_plane_area_matches_pixel_triangle_area():
     depth = depth_of(WALL)
     points = rays() * depth[..., None]
     sides = points[1:, :-1] - points[:-1, :-1], points[:-1, 1:] - points[:-1, :-1]
@@ -65,7 +65,7 @@ def test_area_is_that_of_the_triangles_between_the_pixels():
     assert len(found(depth, min_area=1.02 * area)) == 0
 
 
-def test_a_noisy_room_has_the_planes_of_open3d():
+def test_find_planes_in_noisy_room_matches_open3d():
     """Floor and wall with the noise of a Kinect: the larger one beside segment_plane, both beside the truth."""
     open3d = pytest.importorskip("open3d")
     exact = depth_of(FLOOR, WALL)
@@ -88,7 +88,7 @@ def test_a_noisy_room_has_the_planes_of_open3d():
     assert k == planes.shares.argmax()
 
 
-def test_a_wall_cut_in_two_is_one_plane():
+def test_find_planes_merges_divided_wall():
     depth = depth_of(WALL)
     depth[:, 140:180] = 1.0 + 0.3 * np.sin(np.arange(40) / 3)
     planes = found(depth)
@@ -98,7 +98,7 @@ def test_a_wall_cut_in_two_is_one_plane():
     assert (image == (np.abs(np.arange(320) - 159.5) > 20)).all()
 
 
-def test_parallel_planes_farther_apart_than_the_distance_are_two():
+def test_find_planes_separates_parallel_planes():
     near, far = np.array([0, 0, 1 / 2.0]), np.array([0, 0, 1 / 2.08])
     depth = depth_of(far)
     depth[:, :150] = 2.0
@@ -109,7 +109,7 @@ def test_parallel_planes_farther_apart_than_the_distance_are_two():
     assert planes.behind[nearest(planes, near)] == pytest.approx(170 / 150, rel=0.1)
 
 
-def test_readings_are_on_a_plane_within_the_distance():
+def test_plane_image_assigns_depth_within_distance():
     """A plane at 2 m that leans by 45 degrees, and readings 19 and 21 mm off it, along its normal."""
     m = np.array([0.0, 0.5, 0.5])
     planes = found(depth_of(m))
@@ -120,7 +120,7 @@ def test_readings_are_on_a_plane_within_the_distance():
         assert (plane_image(frame_of(depth_of(moved)), planes, 0.02) == on).all()
 
 
-def test_of_two_planes_a_reading_is_on_the_nearer():
+def test_plane_image_assigns_nearest_plane():
     planes = found(depth_of(FLOOR, WALL))
     floor, wall = nearest(planes, FLOOR), nearest(planes, WALL)
     image = plane_image(frame_of(depth_of(FLOOR, WALL)), planes, 0.3)
@@ -129,7 +129,7 @@ def test_of_two_planes_a_reading_is_on_the_nearer():
     np.testing.assert_array_equal(image[clear], right[clear])
 
 
-def test_no_plane():
+def test_find_planes_without_plane_is_empty():
     rng = np.random.default_rng(0)
     assert len(found(rng.uniform(0.5, 5, CAMERA.shape))) == 0
     assert len(found(np.zeros(CAMERA.shape))) == 0
@@ -142,13 +142,13 @@ def test_no_plane():
     assert len(found(np.ones((1, 400)), Camera(400, 1, 50.0, 50.0, 200.0, 0.0), min_area=0.0)) == 0, "a line"
 
 
-def test_no_reading_is_on_a_plane_without_reading():
+def test_plane_image_without_depth_is_zero():
     depth = depth_of(WALL)
     depth[50:60] = 0
     assert not plane_image(frame_of(depth), found(depth), 0.02)[50:60].any()
 
 
-def test_same_with_one_thread_and_two():
+def test_find_planes_is_independent_of_thread_count():
     exact = depth_of(FLOOR, WALL)
     frame = frame_of(exact + np.random.default_rng(0).normal(0, 0.002, exact.shape) * exact**2)
 
@@ -160,7 +160,7 @@ def test_same_with_one_thread_and_two():
         np.testing.assert_array_equal(one, other)
 
 
-def test_inverse_depth_is_linear_in_the_pixel():
+def test_inverse_depth_of_plane_is_linear_in_pixel():
     """What the method stands on, with the project's own back-projection."""
     depth = depth_of(WALL).astype(np.float32)
     v, u = np.mgrid[:240, :320]

@@ -28,7 +28,7 @@ def lifted(mask: np.ndarray, frame: Frame) -> PointClusters:
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_pose_is_recovered_and_points_are_those_of_lift(flat):
+def test_camera_pose_is_recovered_from_lifted_points(flat):
     depth = np.full((60, 80), 2.0) if flat else np.random.default_rng(0).uniform(1, 4, (60, 80))
     frame = frame_of(depth)
     mask = np.zeros((60, 80), bool)
@@ -43,7 +43,7 @@ def test_pose_is_recovered_and_points_are_those_of_lift(flat):
     np.testing.assert_allclose(points_at(everything.pixels, frame, T_WORLD_CAMERA), everything.points_world, atol=1e-6)
 
 
-def test_points_on_a_line_leave_it_open():
+def test_camera_pose_of_collinear_points_is_none():
     frame = frame_of(np.full((60, 80), 2.0))
     for chosen in ((slice(10, 11), slice(20, 60)), (slice(10, 11), slice(20, 22)), (slice(0, 0), slice(0, 0))):
         mask = np.zeros((60, 80), bool)
@@ -51,7 +51,7 @@ def test_points_on_a_line_leave_it_open():
         assert camera_pose(lifted(mask, frame), frame) is None
 
 
-def test_points_of_another_frame_are_refused():
+def test_camera_pose_points_of_other_frame_raise():
     frame = frame_of(np.random.default_rng(0).uniform(1, 4, (60, 80)))
     clusters = lifted(np.ones((60, 80), bool), frame)
     moved = clusters.points_world.copy()

@@ -22,7 +22,7 @@ def volume(solid):
         (cylinder(0.2, 0.6, 1e-4, segments=64), np.pi * 0.04 * 0.6 / 3),
     ],
 )
-def test_the_volume_is_that_of_the_shape(solid, expected):
+def test_solid_volume_matches_analytic_volume(solid, expected):
     assert volume(solid) == pytest.approx(expected, rel=0.03)
 
 
@@ -35,7 +35,7 @@ def test_the_volume_is_that_of_the_shape(solid, expected):
         tube([(0, 0, 0), (0, 0, 1)], 0.02),
     ],
 )
-def test_normals_point_outward_with_the_triangles(solid):
+def test_solid_normals_point_outward(solid):
     a, b, c = (solid.vertices[solid.triangles[:, i]] for i in range(3))
     faces = np.cross(b - a, c - a)
     area = np.linalg.norm(faces, axis=1)
@@ -46,14 +46,14 @@ def test_normals_point_outward_with_the_triangles(solid):
     assert volume(solid) > 0 or len(solid.triangles) < 60
 
 
-def test_a_panel_faces_forward():
+def test_panel_triangles_face_forward():
     wall = panel(2.0, 1.0)
     a, b, c = (wall.vertices[wall.triangles[:, i]] for i in range(3))
     assert (np.cross(b - a, c - a)[:, 1] > 0).all()
 
 
 @pytest.mark.parametrize("class_name", sorted(LABELED))
-def test_furniture_stands_on_the_floor_and_has_its_size(class_name):
+def test_furniture_stands_on_floor_and_has_expected_size(class_name):
     largest = {
         "bed": (1.9, 2.3, 1.3), "chair": (0.6, 0.7, 1.1), "couch": (2.7, 1.05, 1.0), "dining table": (1.7, 1.2, 0.8),
         "book": (0.4, 0.4, 0.1), "refrigerator": (0.8, 0.8, 1.9), "tv": (1.3, 0.3, 0.8), "toilet": (0.5, 0.8, 0.9),
