@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 class RgbdFolder(Recording):
     """An RGB-D video in a folder of images, with poses and instance ground truth if there are files for them."""
 
-    ground_truth_spacing: float = 0.02  # m, spacing of the ground-truth surface points
+    ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m
 
     def __post_init__(self) -> None:
         check_truth_voxel(self.ground_truth_spacing)

@@ -71,9 +71,9 @@ class TumRgbd(Recording):
     the time of the color image. It is not known if no pose is within `max_time_difference`.
     """
 
-    intrinsics: Intrinsics = Intrinsics.AUTO
-    max_time_difference: float = 0.02  # s, in (0, 1], between color and its depth, and color and the nearest pose
-    undistort: bool = True  # False: leave the images as they are, for a camera without distortion
+    intrinsics: Intrinsics = Intrinsics.AUTO  # intrinsics of the color camera
+    max_time_difference: float = 0.02  # maximum difference from color to depth and to the true pose, s, in (0, 1]
+    undistort: bool = True  # correction of the lens distortion; False = images as stored
 
     def __post_init__(self) -> None:
         difference = self.max_time_difference

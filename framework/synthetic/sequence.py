@@ -32,19 +32,19 @@ class Synthetic(RGBDSequence):
     The same parameters give the same frames to the last bit, in whatever order and from whatever thread they are read.
     """
 
-    seed: int = 0
-    scene: str = "room0"  # any name: each gives another room
-    kind: RoomKind = RoomKind.STUDIO  # what the room is for; a studio holds all nine classes
-    frames: int = 240  # length of the walk, at 30 Hz
-    width: int = 640  # px
-    height: int = 480  # px
-    noise: float = 1.0  # scales the sensor's noise: 0 = exact, 1 = a Kinect v1
-    max_depth: float = 6.0  # m, the sensor's range
-    start: int = 0  # first frame
-    stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
-    stride: int = 1  # take every stride-th frame
-    frame_fraction: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
-    ground_truth_spacing: float = 0.02  # m, spacing of the ground-truth surface points
+    seed: int = 0  # seed of the room and the camera path, combined with scene
+    scene: str = "room0"  # name of the room; every name is a different room
+    kind: RoomKind = RoomKind.STUDIO  # kind of room; a studio contains all nine classes
+    frames: int = 240  # number of frames, at 30 Hz
+    width: int = 640  # width of the images, px
+    height: int = 480  # height of the images, px
+    noise: float = 1.0  # scale of the sensor noise; 0 = none, 1 = Kinect v1
+    max_depth: float = 6.0  # range of the sensor, m
+    start: int = 0  # index of the first frame
+    stop: int = TO_THE_END  # index after the last frame; -1 = to the end
+    stride: int = 1  # step between frames; 1 = every frame
+    frame_fraction: float = 1.0  # fraction of these frames, selected at random with `seed`, in (0, 1]
+    ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m
     domain = RENDERED_ROOMS
 
     def __post_init__(self) -> None:

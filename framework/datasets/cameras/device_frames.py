@@ -30,11 +30,11 @@ class DepthCamera(LiveVideo):
     """Depth registered to color by the library, with the factory's calibration."""
 
     brand: ClassVar[str]
-    serial: str = ""  # of the device, quoted; "" = the first one found
-    width: int = 640  # px, in [64, 4096], of the color image
-    height: int = 480  # px, in [64, 4096]
-    fps: int = 30  # Hz, in [1, 300]; size and rate must be a mode of the device, which the vendor's viewer lists
-    max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
+    serial: str = ""  # serial number of the device; "" = the first device found
+    width: int = 640  # width of the color image, px, in [64, 4096]
+    height: int = 480  # height of the color image, px, in [64, 4096]
+    fps: int = 30  # frame rate, Hz, in [1, 300]; size and rate must be a mode of the device
+    max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
 
     def __post_init__(self) -> None:
         check_bounds(self, width=(64, 4096), height=(64, 4096), fps=(1, 300))

@@ -45,11 +45,11 @@ log = logging.getLogger(__name__)
 class FolderWatch(LiveVideo):
     """Frames that another program writes into a folder of images while they are mapped."""
 
-    root: Path  # the folder, which must exist, relative to the working or project folder
-    idle_timeout: float = 0.0  # s, in [0, 86400], without a new frame before it ends; 0 = never
-    camera_timeout: float = 30.0  # s, in [0, 86400], to wait for camera.json
-    poll_interval: float = 0.01  # s, in [0.001, 0.1], between two polls of the folder
-    max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
+    root: Path  # existing folder of frames from another program, relative to the working or project folder
+    idle_timeout: float = 0.0  # maximum time without a new frame before the run ends, s, in [0, 86400]; 0 = unlimited
+    camera_timeout: float = 30.0  # maximum wait for camera.json, s, in [0, 86400]
+    poll_interval: float = 0.01  # interval between polls of the folder, s, in [0.001, 0.1]
+    max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
 
     def __post_init__(self) -> None:
         waits = (0.0, LONGEST_WAIT)

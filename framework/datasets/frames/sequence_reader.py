@@ -101,15 +101,15 @@ class Recording(RGBDSequence):
     read, so that the pipeline counts and skips it.
     """
 
-    root: Path  # the folder of the recording or of the scenes, relative to the working or project folder
+    root: Path  # folder of the recording or of the scenes, relative to the working or project folder
     scene: str = ""  # sub-folder of root; "" = root itself
-    start: int = 0  # first frame
-    stop: int = TO_THE_END  # frame to stop before; -1 = to the end
-    stride: int = 1  # use every stride-th frame
-    frame_fraction: float = 1.0  # in (0, 1], fraction of these frames, selected at random with `seed`
-    seed: int = 0  # of the random selection
-    max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
-    ground_truth: Path | None = None  # labeled mesh or run directory; None = the recording's own
+    start: int = 0  # index of the first frame
+    stop: int = TO_THE_END  # index after the last frame; -1 = to the end
+    stride: int = 1  # step between frames; 1 = every frame
+    frame_fraction: float = 1.0  # fraction of these frames, selected at random with `seed`, in (0, 1]
+    seed: int = 0  # seed of the random selection
+    max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
+    ground_truth: Path | None = None  # labeled mesh or run directory for the evaluation; None = the recording's own
     pose_reading: PoseReading = field(default_factory=PoseReading)
     depth_reading: DepthReading = field(default_factory=DepthReading)
 

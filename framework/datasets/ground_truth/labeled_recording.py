@@ -23,7 +23,7 @@ class LabeledRecording(Recording):
     The ground truth is the whole mesh, whatever frames are selected.
     """
 
-    frame_ground_truth: bool = False  # frames have the true instances: the mesh is rendered for detectors that need it
+    frame_ground_truth: bool = False  # true instances per frame, rendered from the mesh for simulated detectors
 
     def __post_init__(self) -> None:
         self.mesh: LabeledMesh | None = None

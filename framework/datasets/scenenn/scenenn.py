@@ -56,9 +56,9 @@ class SceneNN(LabeledRecording):
     A frame without an image, or without a usable pose where there is a trajectory, cannot be used.
     """
 
-    scene: str = "011"  # the sequence
-    sensor: SceneNNSensor = SceneNNSensor.ASUS  # names the file of intrinsics
-    release: str = ""  # of the annotation, for tables: two exist, with different results; "" = as in release.txt
+    scene: str = "011"  # number of the sequence
+    sensor: SceneNNSensor = SceneNNSensor.ASUS  # selects the intrinsics file
+    release: str = ""  # annotation release for tables (two exist, with different results); "" = from release.txt
 
     def open(self) -> Contents:
         if (self.root / MADE_BY).is_file():
