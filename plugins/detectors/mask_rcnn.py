@@ -40,18 +40,18 @@ class MaskRCNNDetector(Detector):
     distribution. After construction, `weights` is the file, and `domain` the images that it is for.
     """
 
-    weights: Path = Path("resnet50_fpn_coco")  # published name, or file; relative: to the working, then project folder
-    score_threshold: float = 0.1  # in [0, 1); low, because weak detections can still update existing instances
-    nms_iou: float = 0.5  # IoU in (0, 1] above which a box is suppressed by a better one of its class
-    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
-    proposals_before_nms: int = 1000  # >= 1, best anchors of each pyramid level that are decoded
-    proposals: int = 300  # >= 1, regions for the box head; 1000 as published, with little gain at twice the time
-    max_detections: int = 100  # >= 1, per image
-    short_side: int = 0  # px >= 32, to which images are resized; 0 = as in the network's training
-    long_side: int = 0  # px >= short_side, bound on the other side; 0 = in the proportion of the network's training
-    mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
-    half_precision: bool = True  # half precision on CUDA; the CPU always uses single precision
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda if available
+    weights: Path = Path("resnet50_fpn_coco")  # published name, or file relative to the working or project folder
+    score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
+    nms_iou: float = 0.5  # box IoU for suppression within a class, in (0, 1]
+    agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
+    proposals_before_nms: int = 1000  # maximum number of anchors per pyramid level before suppression, >= 1
+    proposals: int = 300  # maximum number of region proposals for the box head, >= 1; 1000 as published
+    max_detections: int = 100  # maximum number of detections per image, >= 1
+    short_side: int = 0  # short side of the resized image, px, >= 32; 0 = as in training
+    long_side: int = 0  # maximum long side of the resized image, px, >= short_side; 0 = as in training
+    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    half_precision: bool = True  # half precision on CUDA; the CPU uses single precision
+    device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 
     reads = ("color",)
 

@@ -68,17 +68,17 @@ class MaskRCNN2Go(Detector):
     start two map instances.
     """
 
-    weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # folder; relative: to the working, then project folder
-    score_threshold: float = 0.1  # in [0, 1); low, because weak detections can still update existing instances
-    nms_iou: float = 0.3  # IoU in (0, 1] above which a box is suppressed by a better one of its class
-    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
-    proposals: int = 120  # >= 1, regions for the box head; the network was trained with 100 to 120
-    max_detections: int = 100  # >= 1, per image
-    short_side: int = 320  # px >= 32, to which images are resized; the network was trained at 320
-    long_side: int = 640  # px >= short_side, bound on the other side
-    mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
-    int8: bool = True  # compute in 8-bit integers if the CPU has VNNI, three times as fast per core
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda if available
+    weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # relative to the working or project folder
+    score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
+    nms_iou: float = 0.3  # box IoU for suppression within a class, in (0, 1]
+    agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
+    proposals: int = 120  # maximum number of region proposals for the box head, >= 1; 100 to 120 in training
+    max_detections: int = 100  # maximum number of detections per image, >= 1
+    short_side: int = 320  # short side of the resized image, px, >= 32; 320 in training
+    long_side: int = 640  # maximum long side of the resized image, px, >= short_side
+    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    int8: bool = True  # 8-bit integer arithmetic on CPUs with VNNI, three times as fast per core; False = float
+    device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 
     reads = ("color",)
 

@@ -31,24 +31,24 @@ class OnnxBoxes(Detector):
     `boxes_without_depth`. The defaults are those of Megvii's YOLOX.
     """
 
-    weights: Path = field(metadata={"where": WHERE})  # ONNX file; relative: to the working, then project folder
-    sha256: str = ""  # expected hash of the file; "" = any
-    label_space: str = "coco"  # the network's classes: a label space, or a text file with one name per line
-    layout: OutputLayout = OutputLayout.yolox  # of the outputs
-    score_threshold: float = 0.1  # in (0, 1); low, because weak detections can still update existing instances
-    nms_iou: float = 0.45  # IoU in (0, 1] above which a box is suppressed by a better one of its class
-    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
-    max_detections: int = 100  # >= 1, per image
-    input_size: int = 0  # px, side of the input of a network that takes any size; 0 = the network's own
-    placement: Placement = Placement.top_left  # of the image in the input
-    padding: int = 114  # in [0, 255], gray value around the image
+    weights: Path = field(metadata={"where": WHERE})  # ONNX file, relative to the working or project folder
+    sha256: str = ""  # expected SHA-256 of the file; "" = not checked
+    label_space: str = "coco"  # class names: a label space, or a text file with one name per line
+    layout: OutputLayout = OutputLayout.yolox  # layout of the outputs
+    score_threshold: float = 0.1  # minimum score, in (0, 1); low, because weak detections can update instances
+    nms_iou: float = 0.45  # box IoU for suppression within a class, in (0, 1]
+    agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
+    max_detections: int = 100  # maximum number of detections per image, >= 1
+    input_size: int = 0  # side of the input of a network with variable input size, px; 0 = the network's own
+    placement: Placement = Placement.top_left  # position of the image in the input
+    padding: int = 114  # gray value of the padding, in [0, 255]
     bgr: bool = True  # channel order: True = BGR, False = RGB
-    black_level: float = 0.0  # the network's input value for a channel of 0
-    white_level: float = 255.0  # the network's input value for 255; 1 if it takes 0..1
-    min_foreground_fraction: float = 0.4  # in [0, 1], smallest center-weighted fraction of readings in the foreground
-    max_slant: float = 85.0  # degrees in (0, 90) to the image plane; a steeper surface separates two objects
-    min_readings: float = 0.1  # in [0, 1], smallest fraction of the box's pixels with depth; else the box is dropped
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda if onnxruntime has it
+    black_level: float = 0.0  # input of the network for a channel value of 0
+    white_level: float = 255.0  # input of the network for a channel value of 255; 1 for networks with inputs in 0..1
+    min_foreground_fraction: float = 0.4  # minimum center-weighted fraction of readings in the foreground, in [0, 1]
+    max_slant: float = 85.0  # maximum angle of a surface to the image plane, degrees, in (0, 90)
+    min_readings: float = 0.1  # minimum fraction of the box's pixels with depth, in [0, 1]; others are dropped
+    device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if onnxruntime supports it
     reads = ("color", "depth", "camera")
 
     def __post_init__(self) -> None:

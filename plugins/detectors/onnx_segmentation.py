@@ -35,24 +35,24 @@ class OnnxSegmentation(Detector):
     Ultralytics' exports, whose code and weights (AGPL) are not part of this project.
     """
 
-    weights: Path  # ONNX file; relative: to the working, then project folder
-    sha256: str = ""  # expected hash of the file; "" = any
-    label_space: str = "coco"  # the network's classes: a label space, or a text file with one name per line
-    objectness: bool = False  # True = an objectness precedes the class scores, as in YOLOv5
-    box_format: BoxKind = BoxKind.AUTO  # the four numbers of a box
-    class_spread: float = 1.0  # in [0, 1], with suppression inside: fraction of 1 - score for the other classes
-    score_threshold: float = 0.1  # in (0, 1); low, because weak detections can still update existing instances
-    nms_iou: float = 0.45  # IoU in (0, 1] above which a box is suppressed by a better one of its class
-    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
-    max_detections: int = 100  # >= 1, per image
-    mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
-    input_size: int = 0  # px, side of the input of a network that takes any size; 0 = the network's own
-    placement: Placement = Placement.center  # of the image in the input
-    padding: int = 114  # in [0, 255], gray value around the image
+    weights: Path  # ONNX file, relative to the working or project folder
+    sha256: str = ""  # expected SHA-256 of the file; "" = not checked
+    label_space: str = "coco"  # class names: a label space, or a text file with one name per line
+    objectness: bool = False  # objectness before the class scores, as in YOLOv5
+    box_format: BoxKind = BoxKind.AUTO  # box format; AUTO = detected
+    class_spread: float = 1.0  # fraction of 1 - score for other classes if suppression is in the network, in [0, 1]
+    score_threshold: float = 0.1  # minimum score, in (0, 1); low, because weak detections can update instances
+    nms_iou: float = 0.45  # box IoU for suppression within a class, in (0, 1]
+    agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
+    max_detections: int = 100  # maximum number of detections per image, >= 1
+    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    input_size: int = 0  # side of the input of a network with variable input size, px; 0 = the network's own
+    placement: Placement = Placement.center  # position of the image in the input
+    padding: int = 114  # gray value of the padding, in [0, 255]
     bgr: bool = False  # channel order: True = BGR, False = RGB
-    black_level: float = 0.0  # the network's input value for a channel of 0
-    white_level: float = 1.0  # the network's input value for 255
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda if onnxruntime has it
+    black_level: float = 0.0  # input of the network for a channel value of 0
+    white_level: float = 1.0  # input of the network for a channel value of 255; 255 for networks with inputs in 0..255
+    device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if onnxruntime supports it
     reads = ("color",)
 
     def __post_init__(self) -> None:

@@ -31,17 +31,17 @@ class OpenVocabulary(Detector):
     The score is the largest p. Words that are COCO names are evaluated as these classes; others are not evaluated.
     """
 
-    text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # to search for, all different
-    model: str = "google/owlv2-base-patch16-ensemble"  # OWLv2: id on huggingface.co, or a folder
-    revision: str = "main"  # branch, tag or commit of a model id
-    mask_model: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2 or EdgeTAM (needs timm): id or folder; "" = from depth
-    mask_model_revision: str = "main"  # branch, tag or commit of a model id for masks
-    score_threshold: float = 0.1  # in (0, 1)
-    nms_iou: float = 0.5  # IoU in (0, 1] above which a box is suppressed by a better one of any word
-    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a mask is suppressed by a better one; 1 = off
-    max_detections: int = 50  # >= 1, per image
-    half_precision: bool = True  # half precision on CUDA
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda if available
+    text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct names of objects
+    model: str = "google/owlv2-base-patch16-ensemble"  # OWLv2 model: id on huggingface.co or folder
+    revision: str = "main"  # branch, tag or commit of the model id
+    mask_model: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2, EdgeTAM: id or folder; "" = masks from depth
+    mask_model_revision: str = "main"  # branch, tag or commit of the mask model id
+    score_threshold: float = 0.1  # minimum probability of the best query for a box, in (0, 1)
+    nms_iou: float = 0.5  # box IoU for suppression across queries, in (0, 1]
+    agnostic_nms_iou: float = 0.6  # mask IoU for suppression across queries, in (0, 1]; 1 = off
+    max_detections: int = 50  # maximum number of detections per image, >= 1
+    half_precision: bool = True  # half precision on CUDA; the CPU uses single precision
+    device: str = "auto"  # device of the networks: auto, cpu or cuda; auto = cuda if available
     reads = ("color", "depth", "camera")
 
     def __post_init__(self) -> None:

@@ -42,11 +42,11 @@ class Precomputed(Detector):
     of the frames up to its last one had an entry.
     """
 
-    path: Path  # JSON file or folder
-    label_space: str = "coco"  # of the file: a label space, or a text file with one name per line
-    category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id, used without category_name
-    score_threshold: float = 0.0  # in [0, 1]; detections below are dropped
-    class_spread: float = 1.0  # in [0, 1], fraction of 1 - score for the other classes
+    path: Path  # COCO result file, or folder of masks
+    label_space: str = "coco"  # label space of the file, or a text file with one name per line
+    category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id
+    score_threshold: float = 0.0  # minimum score of a detection, in [0, 1]
+    class_spread: float = 1.0  # fraction of 1 - score for other classes of detections with label and score only
 
     reads = ("index", "camera")
 

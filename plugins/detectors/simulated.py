@@ -99,30 +99,32 @@ class SimulatedDetector(Detector):
     (seed, purpose, frame, instance), independent of the order of calls. Raises DataError without ground truth.
     """
 
-    seed: int = 0  # >= 0
-    min_pixels: int = 64  # px >= 1, smaller instances are never detected
-    clutter_rate: float = 0.0  # in [0, 1], fraction of the things of unknown class that are detected as objects
-    attach_rate: float = 0.0  # in [0, 1], fraction of touching pairs of object and thing that share a mask
-    merge_rate: float = 0.1  # in [0, 1], probability that two touching objects share a mask
-    miss_rate: float = 0.1  # in [0, 1], probability to miss a large, whole object
-    small_side: float = 24.0  # px >= 0, side at which 1/e of the objects are missed; 0 = independent of size
-    truncated_miss_rate: float = 0.15  # in [0, 1], additional probability to miss an object at the image border
-    miss_spread: float = 0.0  # >= 0, standard deviation over objects of the logit of being seen
-    split_rate: float = 0.05  # in [0, 1], probability that an object is split in two
-    shift: float = 1.5  # px >= 0, standard deviation along x and y
-    bleed: float = 2.0  # px, distance of masks beyond the object's border; negative = inside
-    boundary_noise: float = 2.5  # px >= 0, standard deviation of the border's wobble
-    boundary_scale: float = 12.0  # px >= 2, correlation length of the wobble
-    mask_grid: int = 28  # cells >= 4 per side of the network's mask; 0 = full resolution
-    confusion: float = 0.25  # in [0, 1), mean probability of wrong classes
-    confusion_concentration: float = 3.0  # > 0, of the Dirichlet: small = confident, often wrong
-    confusion_consistency: float = 0.5  # in [0, 1], fraction of an object's frames with the same distribution
-    score_scale: float = 1.0  # in (0, 1], of the mean score: quality x certainty x this
-    score_concentration: float = 20.0  # >= 0, of the Beta around the mean; 0 = no noise
-    score_threshold: float = 0.1  # in [0, 1), detections below are dropped
-    false_positives: float = 0.5  # >= 0, mean number per image
-    false_positive_score: float = 0.25  # in (0, 1), mean
-    recurring_fraction: float = 0.0  # in [0, 1], fraction of false positives at fixed locations with fixed classes
+    seed: int = 0  # seed of the simulated errors, >= 0
+    min_pixels: int = 64  # minimum size of a detected instance, px, >= 1
+    clutter_rate: float = 0.0  # fraction of things of unknown class with a detection, in [0, 1]
+    attach_rate: float = 0.0  # fraction of touching pairs of object and unknown thing with a common mask, in [0, 1]
+    merge_rate: float = 0.1  # probability of a common mask of two touching objects, in [0, 1]
+    miss_rate: float = 0.1  # probability of missing a large object inside the image, in [0, 1]
+    small_side: float = (
+        24.0  # side of objects with a size-related miss probability of 1/e, px, >= 0; 0 = independent of size
+    )
+    truncated_miss_rate: float = 0.15  # additional probability of missing an object at the image border, in [0, 1]
+    miss_spread: float = 0.0  # standard deviation over objects of the logit of the detection rate, >= 0
+    split_rate: float = 0.05  # probability of two detections for the two halves of an object, in [0, 1]
+    shift: float = 1.5  # standard deviation of the mask shift along x and y, px, >= 0
+    bleed: float = 2.0  # distance of the mask border outside the object, px; negative = inside
+    boundary_noise: float = 2.5  # standard deviation of the mask border, px, >= 0
+    boundary_scale: float = 12.0  # correlation length of the mask border's noise, px, >= 2
+    mask_grid: int = 28  # cells per side of the network's mask, >= 4; 0 = full resolution
+    confusion: float = 0.25  # mean probability of wrong classes, in [0, 1)
+    confusion_concentration: float = 3.0  # concentration of the Dirichlet distribution of classes, > 0
+    confusion_consistency: float = 0.5  # fraction of an object's frames with the same class distribution, in [0, 1]
+    score_scale: float = 1.0  # scale of the mean score (mask IoU times class probability), in (0, 1]
+    score_concentration: float = 20.0  # concentration of the Beta distribution of scores, >= 0; 0 = no noise
+    score_threshold: float = 0.1  # minimum score of a detection, in [0, 1)
+    false_positives: float = 0.5  # mean number of false positives per image, >= 0
+    false_positive_score: float = 0.25  # mean score of false positives, in (0, 1)
+    recurring_fraction: float = 0.0  # fraction of false positives at fixed locations with fixed classes, in [0, 1]
 
     def __post_init__(self) -> None:
         require(self.seed >= 0, "detector.seed", self.seed, "at least 0")

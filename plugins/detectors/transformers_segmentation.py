@@ -36,8 +36,8 @@ class Family:
     auto_class: str  # of transformers
     logits: str  # the output with the classes' logits, (1, Q, C or C + 1)
     masks: str  # the output with the masks' logits, (1, Q, h, w)
-    any_size: bool  # whether they take images of any size
-    mask_quality: bool  # whether the published score includes the mean probability of the mask's pixels
+    any_size: bool  # support for images of any size
+    mask_quality: bool  # multiplication of the score by the mean probability of the mask's pixels, as published
 
 
 UNIVERSAL, INSTANCE = "AutoModelForUniversalSegmentation", "AutoModelForInstanceSegmentation"
@@ -69,16 +69,16 @@ class TransformersSegmentation(Detector):
     of the mask's pixels, as published.
     """
 
-    model: str = "facebook/mask2former-swin-tiny-coco-instance"  # id on huggingface.co, or a folder
-    revision: str = "main"  # branch, tag or commit of a model id
-    score_threshold: float = 0.1  # in [0, 1); low, because weak detections can still update existing instances
-    agnostic_nms_iou: float = 0.6  # IoU in (0, 1] above which a better mask of any class suppresses a mask; 1 = off
-    max_detections: int = 100  # >= 1, per image: the queries with the best class
-    short_side: int = 0  # px, to which images are resized; 0 = as published
-    long_side: int = 0  # px >= short_side, bound on the other side; 0 if short_side is 0
-    mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
-    half_precision: bool = True  # half precision on CUDA
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda if available
+    model: str = "facebook/mask2former-swin-tiny-coco-instance"  # model id on huggingface.co, or a folder
+    revision: str = "main"  # branch, tag or commit of the model id
+    score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
+    agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
+    max_detections: int = 100  # maximum number of detections per image, >= 1: the queries with the best class
+    short_side: int = 0  # short side of the resized image, px; 0 = as published
+    long_side: int = 0  # maximum long side of the resized image, px, >= short_side; 0 if short_side is 0
+    mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
+    half_precision: bool = True  # half precision on CUDA; the CPU uses single precision
+    device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
     reads = ("color",)
 
     def __post_init__(self) -> None:

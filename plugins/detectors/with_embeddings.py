@@ -18,17 +18,17 @@ from framework.interfaces import Detector
 class WithEmbeddings(Detector):
     """Adds the image embedding of a CLIP or SigLIP to each detection of another detector; extra `transformers`."""
 
-    detector: Detector  # finds the objects; detector@detector.detector=NAME selects another one
-    model: str = "google/siglip2-base-patch16-224"  # id on huggingface.co, or a folder
-    revision: str = "main"  # branch, tag or commit of a model id
-    frame_interval: int = 1  # frames, >= 1: only frames whose number is a multiple are embedded
-    min_score: float = 0.3  # in [0, 1], of embedded detections; weaker ones are wrong too often
-    min_pixels: int = 200  # px >= 1, of an embedded mask
-    context: float = 1.2  # >= 1, side of the square crop over the longer side of the object's box
-    background_contrast: float = 0.4  # in [0, 1], remaining contrast of the background: 0 = gray, 1 = unchanged
-    batch_size: int = 16  # crops at once, >= 1
-    half_precision: bool = True  # half precision on CUDA
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda if available
+    detector: Detector  # wrapped detector; replace it with detector@detector.detector=NAME
+    model: str = "google/siglip2-base-patch16-224"  # model: id on huggingface.co or folder
+    revision: str = "main"  # branch, tag or commit of the model id
+    frame_interval: int = 1  # interval between embedded frames, frames, >= 1; 1 = every frame
+    min_score: float = 0.3  # minimum score of an embedded detection, in [0, 1]; weaker ones are wrong too often
+    min_pixels: int = 200  # minimum mask size of an embedded detection, px, >= 1
+    context: float = 1.2  # side of the square crop over the longer side of the object's box, >= 1
+    background_contrast: float = 0.4  # contrast of the background in the crop, in [0, 1]; 0 = gray, 1 = unchanged
+    batch_size: int = 16  # crops per batch, >= 1
+    half_precision: bool = True  # half precision on CUDA; the CPU uses single precision
+    device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 
     def __post_init__(self) -> None:
         check_bounds(
