@@ -105,12 +105,10 @@ class SimulatedDetector(Detector):
     attach_rate: float = 0.0  # fraction of touching pairs of object and unknown thing with a common mask, in [0, 1]
     merge_rate: float = 0.1  # probability of a common mask of two touching objects, in [0, 1]
     miss_rate: float = 0.1  # probability of missing a large object inside the image, in [0, 1]
-    small_side: float = (
-        24.0  # side of objects with a size-related miss probability of 1/e, px, >= 0; 0 = independent of size
-    )
+    small_side: float = 24.0  # side of objects with a size-related miss probability of 1/e, px, >= 0; 0 = no effect
     truncated_miss_rate: float = 0.15  # additional probability of missing an object at the image border, in [0, 1]
     miss_spread: float = 0.0  # standard deviation over objects of the logit of the detection rate, >= 0
-    split_rate: float = 0.05  # probability of two detections for the two halves of an object, in [0, 1]
+    split_rate: float = 0.05  # probability of splitting an object into two detections, in [0, 1]
     shift: float = 1.5  # standard deviation of the mask shift along x and y, px, >= 0
     bleed: float = 2.0  # distance of the mask border outside the object, px; negative = inside
     boundary_noise: float = 2.5  # standard deviation of the mask border, px, >= 0

@@ -29,11 +29,9 @@ class BayesianTsdf(MapFuser):
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)
-    class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
-    instance_floor: float = 0.05  # in [0, 1): likelihood of any other instance; 0 = the rest of the score, divided
-    absence_likelihood: float = (
-        0.7  # in (0, 1]: P(outside the mask | of the matched instance); 1 = no evidence of absence
-    )
+    class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
+    instance_floor: float = 0.05  # likelihood of every other instance, in [0, 1); 0 = 1 - score, divided equally
+    absence_likelihood: float = 0.7  # P(outside the mask | matched instance), in (0, 1]; 1 = no evidence of absence
 
     def __post_init__(self) -> None:
         check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(0.0, 0.999), absence_likelihood=(1e-6, 1.0))

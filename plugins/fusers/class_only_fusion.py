@@ -27,10 +27,10 @@ class ClassOnlyFusion(MapFuser):
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
-    min_area: float = 0.01  # m^2 of surface in the mesh, >= 0, for an instance to count: voxel_size^2 a vertex
-    class_floor: float = 0.1  # in (0, 1): fraction of the uniform distribution mixed into a measured one
-    missed: float = 0.7  # in (0, 1]: P(no mask | surface of any class) over that of the background; 1 = no evidence
-    smoothness: float = 0.0  # >= 0: log-odds for each neighboring vertex of the same class; 0 = no regularization
+    min_area: float = 0.01  # minimum surface area of an instance in the mesh, m^2, >= 0: voxel_size^2 per vertex
+    class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
+    missed: float = 0.7  # P(no mask | surface of any class) / P(no mask | background), in (0, 1]
+    smoothness: float = 0.0  # log-odds per neighboring vertex of the same class, >= 0; 0 = no regularization
 
     def __post_init__(self) -> None:
         check_bounds(self, class_floor=(1e-6, 0.999), missed=MISSED, min_area=AREA, smoothness=SMOOTHNESS)

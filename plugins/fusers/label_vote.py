@@ -36,7 +36,7 @@ class LabelVote(MapFuser):
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)
-    vote: Vote = Vote.COUNT
+    vote: Vote = Vote.COUNT  # rule for the label of a voxel
 
     def __post_init__(self) -> None:
         self.scene: InstanceMap = self.voxels.new_map(RULES[self.vote])

@@ -33,14 +33,14 @@ class ObjectVolumes(MapFuser):
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
-    min_overlap: float = 0.2  # in [0, 1]: a detection may belong to an object above this overlap
-    overlap_rule: OverlapRule = OverlapRule.IOU  # what an overlap is counted over
-    require_same_class: bool = False  # whether their most likely classes must be the same
-    create_score: float = 0.3  # in [0, 1]: a detection needs this to create an object; any may update one
-    create_points: int = 50  # pixels, >= 1: and this many; an object is seen, or missed, with this many in view
-    min_existence: float = 0.1  # in [0, 1]: an object that exists with less probability is forgotten
-    min_observations: int = 3  # frames, >= 1: before that an object is tentative, as in our own map
-    min_area: float = 0.01  # m^2 of surface in the mesh, >= 0: smaller objects are tentative
+    min_overlap: float = 0.2  # minimum overlap of a detection and an object to match, in [0, 1]
+    overlap_rule: OverlapRule = OverlapRule.IOU  # denominator of the overlap
+    require_same_class: bool = False  # match only if the most likely classes are the same
+    create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; any score can update one
+    create_points: int = 50  # minimum size of a detection to create an object, px, >= 1; also of one in view
+    min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; others are removed
+    min_observations: int = 3  # minimum number of frames with a detection of a confirmed object, >= 1
+    min_area: float = 0.01  # minimum surface area of a confirmed object in the mesh, m^2, >= 0
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -26,10 +26,10 @@ class Open3DVoxelBlockGrid(MapFuser):
     tsdf: Tsdf = field(default_factory=Tsdf)
     association: Association = field(default_factory=Association)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    block_resolution: int = 8  # voxels a side, 2 to 64: 16, Open3D's, takes twice the voxels and half as long again
-    max_blocks: int = 200_000  # blocks, > 0: 14 KiB each, and Open3D copies the map to make room: 5.7 GB at its end
-    min_weight: float = 1.0  # frames, >= 1, that must have seen a voxel: Open3D's 3 loses what is seen briefly
-    class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
+    block_resolution: int = 8  # side of a block, voxels, in [2, 64]; 16, Open3D's default, doubles the voxels
+    max_blocks: int = 200_000  # maximum number of blocks, > 0; 14 KiB each, up to 5.7 GB when Open3D copies the map
+    min_weight: float = 1.0  # minimum number of observations of a surface voxel, >= 1; Open3D's default is 3
+    class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
 
     def __post_init__(self) -> None:
         from framework.baselines.open3d_grid import BlockGridSettings

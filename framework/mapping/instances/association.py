@@ -182,20 +182,16 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 class Association:
     """Clusters update matched instances or create new ones; instances that are detected as one are merged."""
 
-    association: InstanceSource = InstanceSource.SURFACE_LOOKUP  # what clusters are compared with
-    min_overlap: float = 0.35  # in [0, 1]: a cluster updates an instance above this overlap
-    overlap_rule: OverlapRule = OverlapRule.SMALLER  # what an overlap is counted over
-    min_class_agreement: float = (
-        0.0  # in [0, 1]: and if their classes agree so much (Bhattacharyya coefficient); 0 = whatever
-    )
-    create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one
-    create_points: int = 50  # pixels, >= 1: and this many; overlaps with less of an instance are counted over this many
-    split_instances: bool = (
-        True  # whether two clusters on one instance split it: the better one keeps it, the other is new
-    )
-    merge_overlap: float = 1.0  # in [0, 1]: two instances under one cluster above this are one object; 1 = off ...
-    merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart ...
-    merge_agreement: float = 0.1  # in [0, 1]: ... and if their classes agree so much (Bhattacharyya coefficient)
+    association: InstanceSource = InstanceSource.SURFACE_LOOKUP  # source of the compared instances
+    min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
+    overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
+    min_class_agreement: float = 0.0  # minimum Bhattacharyya coefficient of the classes to match, in [0, 1]
+    create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; any score can update one
+    create_points: int = 50  # minimum cluster size to create an instance, px, >= 1; also minimum overlap denominator
+    split_instances: bool = True  # new instance for the second of two clusters on one instance; False = none
+    merge_overlap: float = 1.0  # minimum overlap of two instances with one cluster to merge, in [0, 1]; 1 = no merging
+    merge_frames: int = 3  # minimum frames with a joint cluster, minus frames with separate ones, to merge, >= 1
+    merge_agreement: float = 0.1  # minimum Bhattacharyya coefficient of the classes to merge, in [0, 1]
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -33,9 +33,9 @@ class Confirmation:
     `min_confidence` is low: unlikely instances rank last and cost little precision; omitted instances are lost.
     """
 
-    min_observations: int = 3  # frames in which it was detected, >= 1
-    min_confidence: float = 0.05  # in [0, 1]: InstanceRecord.confidence
-    min_area: float = 0.01  # m^2 of its surface in the mesh, >= 0: voxel_size^2 per vertex
+    min_observations: int = 3  # minimum number of frames with a detection of a confirmed instance, >= 1
+    min_confidence: float = 0.05  # minimum InstanceRecord.confidence of a confirmed instance, in [0, 1]
+    min_area: float = 0.01  # minimum surface area of a confirmed instance, m^2, >= 0: voxel_size^2 per mesh vertex
 
     def __post_init__(self) -> None:
         check_bounds(self, min_observations=(1, 2**31), min_confidence=(0.0, 1.0), min_area=(0.0, 1000.0))

@@ -75,15 +75,11 @@ class LabeledVoxels:
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    occlusion_area_ratio: float = (
-        0.25  # in [0, 1]: where clusters overlap, one smaller than this share of another takes the pixels
-    )
-    support_overlap: float = (
-        0.6  # in [0, 1]: an instance covered so much by a cluster of another class lies on it; 1 = off
-    )
-    update_unmatched: bool = False  # whether a cluster without an instance also updates the classes of its voxels
-    instance_class: InstanceClass = InstanceClass.DETECTIONS  # what the class of an instance is computed from
-    storage: Storage = Storage.COMPACT  # COMPACT: the best few labels a voxel; EXACT: all of them, for comparison
+    occlusion_area_ratio: float = 0.25  # maximum area ratio of clusters to give the smaller one the pixels, in [0, 1]
+    support_overlap: float = 0.6  # minimum fraction of an instance covered by a larger mask of another class; 1 = off
+    update_unmatched: bool = False  # class updates of voxels by clusters without an instance
+    instance_class: InstanceClass = InstanceClass.DETECTIONS  # source of an instance's class
+    storage: Storage = Storage.COMPACT  # COMPACT = top few labels of a voxel, EXACT = all, for comparison
 
     def __post_init__(self) -> None:
         check_bounds(self, occlusion_area_ratio=(0.0, 1.0), support_overlap=(0.0, 1.0))
