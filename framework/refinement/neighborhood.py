@@ -125,11 +125,11 @@ class Surroundings:
 class Ring:
     """The band around a mask, and the points of both that a refiner uses."""
 
-    ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area; 0 = no ring
-    min_ring: int = 4  # px, from 1, smallest width of a ring
-    max_ring: int = 12  # px, largest width
-    max_points: int = 1000  # from 100, of a mask and its ring for the fit; all points of the mask are judged
-    min_points: int = 30  # from 10, of a mask and of its ring; smaller ones are not judged
+    ring_fraction: float = 0.25  # width of the ring over the square root of the mask's area, >= 0; 0 = no ring
+    min_ring: int = 4  # minimum width of the ring, px, >= 1
+    max_ring: int = 12  # maximum width of the ring, px, >= min_ring
+    max_points: int = 1000  # maximum number of points of a mask and its ring in the fit, >= 100
+    min_points: int = 30  # minimum number of points of a mask and of its ring, >= 10; smaller clusters stay unchanged
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -24,11 +24,11 @@ class Connected(ClusterRefiner):
     All points vote: with the nearest quarter alone, leaves of a plant get lost.
     """
 
-    max_gap: float = 0.1  # m, from 0, depth step between connected pixels ...
-    gap_per_depth: float = 0.02  # m per m, from 0, ... plus this times the depth
-    connection_radius: int = 2  # px, from 1, between connected pixels; 2 bridges single missing readings
-    min_piece_ratio: float = 0.05  # in [0, 1], of the largest piece's points; a smaller piece is dropped
-    max_depth_slope: float = 2.0  # m per m, from 0, depth over distance across between two pieces of one object
+    max_gap: float = 0.1  # maximum depth step between connected pixels at depth 0, m, >= 0
+    gap_per_depth: float = 0.02  # increase of the maximum depth step with depth, m per m, >= 0
+    connection_radius: int = 2  # maximum distance of connected pixels, px, >= 1; 2 bridges single missing readings
+    min_piece_ratio: float = 0.05  # minimum size relative to the largest piece, in [0, 1]; smaller pieces are dropped
+    max_depth_slope: float = 2.0  # maximum depth difference over distance across of two pieces, m per m, >= 0
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -27,11 +27,11 @@ class Dbscan(ClusterRefiner):
     has the weight of the points it stands for.
     """
 
-    eps: float = 0.04  # m, from 0.001
-    eps_per_depth: float = 0.01  # m per m, from 0; the spacing of readings grows with depth
-    min_points: int = 10  # from 1, within eps of a core point, including itself
-    stride: int = 2  # px, from 1; 1 = all points
-    max_points: int = 20000  # from 100, of a cluster that are searched; limits memory for pairs within eps
+    eps: float = 0.04  # neighborhood radius at depth 0, m, >= 0.001
+    eps_per_depth: float = 0.01  # increase of the radius with depth, m per m, >= 0, like the spacing of readings
+    min_points: int = 10  # minimum number of neighbors of a core point, itself included, >= 1
+    stride: int = 2  # pixel step of the searched points, px, >= 1; 1 = all points
+    max_points: int = 20000  # maximum number of searched points of a cluster, >= 100; limits memory
 
     def __post_init__(self) -> None:
         check_bounds(

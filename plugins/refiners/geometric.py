@@ -23,16 +23,16 @@ class Geometric(ClusterRefiner):
     if the cluster's points determine the camera's pose. A mask without a segment loses all points.
     """
 
-    cell_size: int = 2  # px, from 1, side of the squares whose readings are averaged
-    window_radius: int = 3  # cells, from 1, of the squares that planes are fitted to
-    noise_factor: float = 3.0  # from 0.1, standard deviations of a structured-light camera's depth that count as noise
-    min_noise: float = 0.0  # m, from 0, smallest standard deviation of depth; half a step if readings are rounded
-    max_slope: float = 4.0  # m per m, from 0.1; where the surface is steeper, depth jumps (4: 76 degrees)
-    max_angle: float = 15.0  # degrees, in (0, 90); a surface with a larger concave angle, and more than noise, is cut
-    closing_radius: int = 1  # cells, from 0; gaps in edges up to twice as wide are closed
-    min_segment: int = 100  # px, from 1; smaller segments are merged with their neighbors
-    min_overlap: float = 0.8  # in [0, 1), ratio of a segment that its mask must cover
-    grow_to_segments: bool = True  # add the segments' pixels outside of the mask
+    cell_size: int = 2  # side of the cells of averaged readings, px, >= 1
+    window_radius: int = 3  # radius of the square windows for plane fits, cells, >= 1
+    noise_factor: float = 3.0  # noise threshold of depth, standard deviations of a structured-light camera, >= 0.1
+    min_noise: float = 0.0  # minimum standard deviation of depth, m, >= 0; half a step for rounded readings
+    max_slope: float = 4.0  # maximum slope of a surface, m per m, >= 0.1; steeper = depth jump (4 = 76 degrees)
+    max_angle: float = 15.0  # maximum concave angle within a segment, beyond noise, degrees, in (0, 90)
+    closing_radius: int = 1  # radius of the morphological closing of edges, cells, >= 0
+    min_segment: int = 100  # minimum size of a segment, px, >= 1; smaller ones are merged with their neighbors
+    min_overlap: float = 0.8  # minimum fraction of a segment under its mask, in [0, 1)
+    grow_to_segments: bool = True  # addition of the segments' pixels outside the mask
 
     def __post_init__(self) -> None:
         check_bounds(

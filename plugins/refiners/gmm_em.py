@@ -28,16 +28,16 @@ class GmmEm(ClusterRefiner):
     components, only outliers compete with the object.
     """
 
-    object_components: int = 3  # from 1; the visible faces of an object, which one Gaussian covers badly
-    background_components: int = 6  # from 0; occluders, supporting surface, neighbors, walls; 0 = no ring either
-    start_iterations: int = 1  # from 1, of k-means at the start; 1 = groups of equal size by depth alone
-    max_iterations: int = 8  # from 1
-    tolerance: float = 1e-3  # nats per point; EM ends when the mean log-likelihood increases by less
-    std_floor: float = 0.01  # m, smallest standard deviation of a component along any axis
-    outlier_fraction: float = 0.0  # in [0, 1), of the points, at the start; 0 = no uniform component
-    min_posterior: float = 0.5  # in (0, 1), of the object; points at or below it are dropped
-    mask_log_odds: float = 4.0  # nats, from 0; 0 = the mask is the start only
-    expected_bleed: float = 0.4  # in [0, 1), distance inside of the mask where its log-odds are 0, in ring widths
+    object_components: int = 3  # number of Gaussians of the object, >= 1; about one per visible face
+    background_components: int = 6  # number of Gaussians of the background, >= 0; 0 = no ring
+    start_iterations: int = 1  # iterations of k-means at the start, >= 1; 1 = groups of equal size by depth
+    max_iterations: int = 8  # maximum number of EM iterations, >= 1
+    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
+    std_floor: float = 0.01  # minimum standard deviation of a Gaussian along any axis, m
+    outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 1); 0 = no uniform component
+    min_posterior: float = 0.5  # minimum posterior of the object for a kept point, in (0, 1)
+    mask_log_odds: float = 4.0  # prior log-odds of the object deep in the mask, nats, >= 0; 0 = mask for the start only
+    expected_bleed: float = 0.4  # distance inside the mask with log-odds 0, ring widths, in [0, 1)
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

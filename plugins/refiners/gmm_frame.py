@@ -37,17 +37,17 @@ class GmmFrame(ClusterRefiner):
     after Eckart et al., CVPR 2016).
     """
 
-    levels: int = 2  # from 1; 1 = flat
-    children: int = 8  # of a node: 2, 4 or 8
-    gaussians_per_mask: int = 1  # from 1, of level 1
-    initialization: Initialization = Initialization.MASKS  # of level 1
+    levels: int = 2  # levels of hierarchical EM, >= 1; 1 = flat
+    children: int = 8  # children of a node: 2, 4 or 8
+    gaussians_per_mask: int = 1  # Gaussians of level 1 per mask, >= 1
+    initialization: Initialization = Initialization.MASKS  # initial groups of level 1
     foreign_points: ForeignPoints = ForeignPoints.MOVE  # points of another mask's Gaussian
-    max_iterations: int = 10  # from 1, of EM in a node
-    tolerance: float = 1e-3  # nats per point; EM ends when the mean log-likelihood increases by less
-    std_floor: float = 0.005  # m, smallest standard deviation of a Gaussian along any axis
-    min_support: float = 1e-4  # in [0, 1), of the frame's points; a Gaussian with less is dropped
-    min_points: int = 30  # from 1, of a cluster; one left with fewer is dropped
-    max_points: int = 20_000  # from 100, of a frame for the fit; all points are assigned
+    max_iterations: int = 10  # maximum number of EM iterations in a node, >= 1
+    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
+    std_floor: float = 0.005  # minimum standard deviation of a Gaussian along any axis, m
+    min_support: float = 1e-4  # minimum fraction of the frame's points in a Gaussian, in [0, 1); others are dropped
+    min_points: int = 30  # minimum number of points of a refined cluster, >= 1; smaller ones are dropped
+    max_points: int = 20_000  # maximum number of points of a frame for the fit, >= 100; all points are assigned
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -27,18 +27,18 @@ class GmmTree(ClusterRefiner):
     a node have the node's ratio. Clusters with fewer than `min_points` points in the mask or the ring stay unchanged.
     """
 
-    levels: int = 2  # from 1, of a tree
-    children: int = 8  # from 2, of a node; J of Eckart et al. 2016
-    max_iterations: int = 8  # from 1, of EM in a node
-    tolerance: float = 1e-3  # nats per point; EM ends when the mean log-likelihood increases by less
-    std_floor: float = 0.01  # m, smallest standard deviation of a node along any axis
-    outlier_fraction: float = 0.02  # in [0, 1), of a node's points, at the start
-    min_support: float = 1e-4  # in [0, 1), of the tree's points; a node with less is dropped
-    min_node: int = 32  # from 8, points of a node with children
-    parent_points: float = 4.0  # from 0, weight of the parent's object ratio, in points
-    min_posterior: float = 0.5  # in (0, 1), of the object; points at or below it are dropped
-    mask_log_odds: float = 2.0  # nats, from 0, of a point deep in the mask
-    expected_bleed: float = 0.5  # in [0, 1), distance inside of the mask where its log-odds are 0, in ring widths
+    levels: int = 2  # levels of the tree, >= 1
+    children: int = 8  # children of a node, >= 2; J of Eckart et al. 2016
+    max_iterations: int = 8  # maximum number of EM iterations in a node, >= 1
+    tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
+    std_floor: float = 0.01  # minimum standard deviation of a node along any axis, m
+    outlier_fraction: float = 0.02  # initial fraction of outliers in a node, in [0, 1)
+    min_support: float = 1e-4  # minimum fraction of the tree's points in a node, in [0, 1); other nodes are dropped
+    min_node: int = 32  # minimum number of points of a node with children, >= 8
+    parent_points: float = 4.0  # weight of the parent's object ratio as a prior, points, >= 0
+    min_posterior: float = 0.5  # minimum posterior of the object for a kept point, in (0, 1)
+    mask_log_odds: float = 2.0  # prior log-odds of the object deep in the mask, nats, >= 0
+    expected_bleed: float = 0.5  # distance inside the mask with log-odds 0, ring widths, in [0, 1)
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

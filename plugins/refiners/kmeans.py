@@ -23,9 +23,9 @@ class KMeans(ClusterRefiner):
     `min_points` points in the mask or the ring stay unchanged.
     """
 
-    object_centers: int = 5  # from 1
-    background_centers: int = 5  # from 0; 0 = no ring either: every point stays
-    max_iterations: int = 20  # from 1; it ends earlier if no label changes
+    object_centers: int = 5  # number of centers of the object, >= 1
+    background_centers: int = 5  # number of centers of the background, >= 0; 0 = no ring, all points are kept
+    max_iterations: int = 20  # maximum number of iterations, >= 1; fewer if no label changes
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

@@ -22,9 +22,9 @@ class LargestComponent(ClusterRefiner):
     `max_gap` + `gap_per_depth` * depth of the nearer one: spacing and noise of readings both grow with depth.
     """
 
-    max_gap: float = 0.03  # m, from 0
-    gap_per_depth: float = 0.02  # m per m, from 0
-    connection_radius: int = 2  # px, from 1; 2 bridges single missing readings
+    max_gap: float = 0.03  # maximum depth step between connected pixels at depth 0, m, >= 0
+    gap_per_depth: float = 0.02  # increase of the maximum depth step with depth, m per m, >= 0
+    connection_radius: int = 2  # maximum distance of connected pixels, px, >= 1; 2 bridges single missing readings
 
     def __post_init__(self) -> None:
         check_bounds(self, max_gap=(0.0, np.inf), gap_per_depth=(0.0, np.inf), connection_radius=(1, 16))

@@ -23,13 +23,13 @@ class PlaneRemoval(ClusterRefiner):
     table that fills the image does. The refined clusters pass the planes on as `structure`, for later refiners.
     """
 
-    plane_distance: float = 0.01  # m, from 0, from the plane, in addition to 3 standard deviations of its noise
-    inverse_depth_noise: float = 0.003  # 1/m, from 0, of a plane's inverse depth: 3 mm at 1 m, 27 mm at 3 m
-    min_area: float = 0.8  # m^2, from 0, visible area of a plane
-    min_frame_fraction: float = 0.04  # in [0, 1], of the frame's readings on a plane
-    max_behind_ratio: float = 0.1  # from 0, readings behind a plane over those on it; a doorway shows some
-    max_tilt: float = 180.0  # degrees, in [0, 180], from the camera's upward axis to the normal; 60 = floors only
-    max_cluster_fraction: float = 0.5  # in [0, 1], of the plane's points in a cluster that loses it
+    plane_distance: float = 0.01  # maximum distance to a plane, m, >= 0, plus 3 standard deviations of its noise
+    inverse_depth_noise: float = 0.003  # maximum rms of a plane's inverse depth, 1/m, >= 0: 3 mm at 1 m, 27 mm at 3 m
+    min_area: float = 0.8  # minimum visible area of a plane, m^2, >= 0
+    min_frame_fraction: float = 0.04  # minimum fraction of the frame's readings on a plane, in [0, 1]
+    max_behind_ratio: float = 0.1  # maximum ratio of readings behind a plane to those on it, >= 0
+    max_tilt: float = 180.0  # maximum angle from the camera's up axis to the normal, degrees, in [0, 180]; 60 = floors
+    max_cluster_fraction: float = 0.5  # maximum fraction of the plane's points in a cluster to remove them, in [0, 1]
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -33,9 +33,9 @@ class RankOrder(ClusterRefiner):
     other points join the group of the nearest of them.
     """
 
-    neighbors: int = 16  # from 2, k
-    threshold: float = 1.0  # from 0
-    max_points: int = 500  # from 10, of a cluster that are compared
+    neighbors: int = 16  # number of nearest neighbors k, >= 2
+    threshold: float = 1.0  # maximum rank-order distance of linked points, >= 0
+    max_points: int = 500  # maximum number of compared points of a cluster, >= 10
 
     def __post_init__(self) -> None:
         # ranks are bytes, in a square table
