@@ -47,16 +47,16 @@ class Open3dOdometry(PoseTracker):
     Use POINT_TO_PLANE with the map, HYBRID and INTENSITY with the previous frame: the map's colors are blurred.
     """
 
-    method: Method = Method.POINT_TO_PLANE
-    reference: Reference = Reference.MAP
-    iterations_coarse: int = 10  # >= 1, at 1/4 of the resolution
-    iterations_middle: int = 5  # >= 1, at 1/2
-    iterations_fine: int = 3  # >= 1, at full resolution
-    max_depth: float = 5.0  # m, > 0; farther readings are ignored
-    max_distance: float = 0.07  # m, > 0, between the depths of corresponding pixels
-    max_translation: float = 0.3  # m, > 0, between frames; a larger step is lost
-    max_rotation: float = 0.35  # rad, > 0, between frames; a larger turn is lost
-    min_matched: float = 0.3  # in [0, 1], ratio of the frame's readings with a correspondence
+    method: Method = Method.POINT_TO_PLANE  # minimized error
+    reference: Reference = Reference.MAP  # reference of the alignment
+    iterations_coarse: int = 10  # iterations at 1/4 of the resolution, >= 1
+    iterations_middle: int = 5  # iterations at 1/2 of the resolution, >= 1
+    iterations_fine: int = 3  # iterations at full resolution, >= 1
+    max_depth: float = 5.0  # maximum depth of used readings, m, > 0
+    max_distance: float = 0.07  # maximum depth difference of corresponding pixels, m, > 0
+    max_translation: float = 0.3  # maximum translation between frames, m, > 0; lost above it
+    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
+    min_matched: float = 0.3  # minimum fraction of the frame's readings with a correspondence, in [0, 1]
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -20,17 +20,17 @@ class PycolmapPnp(PoseTracker):
     If that fails, it relocalizes among all keyframes. It does not use the map. The parameters are those of `Keyframes`.
     """
 
-    max_features: int = 800  # >= 1, of a frame
-    min_features: int = 30  # >= 4, with depth, of a keyframe
-    max_keyframes: int = 200  # >= 1
-    min_distance: float = 0.15  # m, > 0, between keyframes; distance and angle add up as fractions of their limits
-    min_angle: float = 0.2  # rad, > 0, between keyframes
-    candidates: int = 4  # >= 1, keyframes that a frame is matched with
-    max_ratio: float = 0.8  # in (0, 1], of a match's distance to that of the second best
-    max_error: float = 4.0  # px, > 0, of the reprojection of an inlier
-    min_inliers: int = 20  # >= 4; with fewer the pose is lost
-    min_inlier_ratio: float = 0.15  # of the matches, in (0, 1]; with fewer the pose is lost
-    seed: int = 0  # >= 0
+    max_features: int = 800  # maximum number of features of a frame, >= 1
+    min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
+    max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant one is dropped
+    min_distance: float = 0.15  # minimum distance between keyframes, m, > 0; added to the angle as fractions of both
+    min_angle: float = 0.2  # minimum angle between keyframes, rad, > 0
+    candidates: int = 4  # maximum number of keyframes to match with a frame, >= 1
+    max_ratio: float = 0.8  # maximum ratio of a match's distance to that of the second best match, in (0, 1]
+    max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
+    min_inliers: int = 20  # minimum number of inliers, >= 4; lost below it
+    min_inlier_ratio: float = 0.15  # minimum fraction of inliers among the matches, in (0, 1]; lost below it
+    seed: int = 0  # seed of RANSAC and of the visual words, >= 0
 
     def __post_init__(self) -> None:
         self._keyframes = Keyframes(**vars(self))

@@ -33,10 +33,10 @@ class TrajectoryFile(PoseTracker):
     DataError, naming file and line, for poses that are not finite or not rigid and for timestamps that do not increase.
     """
 
-    path: Path
-    max_time_difference: float = 0.02  # s, >= 0, between a frame and its pose; 2/3 of a frame at 30 Hz
-    time_offset: float = 0.0  # s, added to the file's timestamps
-    world_frame: World = World.FIRST_FRAME
+    path: Path  # trajectory in TUM format
+    max_time_difference: float = 0.02  # maximum time difference from a frame to its pose, s, >= 0; 2/3 frame at 30 Hz
+    time_offset: float = 0.0  # offset added to the file's timestamps, s
+    world_frame: World = World.FIRST_FRAME  # world frame of the poses
 
     def __post_init__(self) -> None:
         check_bounds(self, max_time_difference=(0.0, 1e6), time_offset=(-1e12, 1e12))

@@ -69,30 +69,30 @@ class VoxelHashingIcp(PoseTracker):
     relocalize=false those by features.
     """
 
-    residual_weights: ResidualWeights = ResidualWeights.TUKEY
-    finest_scale: float = 0.5  # of the image's size, a power of 1/2: resolution of the view and of the finest level
-    iterations_coarse: int = 8  # >= 0, at 1/4 of the finest resolution
-    iterations_middle: int = 6  # >= 0, at 1/2
-    iterations_fine: int = 4  # >= 1
-    max_distance: float = 0.1  # m, > 0, of a point from its model point
-    close_distance: float = 0.05  # m, > 0, at least a voxel: a reading this near to the map's surface agrees with it
-    min_normal_dot: float = 0.7  # in [-1, 1], cosine between the normals of a point and its model point
-    geometric_scale: float = 4.0  # standard deviations, > 0, cut-off of a distance (TUKEY)
-    photometric_scale: float = 4.0  # standard deviations, > 0, cut-off of an intensity difference (TUKEY)
-    intensity_noise: float = 0.05  # of [0, 1], > 0, standard deviation of an intensity difference (TUKEY)
-    max_intensity_difference: float = 0.1  # of [0, 1], > 0, where the weight of an intensity is 0 (LINEAR)
-    color_weight: float = 0.1  # lambda, >= 0; 0 = ICP alone
-    color_levels: int = 3  # in [1, 3], levels that use color, from the coarsest
-    depth_weight: float = 1.0  # 1, or 0 = color alone
-    max_translation: float = 0.3  # m, > 0, between frames; a larger step is lost
-    max_rotation: float = 0.35  # rad, > 0, between frames; a larger turn is lost
-    min_visible: float = 0.05  # in [0, 1], ratio of the frame's points that fall on the map
-    min_matched: float = 0.4  # in [0, 1], ratio of the points in view with a weight
-    min_information: float = 1e-3  # in [0, 1], smallest eigenvalue of A over the mean; less leaves a motion open
-    min_agreement: float = 0.92  # in [0, 1], ratio of the points in view that agree with the map, 0 = unchecked ...
-    max_occluded: float = 0.015  # in [0, 1], ... and that lie behind it, 1 = unchecked; others need confirmation
-    relocalize: bool = True  # by features, when lost, in doubt or jumping, and from visited poses, when lost
-    seed: int = 0  # of the relocalization's random samples
+    residual_weights: ResidualWeights = ResidualWeights.TUKEY  # weights of residuals
+    finest_scale: float = 0.5  # scale of the finest level and of the map's view relative to the image, a power of 1/2
+    iterations_coarse: int = 8  # iterations at 1/4 of the finest resolution, >= 0
+    iterations_middle: int = 6  # iterations at 1/2 of the finest resolution, >= 0
+    iterations_fine: int = 4  # iterations at the finest resolution, >= 1
+    max_distance: float = 0.1  # maximum distance of corresponding points, m, > 0
+    close_distance: float = 0.05  # maximum distance in agreement with the map's surface, m, > 0; at least a voxel
+    min_normal_dot: float = 0.7  # minimum cosine between corresponding normals, in [-1, 1]
+    geometric_scale: float = 4.0  # cut-off of distances, standard deviations, > 0 (TUKEY)
+    photometric_scale: float = 4.0  # cut-off of intensity differences, standard deviations, > 0 (TUKEY)
+    intensity_noise: float = 0.05  # standard deviation of intensity differences, for intensities in [0, 1], > 0 (TUKEY)
+    max_intensity_difference: float = 0.1  # intensity difference with weight 0, for intensities in [0, 1], > 0 (LINEAR)
+    color_weight: float = 0.1  # weight lambda of the photometric term, >= 0; 0 = ICP only
+    color_levels: int = 3  # number of levels with color, from the coarsest, in [1, 3]
+    depth_weight: float = 1.0  # weight of the point-to-plane term, 0 or 1; 0 = color only
+    max_translation: float = 0.3  # maximum translation between frames, m, > 0; lost above it
+    max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
+    min_visible: float = 0.05  # minimum fraction of the frame's points in view of the map, in [0, 1]
+    min_matched: float = 0.4  # minimum fraction of the points in view with a weight, in [0, 1]
+    min_information: float = 1e-3  # minimum eigenvalue of A relative to the mean, in [0, 1]; doubled while lost
+    min_agreement: float = 0.92  # minimum fraction of the points in view on the map's surface, in [0, 1]; 0 = unchecked
+    max_occluded: float = 0.015  # maximum fraction of the points in view behind the surface, in [0, 1]; 1 = unchecked
+    relocalize: bool = True  # relocalization against keyframes and visited poses
+    seed: int = 0  # seed of the relocalization
 
     def __post_init__(self) -> None:
         check_bounds(
