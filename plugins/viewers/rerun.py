@@ -45,17 +45,17 @@ class RerunViewer(Viewer):
     If drawing is slower than mapping, pictures are omitted, but no poses, times or lost frames.
     """
 
-    mode: Mode = Mode.RECORD  # RECORD, WINDOW or BROWSER
-    file: str = ""  # "" = recording.rrd in the run's directory in mode RECORD, none in the others
-    frame_interval: int = 3  # frames from one picture to the next, from 1
-    mesh_interval: float = 2.0  # s, from one look at the map to the next at least, in [0.1, 3600]
-    stride: int = 2  # px of a frame for one of its picture, in [1, 16]
-    jpeg_quality: int = 75  # in [1, 100]
-    region_size: float = 1.0  # m, in [0.1, 1000], side of the cubes that the mesh is drawn in
-    min_confidence: float = 0.3  # in [0, 1], from which on an object is drawn, and a detection named
-    memory_limit: str = "2GB"  # of what WINDOW or BROWSER keep; what is oldest goes first
-    port: int = 9876  # of the data, in [1024, 65535]; WINDOW takes the viewer that listens there, if one does
-    web_port: int = 9090  # of the page of BROWSER, in [1024, 65535]
+    mode: Mode = Mode.RECORD  # output of the viewer
+    file: str = ""  # .rrd file; "" = recording.rrd in the run directory for RECORD, else none
+    frame_interval: int = 3  # interval between images, frames, >= 1
+    mesh_interval: float = 2.0  # minimum interval between mesh snapshots, s, in [0.1, 3600]
+    stride: int = 2  # subsampling of the images, px, in [1, 16]
+    jpeg_quality: int = 75  # JPEG quality of the images, in [1, 100]
+    region_size: float = 1.0  # side of the cubic regions of the mesh, m, in [0.1, 1000]
+    min_confidence: float = 0.3  # minimum confidence of displayed objects and labeled detections, in [0, 1]
+    memory_limit: str = "2GB"  # maximum memory of WINDOW and BROWSER; the oldest data are dropped first
+    port: int = 9876  # port of the data, in [1024, 65535]; an open viewer on this port is reused by WINDOW
+    web_port: int = 9090  # port of the web page of BROWSER, in [1024, 65535]
 
     def __post_init__(self) -> None:
         check_bounds(
