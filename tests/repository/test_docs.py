@@ -87,7 +87,7 @@ def test_configuration_reference_has_all_parameters(built: Path) -> None:
         for parameter in option.parameters:
             assert f"refiner.{parameter.name}</span>" in page
             assert parameter.comment in page
-    assert "every random number of a run derives from it" in (built / "configuration.html").read_text()
+    assert "seed of all random numbers of a run" in (built / "configuration.html").read_text()
 
 
 def test_plugins_and_parameters_in_pages_exist(built: Path) -> None:
