@@ -20,10 +20,10 @@ class FigureChoice:
     `maps` shows the maps of each sequence, in a column for each row, next to the ground truth.
     """
 
-    kind: str = "maps"  # one of KINDS
+    kind: str = "maps"  # kind of the figure, one of KINDS
     sequences: str = "dataset.scene"  # config key that identifies the sequence
     names: dict[str, str] = field(default_factory=dict)  # display names of rows
-    zoom: bool = False  # of `maps`: also show the window in which the columns differ most
+    zoom: bool = False  # close-up of the largest difference between the columns, for `maps`
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

@@ -44,11 +44,11 @@ class TableChoice:
 
     # config keys, averaged over and paired by; runs that agree in the last one are not independent
     average_over: list[str] = field(default_factory=lambda: ["seed"])
-    columns_by: str | None = None  # config key with a column per value; None = columns are figures
-    group_by: str | None = None  # config key with a group of lines per value; None = a row is one line
-    baseline: str | None = None  # name of the row that the others are compared with; None = the first
+    columns_by: str | None = None  # config key with one column per value; None = columns are metrics
+    group_by: str | None = None  # config key with one group of lines per value; None = one line per row
+    baseline: str | None = None  # row for comparisons; None = the first row
     columns: list[str] = field(default_factory=list)  # keys of metrics.json, at least one; with `columns_by`, just one
-    names: dict[str, str] = field(default_factory=dict)  # row -> its name in the table
+    names: dict[str, str] = field(default_factory=dict)  # display names by row
     published: str | None = None  # section of published.yaml, shown if all runs are of the real SceneNN; None = none
 
     def __post_init__(self) -> None:

@@ -33,14 +33,14 @@ LARGEST_GRADIENT = 10.0  # norm
 class Schedule:
     """Length and speed of a training."""
 
-    steps: int = 8000  # >= 1
-    batch: int = 4  # pictures per step, >= 1
-    learning_rate: float = 1e-3  # > 0, the largest (AdamW)
-    weight_decay: float = 1e-2  # >= 0
-    warmup: int = 300  # steps, >= 0, of linear warmup; then the learning rate falls as a cosine to a hundredth
-    ema_decay: float = 0.998  # in [0, 1), decay of the moving average of the weights, which is saved
-    checkpoint_interval: int = 250  # steps, >= 1
-    bfloat16: bool = False  # products in 16 bits, sums and weights in 32
+    steps: int = 8000  # training steps, >= 1
+    batch: int = 4  # images per step, >= 1
+    learning_rate: float = 1e-3  # maximum learning rate of AdamW, > 0
+    weight_decay: float = 1e-2  # weight decay of AdamW, >= 0
+    warmup: int = 300  # steps of linear warmup, >= 0, followed by a cosine decay of the learning rate to a hundredth
+    ema_decay: float = 0.998  # decay of the moving average of the weights, in [0, 1); the average is saved
+    checkpoint_interval: int = 250  # interval between checkpoints, steps, >= 1
+    bfloat16: bool = False  # 16-bit matrix products; sums and weights in 32 bits
     seed: int = 0
     budget: Budget = field(default_factory=Budget)
 
