@@ -1,4 +1,4 @@
-"""Cluster refinement by depth: what lies far before or behind the middle of a cluster is of something else."""
+"""Cluster refinement by depth: points far in front of or behind the median of a cluster are dropped."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from instancemap import ClusterRefiner, Frame, PointClusters, check_bounds, keep
 
 @dataclass
 class DepthMedian(ClusterRefiner):
-    """Keeps of each cluster the points whose depth is near the cluster's median.
+    """Keeps the points of each cluster with a depth near the cluster's median.
 
-    A mask that bleeds over an object's outline takes in what lies behind it, at other depths; as long as that is less
-    than half of it, the median is of the object. A dropped point leaves the arrays, clusters keep their index.
+    A mask that bleeds over an object's outline includes points of the background, at other depths. If these are fewer
+    than half of the points, the median is a depth of the object. Clusters keep their index.
     """
 
-    reach: float = 0.3  # m, from 0, to either side: half the depth of an object
-    reach_per_depth: float = 0.02  # m per m, from 0: the sensor's noise grows with depth
+    reach: float = 0.3  # maximum difference from the median, m, >= 0; half the extent of an object
+    reach_per_depth: float = 0.02  # increase of the difference with depth, m per m, >= 0; for noise
 
     def __post_init__(self) -> None:
         check_bounds(self, reach=(0.0, np.inf), reach_per_depth=(0.0, np.inf))

@@ -1,4 +1,4 @@
-"""What every refiner keeps, and what is special about this one."""
+"""Contract tests of a refiner, and tests of this one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class TestDepthMedian(OptionContract, RefinerContract):
     option = "depth_median"
 
 
-def test_what_a_mask_takes_in_of_the_wall_behind_is_dropped() -> None:
+def test_background_points_of_bleeding_mask_are_dropped() -> None:
     frame = frame_at(1)
     refined = DepthMedian().refine(bleeding_clusters(frame), frame)
     ids = frame.truth.instance_ids[refined.pixels[:, 1], refined.pixels[:, 0]]
@@ -24,7 +24,7 @@ def test_what_a_mask_takes_in_of_the_wall_behind_is_dropped() -> None:
     assert (ids > 0).sum() > 0.99 * (before > 0).sum()
 
 
-def test_what_is_far_behind_the_most_is_dropped_and_the_rest_stays() -> None:
+def test_only_distant_point_is_dropped() -> None:
     frame = frame_at(1)
     clusters = exact_clusters(frame)
     farthest = frame.depth[clusters.pixels[:, 1], clusters.pixels[:, 0]].argmax()

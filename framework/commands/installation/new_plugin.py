@@ -150,9 +150,8 @@ def names_of(stage: str, name: str) -> dict[str, str]:
         "variant": VARIANTS[stage],
         "data": "\n\n\n".join(map(fields_of, DATA[stage])),
     }
-    aim, outcome = ("run", WATCHED) if stage == "viewer" else ("swept plugin", SWEPT)
-    texts = {"try": TRIES[stage], "outcome": outcome}
-    return own | {"aim": aim} | {key: Template(text).substitute(own) for key, text in texts.items()}
+    texts = {"try": TRIES[stage], "outcome": WATCHED if stage == "viewer" else SWEPT}
+    return own | {key: Template(text).substitute(own) for key, text in texts.items()}
 
 
 def fields_of(data: type) -> str:
