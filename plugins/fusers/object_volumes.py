@@ -35,7 +35,7 @@ class ObjectVolumes(MapFuser):
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     min_overlap: float = 0.2  # minimum overlap of a detection and an object to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.IOU  # denominator of the overlap
-    require_same_class: bool = False  # match only if the most likely classes are the same
+    require_same_class: bool = False  # restriction of matches to the same most likely class
     create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; any score can update one
     create_points: int = 50  # minimum size of a detection to create an object, px, >= 1; also of one in view
     min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; others are removed
