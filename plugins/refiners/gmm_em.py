@@ -30,7 +30,7 @@ class GmmEm(ClusterRefiner):
 
     object_components: int = 3  # number of Gaussians of the object, >= 1; about one per visible face
     background_components: int = 6  # number of Gaussians of the background, >= 0; 0 = no ring
-    start_iterations: int = 1  # iterations of k-means at the start, >= 1; 1 = groups of equal size by depth
+    start_iterations: int = 5  # iterations of k-means at the start, >= 1; 1 = groups of equal size by depth
     max_iterations: int = 8  # maximum number of EM iterations, >= 1
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
     std_floor: float = 0.01  # minimum standard deviation of a Gaussian along any axis, m
