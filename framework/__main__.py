@@ -80,7 +80,7 @@ def leave_working_folder(arguments: list[str]) -> None:
     try:
         here = str(Path.cwd())
     except FileNotFoundError:
-        sys.exit("error: the working folder has been removed; change to another one")
+        sys.exit("error: working folder: expected an existing folder, got a removed one; change to another one")
     if sys.flags.safe_path or Path(here) == Path(__file__).resolve().parents[1]:
         return
     if sys.path[0] in ("", here):  # of `python -m`
@@ -92,7 +92,7 @@ def leave_working_folder(arguments: list[str]) -> None:
 def open_standard_streams() -> None:
     """Open /dev/null for closed streams (`2>&-`).
 
-    Otherwise an output file of the run gets the number of one, and receives what libraries print.
+    Otherwise an output file of the run gets the number of one, and receives the output of libraries.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -110,7 +110,10 @@ def main() -> None:
     open_standard_streams()
     leave_working_folder(sys.argv[1:])
     if any(word.startswith("--e") and RERUN.startswith(word.partition("=")[0]) for word in sys.argv[1:]):
-        sys.exit(f"error: {RERUN} reads a pickle, which may bring code that runs; give the run's overrides instead")
+        sys.exit(
+            f"error: {RERUN}: expected no option that reads a pickle, which can run code; pass the overrides "
+            "of the run instead"
+        )
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # file names may not be valid text
             stream.reconfigure(errors="backslashreplace")
@@ -128,8 +131,8 @@ def main() -> None:
         sys.argv[:2] = [f"{program} {word}"]
     elif word and "=" not in word and not word.startswith(("-", "~")):
         close = get_close_matches(word, COMMANDS, n=1)
-        suggestion = f"did you mean {close[0]}?" if close else f"the commands are {', '.join(COMMANDS)}"
-        sys.exit(f"error: there is no command {word!r}; {suggestion}")
+        suggestion = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(COMMANDS)}"
+        sys.exit(f"error: {word!r}: unknown command; {suggestion}")
     else:
         word = "run"
     if word in PRINTING and hasattr(signal, "SIGPIPE"):  # Windows has none

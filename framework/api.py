@@ -120,7 +120,7 @@ def begin(config: DictConfig) -> Pipeline:
 def scene_of(key: str, run: Path) -> SceneMap:
     """Read the map of a stored run. Raises DataError, which begins with `key`."""
     if not (run / MAP).is_file():
-        raise DataError(f"{key}: there is no {run / MAP}: expected the directory of a run")
+        raise DataError(f"{key}: expected the directory of a run, got {run} without {MAP}")
     return load_scene(run / MAP)
 
 
@@ -133,7 +133,7 @@ class FrameResult(Pose):
 
 
 class Mapper(Map):
-    """Maps frames one by one: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`.
+    """Incremental mapping, frame by frame: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`.
 
     Takes the overrides of a run on the command line, as text or by name, with its defaults for recordings. `dataset` is
     not allowed; `prefetch` and `skip_completed` have no effect. `resume_from=DIR` resumes the map of a run.
@@ -150,9 +150,11 @@ class Mapper(Map):
         words = [*overrides, *(_override(name, value) for name, value in named.items())]
         for override in words:
             if not isinstance(override, str):
-                raise ConfigError(f"Mapper takes words such as 'fuser.voxel_size=0.02', found {override!r}")
+                raise ConfigError(f"Mapper: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
             if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
-                raise ConfigError(f"Mapper: {override} is only for the command line")
+                raise ConfigError(
+                    f"Mapper: expected overrides of a mapper, got {override}; it is for the command line only"
+                )
         config = composed("~dataset", *words)
         self._threads = Settings.of(config).threads
         self.pipeline = begin(config)
@@ -196,9 +198,14 @@ class Mapper(Map):
             else:
                 camera = camera or self._camera
                 if depth is None:
-                    raise DataError(f"Mapper.add takes a Frame, or color and depth, found {type(color).__name__} alone")
+                    raise DataError(
+                        f"Mapper.add: expected a Frame, or color and depth, got only {type(color).__name__}"
+                    )
                 if camera is None:
-                    raise DataError("Mapper.add needs the camera once: camera=Camera(width, height, fx, fy, cx, cy)")
+                    raise DataError(
+                        "Mapper.add: expected a camera in the first call, got none; pass camera=Camera(width, height, "
+                        "fx, fy, cx, cy)"
+                    )
                 time = self._frames / FRAME_RATE if timestamp is None else timestamp
                 frame = Frame(self._frames, time, color, depth, camera, pose, up=up)
             self._camera = frame.camera
@@ -236,7 +243,7 @@ class Mapper(Map):
         camera = camera or self._camera
         T_world_camera = self._T_world_camera if T_world_camera is None else T_world_camera
         if camera is None or T_world_camera is None:
-            raise DataError("nothing is mapped yet, so there is no last frame")
+            raise DataError("Mapper.at_pixel: expected a mapped frame, got none; call add first")
         return super().at_pixel(u, v, camera, T_world_camera)
 
 
@@ -245,7 +252,7 @@ def _override(name: str, value: object) -> str:
         return f"{name}={'null' if value is None else value}"
     if isinstance(value, str | Path):
         return f"{name}={QuotedString(str(value), Quote.single).with_quotes()}"
-    raise ConfigError(f"{name} must be a name, a number, true, false or None, found {value!r:.60}")
+    raise ConfigError(f"{name}: expected a name, a number, true, false or None, got {value!r:.60}")
 
 
 def open_dataset(name: str, **parameters: object) -> RGBDSequence:

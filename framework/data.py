@@ -65,25 +65,28 @@ class Camera:
         for name, value in vars(self).items():
             kind: type = Integral if name in ("width", "height") else Real
             if isinstance(value, bool) or not isinstance(value, kind):
-                expected = "a whole number of px" if kind is Integral else "a number of px"
-                raise DataError(f"Camera.{name} must be {expected}, found {value!r}")
+                expected = "an integer number of px" if kind is Integral else "a number of px"
+                raise DataError(f"Camera.{name}: expected {expected}, got {value!r}")
         if self.width < 1 or self.height < 1:
-            raise DataError(f"Camera: the image is at least 1x1 px, not {self.width}x{self.height}")
+            raise DataError(f"Camera: expected an image of at least 1x1 px, got {self.width}x{self.height}")
         if self.width * self.height > MOST_PIXELS:
-            raise DataError(f"Camera: an image has at most {MOST_PIXELS} px, not {self.width}x{self.height}")
+            raise DataError(f"Camera: expected an image of at most {MOST_PIXELS} px, got {self.width}x{self.height}")
         numbers = (self.fx, self.fy, self.cx, self.cy)
         if not np.isfinite(numbers).all() or self.fx <= 0 or self.fy <= 0:
-            raise DataError(f"Camera: fx, fy must be positive and cx, cy finite; found fx, fy, cx, cy = {numbers}")
+            raise DataError(f"Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy = {numbers}")
         if max(self.fx, self.fy) > LONGEST_FOCAL_LENGTH:
-            raise DataError(f"Camera: fx, fy are at most {LONGEST_FOCAL_LENGTH:g} px; found fx, fy, cx, cy = {numbers}")
+            raise DataError(
+                f"Camera: expected fx, fy of at most {LONGEST_FOCAL_LENGTH:g} px, got fx, fy, cx, cy = {numbers}"
+            )
         horizontal = max(
             self.cx, self.width - 1 - self.cx, -self.cx
         )  # px, of the outermost pixels from the principal point
         vertical = max(self.cy, self.height - 1 - self.cy, -self.cy)
         if horizontal > WIDEST * self.fx or vertical > WIDEST * self.fy:
             raise DataError(
-                f"Camera: {self.width}x{self.height} px with fx, fy, cx, cy = {numbers} reach more than {WIDEST:g} m "
-                "sideways per m of depth; give them in px, not as fractions of width and height"
+                f"Camera: expected a field of view of at most {WIDEST:g} m sideways per m of depth, got "
+                f"{self.width}x{self.height} px with fx, fy, cx, cy = {numbers}; give them in px, not as "
+                "fractions of width and height"
             )
 
     @property
@@ -122,7 +125,7 @@ class FrameTruth:
 class DeferredTruth(FrameTruth):
     """A FrameTruth that renders its ids on first access: once, from any thread.
 
-    Each access raises what `render` raises, and DataError if it does not return (H, W) int32 of `shape`.
+    Each access raises the errors of `render`, and DataError if it does not return (H, W) int32 of `shape`.
     """
 
     def __init__(
@@ -169,29 +172,29 @@ class Frame:
     def __post_init__(self) -> None:
         index, camera = cast(object, self.index), cast(object, self.camera)  # of any type
         if isinstance(index, bool) or not isinstance(index, int | np.integer) or index < 0:
-            raise DataError(f"Frame.index must be a whole number, 0 or more, found {index!r}")
+            raise DataError(f"Frame.index: expected an integer of at least 0, got {index!r}")
         where = f"frame {self.index}: "
         if not isinstance(camera, Camera):
-            raise DataError(f"{where}camera must be a Camera, found {type(camera).__name__}")
+            raise DataError(f"{where}camera: expected a Camera, got {type(camera).__name__}")
         if not isinstance(self.timestamp, int | float | np.integer | np.floating) or not math.isfinite(self.timestamp):
-            raise DataError(f"{where}timestamp must be a finite number of seconds, found {self.timestamp!r}")
+            raise DataError(f"{where}timestamp: expected a finite number of seconds, got {self.timestamp!r}")
         check_array(where + "color", self.color, (*self.camera.shape, 3), np.uint8)
         check_array(where + "depth", self.depth, self.camera.shape, np.float32)
         if self.depth.size and self.depth.min() < 0:
-            raise DataError(f"{where}depth must be 0 or positive, found {self.depth.min()} m")
+            raise DataError(f"{where}depth: expected values of at least 0 m, got {self.depth.min()} m")
         if self.T_world_camera is not None:
             check_rigid(where + "T_world_camera", self.T_world_camera)
         if self.up is not None:
             check_array(where + "up", self.up, (3,), np.float64)
             if abs(np.linalg.norm(self.up) - 1) > UNIT_TOLERANCE:
-                raise DataError(f"{where}up must be a unit vector, found one of length {np.linalg.norm(self.up):.4g}")
+                raise DataError(f"{where}up: expected a unit vector, got length {np.linalg.norm(self.up):.4g}")
         # the kernels are compiled for these; views such as bgr[..., ::-1] and read-only arrays are copied
         object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
         object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))
         if self.truth is not None and not isinstance(cast(object, self.truth), FrameTruth):
-            raise DataError(f"{where}truth must be a FrameTruth, found {type(self.truth).__name__}")
+            raise DataError(f"{where}truth: expected a FrameTruth, got {type(self.truth).__name__}")
         if self.truth is not None and self.truth.shape != self.camera.shape:
-            raise DataError(f"{where}truth.instance_ids must have shape {self.camera.shape}, found {self.truth.shape}")
+            raise DataError(f"{where}truth.instance_ids: expected shape {self.camera.shape}, got {self.truth.shape}")
 
 
 @dataclass(frozen=True)
@@ -269,7 +272,7 @@ class PointClusters:
         _check_objects(self, n, c)
         if p and (self.cluster.min() < -1 or self.cluster.max() >= n):
             raise DataError(
-                f"PointClusters.cluster must be in [-1, {n}), found {self.cluster.min()} to {self.cluster.max()}"
+                f"PointClusters.cluster: expected values in [-1, {n}), got {self.cluster.min()} to {self.cluster.max()}"
             )
         if self.structure is not None:
             check_array("PointClusters.structure", self.structure, (None, None), np.bool_)
@@ -401,13 +404,15 @@ def check_rigid(name: str, T: Float64) -> None:
     R = T[:3, :3]
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not np.allclose(T[3], (0, 0, 0, 1)):
-        raise DataError(f"{name} is not a rigid transform: |R R^T - I| is {error:.2g}, det R {np.linalg.det(R):.2g}")
+        raise DataError(
+            f"{name}: expected a rigid transform, got |R R^T - I| = {error:.2g}, det R = {np.linalg.det(R):.2g}"
+        )
 
 
 def check_view(camera: Camera, T_world_camera: Float64) -> None:
     """Raise DataError unless `camera` and its pose are valid."""
     if not isinstance(cast(object, camera), Camera):
-        raise DataError(f"camera must be a Camera, found {type(camera).__name__}")
+        raise DataError(f"camera: expected a Camera, got {type(camera).__name__}")
     check_rigid("T_world_camera", T_world_camera)
 
 
@@ -415,17 +420,17 @@ def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: n
     """Raise DataError unless `array` has this shape (None = any length), this dtype, and finite values."""
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
         found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
-        raise DataError(f"{name} must be an array of {np.dtype(dtype)}, found {found}")
+        raise DataError(f"{name}: expected an array of {np.dtype(dtype)}, got {found}")
     if isinstance(array, np.ma.MaskedArray):
-        raise DataError(f"{name} is a masked array, whose mask would get lost; fill it: {name}.filled(0)")
+        raise DataError(f"{name}: expected an array without a mask, got a masked array; fill it: {name}.filled(0)")
     matches = len(array.shape) == len(shape) and all(
         want in (None, have) for have, want in zip(array.shape, shape, strict=True)
     )
     if not matches:
         wanted = "(" + ", ".join("any" if want is None else str(want) for want in shape) + ")"
-        raise DataError(f"{name} must have shape {wanted}, found {array.shape}")
+        raise DataError(f"{name}: expected shape {wanted}, got {array.shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise DataError(f"{name} holds values that are not finite")
+        raise DataError(f"{name}: expected finite values, got NaN or infinity")
 
 
 def _check_objects(found: Detections | PointClusters, n: int, c: int) -> None:
@@ -433,35 +438,35 @@ def _check_objects(found: Detections | PointClusters, n: int, c: int) -> None:
     name, scores = type(found).__name__, found.scores
     check_array(f"{name}.scores", scores, (n,), np.float32)
     if n and (scores.min() < 0 or scores.max() > 1):
-        raise DataError(f"{name}.scores must be in [0, 1], found {scores.min()} to {scores.max()}")
+        raise DataError(f"{name}.scores: expected values in [0, 1], got {scores.min()} to {scores.max()}")
     _check_distributions(f"{name}.class_probabilities", found.class_probabilities, (n, c))
     _check_embeddings(f"{name}.embeddings", found.embeddings, found.embedding_space, n)
 
 
 def _check_embeddings(name: str, rows: Float32 | None, space: str, n: int) -> None:
     if not isinstance(cast(object, space), str) or len(space) > LONGEST_SPACE:
-        raise DataError(f"{name}: embedding_space must be at most {LONGEST_SPACE} characters, found {space!r:.60}")
+        raise DataError(f"{name}: expected an embedding_space of at most {LONGEST_SPACE} characters, got {space!r:.60}")
     if rows is None:
         if space:
-            raise DataError(f"{name}: there are none, and embedding_space is {space!r}")
+            raise DataError(f"{name}: expected embeddings for embedding_space {space!r}, got none")
         return
     if not space:
-        raise DataError(f"{name}: embedding_space must name what they are of")
+        raise DataError(f"{name}: expected a name in embedding_space, got an empty one")
     check_array(name, rows, (n, None), np.float32)
     if not 1 <= rows.shape[1] <= LONGEST_EMBEDDING:
-        raise DataError(f"{name} must have 1 to {LONGEST_EMBEDDING} columns, found {rows.shape[1]}")
+        raise DataError(f"{name}: expected 1 to {LONGEST_EMBEDDING} columns, got {rows.shape[1]}")
     lengths = np.linalg.norm(rows, axis=1)
     wrong = (lengths != 0) & (np.abs(lengths - 1) > UNIT_TOLERANCE)
     if wrong.any():
-        raise DataError(f"{name}: each row must be a unit vector, or 0, found one of length {lengths[wrong][0]:.4g}")
+        raise DataError(f"{name}: expected unit vectors or 0 in each row, got length {lengths[wrong][0]:.4g}")
 
 
 def _check_distributions(name: str, rows: Float32, shape: tuple[int, int]) -> None:
     check_array(name, rows, shape, np.float32)
     if shape[0] and not shape[1]:
-        raise DataError(f"{name}: there are {shape[0]} rows and no class to be distributed over")
+        raise DataError(f"{name}: expected at least one class for {shape[0]} rows, got none")
     if rows.size and (rows.min() < 0 or np.abs(rows.sum(axis=1) - 1).max() > PROBABILITY_TOLERANCE):
         worst = rows.sum(axis=1)[np.abs(rows.sum(axis=1) - 1).argmax()]
         raise DataError(
-            f"{name}: each row must be a distribution; found a sum of {worst:.4f}, minimum {rows.min():.4f}"
+            f"{name}: expected a distribution in each row, got a sum of {worst:.4f}, minimum {rows.min():.4f}"
         )

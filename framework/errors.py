@@ -37,7 +37,7 @@ class FrameError(DataError):
 
 
 class NoPoseError(FrameError):
-    """A frame without a pose, which is normal where motion capture has gaps: skipped, reported at the end."""
+    """A frame without a pose, as in gaps of motion capture: skipped, and reported at the end."""
 
 
 class MapFullError(InstanceMapError):
@@ -72,7 +72,7 @@ def first_line(error: BaseException) -> str:
 
 @contextmanager
 def errors_of(where: object) -> Iterator[None]:
-    """Prepend the file, or the place in it, to the message of a DataError."""
+    """Prepend the file, or the position in it, to the message of a DataError."""
     try:
         yield
     except DataError as error:
@@ -85,4 +85,6 @@ def import_optional(module: str, purpose: str, extra: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         name = module.partition(".")[0]
-        raise ConfigError(f"{name}, which {purpose}, is not there: pip install instancemap[{extra}]") from error
+        raise ConfigError(
+            f"{name}, which {purpose}: expected an installed package, got none; run pip install instancemap[{extra}]"
+        ) from error

@@ -69,14 +69,14 @@ def nearest_rotation(R: Float64) -> Float64:
 def nearest_rigid(matrix: Float64) -> Float64:
     """Remove the rounding errors of the rotation of a (4, 4) pose. Raises DataError if it is not rigid."""
     if not np.isfinite(matrix).all():
-        raise DataError("the pose is not finite")
+        raise DataError("pose: expected finite values, got NaN or infinity")
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
-        raise DataError("the last row of the pose is not 0 0 0 1")
+        raise DataError(f"pose: expected the last row 0 0 0 1, got {matrix[3].tolist()}")
     R = matrix[:3, :3]
     with np.errstate(all="ignore"):  # files may contain numbers of any size
         error, determinant = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
     if not (error <= RIGID_WITHIN and determinant > 0):
-        raise DataError(f"the pose is not rigid: |R R^T - I| is {error:.2g}, det R {determinant:.2g}")
+        raise DataError(f"pose: expected a rigid transform, got |R R^T - I| = {error:.2g}, det R = {determinant:.2g}")
     T = np.eye(4)
     T[:3, :3] = R if error <= EXACT_WITHIN else nearest_rotation(R)
     T[:3, 3] = matrix[:3, 3]
@@ -110,6 +110,6 @@ def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> No
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
         raise DataError(
-            f"the clusters' pixels must lie in the image of {shape[1]}x{shape[0]}, found u in [{u.min()}, {u.max()}], "
-            f"v in [{v.min()}, {v.max()}]"
+            f"clusters: expected pixels in the image of {shape[1]}x{shape[0]}, got u in [{u.min()}, "
+            f"{u.max()}], v in [{v.min()}, {v.max()}]"
         )

@@ -55,7 +55,7 @@ class RGBDVideo(ABC):
     """A source of frames: a stored sequence (`RGBDSequence`) or a running camera (`LiveVideo`)."""
 
     name: str  # of the scene, for tables
-    annotation: str = ""  # release of the ground truth, for tables; "" = there is only one
+    annotation: str = ""  # release of the ground truth, for tables; "" = a single release
     domain: str = ""  # of the images, compared with that of a detector: "rendered rooms"; "" = photographs, or unknown
 
     def has_poses(self) -> bool:
@@ -107,10 +107,10 @@ class LiveVideo(RGBDVideo):
 
 
 class Detector(ABC):
-    """Finds object instances in one image."""
+    """Detector of object instances in one image."""
 
     classes: tuple[str, ...]  # names of the columns of class_probabilities; set by the constructor
-    concurrent: bool = False  # whether threads may call `detect` at the same time; each call uses about one core
+    concurrent: bool = False  # true: threads may call `detect` at the same time; each call uses about one core
     domain: str = ""  # the only `RGBDVideo.domain` that the detector is for; "" = any
 
     @abstractmethod
@@ -119,7 +119,7 @@ class Detector(ABC):
 
 
 class PoseTracker(ABC):
-    """Estimates the camera pose."""
+    """Tracker of the camera pose."""
 
     pose_source: str = "tracked"  # for tables; `ground_truth` for a tracker that returns the poses of the sequence
 
@@ -149,11 +149,14 @@ class PoseTracker(ABC):
             ConfigError: the tracker cannot relocalize with these keyframes.
             DataError: the arrays are not keyframes.
         """
-        raise ConfigError(f"tracker: {type(self).__name__} cannot relocalize in a stored map; choose another tracker")
+        raise ConfigError(
+            f"tracker: expected a tracker that relocalizes in a stored map, got {type(self).__name__}; "
+            "choose another tracker"
+        )
 
 
 class ClusterRefiner(ABC):
-    """Cleans, splits or merges the point clusters of one frame."""
+    """Refiner of the point clusters of one frame: cleans, splits or merges them."""
 
     @abstractmethod
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
@@ -164,7 +167,7 @@ class ClusterRefiner(ABC):
 
 
 class MapFuser(ABC):
-    """Associates clusters with map instances and integrates the frame. The only stage that writes the map."""
+    """Fuser of clusters and frames into the map. No other stage writes the map."""
 
     scene: SceneMap
 
@@ -186,7 +189,9 @@ class MapFuser(ABC):
         Raises:
             ConfigError: the fuser cannot write this map.
         """
-        raise ConfigError(f"fuser: {type(self).__name__} cannot resume a stored map; choose another fuser")
+        raise ConfigError(
+            f"fuser: expected a fuser that resumes a stored map, got {type(self).__name__}; choose another fuser"
+        )
 
 
 @dataclass(frozen=True)
@@ -275,7 +280,7 @@ class SceneMap(ABC):
 
 
 class Viewer:
-    """Shows a run while it is in progress. This class shows nothing; override the methods that a viewer needs.
+    """Viewer of a run in progress. This class shows nothing; override the methods that a viewer needs.
 
     The pipeline waits for each call, so do slow work in a thread (`framework.live_view.drawing_thread`). Read the map
     only within a call. A viewer never changes results.

@@ -36,10 +36,10 @@ from framework.runtime.signals import Interruption, signals_deferred
 
 log = logging.getLogger(__name__)
 
-WITHOUT_POSES = "add the sequence's poses, or choose a tracker that needs none, tracker=voxel_hashing_icp"
+WITHOUT_POSES = "add the poses of the sequence, or set tracker=voxel_hashing_icp, which needs none"
 WITHOUT_THREADS = (
-    "numba's threading layer is not thread-safe, so detection runs in the calling thread; call"
-    " instancemap.configure_process() before numba is imported"
+    "numba's threading layer is not thread-safe; detection runs in the calling thread; call "
+    "instancemap.configure_process() before numba is imported"
 )
 
 
@@ -51,17 +51,17 @@ class Pipeline:
     tracker: PoseTracker
     refiner: ClusterRefiner
     fuser: MapFuser
-    prefetch: int = 2  # frames that other threads read and detect ahead (live video: at most 1); 0 = none
+    prefetch: int = 2  # frames prefetched by other threads (live video: at most 1); 0 = none
     viewer: Viewer = field(default_factory=Viewer)
     detection_interval: int = 1  # frames from one detection to the next; the frames between are tracked and mapped
 
     def __post_init__(self) -> None:
         if self.detection_interval < 1:
             raise ConfigError(
-                f"Pipeline.detection_interval: expected 1 or more frames, got {self.detection_interval}; set it to 1"
+                f"Pipeline.detection_interval: expected at least 1 frame, got {self.detection_interval}; set it to 1"
             )
         if self.prefetch < 0:
-            raise ConfigError(f"Pipeline.prefetch: must be 0 or more frames, found {self.prefetch}")
+            raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}")
         self.viewer = GuardedViewer(self.viewer)
 
     def run(self, video: RGBDVideo) -> RunResult:
@@ -85,10 +85,10 @@ class Pipeline:
         """
         frames_expected = len(video) if isinstance(video, RGBDSequence) else None
         if frames_expected == 0:
-            raise DataError(f"{video.name}: there are no frames to map: start, stop and stride leave none")
+            raise DataError(f"{video.name}: expected at least 1 frame, got 0; change start, stop or stride")
         if self.tracker.pose_source == "ground_truth" and not video.has_poses():
             frames = "its frames" if frames_expected is None else f"the {frames_expected} frames"
-            raise DataError(f"{video.name}: none of {frames} has a true pose; {WITHOUT_POSES}")
+            raise DataError(f"{video.name}: expected true poses, got none for {frames}; {WITHOUT_POSES}")
         warn_outside_domain(self.detector, video)
         journal = Journal(self.fuser.scene, frames_expected, self.tracker.pose_source)
         with (
@@ -123,21 +123,21 @@ class Pipeline:
         """Return why the map of a run is empty."""
         result = journal.result()
         if result.frames == 0:
-            return "no frame came"
+            return "expected at least one frame, got none"
         if journal.without_pose == result.frames:
             first = journal.first_without_pose
-            return f"no pose is given for any of the {result.frames} frames; the first: {first}; {WITHOUT_POSES}"
+            return f"expected poses, got none for the {result.frames} frames; the first: {first}; {WITHOUT_POSES}"
         if result.frames_skipped == result.frames:
-            return f"none of the {result.frames} frames can be used; the log says why"
+            return f"expected usable frames, got none of {result.frames}; the log lists the reasons"
         lost = next((frame.pose.reason for frame in result.tracked if frame.pose.lost), "")
         nearest, farthest = self.fuser.scene.depth_range
         rest = result.frames - result.frames_skipped - result.frames_lost
         parts = [
-            (result.frames_skipped, "cannot be used"),
-            (result.frames_lost, f"are lost, the first because: {lost or 'the tracker gave no reason'}"),
-            (rest, f"have no depth that is mapped, {nearest:g} to {farthest:g} m"),
+            (result.frames_skipped, "unusable"),
+            (result.frames_lost, f"lost (first reason: {lost or 'none given'})"),
+            (rest, f"without depth within {nearest:g} to {farthest:g} m"),
         ]
-        return f"nothing was mapped: of {result.frames} frames " + "; ".join(
+        return f"expected mapped frames, got none of {result.frames}: " + "; ".join(
             f"{count} {what}" for count, what in parts if count
         )
 
@@ -232,7 +232,7 @@ class Pipeline:
         with journal.timed(frame.index, "tracking"):
             pose = self.tracker.track(frame, self.fuser.scene)
         if not isinstance(cast(object, pose), Pose):
-            raise DataError(f"frame {frame.index}: a tracker must return a Pose, found {type(pose).__name__}")
+            raise DataError(f"frame {frame.index}: expected a Pose from the tracker, got {type(pose).__name__}")
         journal.frame_tracked(frame, pose)
         if pose.lost:
             return pose

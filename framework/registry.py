@@ -1,4 +1,4 @@
-"""Builds plugins from config nodes: the only place where a name in a config becomes code that runs."""
+"""Construction of plugins from config nodes; no other module runs code named in a config."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ STAGES: Mapping[str, type[Any]] = {
 GROUPS: Mapping[str, type[Any]] = {**STAGES, "viewer": Viewer}
 """All config groups whose options are plugins."""
 
-REGISTER = "; register a class of your own with a YAML {stage}/NAME.yaml in a folder that --config-dir names"
+REGISTER = "; register your class with a YAML {stage}/NAME.yaml in a folder given by --config-dir"
 
 Plugin = TypeVar("Plugin")
 
 
 def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
-    """Build the plugin that a config node describes: `_target_` names the class, the other keys are its parameters.
+    """Build the plugin of a config node: `_target_` names the class, the other keys are its parameters.
 
     The class must be the `_target_` of a registered option of the stage: of this project, an installed package, or
     --config-dir (without a running Hydra: `framework.config.composition.add_config_dir`). Only then is its module
@@ -63,13 +63,13 @@ def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
     stage = stage_of(interface)
     if not isinstance(node, DictConfig) or OmegaConf.is_missing(node, "_target_") or not node.get("_target_"):
         raise ConfigError(
-            f"{stage}: expected a plugin's config with a _target_, found {_shown(node)}; choose {stage}=NAME"
+            f"{stage}: expected a plugin's config with a _target_, got {_shown(node)}; choose {stage}=NAME"
         )
     target = str(node["_target_"])
     with _options_loader() as loader:
         if target not in _targets(loader, stage, target):
             hint = _did_you_mean(target, list(_targets(loader, stage, target))) or REGISTER.format(stage=stage)
-            raise ConfigError(f"{stage} {target}: no registered option of {stage} has this _target_{hint}")
+            raise ConfigError(f"{stage}: expected the _target_ of a registered option of {stage}, got {target}{hint}")
     plugin_class = find_class(interface, target)
     where = f"{stage} {target}"
     arguments = parameters(where, plugin_class, node)
@@ -110,7 +110,9 @@ def parameter_fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[An
     for name, (field, kind) in _fields(plugin_class).items():
         more = parameter_fields(kind) if _is_part(kind) else {name: (field, kind)}
         if twice := found.keys() & more.keys():
-            raise ConfigError(f"{plugin_class.__name__} has two parameters {', '.join(sorted(twice))}")
+            raise ConfigError(
+                f"{plugin_class.__name__}: expected unique parameters, got two {', '.join(sorted(twice))}"
+            )
         found |= more
     return found
 
@@ -181,23 +183,26 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
     where = f"{stage} {target}"
     module_name, _, class_name = target.rpartition(".")
     if not module_name:
-        raise ConfigError(f"{where}: _target_ must be package.module.Class")
+        raise ConfigError(f"{where}: _target_: expected package.module.Class, got {target}")
     module = _import(where, module_name)
     found = getattr(module, class_name, None)
     if found is None:
         fitting = [name for name, value in vars(module).items() if _implements(value, interface)]
-        raise ConfigError(f"{where}: module {module_name} has no {class_name}{_did_you_mean(class_name, fitting)}")
+        raise ConfigError(
+            f"{where}: expected a class of the module {module_name}, got "
+            f"{class_name}{_did_you_mean(class_name, fitting)}"
+        )
     if not _implements(found, interface):
-        kind = "a class that does not" if isinstance(found, type) else f"a {type(found).__name__}"
+        kind = "another class" if isinstance(found, type) else f"a {type(found).__name__}"
         if _implements(found, GROUPS[stage]):
             what = (inspect.getdoc(interface) or "").partition("\n")[0].removesuffix(".")
-            raise ConfigError(f"{where}: here it must be of the kind {interface.__name__} ({what})")
-        raise ConfigError(f"{where}: expected a class that implements {interface.__name__}, found {kind}")
+            raise ConfigError(f"{where}: expected a subclass of {interface.__name__} ({what}), got {class_name}")
+        raise ConfigError(f"{where}: expected a class that implements {interface.__name__}, got {kind}")
     if "__dataclass_fields__" not in vars(found):
-        raise ConfigError(f"{where}: a plugin must be a dataclass, and {class_name} is not decorated with @dataclass")
+        raise ConfigError(f"{where}: expected a dataclass, got {class_name} without @dataclass")
     if inspect.isabstract(found):
         missing = ", ".join(sorted(found.__abstractmethods__))
-        raise ConfigError(f"{where}: {class_name} does not implement {missing} of {interface.__name__}")
+        raise ConfigError(f"{where}: expected {missing} of {interface.__name__}, got none in {class_name}")
     with _errors_at(where):
         parameter_fields(found)
     plugin_class: type[Plugin] = found
@@ -219,7 +224,9 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
         stage = where.split()[0]
         needed = " ".join(f"{stage}.{name}=..." for name in missing)
         hints = [str(fields[name][0].metadata["where"]) for name in missing if "where" in fields[name][0].metadata]
-        raise ConfigError(f"{where}: {', '.join(missing)} must be given: {'; '.join([needed, *hints])}")
+        raise ConfigError(
+            f"{where}: expected a value for {', '.join(missing)}, got none; set {'; '.join([needed, *hints])}"
+        )
     values = {name: plugins[name] if name in stages else schema[name] for name in fields}
     return {name: list(value) if isinstance(value, ListConfig) else value for name, value in values.items()}
 
@@ -247,7 +254,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
         schema: DictConfig = OmegaConf.structured(dataclasses.make_dataclass(plugin_class.__name__, typed))
     except OmegaConfBaseException as error:
         raise ConfigError(
-            f"{where}: parameters must be bool, int, float, str, Path, Enum or list[str]: {first_line(error)}"
+            f"{where}: expected parameters of bool, int, float, str, Path, Enum or list[str]; {first_line(error)}"
         ) from error
     plugins: dict[str, Any] = {}
     for key in map(str, node):
@@ -255,8 +262,8 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
             continue
         if key not in fields:
             hint = rename_hint(f"{where.split()[0]}.{key}")
-            suggestion = f"; {hint}" if hint else _did_you_mean(key, list(fields), "it has")
-            raise ConfigError(f"{where}: there is no parameter {key!r}{suggestion}")
+            suggestion = f"; {hint}" if hint else _did_you_mean(key, list(fields), "expected one of")
+            raise ConfigError(f"{where}: unknown parameter {key!r}{suggestion}")
         if key in stages:
             plugins[key] = _inner(f"{where}: {key}", stages[key], node[key], holds_one(plugin_class, key))
             continue
@@ -290,7 +297,7 @@ def _inner(where: str, interface: type[Any], node: Any, one: bool) -> Any:
         with _errors_at(where):
             return build(interface, node)
     if not isinstance(node, DictConfig):
-        raise ConfigError(f"{where}: expected plugins by name, found {_shown(node)}")
+        raise ConfigError(f"{where}: expected plugins by name, got {_shown(node)}")
     found = {}
     for name in map(str, node):
         if node[name] is not None:
@@ -305,10 +312,12 @@ def _import(where: str, module_name: str) -> ModuleType:
     try:
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{where}: {module_name} needs the package {error.name!r}, which is not installed") from error
+        raise ConfigError(
+            f"{where}: {module_name} requires the package {error.name!r}, which is not installed; install it"
+        ) from error
     except Exception as error:  # third-party code
         kind = type(error).__name__
-        raise ConfigError(f"{where}: {module_name} cannot be imported: {kind}: {first_line(error)}") from error
+        raise ConfigError(f"{where}: {module_name}: import failed: {kind}: {first_line(error)}") from error
 
 
 def _check_module(where: str, module_name: str) -> None:
@@ -330,9 +339,9 @@ def _check_module(where: str, module_name: str) -> None:
         spec = next((spec for spec in specs if spec and spec.loader), next(filter(None, specs), None))
         if spec is None:
             close = _did_you_mean(part, [module.name for module in pkgutil.iter_modules(folders)])
-            raise ConfigError(f"{where}: there is no module {name}{close}")
+            raise ConfigError(f"{where}: unknown module {name}{close}")
     if spec is None:
-        raise ConfigError(f"{where}: there is no module {name}")
+        raise ConfigError(f"{where}: unknown module {name}")
 
 
 def _check_plugins_package(plugins: ModuleSpec) -> None:
@@ -340,8 +349,8 @@ def _check_plugins_package(plugins: ModuleSpec) -> None:
     found = Path([*(plugins.submodule_search_locations or []), str(plugins.origin)][0]).resolve()
     if found != PROJECT_ROOT / "plugins":
         raise InstanceMapError(
-            f"the package 'plugins' at {found} hides InstanceMap's own at {PROJECT_ROOT / 'plugins'}: "
-            "rename it or start elsewhere"
+            f"plugins: expected InstanceMap's package at {PROJECT_ROOT / 'plugins'}, got another one at "
+            f"{found}; rename it or start in another folder"
         )
 
 

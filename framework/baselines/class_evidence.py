@@ -76,7 +76,7 @@ def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists
 
 
 class ClassRows:
-    """Owns the class evidence of a grid and grows it. The kernels work on `self.evidence`."""
+    """Owner of the growing class evidence of a grid. The kernels work on `self.evidence`."""
 
     def __init__(self, voxels: VoxelGrid) -> None:
         self.voxels = voxels
@@ -97,7 +97,7 @@ class ClassRows:
     def begin(self, classes: int) -> None:
         """Set the number of classes before the first update. Raises DataError if there are too many."""
         if classes > NO_CLASS:
-            raise DataError(f"a map tells {NO_CLASS} classes apart, and the detector has {classes}")
+            raise DataError(f"detector: expected at most {NO_CLASS} classes, got {classes}")
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
     def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
@@ -126,7 +126,7 @@ class ClassRows:
         check_like(arrays, free, len(arrays["rest"]))
         check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
         if len(arrays["rest"]) and not classes:
-            raise DataError("rest has rows, and the map no class")
+            raise DataError("rest: expected no rows without classes, got some")
         _check_order(arrays["class_ids"], arrays["log_ratio"], arrays["rest"], classes)
         self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
         self.row_count = len(self.evidence.rest)
@@ -152,9 +152,9 @@ def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: i
     ratios = np.where(named, log_ratio, np.float32(-np.inf))
     best = ratios.max(axis=-1, initial=-np.inf)
     if (ratios[..., :1] < best[..., None]).any():
-        raise DataError("log_ratio must have the best class of each voxel in slot 0")
+        raise DataError("log_ratio: expected the best class of each voxel in slot 0, got another one")
     if ((named.sum(axis=-1) == classes) & (rest - np.maximum(best, 0) > MAX_EXPONENT)).any():
-        raise DataError("rest is too large in a voxel that names all classes")
+        raise DataError("rest: expected a smaller value in a voxel that names all classes, got a larger one")
 
 
 def _free_rows(class_slots: int) -> ClassEvidence:

@@ -83,7 +83,7 @@ def observe_mask(evidence, row, n, masks, k):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_blocks_under_masks(grid, seen, cluster, wants_row):
-    """Fill wants_row (A,) with whether a block has no row, and a voxel under a mask."""
+    """Fill wants_row (A,): true for blocks without a row that have a voxel under a mask."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
         start = seen.near_start[a]

@@ -214,11 +214,11 @@ class ObjectMap(InstanceTableMap):
             scene.table = table_of(header.part("table"), len(scene.classes), arrays)
             objects = header.part("objects")
             if objects.values.keys() != {str(key) for key in scene.table.records}:
-                raise DataError("header.objects must be the instances of its table")
+                raise DataError("header.objects: expected the instances of the table, got others")
             counts = {int(key): objects.whole(key) for key in objects.values}
             check_like(arrays, scene._empty_volume().arrays(), sum(counts.values()), OBJECT)
             if (arrays[OBJECT + "foreground"] > arrays[OBJECT + "observed"]).any():
-                raise DataError(f"{OBJECT}foreground must not be above {OBJECT}observed, of which it is a part")
+                raise DataError(f"{OBJECT}foreground: expected at most {OBJECT}observed, got more")
             start = 0
             for key, blocks in counts.items():
                 volume = scene.volumes[key] = scene._empty_volume()

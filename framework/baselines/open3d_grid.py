@@ -162,8 +162,8 @@ class BlockGrid:
         needed = hashmap.size() + new
         if needed > self.settings.max_blocks:
             raise MapFullError(
-                f"the map is full: {self.settings.max_blocks} blocks of {self.settings.block_resolution}^3 voxels "
-                f"({self.byte_count / 2**20:.0f} MiB in use); raise fuser.max_blocks or fuser.voxel_size"
+                f"the map is full: {self.settings.max_blocks} blocks of {self.settings.block_resolution}^3 "
+                f"voxels ({self.byte_count / 2**20:.0f} MiB in use); raise fuser.max_blocks or fuser.voxel_size"
             )
         if needed > hashmap.capacity():
             hashmap.reserve(min(max(needed, 2 * hashmap.capacity()), self.settings.max_blocks))
@@ -225,7 +225,7 @@ class BlockGrid:
         return SurfaceView(camera, T_world_camera, depth, normals, color)
 
     def _cast(self, blocks: Int32, far: float, camera: Camera, T_world_camera: Float64) -> dict[str, npt.NDArray[Any]]:
-        """Return what Open3D's rays find, each (H, W, channels).
+        """Return the results of Open3D's ray casting, each (H, W, channels).
 
         The image is padded to multiples of RANGE_TILE, because the range map omits other last rows and columns.
         """

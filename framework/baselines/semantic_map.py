@@ -83,7 +83,7 @@ class SemanticMap(SceneMap):
         return np.float32(np.log(self.elections.missed))
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return surface and classes; voxels know no instances."""
+        """Return surface and classes; voxels have no instances."""
         surface = self.volume.render(camera, T_world_camera)
         class_ids = np.empty(camera.shape, np.int32)
         view = pinhole(camera, T_world_camera)

@@ -1,4 +1,4 @@
-"""One file = one command of `instancemap`; `command_line`, `experiment` and `sweep` are what they share."""
+"""Commands of `instancemap`, one per file; `command_line`, `experiment` and `sweep` are shared."""
 
 from framework.runtime.process_settings import set_environment
 

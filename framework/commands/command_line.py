@@ -72,7 +72,7 @@ def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """Parse the command line. All commands also take `debug=true` and --config-dir, which registers more options."""
     for word in sys.argv[1:]:
         if word.startswith("debug=") and word not in ("debug=true", "debug=false"):
-            parser.error(f"debug must be true or false, found {word.partition('=')[2][:60]!r}")
+            parser.error(f"debug: expected true or false, got {word.partition('=')[2][:60]!r}")
     parser.add_argument("--config-dir", metavar="FOLDER", type=Path, help="folder with more options, as in a run")
     parsed = parser.parse_intermixed_args([word for word in sys.argv[1:] if not word.startswith("debug=")])
     if parsed.config_dir is not None:
@@ -104,7 +104,7 @@ def print_for_directories(description: str, directory_help: str, write: Callable
 
 @dataclass
 class Jobs:
-    """Reports the error of each job of a sweep, so that the others still run, and keeps the exit status."""
+    """Error reports and exit status of the jobs of a sweep. An error does not stop the other jobs."""
 
     status: int = 0
 
@@ -131,7 +131,7 @@ class Jobs:
         """Run Hydra's command for a reported job, and exit with a status if one has failed."""
         with one_line_errors():
             for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra reports a missing one
-                add_config_dir(folder)  # for what follows Hydra's part, such as a sweep's figure
+                add_config_dir(folder)  # for the work after Hydra's part, such as the figure of a sweep
             Plugins.instance().register(InstalledConfigs)
             command()
         if self.status:
@@ -142,7 +142,7 @@ def check_switches(config: DictConfig) -> None:
     """Raise ConfigError for a switch that is not a boolean, such as `skip_completed=flase`."""
     for name in ("skip_completed", "debug"):
         if not isinstance(config.get(name, False), bool):
-            raise ConfigError(f"{name} must be true or false, found {config[name]!r}")
+            raise ConfigError(f"{name}: expected true or false, got {config[name]!r}")
 
 
 def is_of_sweep(hydra_config: HydraConf) -> bool:

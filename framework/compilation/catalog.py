@@ -55,7 +55,8 @@ class Kernel:
         found = getattr(import_module(self.module), self.name, None)
         if not isinstance(found, Dispatcher):
             raise DataError(
-                f"{LIST.name}: there is no kernel {self.module}.{self.name}; run python -m tests.support.kernel_calls"
+                f"{LIST.name}: expected an existing kernel, got {self.module}.{self.name}; run python -m "
+                "tests.support.kernel_calls"
             )
         return found
 
@@ -122,7 +123,7 @@ def compile_for_run() -> None:
         try:
             compile_all(missing)
         except DataError as error:
-            log.warning("%s; it is compiled when it is first called", error)
+            log.warning("%s; it is compiled at its first call", error)
 
 
 def compile_all(kernels: list[Kernel]) -> None:
@@ -185,7 +186,11 @@ def _feed(
                     answer = process.stdout.readline()
                 except OSError:
                     answer = ""
-                error = answer.strip() if answer else f"{kernel.module}.{kernel.name}: its process has ended"
+                error = (
+                    answer.strip()
+                    if answer
+                    else f"{kernel.module}.{kernel.name}: expected a result, got the end of its process"
+                )
                 events.put(("done", error))
 
 
@@ -200,7 +205,7 @@ def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueu
             except queue.Empty:
                 event, text = "", ""
                 if not any(thread.is_alive() for thread in threads):
-                    raise DataError("the processes that compile kernels have ended") from None
+                    raise DataError("kernels: expected running processes, got none; all have ended") from None
             if event == "done":
                 left -= 1
                 bar.update()
@@ -209,13 +214,13 @@ def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueu
                 bar.set_description_str(f"{left} left, {text}", refresh=False)
             bar.refresh()
             if bar.line_is_due():
-                log.info("%d of %d kernels are left", left, count)
+                log.info("%d of %d kernels remaining", left, count)
     return errors
 
 
 @contextmanager
 def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
-    """Let one process compile and the others wait: the jobs of a sweep start at the same time."""
+    """Serialize compilation: the jobs of a sweep start at the same time."""
     folder = Path(kernels[0].dispatcher._cache.cache_path)
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / "compiling.lock")
@@ -223,10 +228,10 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
         try:
             lock.acquire(timeout=0)
         except Timeout:
-            log.info("another process compiles kernels: waiting for it")
+            log.info("another process is compiling kernels; waiting for it")
             lock.acquire()
     except OSError as error:  # no locks: several processes may compile the same kernels
-        log.warning("%s cannot be locked (%s)", folder, error.strerror)
+        log.warning("%s: expected a file system with locks (%s); compiling without a lock", folder, error.strerror)
     try:
         yield
     finally:
@@ -272,7 +277,7 @@ def _text_of(kind: Any) -> str:
         return f"omitted({kind.value!r})"
     text = "boolean" if kind == types.boolean else str(kind)
     if getattr(types, text, None) != kind:
-        raise TypeError(f"cannot write the type {kind}")
+        raise TypeError(f"{kind}: expected a type of numba.types, got another one")
     return text
 
 

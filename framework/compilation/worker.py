@@ -1,4 +1,4 @@
-"""The process that compiles kernels for others without running them, and skips what only running them needs.
+"""Worker process that compiles kernels without running them.
 
 numba generates machine code and Python and C wrappers for each function that a kernel calls, although the kernel
 contains a copy. Skipping that saves a third of the time and gives the same cache.
@@ -49,7 +49,7 @@ def work() -> None:
                     dispatcher._cache = NullCache()
             kernel.compile()
         except Exception as error:
-            reason = f"{kernel.module}.{kernel.name} cannot be compiled: {type(error).__name__}: {error}"
+            reason = f"{kernel.module}.{kernel.name}: compilation failed: {type(error).__name__}: {error}"
             print(reason.splitlines()[0], flush=True)
         else:
             print(flush=True)

@@ -1,4 +1,4 @@
-"""The configs: composing one as the command line does, and saying in one line what is wrong with it."""
+"""Composition of configs as on the command line, with errors in one line."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def composed(*overrides: str) -> DictConfig:
     try:
         with config_loader() as loader:
             return loader.compose([*overrides])
-    except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra answers some faults with ValueError
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra raises ValueError for some errors
         raise ConfigError(one_line(error)) from error
 
 
@@ -47,10 +47,10 @@ _added: list[Path] = []
 def add_config_dir(folder: Path) -> None:
     """Register the options of another folder in this process, like --config-dir.
 
-    Raises ConfigError when there is no such folder.
+    Raises ConfigError if the folder does not exist.
     """
     if not folder.is_dir():
-        raise ConfigError(f"--config-dir: there is no folder {folder}")
+        raise ConfigError(f"--config-dir: expected a folder, got {folder}")
     _added.append(folder.resolve())
 
 
@@ -75,7 +75,7 @@ def installed_config_dirs() -> dict[Path, str]:
 
 
 class InstalledConfigs(SearchPathPlugin):
-    """Adds the config folders of installed packages to the runs of this process, once registered with Hydra."""
+    """Search path plugin with the config folders of installed packages, once registered with Hydra."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder, package in installed_config_dirs().items():
@@ -83,7 +83,7 @@ class InstalledConfigs(SearchPathPlugin):
 
 
 class FileConfigSource(hydra_api.FileConfigSource):
-    """Hydra's own reader of YAML in folders, but files are checked first. Hydra tells sources apart by their name."""
+    """Hydra's reader of YAML folders with a check of each file. Hydra distinguishes sources by name."""
 
     def load_config(self, config_path: str) -> ConfigResult:
         path = Path(self.path, self._normalize_file_name(config_path))
@@ -94,14 +94,14 @@ class FileConfigSource(hydra_api.FileConfigSource):
             found = super().load_config(config_path)
         config: Any = found.config
         if not isinstance(config, DictConfig):
-            raise DataError(f"{path}: expected keys and values, found a list")
+            raise DataError(f"{path}: expected keys and values, got a list")
         if "defaults" in config and not isinstance(config.get("defaults"), ListConfig):
-            raise DataError(f"{path}: defaults must be a list")  # Hydra has no word for some of what else it may be
+            raise DataError(f"{path}: expected a list as defaults")  # Hydra does not check some other types
         return found
 
 
 class HydraNodes(hydra_api.StructuredConfigSource):
-    """Hydra's own structured nodes, but nothing that the host has stored.
+    """Hydra's structured nodes, without those stored by the host.
 
     Hydra adds the basic launcher and sweeper only when it scans its plugins, which changes the host's store.
     """
@@ -115,11 +115,11 @@ class HydraNodes(hydra_api.StructuredConfigSource):
                 self.store.store("basic", {}, f"hydra/{part}")
 
 
-HydraNodes.__name__ = "StructuredConfigSource"  # by which Hydra tells the schema's source
+HydraNodes.__name__ = "StructuredConfigSource"  # Hydra finds the source of the schema by this name
 
 
 class Repository(hydra_api.ConfigRepository):
-    """Finds configs in folders, packages and Hydra's own structured nodes, without Hydra's registries."""
+    """Repository of configs in folders, packages and Hydra's structured nodes, without Hydra's registries."""
 
     def initialize_sources(self, config_search_path: ConfigSearchPath) -> None:
         kinds = (FileConfigSource, hydra_api.ImportlibResourcesConfigSource, HydraNodes)
@@ -131,7 +131,7 @@ class Repository(hydra_api.ConfigRepository):
 
 
 class ConfigLoader(hydra_api.ConfigLoaderImpl):
-    """Composes our configs, and those of the added folders, without Hydra's process-wide state."""
+    """Loader of our configs and those of the added folders, without Hydra's process-wide state."""
 
     def __init__(self) -> None:
         path = hydra_api.ConfigSearchPathImpl()
@@ -180,12 +180,12 @@ def _said(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _no_such_option(error)
     if isinstance(error, OverrideParseException):
-        return f"{error.override!r} is not an override of the form key=value: {error.message.splitlines()[0]}"
+        return f"{error.override!r}: expected an override of the form key=value; {error.message.splitlines()[0]}"
     if isinstance(error, HydraException) and isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
         return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         return _joined(f"{error} {error.__cause__}")
-    if isinstance(error, InterpolationResolutionError):  # what a resolver says stands between its kind and the key
+    if isinstance(error, InterpolationResolutionError):  # the message of a resolver is between its kind and the key
         return _joined(
             str(error).partition("\n")[0].partition(" raised while resolving interpolation: ")[2] or str(error)
         )
@@ -195,7 +195,7 @@ def _said(error: BaseException) -> str:
 
 
 _EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
-"""What to install, by Hydra's name of a launcher; ours are called like the extras."""
+"""Extras to install, by Hydra's name of a launcher; our launchers have the names of the extras."""
 
 
 def _no_such_option(error: MissingConfigException) -> str:
@@ -204,11 +204,11 @@ def _no_such_option(error: MissingConfigException) -> str:
         return _joined(str(error))
     if group == "hydra/launcher" and name in _EXTRAS:
         extra = _EXTRAS[name]
-        return f"launcher={extra} needs a package that is not installed: pip install instancemap[{extra}]"
+        return f"launcher={extra}: expected its optional package, got none; run pip install instancemap[{extra}]"
     options = list(error.options or ())
     close = get_close_matches(name, options, n=1)
-    suggestion = f"; did you mean {close[0]}?" if close else "."
-    return f"there is no {group}={name}{suggestion} The options are: {', '.join(options) or 'none'}"
+    suggestion = f"; did you mean {close[0]}?" if close else ""
+    return f"{group}: expected one of {', '.join(options) or 'none'}, got {name}{suggestion}"
 
 
 def _known_keys(error: OmegaConfBaseException) -> str:
@@ -219,8 +219,8 @@ def _known_keys(error: OmegaConfBaseException) -> str:
     if hint := rename_hint(path):
         return hint
     if close:
-        return f"There is no {path}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
-    return f"There is no {path}; beside it there are: {', '.join(keys) or 'none'}"
+        return f"{path}: unknown key; did you mean {path[: -len(str(error.key))]}{close[0]}?"
+    return f"{path}: unknown key; expected one of {', '.join(keys) or 'none'}"
 
 
 def _joined(text: str) -> str:

@@ -72,4 +72,4 @@ def new_name(key: str) -> str | None:
 def rename_hint(key: str) -> str:
     """Return the end of an error for an unknown key: its new name, or an empty string."""
     found = new_name(key)
-    return f"{key} was renamed: set {found}" if found else ""
+    return f"{key} was renamed; set {found}" if found else ""

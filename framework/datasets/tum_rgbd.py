@@ -77,7 +77,7 @@ class TumRgbd(Recording):
 
     def __post_init__(self) -> None:
         difference = self.max_time_difference
-        require(0 < difference <= 1, "dataset.max_time_difference", difference, "in (0, 1] s")
+        require(0 < difference <= 1, "dataset.max_time_difference", difference, "a value in (0, 1] s")
         super().__post_init__()
 
     def open(self) -> Contents:

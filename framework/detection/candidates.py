@@ -57,7 +57,7 @@ def decode(layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[in
     if layout not in (OutputLayout.yolox, OutputLayout.yolo, OutputLayout.yolo_objectness):
         return _decode_ssd(layout, outputs, shape, classes)
     if len(outputs) != 1:
-        raise DataError(f"the network must have one output, found {described(outputs)}: choose another detector.layout")
+        raise DataError(f"detector.layout: expected one output, got {described(outputs)}; choose another layout")
     (output,) = outputs.values()
     if layout is OutputLayout.yolo:
         rows = _rows(output, 4 + classes, "yolo_objectness")
@@ -76,8 +76,9 @@ def check_scores(class_scores: Float32) -> None:
     """Raise DataError unless all scores are in [0, 1]; some networks are exported without sigmoid or softmax."""
     if class_scores.size and (class_scores.min() < -1e-3 or class_scores.max() > 1 + 1e-3):
         raise DataError(
-            f"the network's scores must be in [0, 1], found {class_scores.min():.3g} to {class_scores.max():.3g}:"
-            " choose another detector.layout, or export the network with its sigmoid or softmax"
+            f"detector.layout: expected scores in [0, 1], got {class_scores.min():.3g} to "
+            f"{class_scores.max():.3g}; choose another layout, or export the network with its sigmoid or "
+            "softmax"
         )
 
 
@@ -95,8 +96,8 @@ def _rows(output: Float32, columns: int, other_layout: str) -> Float32:
         return table.T
     hint = "detector.label_space" + (f" or detector.layout (perhaps {other_layout})" if other_layout else "")
     raise DataError(
-        f"the network's output must have {columns} columns for its box and classes, found the shape {output.shape}:"
-        f" choose other {hint}"
+        f"{hint}: expected {columns} columns for box and classes, got an output of shape {output.shape}; "
+        "set another value"
     )
 
 
@@ -119,8 +120,8 @@ def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
     cell, stride_of = np.concatenate(cells), np.concatenate(strides)
     if len(cell) != len(rows):
         raise DataError(
-            f"a YOLOX of input {shape[0]}x{shape[1]} has {len(cell)} candidates, the network's output has {len(rows)}:"
-            " choose another detector.layout"
+            f"detector.layout: expected {len(cell)} candidates of a YOLOX with input {shape[0]}x{shape[1]}, "
+            f"got {len(rows)}; choose another layout"
         )
     centers = (rows[:, :2] + cell) * stride_of
     sizes = np.exp(np.minimum(rows[:, 2:4], np.float32(LARGEST_LOG_SCALE))) * stride_of
@@ -150,8 +151,8 @@ def _decode_ssd(
         if not by_class and len(scores) == len(labels) == 1:
             return _checked(_ssd_boxes(layout, boxes[0], shape), _spread(scores[0], labels[0], classes))
     raise DataError(
-        f"a network of the layout {layout.value} with {classes} classes must have outputs named boxes (K, 4), and"
-        f" either scores (K, {classes} or {classes + 1}), or scores (K,) and labels (K,); found {described(outputs)}"
+        f"detector.layout: expected outputs boxes (K, 4) and either scores (K, {classes} or "
+        f"{classes + 1}), or scores (K,) and labels (K,) for {layout.value}, got {described(outputs)}"
     )
 
 
@@ -174,7 +175,7 @@ def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
     used = (column != -1) & (scores > 0)
     if (beyond := column[used & ((column < 0) | (column >= classes))]).size:
         raise DataError(
-            f"the network's labels must be 1 to {classes}, found {beyond.max() + 1}: choose other detector.label_space"
+            f"detector.label_space: expected labels 1 to {classes}, got {beyond.max() + 1}; set another label_space"
         )
     check_scores(scores)
     own = scores[used]

@@ -88,8 +88,8 @@ class SegmentationLayout:
         labels = rows[:, LABEL]
         if not _are_labels(labels, self.classes):
             raise DataError(
-                f"the network's sixth column must be labels from 0 to {self.classes - 1}, found {labels.min():g} to"
-                f" {labels.max():g}: choose other detector.label_space"
+                f"detector.label_space: expected labels 0 to {self.classes - 1} in the network's sixth column, "
+                f"got {labels.min():g} to {labels.max():g}; set another label_space"
             )
         class_scores = np.zeros((len(rows), self.classes), np.float32)
         class_scores[np.arange(len(rows)), labels.astype(np.int64)] = rows[:, SCORE]
@@ -106,8 +106,8 @@ class SegmentationLayout:
             boxes[confident, 2:] < boxes[confident, :2]
         ).any():  # None: every known export with suppression has corners
             raise DataError(
-                "the network's boxes cannot be corners, because one of a confident detection ends before it begins:"
-                " set detector.box_format=CENTER"
+                "detector.box_format: expected corners with x1 <= x2 and y1 <= y2, got others in a confident "
+                "detection; set detector.box_format=CENTER"
             )
         return boxes * np.array([self.shape[1], self.shape[0]] * 2, np.float32) if unit else boxes
 
@@ -148,8 +148,8 @@ def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
     maps = [output for output in outputs.values() if output.ndim == 4 and output.shape[0] == 1]
     if len(outputs) != 2 or len(tables) != 1 or len(maps) != 1:
         raise DataError(
-            "a segmentation network must have two outputs, (1, 4 + classes + M, K) or with suppression (1, K, 6 + M),"
-            f" and (1, M, h, w), found {described(outputs)}"
+            "detector.weights: expected two outputs, (1, 4 + classes + M, K) or with suppression (1, K, 6 + "
+            f"M), and (1, M, h, w), got {described(outputs)}"
         )
     return tables[0], maps[0]
 
@@ -164,8 +164,11 @@ def _is_channels_last(
     if first and last and metadata.author.startswith("Ultralytics"):
         return input_channels_last  # their exports transpose both or none
     if first == last:
-        why = "may be (1, M, h, w) or (1, h, w, M): export for another size" if first else "have other proportions"
-        raise DataError(f"the network's prototypes {prototypes.shape} {why}; its input is {height}x{width}")
+        why = "ambiguous (1, M, h, w) or (1, h, w, M); export for another size" if first else "other proportions"
+        raise DataError(
+            f"detector.weights: expected prototypes with the proportions of the input {height}x{width}, got "
+            f"{prototypes.shape} with {why}"
+        )
     return bool(last)
 
 
@@ -185,12 +188,16 @@ def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bo
 
 def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness: bool, both: bool) -> str:
     if both:
-        return f"a network with as many candidates as columns, {columns}, cannot be read: export for another size"
+        return (
+            f"detector.weights: expected different numbers of candidates and columns, got {columns} of both; "
+            "export for another size"
+        )
     other = columns - 1 if objectness else columns + 1
     fix = f"set detector.objectness={str(not objectness).lower()} or" if other in shape[1:] else "choose"
     return (
-        f"the network's output must have {columns} columns for box, classes and {count} coefficients, or"
-        f" {COEFFICIENTS + count} with suppression inside, found the shape {shape}: {fix} other detector.label_space"
+        f"detector.label_space: expected {columns} columns for box, classes and {count} coefficients, or "
+        f"{COEFFICIENTS + count} with suppression inside, got an output of shape {shape}; {fix} another "
+        "detector.label_space"
     )
 
 
@@ -206,8 +213,8 @@ def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
     if suppressed:
         return None
     raise DataError(
-        f"the network's boxes may be corners or center and size ({ordered:.0%} of them could be corners): set"
-        " detector.box_format=CENTER or CORNER"
+        f"detector.box_format: expected corners or centers and sizes, got ambiguous boxes ({ordered:.0%} "
+        "could be corners); set detector.box_format=CENTER or CORNER"
     )
 
 
@@ -220,7 +227,7 @@ def _is_unit(boxes: Float32, shape: tuple[int, int], suppressed: bool) -> bool |
     # cells cover the input; detections may not
     if not suppressed and (boxes[:, 0].max() < shape[1] / 4 or boxes[:, 1].max() < shape[0] / 4):
         raise DataError(
-            f"the network's boxes are neither in px of its input {shape[0]}x{shape[1]} nor in 0..1: they begin at up to"
-            f" {boxes[:, 0].max():.3g}, {boxes[:, 1].max():.3g}; export it with boxes that are decoded"
+            f"detector.weights: expected boxes in px of the input {shape[0]}x{shape[1]} or in 0..1, got "
+            f"starts of up to {boxes[:, 0].max():.3g}, {boxes[:, 1].max():.3g}; export with decoded boxes"
         )
     return False

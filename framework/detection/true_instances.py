@@ -30,15 +30,15 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
     """
     if frame.truth is None:
         raise DataError(
-            f"frame {frame.index} has no instance ground truth, which this detector needs:"
-            " set dataset.frame_ground_truth=true where the dataset has a labeled mesh (scenenn, scannet),"
-            " name one with dataset.ground_truth=PATH, or choose another dataset or detector"
+            f"frame {frame.index}: expected instance ground truth, which this detector needs, got none; set "
+            "dataset.frame_ground_truth=true (scenenn, scannet) or dataset.ground_truth=PATH, or choose "
+            "another dataset or detector"
         )
     index = {name: k for k, name in enumerate(classes)}
     names = {i: name for i, name in frame.truth.class_names.items() if i != 0 and name is not None}
     unknown = sorted({name for name in names.values() if name not in index})
     if unknown:
-        raise DataError(f"the ground truth names classes that the detector does not have: {', '.join(unknown)}")
+        raise DataError(f"detector: expected the classes of the ground truth, got none for {', '.join(unknown)}")
 
     found, areas = np.unique(frame.truth.instance_ids, return_counts=True)
     chosen = np.array([i in names for i in found.tolist()], np.bool_) & (areas >= min_pixels)

@@ -1,1 +1,1 @@
-"""How good a map and a trajectory are, measured against what is true."""
+"""Metrics of maps and trajectories."""

@@ -19,10 +19,10 @@ from framework.data import Bool, Detections, FrameTruth, Int64
 SMALLEST = 64  # px, an appearance that counts
 FOUND_IOU = 0.3  # of an appearance that is found, whatever its class
 SIDES = (32.0, 96.0)  # px, square roots of areas: COCO's bounds between small, medium and large
-ENOUGH = 5  # appearances of an object, for its share of found ones to count
+ENOUGH = 5  # minimum appearances of an object for its detection rate
 RARELY, MOSTLY = 0.25, 0.75  # shares of an object's appearances
 PART_INSIDE, PART_COVERS = 0.6, 0.05  # least shares of the detection and of the object, for a part of an object
-ON_ONE = 0.6  # least share of a false detection on one thing that is taken for an object
+ON_ONE = 0.6  # minimum fraction of a false detection on one thing to count as an object
 
 
 class Appearance(NamedTuple):
@@ -32,8 +32,8 @@ class Appearance(NamedTuple):
     side: float  # px, square root of the area
     parts: int  # detections that lie mostly on it
     iou: float = 0.0
-    inside: float = 0.0  # share of the detection on the object
-    covered: float = 0.0  # share of the object under the detection
+    inside: float = 0.0  # fraction of the detection on the object
+    covered: float = 0.0  # fraction of the object under the detection
     score: float = 0.0
     class_name: str = ""
     is_right: bool = False

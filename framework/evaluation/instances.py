@@ -55,14 +55,16 @@ class PredictedInstances:
             raise DataError(f"PredictedInstances: expected equally many values, got {counts}")
         shape = len(self.instance_ids), 3
         if self.points_world.shape != shape:
-            raise DataError(f"PredictedInstances.points_world must be {shape}, found {self.points_world.shape}")
+            raise DataError(
+                f"PredictedInstances.points_world: expected the shape {shape}, got {self.points_world.shape}"
+            )
         if len(np.unique(self.ids)) != len(self.ids) or (self.ids < 1).any():
-            raise DataError("PredictedInstances.ids must be positive and each there once")
+            raise DataError("PredictedInstances.ids: expected unique positive integers")
         if not np.isfinite(self.confidences).all():
-            raise DataError("PredictedInstances.confidences holds values that are not finite")
+            raise DataError("PredictedInstances.confidences: expected finite values, got NaN or infinity")
         unlisted = np.setdiff1d(self.instance_ids, np.append(self.ids, 0))
         if len(unlisted):
-            raise DataError(f"PredictedInstances: points are labeled {unlisted[0]}, which is not among the ids")
+            raise DataError(f"PredictedInstances: expected points labeled with its ids, got the label {unlisted[0]}")
 
     @classmethod
     def of_map(
@@ -322,7 +324,7 @@ def average_precision(hits: Bool, truths: int) -> float:
     All-point interpolation: the sum over the hits of the largest precision at this or a lower rank, by `truths`.
     """
     if truths == 0:
-        raise ValueError("average precision is not defined without a true instance")
+        raise ValueError("average precision: expected at least one true instance, got none")
     precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
     return float(envelope[hits].sum() / truths)

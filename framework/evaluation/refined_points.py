@@ -15,7 +15,7 @@ from framework.interfaces import ClusterRefiner
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 
-TIMED = 5  # calls, of which the median counts; the call before them may compile
+TIMED = 5  # number of timed calls, for the median; an earlier call may compile
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> 
     """
     if len(reference) != len(estimated):
         raise DataError(
-            f"trajectories must be equally long, found {len(reference)} true and {len(estimated)} estimated poses"
+            f"trajectories: expected equal lengths, got {len(reference)} true and {len(estimated)} estimated poses"
         )
     usable = np.array([q is not None and not p.lost for q, p in zip(reference, estimated, strict=True)], np.bool_)
     Q = np.array([np.eye(4) if q is None else q for q in reference]).reshape(-1, 4, 4)

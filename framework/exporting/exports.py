@@ -63,7 +63,7 @@ class Chosen:
     def __post_init__(self) -> None:
         for name, low, high in (("min_confidence", 0.0, 1.0), ("resolution", 0.01, 1.0), ("robot_height", 0.1, 3.0)):
             value = getattr(self, name)
-            require(low <= value <= high, name, value, f"in [{low:g}, {high:g}]")
+            require(low <= value <= high, name, value, f"a value in [{low:g}, {high:g}]")
         if self.triangles is not None and self.triangles < 4:
             raise DataError(f"triangles must be at least 4, found {self.triangles}")
 

@@ -40,7 +40,7 @@ def write_figure(directory: Path) -> list[Path]:
     """
     pictured = Pictured.below(directory)
     if missing := list(pictured.missing()):
-        log.warning("not in the figure: %s", "; ".join(missing))
+        log.warning("omitted from the figure: %s", "; ".join(missing))
     return DRAWN[pictured.choice.kind](pictured).write(directory / NAME)
 
 
@@ -59,23 +59,24 @@ class Pictured:
         Raises DataError for a sweep without figure or complete runs, ConfigError for an invalid figure.
         """
         if not directory.is_dir():
-            raise DataError(f"{directory} is not a folder with records of runs")
+            raise DataError(f"{directory}: expected a folder of runs")
         if not (directory / SWEEP).exists():
             raise DataError(
-                f"{directory} has no {SWEEP}: pictures are of experiments, like experiment=figure4_progress"
+                f"{directory}: expected the folder of an experiment, got no {SWEEP}; run "
+                "one such as experiment=figure4_progress"
             )
         sweep = read_yaml(directory / SWEEP)
         if not sweep.get(NAME):
             raise DataError(
-                f"{directory / SWEEP} has no block `{NAME}:`, which says what to draw: only some experiments have one, "
-                "like experiment=figure4_progress"
+                f"{directory / SWEEP}: expected a block `{NAME}:`, got none; run an experiment with a figure "
+                "such as experiment=figure4_progress"
             )
         choice = FigureChoice.of(sweep[NAME])
         overrides = checked_rows(sweep.get("rows"))
         records, incomplete = find_records(directory)
         if not records:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
-            raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
+            raise DataError(f"{directory}: expected a completed run, got none{f' ({why})' if why else ''}")
         found = rows_of(records, choice.over, overrides)
         rows: dict[str, RunRow | None] = {}
         for system in dict.fromkeys([*overrides, *(row.system for row in found)]):
@@ -112,7 +113,7 @@ def _stage_times(pictured: Pictured) -> Page:
     means = {name: MeanTimes.of(list(times.values())) if times else None for name, times in read.items()}
     shown = [one for one in means.values() if one is not None]
     if not shown:
-        raise DataError("no timings.csv can be read; the log says why")
+        raise DataError("timings.csv: expected a readable file, got none; the log lists the reasons")
     counts = "/".join(map(str, dict.fromkeys(one.count for one in shown)))
     sequences = [pictured.called(run) for run in pictured.runs if any(run in times for times in read.values())]
     stages = "; ".join(f"{name}: {' and '.join(added)}" for name, added in COLUMNS.items())
@@ -151,7 +152,7 @@ def _maps(pictured: Pictured) -> Page:
         captions = [*map(_caption, maps), f"{line.true_count} instances" if truth else ""]
         lines.append(CaptionedLine(pictured.called(run), line, captions))
     if not lines:
-        raise DataError("no map can be read; the log says why")
+        raise DataError("maps: expected a readable map, got none; the log lists the reasons")
     note = (
         "An object has the same color in all pictures of a line. Dark: no match with a true object. "
         "Beige: a true object of unknown class, which is not evaluated."
@@ -183,7 +184,7 @@ def _if_readable(read: Callable[[Record], Read], record: Record) -> Read | None:
     try:
         return read(record)
     except InstanceMapError as error:
-        log.warning("not in the figure: %s", error)
+        log.warning("omitted from the figure: %s", error)
         return None
 
 

@@ -27,9 +27,9 @@ class FigureChoice:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise ConfigError(f"figure.kind must be one of {', '.join(KINDS)}, found {self.kind!r}")
+            raise ConfigError(f"figure.kind: expected one of {', '.join(KINDS)}, got {self.kind!r}")
         if self.zoom and self.kind != "maps":
-            raise ConfigError(f"figure.zoom=true needs figure.kind=maps, found {self.kind}")
+            raise ConfigError(f"figure.zoom: expected figure.kind=maps with zoom=true, got {self.kind}")
 
     @classmethod
     def of(cls, node: Any) -> FigureChoice:

@@ -39,7 +39,7 @@ class Writing:
     turn: int = 0  # degrees clockwise, 0, 90, 180 or 270, of the written images
 
     def __post_init__(self) -> None:
-        require(0 <= self.width <= MOST_PIXELS, "--width", self.width, f"0 or positive and at most {MOST_PIXELS} px")
+        require(0 <= self.width <= MOST_PIXELS, "--width", self.width, f"a value in [0, {MOST_PIXELS}] px")
         require(self.stride >= 1, "--stride", self.stride, "at least 1")
         require(self.turn in range(0, 360, QUARTER), "--turn", self.turn, "0, 90, 180 or 270 degrees")
         require(UNSURE <= self.confidence <= SURE, "--confidence", self.confidence, "0, 1 or 2")

@@ -19,7 +19,7 @@ from framework.mapping.storage.map_header import MapHeader
 
 MOST_FRAMES = 1e9  # of a map
 AGREED = 0.95  # least length of the mean of the sensor's unit vectors: they are within 18 degrees of it
-DIGITS = 6  # of what a frame adds: the last digits of float64 depend on the memory layout of arrays
+DIGITS = 6  # of the contribution of a frame: the last digits of float64 depend on the memory layout
 SAMPLED = 20_000  # triangles that refine a direction; each VOTING-th of them votes for it
 VOTING = 5
 DIRECTIONS = 3000  # candidates on half a sphere, 2.6 degrees apart
@@ -30,7 +30,7 @@ FACING_UP = 2.0  # weight of surface that faces up; in a boxy room all three axe
 LEAST_SHARE = 0.15  # of the surface, that must be level or upright; a heap of objects has less
 LEVEL = np.cos(np.radians(18.0))  # least dot product of up and the normal of a floor
 STEP = 0.05  # m, of heights
-FLOOR_SHARE = 0.05  # of all level surface, that lies within a step of the height of the floor, at least
+FLOOR_SHARE = 0.05  # minimum fraction of all level surfaces within a step of the floor height
 BELOW_FLOOR = 0.02  # of all surface, that may lie below the floor: noise, windows and mirrors
 
 
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 class GravityEstimator:
-    """Accumulates the camera's orientation and the sensor's directions over frames."""
+    """Accumulator of the camera's orientation and the sensor's directions over frames."""
 
     def __init__(self) -> None:
         self.camera_up: Float64 = np.zeros(3)  # (3,) sum of the unit vectors to the upper edge of the images, world
@@ -70,7 +70,10 @@ class GravityEstimator:
         found.sensed_frames = header.whole("sensed_frames")
         length = float(np.linalg.norm(found.sensed_up))
         if not length <= found.sensed_frames * (1 + UNIT_TOLERANCE):
-            raise DataError(f"sensed_up has the length {length:.4g}, of {found.sensed_frames} unit vectors")
+            raise DataError(
+                f"sensed_up: expected a length of at most {found.sensed_frames} (a sum of unit vectors), got "
+                f"{length:.4g}"
+            )
         return found
 
     def sensed(self) -> Float64 | None:
@@ -80,7 +83,9 @@ class GravityEstimator:
             return None
         if length < AGREED * self.sensed_frames:
             if not self._warned:
-                log.warning("gravity of the sensor is not one direction in the world; estimating it from surfaces")
+                log.warning(
+                    "sensor gravity: expected one direction in the world, got several; estimating it from surfaces"
+                )
             self._warned = True
             return None
         return self.sensed_up / length
@@ -113,7 +118,7 @@ def _vector(header: MapHeader, key: str) -> Float64:
     saved = header.items(key)
     numbers = [float(value) for value in saved if isinstance(value, int | float)]
     if len(numbers) != 3 or len(saved) != 3 or not (np.abs(numbers) < MOST_FRAMES).all():
-        raise DataError(f"{key} must be three numbers, sums of unit vectors, found {saved!r:.60}")
+        raise DataError(f"{key}: expected three numbers (a sum of unit vectors), got {saved!r:.60}")
     return np.array(numbers)
 
 

@@ -151,7 +151,7 @@ class InstanceMap(InstanceTableMap):
             check_known("class_ids", arrays["class_ids"], [*range(len(classes)), NO_CLASS])
             check_known("instance_ids", arrays["instance_ids"], [0, *table.records])
             if (arrays["class_ids"][:, 0] == NO_CLASS).any():
-                raise DataError("class_ids must have a first one for each voxel with labels")
+                raise DataError("class_ids: expected a class in the first slot of each voxel with labels")
             scene.labels.fill(Evidence(**{name: arrays[name] for name in Evidence._fields}))
             scene.labels.evicted = header.whole("evicted")
             scene.table = table

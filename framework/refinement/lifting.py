@@ -18,10 +18,10 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
     DataError if the masks have another size than the frame or `detections` has another type.
     """
     if not isinstance(cast(object, detections), Detections):
-        raise DataError(f"frame {frame.index}: a detector must return Detections, found {type(detections).__name__}")
+        raise DataError(f"frame {frame.index}: expected Detections from the detector, got {type(detections).__name__}")
     height, width = frame.depth.shape
     if detections.masks.shape[1:] != (height, width):
-        raise DataError(f"frame {frame.index}: masks must be {(height, width)}, found {detections.masks.shape[1:]}")
+        raise DataError(f"frame {frame.index}: expected masks of {(height, width)}, got {detections.masks.shape[1:]}")
     starts = np.zeros(len(detections) * height + 1, np.int64)  # first point of each row of each mask
     count_readings(detections.masks, frame.depth, starts)
     np.cumsum(starts, out=starts)

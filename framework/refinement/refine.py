@@ -1,4 +1,4 @@
-"""Refinement of the clusters of one frame: what all refiners share."""
+"""Refinement of the clusters of one frame, shared by all refiners."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> Po
         return clusters
     refined = refiner.refine(clusters, frame)
     if not isinstance(cast(object, refined), PointClusters):
-        raise DataError(f"frame {frame.index}: a refiner must return PointClusters, found {type(refined).__name__}")
+        raise DataError(f"frame {frame.index}: expected PointClusters from the refiner, got {type(refined).__name__}")
     require_pixels_inside(refined, frame.depth.shape)
     return refined
 

@@ -87,7 +87,7 @@ class MapScene:
         return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
 
     def data(self) -> dict[str, Any]:
-        """Return what the viewer's script needs besides the GLB."""
+        """Return the data of the viewer's script in addition to the GLB."""
         poses = self.contents.poses
         _, T_world_camera = self.view
         eye, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]

@@ -54,7 +54,7 @@ class RunReport:
     pictures: Mapping[int, Picture]
     true_path: TruePath | None
     check: TruthCheck | None
-    why_unchecked: str  # why there is no check although the run was evaluated
+    why_unchecked: str  # reason for a missing comparison of an evaluated run
 
     @classmethod
     def of(cls, contents: RunContents) -> RunReport:

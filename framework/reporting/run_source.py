@@ -36,16 +36,16 @@ class RunSource:
         """Open the sequence from the run's config. A sequence that cannot be read is None."""
         dataset = contents.record.dataset
         if any("${" in str(value) for _, value in leaves({"dataset": dataset})):
-            return cls(contents, None, "its config is not resolved")
+            return cls(contents, None, "the config of the run is not resolved")
         try:
             video = build(RGBDVideo, OmegaConf.create(dataset))
         except (InstanceMapError, OSError) as error:
             return cls(contents, None, str(error))
         if not isinstance(video, RGBDSequence):
-            return cls(contents, None, "it was mapped as it came from a camera")
+            return cls(contents, None, "the run mapped a live camera")
         source = cls(contents, video, "")
         if len(contents.poses) and source.frame(0) is None:
-            return cls(contents, None, "the recording is not the one that was mapped: its first frame is another")
+            return cls(contents, None, "the first frame differs from the one of the run")
         return source
 
     @property
@@ -83,9 +83,9 @@ class RunSource:
         except (InstanceMapError, OSError) as error:
             return None, str(error)
         if truth is None:
-            return None, "the dataset has no true instances any more" if expected else ""
+            return None, "the dataset has no ground-truth instances anymore" if expected else ""
         if expected is not None and truth_sha256(truth) != expected:
-            return None, "the true instances are no longer those that the run was compared with"
+            return None, "the ground-truth instances differ from those used in the run"
         try:
             return in_map_world(truth, self.contents.timestamps, self.contents.poses), ""
         except DataError as error:
@@ -139,6 +139,6 @@ class TruePath:
         try:
             R, t = umeyama(true, estimated)
         except np.linalg.LinAlgError as error:
-            raise DataError(f"the true poses cannot be compared with the trajectory: {error}") from error
+            raise DataError(f"ground truth: expected poses that match the trajectory, got {error}") from error
         aligned = true @ R.T + t
         return cls(chosen, aligned, np.linalg.norm(aligned - estimated, axis=1))

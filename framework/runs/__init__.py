@@ -1,1 +1,1 @@
-"""What a run leaves behind, and reading it back."""
+"""Run directories: writing and reading."""

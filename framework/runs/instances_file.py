@@ -75,20 +75,20 @@ def read_instances(path: Path) -> list[StoredInstance]:
     """Read the objects that `write_instances` wrote. Raises DataError."""
     entries = read_json(path)
     if not isinstance(entries, list):
-        raise DataError(f"{path} must hold a list of instances, found {type(entries).__name__}")
+        raise DataError(f"{path}: expected a list of instances, got {type(entries).__name__}")
     found = [_stored(f"{path}, entry {number}", entry) for number, entry in enumerate(entries, start=1)]
     ids = {instance.id for instance in found}
     if len(ids) < len(found):
-        raise DataError(f"{path} lists {len(found)} instances with {len(ids)} different ids; each must have its own")
+        raise DataError(f"{path}: expected unique ids, got {len(ids)} different ones for {len(found)} instances")
     return found
 
 
 def _stored(where: str, entry: Any) -> StoredInstance:
     if not isinstance(entry, dict):
-        raise DataError(f"{where}: expected an object with id, class, confidence and so on, found {entry!r:.40}")
+        raise DataError(f"{where}: expected an object with id, class, confidence and so on, got {entry!r:.40}")
     box, probabilities = entry.get("obb"), entry.get("class_probabilities")
     if not isinstance(box, dict) or not isinstance(probabilities, dict):
-        raise DataError(f"{where}: expected obb and class_probabilities with keys and values")
+        raise DataError(f"{where}: expected keys and values in obb and class_probabilities, got other values")
     return StoredInstance(
         id=_integer(where, entry, "id", 1),
         class_name=_class(where, entry),
@@ -114,21 +114,21 @@ def _integer(where: str, entry: Mapping[str, Any], key: str, lowest: int | None 
     value = entry.get(key)
     if isinstance(value, int) and not isinstance(value, bool) and (lowest is None or lowest <= value <= LARGEST_ID):
         return value
-    limits = "" if lowest is None else f" from {lowest} to {LARGEST_ID}"
-    raise DataError(f"{where}: {key} must be a whole number{limits}, found {value!r:.40}")
+    limits = "" if lowest is None else f" in [{lowest}, {LARGEST_ID}]"
+    raise DataError(f"{where}: {key}: expected an integer{limits}, got {value!r:.40}")
 
 
 def _class(where: str, entry: Mapping[str, Any]) -> str:
     value = entry.get("class", ...)
     if value is not None and not isinstance(value, str):
-        raise DataError(f"{where}: class must be a name, or null, found {entry.get('class', 'no class')!r:.40}")
+        raise DataError(f"{where}: class: expected a name or null, got {entry.get('class', 'no class')!r:.40}")
     return NO_CLASS if value is None else value
 
 
 def _fraction(where: str, entry: Mapping[str, Any], key: str) -> float:
     value = entry.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:  # NaN is neither
-        raise DataError(f"{where}: {key:.40} must be a number in [0, 1], found {value!r:.40}")
+        raise DataError(f"{where}: {key:.40}: expected a number in [0, 1], got {value!r:.40}")
     return float(value)
 
 
@@ -139,6 +139,6 @@ def _array(where: str, entry: Mapping[str, Any], key: str, shape: tuple[int, ...
         values = np.zeros(0)
     if values.shape != shape or not (np.abs(values) <= FARTHEST).all():  # NaN is not
         raise DataError(
-            f"{where}: {key} must hold numbers of shape {shape}, up to {FARTHEST:g}, found {entry.get(key)!r:.60}"
+            f"{where}: {key}: expected numbers of shape {shape}, at most {FARTHEST:g}, got {entry.get(key)!r:.60}"
         )
     return values

@@ -37,7 +37,7 @@ class Truth:
         """Read the ground truth of a dataset's resolved config. Raises InstanceMapError."""
         for key, value in leaves({"dataset": dataset}):
             if "${" in str(value):
-                raise DataError(f"a run's config is stored resolved, and this one is not: {key}={value}")
+                raise DataError(f"config of the run: expected resolved values, got {key}={value}")
         video = build(RGBDVideo, OmegaConf.create(dict(dataset)))
         named = dataset.get("ground_truth")
         return cls(video.scene_truth(), video.annotation, None if named is None else str(named))
@@ -63,16 +63,18 @@ class Reevaluation:
         """
         if truth.scene is None:
             if any(map(is_evaluation, record.metrics)):
-                raise DataError(f"{record.directory}: its figures are of true instances that the dataset has no longer")
+                raise DataError(
+                    f"{record.directory}: expected the ground truth of its metrics, got a dataset without instances"
+                )
             return cls(record, record.metrics)
         aligned = truth.in_world_of(record)
         assert aligned is not None
         found = evaluation_metrics(read_predictions(record), truth.scene, aligned, truth.annotation)
         if not other_truth and record.metrics.get(TRUTH) not in (None, found[TRUTH]):
             raise DataError(
-                f"{record.directory}: the true instances of {record.dataset['_target_']} are not those that "
-                "the run was compared with: its dataset has changed, or a relative dataset.root means another folder "
-                "here; --other-truth compares with them all the same"
+                f"{record.directory}: expected the ground truth used in the run, got other instances of "
+                f"{record.dataset['_target_']}; check the dataset and a relative dataset.root, or set "
+                "--other-truth to compare anyway"
             )
         metrics: dict[str, Any] = {}
         for key, value in record.metrics.items():
@@ -109,7 +111,9 @@ class Reevaluation:
             except OSError:
                 before = None
             if before is None or before.st_mtime != self.record.written:
-                raise DataError(f"{path} has changed: the run has begun again meanwhile; evaluate it later")
+                raise DataError(
+                    f"{path}: expected an unchanged file, got a new one; the run has started again, evaluate it later"
+                )
             write_json(path, self.metrics)
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 

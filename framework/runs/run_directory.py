@@ -54,7 +54,7 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Writes one run's directory."""
+    """Writer of one run directory."""
 
     directory: Path
     config: Mapping[str, Any]  # resolved
@@ -149,7 +149,7 @@ class RunRecord:
 
     def _write_partial(self, video: RGBDVideo, figures: Metrics, error: BaseException | None) -> None:
         """Write the metrics of a partial run with the reason; no error = it is still being written."""
-        why = "its record was not finished" if error is None else reason(error)
+        why = "the outputs were not completed" if error is None else reason(error)
         write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
 
     def _announce(
@@ -159,19 +159,19 @@ class RunRecord:
         likely = Counter(name for name, _ in labels.values())
         counted = ", ".join(f"{count} {name}" for name, count in likely.most_common()) or "no likely instance"
         unlikely = int(figures.get("instances.count") or 0) - len(labels)
-        rest = f"; {unlikely} of a confidence below {LIKELY} are in the files alone" if unlikely else ""
-        log.info("found: %s%s", counted, rest)
+        rest = f"; {unlikely} with a confidence below {LIKELY} only in the files" if unlikely else ""
+        log.info("objects: %s%s", counted, rest)
         written = [name for name in ("overview.png", "mesh.ply", "instances.json") if (self.directory / name).exists()]
         if written:  # one line: a job of a sweep has a long name
-            beside = f", and beside it {', '.join(written[1:])}" if written[1:] else ""
+            beside = f", {', '.join(written[1:])}" if written[1:] else ""
             log.info("%s%s", _from_here(self.directory / written[0]), beside)
         if error is not None:
-            log.warning("partial run, %s: its figures are in %s", reason(error), PARTIAL_METRICS)
+            log.warning("partial run (%s): its metrics are in %s", reason(error), PARTIAL_METRICS)
 
 
 @dataclass
 class _Attempts:
-    """Calls functions; logs the error of one that fails, so that the others still run."""
+    """Calls of functions with logged errors: a failing one does not stop the others."""
 
     error: BaseException | None  # the first
 

@@ -55,7 +55,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class RunRow:
-    """Runs that differ only in the keys that are averaged over."""
+    """Runs with equal keys except those averaged over."""
 
     name: str
     records: Mapping[Run, Record]

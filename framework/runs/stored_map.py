@@ -33,7 +33,7 @@ class StoredMap:
         mesh, instances = read_objects(record)
         _, poses = read_tum(record.directory / TRAJECTORY)
         if not len(mesh.triangles) or not len(poses):
-            raise DataError(f"{record.directory}: nothing was mapped")
+            raise DataError(f"{record.directory}: expected a map, got an empty one")
         names = {instance.id: instance.class_name for instance in instances}
         ids = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
         return cls(mesh, ids, names, poses, record)
@@ -48,8 +48,8 @@ def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
     mesh, instances = read_labeled_mesh(record.directory)
     if len(instances) != record.metrics.get("instances.count"):
         raise DataError(
-            f"{record.directory / INSTANCES} lists {len(instances)} instances, but {METRICS} counts "
-            f"{record.metrics.get('instances.count')}: they are not of one run; run it again"
+            f"{record.directory / INSTANCES}: expected {record.metrics.get('instances.count')} instances (as "
+            f"in {METRICS}), got {len(instances)}; the files are of different runs, run it again"
         )
     return mesh, instances
 
@@ -63,7 +63,7 @@ def read_labeled_mesh(directory: Path) -> tuple[InstanceMesh, list[StoredInstanc
     for instance in instances:
         if vertices.get(instance.id, 0) != instance.vertices:
             raise DataError(
-                f"{instances_path} gives instance {instance.id} {instance.vertices} vertices, but {mesh_path} has "
-                f"{vertices.get(instance.id, 0)}: they are not of one run; run it again"
+                f"{instances_path}: expected {vertices.get(instance.id, 0)} vertices of instance {instance.id} "
+                f"(as in {mesh_path}), got {instance.vertices}; the files are of different runs, run it again"
             )
     return mesh, instances

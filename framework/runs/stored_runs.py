@@ -110,11 +110,11 @@ def _read(directory: Path, name: str) -> Record:
     path = directory / name
     metrics, config = _read_flat(path), read_yaml(directory / CONFIG)
     if metrics.get("config_hash") != config_hash(config):
-        raise DataError(f"{path} is not of the config beside it: config_hash differs; run it again")
+        raise DataError(f"{path}: expected the config_hash of the config next to it, got another one; run it again")
     try:
         written = path.stat().st_mtime
     except OSError as error:  # the run has started again
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+        raise DataError(f"{path}: expected a readable file, got {error.strerror}") from error
     return Record(directory, metrics, config, written)
 
 
@@ -150,24 +150,27 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     assert isinstance(resolved, dict)
     asked = {str(key): value for key, value in resolved.items()}
     if record.metrics["config_hash"] != config_hash(asked):
-        log.info("run again: the record in %s is of another config", directory)
+        log.info("run again: the config of the run in %s differs", directory)
         return False
     if record.metrics.get(INPUTS) not in (None, inputs_sha256(asked)):  # None: an older run
-        log.info("run again: weights or data have changed since the record in %s", directory)
+        log.info("run again: weights or data changed since the run in %s", directory)
         return False
     settings = speed_settings(record.config, record.metrics)
     if shows_speed(asked) and settings != speed_settings(asked, environment()):
         shown = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in settings.items())
-        log.info("run again: the times in %s are of other settings or another machine: %s", directory, shown)
+        log.info(
+            "run again: the times in %s were measured with other settings or on another machine: %s", directory, shown
+        )
         return False
     if lost := [name for name in MAPPED if not (directory / name).exists()]:
-        log.warning("%s has lost %s; skip_completed=false would make it again", directory, ", ".join(lost))
+        log.warning("%s: expected %s, got none; set skip_completed=false to run it again", directory, ", ".join(lost))
     now = commit_of(code_version())
     if record.commit == now and not now.endswith(WITH_CHANGES):  # modified trees may differ
-        log.info("kept: the complete record in %s", directory)
+        log.info("skipped: the completed run in %s", directory)
     else:
         message = (
-            "kept: the complete record in %s, of commit %s; this is %s, and skip_completed=false would run it again"
+            "skipped: the completed run in %s, of commit %s; the current commit is %s; set "
+            "skip_completed=false to run it again"
         )
         log.warning(message, directory, record.commit, now)
     return True
@@ -176,13 +179,13 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML mapping without resolving interpolations. Raises DataError."""
     if not path.exists():
-        raise DataError(f"{path} is missing")
+        raise DataError(f"{path}: expected a file, got none")
     try:
         content = OmegaConf.to_container(load_yaml(path), resolve=False)
     except OmegaConfBaseException as error:
-        raise DataError(f"{path} cannot be read: {first_line(error)}") from error
+        raise DataError(f"{path}: expected a readable file, got {first_line(error)}") from error
     if not isinstance(content, dict):
-        raise DataError(f"{path} must hold keys and values, found a list")
+        raise DataError(f"{path}: expected keys and values, got a list")
     return {str(key): _with_text_keys(value) for key, value in content.items()}
 
 
@@ -198,18 +201,18 @@ def read_figures(directory: Path) -> dict[str, Any]:
     for name in (METRICS, PARTIAL_METRICS):
         if is_there(directory / name):
             return _read_flat(directory / name)
-    raise DataError(f"there is no {directory / METRICS}, nor a {PARTIAL_METRICS}: expected the directory of a run")
+    raise DataError(f"{directory}: expected the directory of a run, got no {METRICS} or {PARTIAL_METRICS}")
 
 
 def _read_flat(path: Path) -> dict[str, Any]:
     content = read_json(path)
     if not isinstance(content, dict):
-        raise DataError(f"{path} must hold an object, found {type(content).__name__}")
+        raise DataError(f"{path}: expected an object, got {type(content).__name__}")
     if nested := [key for key, value in content.items() if isinstance(value, dict | list)]:
-        raise DataError(f"{path} must be flat, found more below {nested[0]!r}")
+        raise DataError(f"{path}: expected flat values, got nested ones below {nested[0]!r}")
     for key, value in content.items():
         if key.startswith(FIGURES) and value is not None and not is_number(value):
-            raise DataError(f"{path}: {key} must be a number or null, found {value!r}")
+            raise DataError(f"{path}: {key}: expected a number or null, got {value!r}")
     return {current_key(key): value for key, value in content.items()}
 
 
@@ -239,4 +242,4 @@ def _why_incomplete(directory: Path) -> str:
     matches = [match for match in map(_LOG_LINE.match, lines) if match]
     if matches and matches[-1]["level"] in ("ERROR", "CRITICAL"):
         return f"failed: {matches[-1]['message']}"
-    return "not complete: running, or killed"
+    return "incomplete: running or killed"

@@ -45,9 +45,9 @@ def read_timings(path: Path) -> StageTimes:
     try:
         lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
     except csv.Error as error:
-        raise DataError(f"{path} cannot be read: {error}") from error
+        raise DataError(f"{path}: expected a readable file, got {error}") from error
     if lines[:1] != [HEADER]:
-        raise DataError(f"{path}, line 1: expected {','.join(HEADER)}, found {','.join(next(iter(lines), []))!r:.60}")
+        raise DataError(f"{path}, line 1: expected {','.join(HEADER)}, got {','.join(next(iter(lines), []))!r:.60}")
     taken: dict[tuple[int, str], float] = {}
     for number, line in enumerate(lines[1:], start=2):
         try:
@@ -55,12 +55,10 @@ def read_timings(path: Path) -> StageTimes:
         except (ValueError, IndexError):
             frame, stage, milliseconds = 0, "", np.nan
         if not (0 <= milliseconds < np.inf and abs(frame) < LARGEST):
-            raise DataError(
-                f"{path}, line {number}: expected a frame, a stage and a time, found {','.join(line)!r:.60}"
-            )
+            raise DataError(f"{path}, line {number}: expected a frame, a stage and a time, got {','.join(line)!r:.60}")
         taken[frame, OLD_STAGES.get(stage, stage)] = milliseconds
     if not taken:
-        raise DataError(f"{path} has no times")
+        raise DataError(f"{path}: expected at least one time, got none")
     frames = sorted({frame for frame, _ in taken})
     stages = dict.fromkeys(stage for _, stage in taken)
     return StageTimes(

@@ -19,7 +19,7 @@ from statistics import median
 import numba
 
 LOW_PRIORITY = 10  # of nice(2): a tenth of the CPU time of normal threads on a busy core
-RECENT = 15  # number of frames whose median is the work of a frame
+RECENT = 15  # number of frames in the median of the work per frame
 
 
 def lower_priority() -> None:
@@ -67,7 +67,7 @@ def limited_threads(threads: int) -> Iterator[None]:
 
 
 class CoreSharing:
-    """Divides the kernel threads between both sides, by their work on recent frames."""
+    """Division of the kernel threads between both sides, by their work on recent frames."""
 
     def __init__(self, with_a_thread_ahead: bool = True) -> None:
         self.cores = int(numba.get_num_threads())

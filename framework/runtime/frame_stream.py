@@ -39,7 +39,7 @@ def stream_of(video: RGBDVideo, ended: Callable[[], bool]) -> FrameStream:
         return LiveFrames(video, ended)
     if isinstance(video, RGBDSequence):
         return RecordedFrames(video)
-    raise DataError(f"{type(video).__name__} must be an RGBDSequence or a LiveVideo")
+    raise DataError(f"dataset: expected an RGBDSequence or a LiveVideo, got {type(video).__name__}")
 
 
 class RecordedFrames(FrameStream):
@@ -142,7 +142,7 @@ def map_ahead(
 
 
 class Turns:
-    """Serializes a part of the work of several threads, in the order of their numbers from 0."""
+    """Serialization of a part of the work of several threads, in the order of their numbers from 0."""
 
     def __init__(self) -> None:
         self._next = 0

@@ -94,8 +94,8 @@ def configure_process(threads: int = 0, seed: int | None = None) -> None:
     set_environment()
     if late:
         log.warning(
-            "configure_process: expected a call before numpy and numba are imported; %s may have no effect: call it"
-            " before these imports, or set the variables before Python starts",
+            "configure_process: expected a call before numpy and numba are imported; %s may have no effect; "
+            "call it before these imports, or set the variables before Python starts",
             ", ".join(late),
         )
     settings.limit_threads()
@@ -122,9 +122,9 @@ class Settings:
         for name, (least, most) in BOUNDS.items():
             value: object = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-                raise ConfigError(f"{name} must be a whole number, {least} or more and at most {most}, found {value!r}")
+                raise ConfigError(f"{name}: expected an integer in [{least}, {most}], got {value!r}")
         if self.device not in DEVICES:
-            raise ConfigError(f"device must be one of {', '.join(DEVICES)}, found {self.device!r}")
+            raise ConfigError(f"device: expected one of {', '.join(DEVICES)}, got {self.device!r}")
 
     @classmethod
     def of(cls, config: DictConfig) -> Settings:

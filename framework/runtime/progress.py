@@ -13,7 +13,7 @@ SIGN_OF_LIFE, LONGEST = 3.0, 60.0  # s, the least and the most from one line to 
 
 
 class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
-    """tqdm's bar of `total` things (None = unknown), and when it is time for a line where no bar is shown."""
+    """tqdm's bar of `total` items (None = unknown), and the interval of log lines without a bar."""
 
     def __init__(self, total: int | None, unit: str, **options: Any) -> None:
         # tqdm itself does not look where `disable` is given; a program without a console has no stderr
@@ -23,7 +23,7 @@ class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
         self._begun = self._spoken = time.monotonic()
 
     def line_is_due(self) -> bool:
-        """Whether it is time for a line, as no bar is shown: every few seconds, and more rarely the longer it takes."""
+        """Return whether a log line is due without a bar: every few seconds, less often in long runs."""
         now = time.monotonic()
         interval = min(max(SIGN_OF_LIFE, 0.1 * (now - self._begun)), LONGEST)
         if not self.disable or self.quiet or now - self._spoken < interval:
@@ -33,7 +33,7 @@ class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
 
 
 def _columns() -> int:
-    """Of the terminal at standard error; 0 = it does not say, and tqdm would show nothing."""
+    """Return the width of the terminal at standard error; 0 = unknown, and tqdm would show nothing."""
     try:
         return os.get_terminal_size(sys.stderr.fileno()).columns
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""What happens while a pipeline runs: timings, poses, faults and progress."""
+"""Journal of a pipeline: timings, poses, errors and progress."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SKIPS_LOGGED = 10  # later unusable frames are only counted, so that a broken di
 FUSION_STAGES: tuple[str, ...] = get_args(FusionStage)
 STAGES = ("reading", "detection", "tracking", "lifting", "refinement", *FUSION_STAGES)
 FUSION = "fusion"  # the total of FUSION_STAGES, if the fuser does not time them
-COUNT_INTERVAL_S = 1.0  # how often the progress bar asks the map for its number of instances
+COUNT_INTERVAL_S = 1.0  # s, interval of the number of instances in the progress bar
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class RunResult:
 
 @dataclass
 class Journal:
-    """Records a run and shows its progress."""
+    """Journal and progress display of a run."""
 
     scene: SceneMap
     frames_expected: int | None  # None = a live video
@@ -121,11 +121,11 @@ class Journal:
         self._screen.close()
         if 0 < self.without_pose < self.frames:
             counts = (self.without_pose, self.frames, self.first_without_pose)
-            log.warning("%d of %d frames skipped, as no pose is given for them; the first: %s", *counts)
+            log.warning("%d of %d frames skipped because they have no pose; the first: %s", *counts)
         if self._errors > SKIPS_LOGGED:
-            log.warning("%d frames skipped in all", self.frames_skipped)
+            log.warning("%d frames skipped in total", self.frames_skipped)
         if self.frames_dropped:
-            log.warning("%d frames dropped: they came while others were mapped", self.frames_dropped)
+            log.warning("%d frames dropped because mapping fell behind", self.frames_dropped)
 
     @contextmanager
     def timed(self, frame: int, stage: str) -> Iterator[None]:
@@ -181,7 +181,7 @@ class Journal:
         if self._errors <= SKIPS_LOGGED:
             log.warning("frame skipped: %s", error)
         if self._errors == SKIPS_LOGGED:
-            log.warning("further skipped frames are only counted")
+            log.warning("further skipped frames are counted but not logged")
 
     @property
     def _errors(self) -> int:

@@ -74,7 +74,7 @@ class Interruption:
         if self.asked is None:
             self.asked = Interrupted(number)
             if not self.quiet:
-                _print(f"{self.asked}: ending {self._when}; a second time ends at once\n")
+                _print(f"{self.asked}: stopping {self._when}; a second signal stops immediately\n")
         elif self._at_once:
             raise Interrupted(number)
 
@@ -145,7 +145,9 @@ def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterato
         asked = Interrupted(number)
         for each in taken:
             signal.signal(each, _raise_interrupted)
-        _print(f"{asked}: ending once the runs in work have left their records; a second time ends at once\n")
+        _print(
+            f"{asked}: stopping after the active runs have written their outputs; a second signal stops immediately\n"
+        )
         signaled: set[int | None] = set()
         while busy := at_work():
             for worker in busy:

@@ -1,4 +1,4 @@
-"""The contents of a table: the run directories below a folder as rows, their base, and what is shown of them."""
+"""The contents of a table: the run directories below a folder as rows, their baseline and the columns."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class TableChoice:
     def __post_init__(self) -> None:
         for name in ("average_over", "columns"):
             if not getattr(self, name):
-                raise ConfigError(f"table.{name} must name at least one key")
+                raise ConfigError(f"table.{name}: expected at least one key, got none")
         if self.columns_by and self.group_by:
             raise ConfigError(
                 f"table.columns_by={self.columns_by}, table.group_by={self.group_by}: expected one of them to be null"
@@ -63,13 +63,13 @@ class TableChoice:
             raise ConfigError(f"table.average_over: expected other keys than table.{self.layout}, got {self.split_key}")
         if self.columns_by and len(self.columns) > 1:
             raise ConfigError(
-                f"table.columns must name one figure, the one that stands across {self.columns_by}, found "
-                f"{len(self.columns)}; table.group_by={self.columns_by} shows several"
+                f"table.columns: expected one metric across {self.columns_by}, got {len(self.columns)}; set "
+                f"table.group_by={self.columns_by} to show several"
             )
         if self.published and read_published(self.published).layout != self.layout:
             raise ConfigError(
-                f"table.published={self.published} has numbers for a table with another layout: "
-                f"{read_published(self.published).layout}, found {self.layout}"
+                f"table.published: expected numbers for the layout {self.layout}, got "
+                f"{read_published(self.published).layout} of {self.published}"
             )
 
     @property
@@ -110,14 +110,14 @@ class ComparisonTable:
         Raises DataError if no run is complete or the experiment's config cannot be read.
         """
         if not directory.is_dir():
-            raise DataError(f"{directory} is not a folder with records of runs")
+            raise DataError(f"{directory}: expected a folder of runs")
         sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
         choice = TableChoice.of(sweep.get("table") or {"columns": list(PLAIN)})
         overrides = sweep_rows(sweep)
         records, incomplete = find_records(directory)
         if not records:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
-            raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
+            raise DataError(f"{directory}: expected a completed run, got none{f' ({why})' if why else ''}")
         keys = [*choice.average_over, choice.split_key] if choice.split_key else choice.average_over
         rows = rows_of(records, keys, overrides)
         asked = asked_runs(sweep, keys)

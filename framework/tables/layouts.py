@@ -1,6 +1,6 @@
 """Layouts of a comparison: a line per row, a column per sequence, or a group of lines per sequence.
 
-In the layouts with sequences, rows of the same poses stand together, and the highest mean among them is bold. Only
+In the layouts with sequences, rows of one pose source are adjacent, and the highest mean among them is bold. Only
 means over equally many runs compete.
 """
 
@@ -229,7 +229,7 @@ def _by_variant(rows: Sequence[RunRow]) -> list[list[RunRow]]:
 
 
 def _labels(comparison: ComparisonTable, name: str, poses: str = "poses", annotation: str = "annotation") -> list[str]:
-    """Return the first cells of a line, or of the heads: a name, and what must not be averaged over."""
+    """Return the first cells of a line, or of the heads: a name, and the keys that must not be averaged."""
     return [name, poses, annotation] if comparison.judged else [name, poses]
 
 

@@ -58,7 +58,7 @@ def read_published(section: str) -> Published:
     """Return the numbers of a section; raise ConfigError if the file does not have it."""
     sections: dict[str, Any] = yaml.safe_load(FILE.read_text("utf-8"))
     if section not in sections:
-        raise ConfigError(f"table.published must be null or one of {', '.join(sections)}, found {section}")
+        raise ConfigError(f"table.published: expected null or one of {', '.join(sections)}, got {section}")
     node = sections[section]
     rows = tuple(
         PublishedRow(

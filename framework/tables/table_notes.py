@@ -1,4 +1,4 @@
-"""Notes below a table: how its figures were computed, and what is missing."""
+"""Notes below a table: computation of the metrics, and missing runs."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class OptionContract:
     def test_option_lists_every_parameter_with_comment(self) -> None:
         [listed] = registered(self.stage, only=self.option)
         assert listed.documentation, "the class has no docstring"
-        assert not listed.documentation.startswith("cannot be used"), listed.documentation
+        assert not listed.documentation.startswith("unusable"), listed.documentation
         named = {parameter.name for parameter in listed.parameters}
         assert named == set(map(str, self.node())) - {"_target_"}, "the YAML needs every parameter"
         bare = [parameter.name for parameter in listed.parameters if not parameter.comment]
@@ -362,7 +362,7 @@ class FuserContract:
             assert_data_error(partial(scene.render, CAMERA, no_pose), "T_world_camera")
             assert_data_error(partial(scene.render_near, CAMERA, no_pose, depth), "T_world_camera")
         no_camera: Any = CAMERA.K
-        assert_data_error(partial(scene.render, no_camera, pose), "camera must be a Camera, found ndarray")
+        assert_data_error(partial(scene.render, no_camera, pose), "camera: expected a Camera, got ndarray")
 
     def test_fuser_map_survives_saving(self, tmp_path: Path) -> None:
         scene = fused(self.plugin(), frames=3).scene

@@ -25,7 +25,7 @@ class AbsolutePose:
 
 @dataclass
 class AbsolutePoseEstimator:
-    """Estimates an `AbsolutePose` from matches; equal matches give equal poses."""
+    """Estimator of an `AbsolutePose` from matches; equal matches give equal poses."""
 
     max_error: float = 4.0  # px, > 0, of the reprojection of an inlier
     min_inliers: int = 15  # >= 4; wrong matches reach 4 to 8

@@ -44,7 +44,7 @@ class Features:
 
 @dataclass
 class FeatureExtractor:
-    """Finds `Features` in a frame, independent of the number of threads."""
+    """Extractor of `Features` of a frame, independent of the number of threads."""
 
     max_features: int = 800  # >= 1
     contrast: float = 0.015  # in (0, 1], SIFT's threshold; a lower one finds more and weaker features

@@ -109,16 +109,16 @@ class Keyframes:
         Raises ConfigError if the arrays are empty, DataError if they are invalid.
         """
         if not arrays:
-            raise ConfigError("the run before has left no keyframes, by which a camera finds itself in its map")
+            raise ConfigError("resume_from or localize_in: expected a run with stored keyframes, got one without")
         if set(arrays) != set(SAVED):
-            raise DataError(f"keyframes are {', '.join(SAVED)}, found {', '.join(arrays) or 'nothing'}")
+            raise DataError(f"keyframes: expected {', '.join(SAVED)}, got {', '.join(arrays) or 'nothing'}")
         for name, (shape, kind) in SAVED.items():
             check_array(name, arrays[name], shape, kind)
         counts, poses = np.asarray(arrays["counts"], np.int64), np.asarray(arrays["poses"], np.float64)
         points, descriptors = arrays["points_world"], arrays["descriptors"]
         total = len(points) if len(points) == len(descriptors) else -1
         if len(counts) != len(poses) or counts.min(initial=0) < 0 or counts.sum() != total:
-            raise DataError(f"keyframes' counts {counts.tolist()!s:.60} are not those of their poses and points")
+            raise DataError(f"keyframe counts: expected those of the poses and points, got {counts.tolist()!s:.60}")
         self._settle()
         for k, end in enumerate(np.cumsum(counts)):
             check_rigid(f"keyframe {k}", poses[k])

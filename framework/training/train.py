@@ -98,7 +98,7 @@ def _started(config: DictConfig) -> MaskRCNN:
 
 def architecture(network: DictConfig) -> Architecture:
     """Return the configured architecture, for the classes of synthetic rooms."""
-    require(network.backbone in DEPTHS, "network.backbone", network.backbone, ", ".join(DEPTHS))
+    require(network.backbone in DEPTHS, "network.backbone", network.backbone, f"one of {', '.join(DEPTHS)}")
     return Architecture(
         classes=tuple(name for name in COCO if name in SCENENN_TO_COCO.values()),
         backbone=ResNetShape(network.backbone, network.width),

@@ -48,9 +48,9 @@ class Schedule:
         for name in ("steps", "batch", "checkpoint_interval"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
         for name in ("weight_decay", "warmup"):
-            require(getattr(self, name) >= 0, name, getattr(self, name), "0 or positive")
-        require(self.learning_rate > 0, "learning_rate", self.learning_rate, "positive")
-        require(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "in [0, 1)")
+            require(getattr(self, name) >= 0, name, getattr(self, name), "at least 0")
+        require(self.learning_rate > 0, "learning_rate", self.learning_rate, "a positive value")
+        require(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "a value in [0, 1)")
 
     def rate(self, step: int) -> float:
         """Return the learning rate of a step."""

@@ -73,13 +73,13 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
         lines = read_text(path, LARGEST_FILE).rstrip().splitlines()
     except DataError as error:
         raise ConfigError(
-            f"labels must be one of {', '.join(SPACES)}, or a text file with one name per line, found {name_or_path}"
+            f"labels: expected one of {', '.join(SPACES)}, or a text file with one name per line, got {name_or_path}"
         ) from error
     names = tuple(line.strip() for line in lines)
     if "" in names:  # skipping an empty line would shift the following names
-        raise ConfigError(f"labels: {path}, line {names.index('') + 1}: expected a name, found nothing")
+        raise ConfigError(f"labels: {path}, line {names.index('') + 1}: expected a name, got an empty line")
     if not names:
-        raise ConfigError(f"labels: {path} is empty; expected one name per line")
+        raise ConfigError(f"labels: {path}: expected one name per line, got an empty file")
     return names
 
 
@@ -93,13 +93,13 @@ def to_coco(labels: Sequence[str]) -> LabelMapping:
     unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]
     if unknown:
         raise ConfigError(
-            f"{len(unknown)} of {len(labels)} labels are in no label space: {', '.join(map(repr, unknown))};"
-            f" framework/vocabulary/{Path(__file__).stem}.yaml maps names to COCO: add them there"
+            f"labels: expected names of a label space, got {len(unknown)} of {len(labels)} others: "
+            f"{', '.join(map(repr, unknown))}; add them to framework/vocabulary/{Path(__file__).stem}.yaml"
         )
     meanings = [MEANINGS[key] for key in keys]
     classes = tuple(name for name in COCO if name in meanings)
     if not classes:
-        raise ConfigError(f"none of the {len(labels)} labels means an object class of COCO")
+        raise ConfigError(f"labels: expected an object class of COCO, got none in {len(labels)} labels")
     index = {name: k for k, name in enumerate(classes)}
     meaning = [-1 if name is None else index[name] for name in meanings]
     return LabelMapping(classes, np.array(meaning, np.int32))

@@ -16,7 +16,7 @@ from framework.vocabulary.label_spaces import COCO
 
 @dataclass
 class GroundTruthDetector(Detector):
-    """Returns each visible instance of known class with its exact mask, score 1 and a certain class.
+    """Visible instances of known class with exact masks, score 1 and a certain class.
 
     Raises DataError for a sequence without instance ground truth.
     """

@@ -63,7 +63,7 @@ class MaskRCNNDetector(Detector):
             check_count(f"detector.{name}", getattr(self, name), limit)
         for name in ("short_side", "long_side"):
             side = getattr(self, name)
-            allowed = f"at least 32 px, or 0, and at most {LONGEST_SIDE}"
+            allowed = f"0 or a value in [32, {LONGEST_SIDE}] px"
             require(side == 0 or 32 <= side <= LONGEST_SIDE, f"detector.{name}", side, allowed)
         self._device = torch_device(self.device)
         with errors_of("detector.weights"):
@@ -132,5 +132,7 @@ class MaskRCNNDetector(Detector):
         array: Float32 = tensor.float().cpu().numpy()
         if not np.isfinite(array).all():
             fix = "; set detector.half_precision=false" if self._network.dtype == torch.float16 else ""
-            raise DataError(f"{self.weights.name} computed numbers that are not finite{fix}")
+            raise DataError(
+                f"detector.weights: expected finite outputs of {self.weights.name}, got NaN or infinity{fix}"
+            )
         return array

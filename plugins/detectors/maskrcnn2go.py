@@ -100,7 +100,10 @@ class MaskRCNN2Go(Detector):
         wants_integers = self.int8 and self._device.type == "cpu"
         self._integers = self.concurrent = wants_integers and has_int8_kernels()
         if wants_integers and not self._integers:
-            log.info("detector.int8: this CPU has no VNNI for exact 8-bit convolutions; the network runs in float")
+            log.info(
+                "detector.int8: expected a CPU with VNNI for exact 8-bit convolutions, got none; running the "
+                "network in float32"
+            )
         steps = spacings if self._integers else None
         outputs = ("xif3_6_int8", "rpn_cls_logits_int8", "rpn_bbox_pred_int8")
         boxes = ("cls_score_int8", "bbox_pred_int8")
@@ -174,8 +177,8 @@ def _find_weights(folder: Path) -> Path:
     for candidate in candidates(folder):
         if candidate.is_dir():
             return candidate
-    searched = " and ".join(str(candidate.resolve()) for candidate in candidates(folder))
-    raise DataError(f"detector.weights: there is no folder {searched}; put {' and '.join(SHA256)} there")
+    searched = " or ".join(str(candidate.resolve()) for candidate in candidates(folder))
+    raise DataError(f"detector.weights: expected the folder {searched}, got none; put {' and '.join(SHA256)} there")
 
 
 def _read_network(folder: Path) -> tuple[list[Operator], dict[str, Tensor], dict[str, float]]:
@@ -193,5 +196,7 @@ def _read_checked(path: Path, sha256: str) -> bytes:
         content = read_bytes(path, LARGEST_FILE)
     found = hashlib.sha256(content).hexdigest()
     if found != sha256:
-        raise DataError(f"detector.weights: {path} is damaged: sha256 {found[:12]}..., expected {sha256[:12]}...")
+        raise DataError(
+            f"detector.weights: {path}: expected sha256 {sha256[:12]}..., got {found[:12]}...; the file is damaged"
+        )
     return content

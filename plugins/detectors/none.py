@@ -11,7 +11,7 @@ from framework.vocabulary.label_spaces import COCO
 
 @dataclass
 class NoDetections(Detector):
-    """Returns nothing: the map is geometry only, to measure the cost of everything except instances."""
+    """No detections, for a map of geometry only: measures the cost without instances."""
 
     def __post_init__(self) -> None:
         self.classes = COCO

@@ -88,7 +88,7 @@ class OnnxBoxes(Detector):
         self.boxes_without_depth += missing
         log.log(
             level,
-            "frame %d: %d of %d boxes have too little depth for a mask and are dropped, %d so far",
+            "frame %d: dropped %d of %d boxes with too little depth for a mask, %d so far",
             frame.index,
             missing,
             len(found),

@@ -31,7 +31,7 @@ class OnnxSegmentation(Detector):
 
     The class distribution of a detection is its normalized class scores; its score is the largest of them before
     normalization. With suppression in the network the other scores are lost, and the other classes get equal parts of
-    `class_spread` * (1 - score): the map learns less about ambiguous objects. The other defaults are those of
+    `class_spread` * (1 - score): ambiguous objects contribute less to the map. The other defaults are those of
     Ultralytics' exports, whose code and weights (AGPL) are not part of this project.
     """
 
@@ -98,12 +98,12 @@ class OnnxSegmentation(Detector):
         """Log one-class outputs, and class names in the file that differ from `label_space`."""
         if self._layout.suppressed:
             log.info(
-                "%s reports one class per detection; the other classes get detector.class_spread=%g of the rest",
+                "detector.class_spread: %s reports one class per detection; the other classes get %g of the rest",
                 self.weights.name,
                 self.class_spread,
             )
         names = self._network.metadata.names
         different = [(k, a, b) for k, (a, b) in enumerate(zip(names, self._labels, strict=False)) if a != b]
         if different:
-            log.warning("%s names %d of its %d classes differently than detector.label_space=%s: %d is %r, not %r",
+            log.warning("%s: %d of its %d classes differ from detector.label_space=%s: %d is %r, expected %r",
                         self.weights.name, len(different), len(names), self.label_space, *different[0])  # fmt: skip

@@ -24,7 +24,7 @@ SIGNIFICANCE, MAX_SLANT, MIN_READINGS = 0.4, 85.0, 0.1  # of masks from depth, a
 
 @dataclass
 class OpenVocabulary(Detector):
-    """Finds objects named by text: OWLv2's boxes and SAM's, SAM 2's or EdgeTAM's masks; needs the extra `transformers`.
+    """Text-prompted detection with OWLv2's boxes and SAM's, SAM 2's or EdgeTAM's masks; needs the extra `transformers`.
 
     The classes are the words as written, and `something else`. OWLv2 estimates an independent probability p for each
     word. The distribution is proportional to the odds p / (1 - p), with the odds of the threshold for `something else`.
@@ -49,7 +49,7 @@ class OpenVocabulary(Detector):
         check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
         names = [word.strip() for word in self.text_queries]
         fits = 1 <= len(names) <= MOST_WORDS and all(names) and len({*names, SOMETHING_ELSE}) == len(names) + 1
-        allowed = f"1 to {MOST_WORDS} different words, not {SOMETHING_ELSE!r}"
+        allowed = f"1 to {MOST_WORDS} different text queries, none of them {SOMETHING_ELSE!r}"
         require(fits, "detector.text_queries", self.text_queries, allowed)
         device = torch_device(self.device)
         self.classes = (*names, SOMETHING_ELSE)

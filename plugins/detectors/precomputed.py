@@ -30,7 +30,7 @@ FRAMES_IN_DOUBT = 30  # first frames without an entry until a warning
 
 @dataclass
 class Precomputed(Detector):
-    """Returns the detections of a COCO result file or a folder of masks for the frame's number.
+    """Detections in a COCO result file or a folder of masks, by frame number.
 
     `instancemap detect` and programs for COCO's evaluation write such files. A folder has NNNNNN.png with 16-bit
     instance ids and NNNNNN.json with [{"id", "class", "score"}] for frame NNNNNN. Both may have `class_probabilities`
@@ -55,19 +55,19 @@ class Precomputed(Detector):
         self.path = Path(self.path).expanduser()
         self._labels = read_labels(self.label_space)
         if len(set(self._labels)) < len(self._labels):
-            raise ConfigError(f"detector.label_space: {self.label_space} has a name twice")
+            raise ConfigError(f"detector.label_space: expected unique names, got duplicates in {self.label_space}")
         if self.path.is_dir():
             stored = read_mask_folder(self.path, self._labels)
         else:
             stored = read_results(self.path, self._labels, self.category_ids)
         if not stored:
-            raise DataError(f"{self.path} holds no detection")
+            raise DataError(f"{self.path}: expected at least one detection, got none")
         probabilities, known = self._distributions(stored)
         if not known.any():
-            raise DataError(f"{self.path}: none of the {len(stored)} detections is of a class of COCO's")
+            raise DataError(f"{self.path}: expected detections of COCO's classes, got none of {len(stored)}")
         if not known.all():
             lost = sorted({one.label for one, is_known in zip(stored, known, strict=True) if not is_known})
-            log.info("%s: %d of %d detections are of no class of COCO's and are dropped: %s",
+            log.info("%s: dropped %d of %d detections of classes that COCO does not have: %s",
                      self.path, int((~known).sum()), len(stored), ", ".join(lost))  # fmt: skip
         self._frames = {one.frame for one in stored}
         self._of_frame: dict[int, list[tuple[StoredDetection, Float32]]] = defaultdict(list)
@@ -121,12 +121,18 @@ class Precomputed(Detector):
             return
         self._asked.add(index)
         first, last = min(self._frames), max(self._frames)
-        has = f"{self.path} has detections for frames {first} to {last}"
+        has = f"{self.path} with detections for frames {first} to {last}"
         if index > last:
-            raise DataError(f"{has}, and for none of those asked for so far, up to {index}: is it this sequence's?")
+            raise DataError(
+                f"detector.path: expected detections of this sequence, got {has} and none for the frames "
+                f"requested so far, up to {index}; check that the file is of this sequence"
+            )
         if len(self._asked) == FRAMES_IN_DOUBT:
             log.warning(
-                "%s, but none of the first %d frames; check that the file is of this sequence", has, FRAMES_IN_DOUBT
+                "detector.path: expected detections of this sequence, got %s and none for the first %d frames; "
+                "check that the file is of this sequence",
+                has,
+                FRAMES_IN_DOUBT,
             )
 
 

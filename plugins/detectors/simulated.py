@@ -128,7 +128,7 @@ class SimulatedDetector(Detector):
         require(self.seed >= 0, "detector.seed", self.seed, "at least 0")
         check_intervals("detector", self, **INTERVALS)
         grid = self.mask_grid
-        require(grid == 0 or 4 <= grid <= 4096, "detector.mask_grid", grid, "0 or at least 4 and at most 4096")
+        require(grid == 0 or 4 <= grid <= 4096, "detector.mask_grid", grid, "0 or a value in [4, 4096]")
         self.classes = COCO
         self._kernel = confusion_kernel(self.classes, self.confusion)
 

@@ -95,7 +95,7 @@ class TransformersSegmentation(Detector):
         with errors_of("detector.model"):
             self._preprocessing = Preprocessing.parse(read_json(path), str(path))
         if short:
-            require(self._family.any_size, "detector.short_side", short, "0, because this model takes one size only")
+            require(self._family.any_size, "detector.short_side", short, "0, because this model has a fixed input size")
             size = {"shortest_edge": short, "longest_edge": long}
             self._preprocessing = replace(self._preprocessing, size=size)
         self._mapping = to_coco(checkpoint.labels)
@@ -134,7 +134,7 @@ class TransformersSegmentation(Detector):
         logits, grids = output[self._family.logits][0].float(), output[self._family.masks][0].float()
         if not (torch.isfinite(logits).all() and torch.isfinite(grids).all()):
             advice = "; try detector.half_precision=false" if half else ""
-            raise DataError(f"detector.model: the output of {self.model} is not finite{advice}")
+            raise DataError(f"detector.model: expected finite outputs of {self.model}, got NaN or infinity{advice}")
         return np.asarray(logits.cpu().numpy(), np.float32), grids
 
 
@@ -144,7 +144,7 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
     logits (Q, K). K = C + 1: softmaxes, the last for no-object. K = C: independent sigmoids. See the detector.
     """
     if logits.shape[1] not in (labels, labels + 1):
-        raise DataError(f"detector.model: {logits.shape[1]} class logits do not fit the config's {labels} labels")
+        raise DataError(f"detector.model: expected {labels} class logits (as in config.json), got {logits.shape[1]}")
     objects = logits[:, :labels]
     highest = objects.max(axis=1, keepdims=True)
     weights = np.exp(objects - highest, dtype=np.float64)
@@ -195,20 +195,21 @@ class Preprocessing:
     def parse(cls, content: Mapping[str, Any], where: str) -> Preprocessing:
         """Parse the file `where`. Raises DataError for missing or unsupported settings."""
         if content.get("do_split_image"):
-            raise DataError(f"{where} splits images, as for semantic segmentation: choose an instance model")
+            raise DataError(
+                f"{where}: expected an instance model, got one that splits images for semantic segmentation; "
+                "choose another model"
+            )
         if content.get("pad_size"):
-            raise DataError(f"{where}: pad_size is not supported, found {content['pad_size']}")
+            raise DataError(f"{where}: pad_size: expected none, got {content['pad_size']}")
         if content.get("resample", 2) not in RESAMPLING:
-            raise DataError(f"{where}: resample must be one of {[*RESAMPLING]}, found {content['resample']}")
+            raise DataError(f"{where}: resample: expected one of {[*RESAMPLING]}, got {content['resample']}")
         size = content.get("size") if content.get("do_resize", True) else None
         if isinstance(size, int):  # as in files before 2023
             size = {"shortest_edge": size, "longest_edge": content.get("max_size", size)}
         keys = {key for key, value in (size or {}).items() if value}
         known = ({"shortest_edge", "longest_edge"}, {"max_height", "max_width"}, {"height", "width"})
         if content.get("do_resize", True) and keys not in known:
-            raise DataError(
-                f"{where}: size must have height and width, or shortest_edge and longest_edge, found {size}"
-            )
+            raise DataError(f"{where}: size: expected height and width, or shortest_edge and longest_edge, got {size}")
         normalizes = content.get("do_normalize", True)
         pads = content.get("do_pad") and str(content.get("image_processor_type", "")).startswith("Eomt")
         return cls(
@@ -269,9 +270,9 @@ class Checkpoint:
     def __init__(self, model: str, revision: str) -> None:
         transformers = imported_transformers()
         self.folder = find_model(model, revision)
-        self.config = read_part("detector.model", self.folder, "its config.json", transformers.AutoConfig)
+        self.config = read_part("detector.model", self.folder, "config.json", transformers.AutoConfig)
         kind = self.config.model_type
-        require(kind in FAMILIES, "detector.model", f"{model}, which is {kind}", f"one of {', '.join(FAMILIES)}")
+        require(kind in FAMILIES, "detector.model", f"{model} ({kind})", f"one of {', '.join(FAMILIES)}")
         self.family = FAMILIES[kind]
         self._auto_class = getattr(transformers, self.family.auto_class)
 
@@ -286,21 +287,21 @@ class Checkpoint:
             return COCO_BY_ID
         if not named:
             raise DataError(
-                f"detector.model: {self.folder} does not name its classes: fill id2label in its config.json"
+                f"detector.model: {self.folder}: expected class names, got none; fill id2label in its config.json"
             )
         return names
 
     def read_network(self) -> torch.nn.Module:
         """Return the network in float32 on the CPU. Raises DataError unless the weights fit and are complete."""
         network, loading = read_part(
-            "detector.model", self.folder, "its weights", self._auto_class, output_loading_info=True
+            "detector.model", self.folder, "the weights", self._auto_class, output_loading_info=True
         )
         # transformers only warns, and initializes them randomly
         missing = sorted(set(loading["missing_keys"]) & {name for name, _ in network.named_parameters()})
         if missing:
             raise DataError(
-                f"detector.model: {self.folder} has no weights for {len(missing)} of the network's tensors,"
-                f" {', '.join(missing[:3])}, ...: it is not a checkpoint for segmentation"
+                f"detector.model: {self.folder}: expected a checkpoint for segmentation, got no weights for "
+                f"{len(missing)} of the network's tensors ({', '.join(missing[:3])}, ...)"
             )
         module: torch.nn.Module = network.float().eval()
         return module

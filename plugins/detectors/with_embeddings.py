@@ -16,7 +16,7 @@ from framework.interfaces import Detector
 
 @dataclass
 class WithEmbeddings(Detector):
-    """Adds the image embedding of a CLIP or SigLIP to each detection of another detector; extra `transformers`."""
+    """Detections of another detector with image embeddings of a CLIP or SigLIP; needs the extra `transformers`."""
 
     detector: Detector  # wrapped detector; replace it with detector@detector.detector=NAME
     model: str = "google/siglip2-base-patch16-224"  # model: id on huggingface.co or folder

@@ -17,7 +17,7 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 @dataclass
 class ClassOnlyFusion(MapFuser):
-    """Voxels store a distribution over classes and background only; there is no data association.
+    """Class fusion in voxels, with distributions over classes and background and without data association.
 
     After SemanticFusion (McCormac et al. 2017) and Pham et al. (WACV 2019), which label every pixel; here distributions
     come from masks. A pixel has the distribution of the mask with the best score over it, in which the background has

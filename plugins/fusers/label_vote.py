@@ -32,7 +32,7 @@ RULES = {
 
 @dataclass
 class LabelVote(MapFuser):
-    """The label with the most votes wins. There is no evidence against a label."""
+    """Majority vote over labels, without evidence against a label."""
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)

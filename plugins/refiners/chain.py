@@ -13,7 +13,7 @@ from framework.refinement.refine import refine
 
 @dataclass
 class Chain(ClusterRefiner):
-    """Applies its links in their order.
+    """Refiners applied in order.
 
     `refiner.links.gmm_em=null` removes a link, `refiner@refiner.links.gmm_em=kmeans` replaces it.
     """
@@ -22,7 +22,9 @@ class Chain(ClusterRefiner):
 
     def __post_init__(self) -> None:
         if not self.links:
-            raise ConfigError("refiner.links has no link left: choose refiner=identity")
+            raise ConfigError(
+                "refiner.links: expected at least one refiner, got none; set refiner=identity for no refinement"
+            )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         for link in self.links.values():

@@ -16,7 +16,7 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class Connected(ClusterRefiner):
-    """Keeps of each cluster its largest piece that is connected in 3D, and pieces at a similar depth.
+    """Selection of the largest 3D-connected piece of each cluster, and of pieces at a similar depth.
 
     Pieces are those of `largest_component`. A piece is similar if most of its points differ in depth from the nearest
     kept point by at most the gap plus `max_depth_slope` times the distance across. This removes what is behind an

@@ -15,7 +15,7 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class Dbscan(ClusterRefiner):
-    """Keeps of each cluster its largest dense piece, of equal ones the first in the image.
+    """Selection of the largest dense piece of each cluster, of equal ones the first in the image.
 
     scikit-learn's DBSCAN (Ester, Kriegel, Sander and Xu, "A Density-Based Algorithm for Discovering Clusters in Large
     Spatial Databases with Noise", KDD 1996) with eps = `eps` + `eps_per_depth` * the cluster's median depth. The piece

@@ -15,7 +15,7 @@ from framework.refinement.segmentation.segment_owners import owned_segments
 
 @dataclass
 class Geometric(ClusterRefiner):
-    """Makes each cluster the union of the convex segments of the depth image that its mask covers.
+    """Clusters as unions of the convex depth segments covered by a mask.
 
     Voxblox++ (Grinvald et al., RA-L 2019) cuts the depth image where depth jumps or the surface is concave, and assigns
     each segment to the mask that covers most of it, if that is more than `min_overlap` of its pixels. A cluster loses

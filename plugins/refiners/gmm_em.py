@@ -18,7 +18,7 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class GmmEm(ClusterRefiner):
-    """Drops the points that a Gaussian mixture of object, background and outliers assigns to the last two.
+    """Removal of background and outliers by a Gaussian mixture of object, background and outliers.
 
     Eqs. (1) to (4) for each mask: object components start from groups of the mask's points, background components from
     groups of the points in a ring around it; a uniform component can take outliers. The mask also enters as evidence

@@ -29,7 +29,7 @@ class ForeignPoints(Enum):
 
 @dataclass
 class GmmFrame(ClusterRefiner):
-    """Assigns the points of a frame's masks to the most probable mask, by hierarchical EM.
+    """Assignment of the points of a frame's masks to the most probable mask, by hierarchical EM.
 
     Eqs. (1) to (4) over the points of all masks, section 3.2.2. A pixel in several masks is one point, of the mask with
     the best score. There is no background and no evidence of the masks beyond the start, so clusters lose points to
@@ -55,7 +55,7 @@ class GmmFrame(ClusterRefiner):
             std_floor=(1e-4, 1.0), min_support=(0.0, 0.99), min_points=(1, 10**9), max_points=(100, 10**9),
         )  # fmt: skip
         if self.children not in (2, 4, 8):
-            raise ConfigError(f"children: expected 2, 4 or 8, got {self.children}; set refiner.children=8")
+            raise ConfigError(f"refiner.children: expected 2, 4 or 8, got {self.children}; set refiner.children=8")
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         single = keep_points(clusters, best_of_pixels(clusters, frame.depth.shape))

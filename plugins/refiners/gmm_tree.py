@@ -17,7 +17,7 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class GmmTree(ClusterRefiner):
-    """Drops the points on surface patches outside of the object, found by hierarchical EM.
+    """Removal of the points on surface patches outside of the object, by hierarchical EM.
 
     A tree of mixtures (Eckart et al., CVPR 2016) is fitted to each mask together with the ring around it. Its nodes are
     surface patches and do not depend on the mask: a point on the wrong side at the first level could not return. The

@@ -10,7 +10,7 @@ from framework.interfaces import ClusterRefiner
 
 @dataclass
 class Identity(ClusterRefiner):
-    """Returns the clusters unchanged."""
+    """Unchanged clusters."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return clusters

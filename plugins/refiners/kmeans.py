@@ -16,7 +16,7 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class KMeans(ClusterRefiner):
-    """Drops the points that are nearer to a center of the background than to one of the object.
+    """Removal of the points nearer to a center of the background than to one of the object.
 
     Lloyd's algorithm runs on each mask and the ring around it, as in `gmm_em`. The object's centers start at the means
     of the mask cut into equal parts by depth, the background's at those of the ring. Clusters with fewer than

@@ -16,7 +16,7 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class LargestComponent(ClusterRefiner):
-    """Keeps of each cluster its largest piece that is connected in 3D, of equal ones the first in the image.
+    """Selection of the largest 3D-connected piece of each cluster, of equal ones the first in the image.
 
     Points are connected if they are at most `connection_radius` pixels apart and their depths differ by less than
     `max_gap` + `gap_per_depth` * depth of the nearer one: spacing and noise of readings both grow with depth.

@@ -15,7 +15,7 @@ from framework.refinement.segmentation.planes import Planes, find_planes, off_pl
 
 @dataclass
 class PlaneRemoval(ClusterRefiner):
-    """Drops the points that lie on the floor, a wall or another plane that bounds the scene.
+    """Removal of the points on the floor, a wall or another plane at the border of the scene.
 
     Planes are found in the depth of the whole frame, without the gravity direction. A plane is structure if it is large
     (`min_area`, `min_frame_fraction`) and the frame shows nearly nothing behind it (`max_behind_ratio`), unlike a table

@@ -15,7 +15,7 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class RankOrder(ClusterRefiner):
-    """Keeps of each cluster its largest group under the rank-order distance, of equal ones the first in the image.
+    """Selection of the largest rank-order group of each cluster, of equal ones the first in the image.
 
     The paper names an alternative, "ROC algorithm [12]"; its reference list is not available. We read it as rank-order
     clustering (Zhu, Wen and Sun, "A Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR 2011):

@@ -12,14 +12,14 @@ from framework.interfaces import PoseTracker, SceneMap
 
 @dataclass
 class GroundTruth(PoseTracker):
-    """Returns the sequence's own poses; frames without one are skipped."""
+    """Poses of the sequence; frames without one are skipped."""
 
     pose_source = "ground_truth"
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         """Return the given pose. Raises NoPoseError for a frame without a pose."""
         if frame.T_world_camera is None:
-            raise NoPoseError(f"frame {frame.index} has no true pose at {frame.timestamp:.3f} s")
+            raise NoPoseError(f"frame {frame.index}: expected a true pose at {frame.timestamp:.3f} s, got none")
         return Pose(frame.T_world_camera)
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:

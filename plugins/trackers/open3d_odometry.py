@@ -42,7 +42,7 @@ class _Seen:
 
 @dataclass
 class Open3dOdometry(PoseTracker):
-    """Aligns each frame to a view of the map, or to the previous frame, with Open3D's multi-scale RGB-D odometry.
+    """Open3D's multi-scale RGB-D odometry to a view of the map, or to the previous frame.
 
     Use POINT_TO_PLANE with the map, HYBRID and INTENSITY with the previous frame: the map's colors are blurred.
     """
@@ -108,17 +108,17 @@ class Open3dOdometry(PoseTracker):
                 self._method, self._loss,
             )  # fmt: skip
         except RuntimeError as error:  # "Singular 6x6 linear system": no overlap
-            return np.eye(4), f"Open3D could not align the frame: {str(error).strip().splitlines()[-1]}"
+            return np.eye(4), f"Open3D did not align the frame: {str(error).strip().splitlines()[-1]}"
         T_last_camera = result.transformation.numpy()
         matched = result.fitness * frame.depth.size / readings
         if not np.isfinite(T_last_camera).all():
             return np.eye(4), "Open3D's alignment diverged"
         if matched < self.min_matched:
-            return np.eye(4), f"{matched:.0%} of the frame's readings have a partner"
+            return np.eye(4), f"{matched:.0%} of the frame's readings have a correspondence"
         step = float(np.linalg.norm(T_last_camera[:3, 3]))
         turn = rotation_angle(T_last_camera[:3, :3])
         if step > self.max_translation or turn > self.max_rotation:
-            return np.eye(4), f"a step of {step:.2f} m and {np.degrees(turn):.0f} deg is not plausible"
+            return np.eye(4), f"implausible step of {step:.2f} m and {np.degrees(turn):.0f} deg"
         return T_last_camera, ""
 
 

@@ -15,7 +15,7 @@ from framework.tracking.keyframes import Keyframes
 
 @dataclass
 class PycolmapPnp(PoseTracker):
-    """Matches each frame's features with the nearest keyframes and estimates its pose with pycolmap's PnP and RANSAC.
+    """Feature matching with the nearest keyframes, and pycolmap's PnP with RANSAC.
 
     If that fails, it relocalizes among all keyframes. It does not use the map. The parameters are those of `Keyframes`.
     """
@@ -46,7 +46,7 @@ class PycolmapPnp(PoseTracker):
             found = self._keyframes.locate(frame, features, self._keyframes.alike(features))
         if found is None:
             T_world_last = np.eye(4) if self._T_world_last is None else self._T_world_last
-            reason = f"no keyframe explains {self.min_inliers} of the frame's {len(features)} features"
+            reason = f"no keyframe matches {self.min_inliers} of the frame's {len(features)} features"
             return Pose(T_world_last, lost=True, reason=reason)
         self._T_world_last = found.T_world_camera
         self._keyframes.add_with(frame, features, found.T_world_camera)

@@ -20,13 +20,13 @@ from framework.interfaces import PoseTracker, SceneMap
 class World(Enum):
     """The world that the poses are given in."""
 
-    FIRST_FRAME = "that in which the first frame has its true pose, or the identity"
-    FILE = "that of the file"
+    FIRST_FRAME = "true pose of the first frame, or the identity"
+    FILE = "frame of the file"
 
 
 @dataclass
 class TrajectoryFile(PoseTracker):
-    """Returns the pose in a TUM file nearest in time to the frame; frames without one are skipped.
+    """Poses in a TUM file nearest in time to the frame; frames without one are skipped.
 
     By default the trajectory is moved rigidly so that the first frame with a pose defines the world, as in
     `PoseTracker`. `world_frame=FILE` keeps the file's world, in which the sequence's true poses are meaningless. Raises
@@ -43,7 +43,7 @@ class TrajectoryFile(PoseTracker):
         self.path = Path(self.path).expanduser()
         timestamps, self._T_file_camera = read_tum(self.path)
         if len(timestamps) == 0:
-            raise DataError(f"{self.path} holds no pose: expected a trajectory in TUM format")
+            raise DataError(f"{self.path}: expected poses in TUM format, got none")
         self._timestamps = timestamps + self.time_offset
         self._T_world_file: Float64 | None = np.eye(4) if self.world_frame is World.FILE else None
 
@@ -53,8 +53,8 @@ class TrajectoryFile(PoseTracker):
         difference = abs(float(self._timestamps[nearest]) - frame.timestamp)
         if difference > self.max_time_difference:
             raise NoPoseError(
-                f"frame {frame.index}: {self.path.name} has no pose at {frame.timestamp:.3f} s, the nearest is"
-                f" {difference:.3f} s away, farther than tracker.max_time_difference"
+                f"frame {frame.index}: {self.path.name}: expected a pose within tracker.max_time_difference of "
+                f"{frame.timestamp:.3f} s, got the nearest {difference:.3f} s away"
             )
         T_file_camera = self._T_file_camera[nearest]
         if self._T_world_file is None:

@@ -104,12 +104,10 @@ class VoxelHashingIcp(PoseTracker):
             max_translation=(1e-3, 100.0), max_rotation=(1e-3, 3.15), min_visible=(0.0, 1.0),
             min_matched=(0.0, 1.0), min_information=(0.0, 1.0), min_agreement=(0.0, 1.0), max_occluded=(0.0, 1.0),
         )  # fmt: skip
-        require(
-            np.log2(self.finest_scale) % 1 == 0, "VoxelHashingIcp.finest_scale", self.finest_scale, "1, 1/2, 1/4, ..."
-        )
+        require(np.log2(self.finest_scale) % 1 == 0, "tracker.finest_scale", self.finest_scale, "1, 1/2, 1/4, ...")
         require(
             self.depth_weight > 0 or self.color_levels == LEVELS,
-            "VoxelHashingIcp.color_levels", self.color_levels, f"{LEVELS} without depth",
+            "tracker.color_levels", self.color_levels, f"{LEVELS} if depth_weight is 0",
         )  # fmt: skip
         self._weights = Weights(*(np.float32(getattr(self, name)) for name in Weights._fields))
         self._T_world_last: Float64 | None = None  # the last trusted pose
@@ -162,7 +160,7 @@ class VoxelHashingIcp(PoseTracker):
 
     def _relocalize_in_stored(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
         """Find the camera in a stored map by features, confirmed by alignment."""
-        alignment = Alignment(np.eye(4), 0, 0, 0, 0, "it has not been found in the map from before", "")
+        alignment = Alignment(np.eye(4), 0, 0, 0, 0, "not relocalized in the stored map yet", "")
         found = self._keyframes.relocalize(seen.frame)
         if found is not None:
             alignment = self._confirmed(alignment, found.T_world_camera, self._pyramid(seen.frame), scene)
@@ -200,14 +198,14 @@ class VoxelHashingIcp(PoseTracker):
         frame = seen.frame
         if min(frame.camera.shape) * self.finest_scale < SMALLEST * 2 ** (LEVELS - 1):
             raise DataError(
-                f"images of {frame.camera.width}x{frame.camera.height} px are too small for tracker.finest_scale="
-                f"{self.finest_scale:g}: {LEVELS} levels from there leave less than {SMALLEST} px"
+                f"tracker.finest_scale: expected at least {SMALLEST} px at the coarsest of {LEVELS} levels, got "
+                f"{self.finest_scale:g} for images of {frame.camera.width}x{frame.camera.height} px"
             )
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         nearest, farthest = scene.depth_range
         readings = np.mean((frame.depth > 0) & (frame.depth >= nearest) & (frame.depth <= farthest))
         if readings < max(self.min_visible, 1 / frame.depth.size):
-            few = f"{readings:.1%} of the pixels have a depth that is mapped, {nearest:g} to {farthest:g} m"
+            few = f"depth within {nearest:g} to {farthest:g} m in {readings:.1%} of the pixels only"
             return Pose(T_world_camera, lost=True, reason=few if frame.depth.any() else "the frame has no depth")
         return self._trust(seen, T_world_camera)
 
@@ -259,7 +257,7 @@ class VoxelHashingIcp(PoseTracker):
             return alignment
         if _near(alignment.T_world_camera, T_world_found, self.max_distance):
             return alignment._replace(doubt="")
-        return alignment._replace(doubt=alignment.doubt or "features tell another pose than alignment with the map")
+        return alignment._replace(doubt=alignment.doubt or "features and alignment with the map disagree")
 
     def _pose_from_features(self, seen: FrameFeatures) -> AbsolutePose | None:
         """Return the pose from features of the last trusted frame and keyframes near it, else of similar keyframes."""
@@ -279,7 +277,7 @@ class VoxelHashingIcp(PoseTracker):
             return alignment
         again = self._align(levels, scene, alignment.T_world_camera, T_world_from)
         if not _near(alignment.T_world_camera, again.T_world_camera, SAME_POSE / 2):
-            return again._replace(doubt="two alignments, the second from where the first has ended, do not agree")
+            return again._replace(doubt="two alignments, the second started at the result of the first, disagree")
         return again
 
     def _align(
@@ -315,9 +313,9 @@ class VoxelHashingIcp(PoseTracker):
         reason = self._rejection(levels[0], equations, inverse(T_world_from) @ T_world_camera)
         doubt = ""
         if agreement < self.min_agreement or behind > self.max_occluded:
-            doubt = f"{agreement:.0%} of the points in view agree with the map, {behind:.1%} lie behind it"
+            doubt = f"{agreement:.0%} of the visible points agree with the map, {behind:.1%} lie behind it"
         elif matched < self.min_matched:
-            doubt = f"{agreement:.0%} of the points in view agree with the map, but {matched:.0%} in their normals, too"
+            doubt = f"{agreement:.0%} of the visible points agree with the map, but only {matched:.0%} in their normals"
         return Alignment(T_world_camera, matched, agreement, behind, agreement_in_front, reason, doubt)
 
     def _linear_weights(self, scene: SceneMap) -> LinearWeights | None:
@@ -349,17 +347,17 @@ class VoxelHashingIcp(PoseTracker):
         if points == 0:
             return "the frame has no depth"
         if equations.visible < self.min_visible * points:
-            return f"{equations.visible / points:.0%} of the frame's points fall on the map"
+            return f"{equations.visible / points:.0%} of the frame's points are visible in the map"
         few_match = equations.matched < self.min_matched * equations.visible
         if few_match and (self.min_agreement == 0 or equations.close < self.min_agreement * equations.visible):
-            return f"{equations.matched / equations.visible:.0%} of the points in view agree with the map"
+            return f"{equations.matched / equations.visible:.0%} of the visible points agree with the map"
         if self._is_jump(T_from_camera):
             step, turn = np.linalg.norm(T_from_camera[:3, 3]), rotation_angle(T_from_camera[:3, :3])
-            return f"a step of {step:.2f} m and {np.degrees(turn):.0f} deg is not plausible"
+            return f"implausible step of {step:.2f} m and {np.degrees(turn):.0f} deg"
         information = np.linalg.eigvalsh(equations.A)
         least = self.min_information * (RECOVERY_INFORMATION if self._lost_frames else 1.0)
         if information[0] < least * information.mean():
-            return "the surface in view does not determine the motion"
+            return "the visible surface does not determine the motion"
         return ""
 
 

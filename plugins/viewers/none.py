@@ -9,4 +9,4 @@ from framework.interfaces import Viewer
 
 @dataclass
 class NoViewer(Viewer):
-    """Shows nothing."""
+    """Viewer that shows nothing."""

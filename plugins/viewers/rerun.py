@@ -70,10 +70,10 @@ class RerunViewer(Viewer):
             web_port=(1024, 65535),
         )
         limit = self.memory_limit.removesuffix("B").removesuffix("i").rstrip("kMGT%")
-        require(limit.isdecimal(), "RerunViewer.memory_limit", self.memory_limit, "like 2GB or 25%")
+        require(limit.isdecimal(), "viewer.memory_limit", self.memory_limit, "a size such as 2GB or 25%")
         self._page: SealedPage | None = None
         if importlib.util.find_spec("rerun") is None:
-            raise ConfigError("rerun, which draws the run, is missing: pip install instancemap[viewer]")
+            raise ConfigError("viewer: expected the package rerun, got none; run pip install instancemap[viewer]")
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
         import rerun as rr
@@ -109,14 +109,14 @@ class RerunViewer(Viewer):
             sinks.append(_open_window(rr, self.port, self.memory_limit))
         if self.mode is Mode.BROWSER:
             sinks.append(_server(rr, self.port, self.memory_limit))
-            with _faults(f"the page cannot be served on port {self.web_port} (viewer.web_port)"):
+            with _faults(f"viewer.web_port: expected a free port, got {self.web_port}"):
                 self._page = SealedPage(self.web_port, self.port)
             log.info("viewer: %s until the run ends", self._page.url)
         return sinks
 
 
 def _file_sink(rr: Any, path: Path) -> Any:
-    with _faults(f"{path} cannot be written"):
+    with _faults(f"viewer.file: expected a writable file, got {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("wb").close()  # rerun would report this only on stderr
         return rr.FileSink(path)
@@ -124,7 +124,7 @@ def _file_sink(rr: Any, path: Path) -> Any:
 
 def _server(rr: Any, port: int, memory_limit: str) -> Any:
     """Serve the data on 127.0.0.1."""
-    with _faults(f"port {port} cannot be had: set viewer.port"):
+    with _faults(f"viewer.port: expected a free port, got {port}"):
         with socket.socket() as probe:  # rerun would report this only on stderr
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((HERE, port))
@@ -133,8 +133,8 @@ def _server(rr: Any, port: int, memory_limit: str) -> Any:
 
 def _open_window(rr: Any, port: int, memory_limit: str) -> Any:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ConfigError("mode WINDOW needs a screen, and there is none: viewer.mode=BROWSER or RECORD")
-    with _faults("rerun's viewer cannot be started"):
+        raise ConfigError("viewer.mode: expected a screen for WINDOW, got none; set viewer.mode=BROWSER or RECORD")
+    with _faults("viewer.mode: expected rerun's viewer to start"):
         open_window(port, memory_limit)
     return rr.GrpcSink(f"rerun+http://{HERE}:{port}/proxy")
 
@@ -144,4 +144,4 @@ def _faults(what: str) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError, ValueError, subprocess.SubprocessError) as error:
-        raise ConfigError(f"viewer: {what}: {in_one_line(error)}") from error
+        raise ConfigError(f"{what}: {in_one_line(error)}") from error

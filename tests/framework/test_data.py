@@ -44,7 +44,7 @@ def frame(**changes: Any) -> Frame:
 
 @pytest.mark.parametrize("index", [1.5, "a", -5, None, True])
 def test_frame_invalid_index_raises(index: object) -> None:
-    with pytest.raises(DataError, match=r"Frame\.index must be a whole number, 0 or more, found"):
+    with pytest.raises(DataError, match=r"Frame\.index: expected an integer of at least 0, got"):
         frame(index=index)
 
 
@@ -56,9 +56,9 @@ def test_camera_and_frame_accept_numpy_scalars() -> None:
 def test_frame_up_must_be_unit_vector() -> None:
     np.testing.assert_array_equal(frame(up=np.array([0.6, -0.8, 0.0])).up, [0.6, -0.8, 0.0])
     for wrong, said in (
-        ([0.0, -9.81, 0.0], "a unit vector, found one of length 9.81"),
+        ([0.0, -9.81, 0.0], "expected a unit vector, got length 9.81"),
         ([0.0, -1.0], r"shape \(3\)"),
-        ([0.0, np.nan, 0.0], "not finite"),
+        ([0.0, np.nan, 0.0], "expected finite values"),
     ):
         with pytest.raises(DataError, match=f"frame 7: up .*{said}"):
             frame(up=np.array(wrong))
@@ -66,13 +66,13 @@ def test_frame_up_must_be_unit_vector() -> None:
 
 @pytest.mark.parametrize("camera", [None, (4, 3, 5.0, 5.0, 1.5, 1.0)])
 def test_frame_invalid_camera_type_raises(camera: object) -> None:
-    with pytest.raises(DataError, match="frame 7: camera must be a Camera, found"):
+    with pytest.raises(DataError, match="frame 7: camera: expected a Camera, got"):
         frame(camera=camera)
 
 
 @pytest.mark.parametrize(("name", "value"), [("width", "160"), ("height", 3.0), ("fx", None), ("cy", True)])
 def test_camera_non_numeric_value_raises(name: str, value: object) -> None:
-    with pytest.raises(DataError, match=rf"Camera\.{name} must be a (whole )?number of px, found"):
+    with pytest.raises(DataError, match=rf"Camera\.{name}: expected an? (integer )?number of px, got"):
         replace(CAMERA, **{name: value})
 
 
@@ -137,40 +137,56 @@ def test_valid_data_objects_are_accepted() -> None:
 @pytest.mark.parametrize(
     ("make", "changes", "said"),
     [
-        (frame, {"color": np.zeros((3, 5, 3), np.uint8)}, r"frame 7: color must have shape \(3, 4, 3\)"),
-        (frame, {"color": np.zeros((3, 4, 3), np.float32)}, "color must be an array of uint8, found float32"),
-        (frame, {"depth": np.ones((4, 3), np.float32)}, r"depth must have shape \(3, 4\), found \(4, 3\)"),
-        (frame, {"depth": np.ones((3, 4))}, "depth must be an array of float32, found float64"),
-        (frame, {"depth": with_nan((3, 4))}, "depth holds values that are not finite"),
-        (frame, {"depth": -np.ones((3, 4), np.float32)}, "depth must be 0 or positive, found -1.0 m"),
-        (frame, {"depth": np.ma.masked_less(np.ones((3, 4), np.float32), 2)}, "depth is a masked array"),
-        (frame, {"timestamp": float("nan")}, "frame 7: timestamp must be a finite number of seconds, found nan"),
-        (frame, {"timestamp": "5"}, "timestamp must be a finite number of seconds, found '5'"),
-        (frame, {"T_world_camera": with_nan((4, 4), np.float64)}, "frame 7: T_world_camera holds values"),
-        (frame, {"T_world_camera": 2 * np.eye(4)}, "not a rigid transform"),
-        (frame, {"T_world_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "not a rigid transform"),
-        (frame, {"truth": "none"}, "frame 7: truth must be a FrameTruth, found str"),
-        (frame, {"truth": FrameTruth(np.zeros((2, 2), np.int32), {})}, "truth.instance_ids must have shape"),
-        (detections, {"masks": np.zeros((3, 3, 4), np.bool_)}, r"masks must have shape \(2, any, any\)"),
-        (detections, {"scores": np.array([0.9, 1.2], np.float32)}, r"scores must be in \[0, 1\]"),
-        (detections, {"class_probabilities": np.full((2, 2), 0.4, np.float32)}, "each row must be a distribution"),
+        (frame, {"color": np.zeros((3, 5, 3), np.uint8)}, r"frame 7: color: expected shape \(3, 4, 3\)"),
+        (frame, {"color": np.zeros((3, 4, 3), np.float32)}, "color: expected an array of uint8, got float32"),
+        (frame, {"depth": np.ones((4, 3), np.float32)}, r"depth: expected shape \(3, 4\), got \(4, 3\)"),
+        (frame, {"depth": np.ones((3, 4))}, "depth: expected an array of float32, got float64"),
+        (frame, {"depth": with_nan((3, 4))}, "depth: expected finite values, got NaN or infinity"),
+        (frame, {"depth": -np.ones((3, 4), np.float32)}, r"depth: expected values of at least 0 m, got -1\.0 m"),
+        (
+            frame,
+            {"depth": np.ma.masked_less(np.ones((3, 4), np.float32), 2)},
+            "depth: expected an array without a mask, got a masked array",
+        ),
+        (frame, {"timestamp": float("nan")}, "frame 7: timestamp: expected a finite number of seconds, got nan"),
+        (frame, {"timestamp": "5"}, "timestamp: expected a finite number of seconds, got '5'"),
+        (frame, {"T_world_camera": with_nan((4, 4), np.float64)}, "frame 7: T_world_camera: expected finite values"),
+        (frame, {"T_world_camera": 2 * np.eye(4)}, r"expected a rigid transform, got \|R R\^T - I\| = .*, det R ="),
+        (
+            frame,
+            {"T_world_camera": np.diag([1.0, 1.0, -1.0, 1.0])},
+            r"expected a rigid transform, got \|R R\^T - I\| = .*, det R =",
+        ),
+        (frame, {"truth": "none"}, "frame 7: truth: expected a FrameTruth, got str"),
+        (frame, {"truth": FrameTruth(np.zeros((2, 2), np.int32), {})}, r"truth\.instance_ids: expected shape"),
+        (detections, {"masks": np.zeros((3, 3, 4), np.bool_)}, r"masks: expected shape \(2, any, any\)"),
+        (detections, {"scores": np.array([0.9, 1.2], np.float32)}, r"\.scores: expected values in \[0, 1\], got .* to"),
+        (
+            detections,
+            {"class_probabilities": np.full((2, 2), 0.4, np.float32)},
+            "expected a distribution in each row, got a sum of .*, minimum",
+        ),
         (
             detections,
             {"class_probabilities": np.array([[1.5, -0.5], [1, 0]], np.float32)},
-            "each row must be a distribution",
+            "expected a distribution in each row, got a sum of .*, minimum",
         ),
-        (clusters, {"cluster": np.array([0, 2, 1], np.int32)}, r"cluster must be in \[-1, 2\), found 0 to 2"),
-        (clusters, {"points_world": with_nan((3, 3))}, "points_world holds values that are not finite"),
-        (clusters, {"pixels": np.zeros((2, 2), np.int32)}, "pixels must have shape"),
+        (
+            clusters,
+            {"cluster": np.array([0, 2, 1], np.int32)},
+            r"PointClusters\.cluster: expected values in \[-1, 2\), got 0 to 2",
+        ),
+        (clusters, {"points_world": with_nan((3, 3))}, "points_world: expected finite values, got NaN or infinity"),
+        (clusters, {"pixels": np.zeros((2, 2), np.int32)}, "pixels: expected shape"),
         (
             clusters,
             {"class_probabilities": np.zeros((2, 0), np.float32), "classes": ()},
-            "there are 2 rows and no class to be distributed over",
+            "expected at least one class for 2 rows, got none",
         ),
-        (clusters, {"structure": np.zeros((3, 4), np.uint8)}, "structure must be an array of bool, found uint8"),
-        (clusters, {"structure": np.zeros(12, np.bool_)}, r"structure must have shape \(any, any\)"),
-        (mesh, {"class_ids": np.zeros(2, np.int32)}, "class_ids must have shape"),
-        (mesh, {"triangles": [[0, 1, 2]]}, "triangles must be an array of int32, found list"),
+        (clusters, {"structure": np.zeros((3, 4), np.uint8)}, "structure: expected an array of bool, got uint8"),
+        (clusters, {"structure": np.zeros(12, np.bool_)}, r"structure: expected shape \(any, any\)"),
+        (mesh, {"class_ids": np.zeros(2, np.int32)}, "class_ids: expected shape"),
+        (mesh, {"triangles": [[0, 1, 2]]}, "triangles: expected an array of int32, got list"),
     ],
 )
 def test_invalid_data_objects_raise_one_line_error(
@@ -223,12 +239,24 @@ def test_camera_out_of_range_value_raises(wrong: dict[str, float]) -> None:
             {"fx": 0.82, "fy": 1.09, "cx": 0.5, "cy": 0.5},
             "not as fractions of width and height",
         ),
-        ({"fx": 1e-300}, "more than 10 m sideways"),
-        ({"fy": 1e-5}, "more than 10 m sideways"),
-        ({"cx": 1e9}, "more than 10 m sideways"),
-        ({"cy": -1e9}, "more than 10 m sideways"),
+        (
+            {"fx": 1e-300},
+            "Camera: expected a field of view of at most 10 m sideways per m of depth",
+        ),
+        (
+            {"fy": 1e-5},
+            "Camera: expected a field of view of at most 10 m sideways per m of depth",
+        ),
+        (
+            {"cx": 1e9},
+            "Camera: expected a field of view of at most 10 m sideways per m of depth",
+        ),
+        (
+            {"cy": -1e9},
+            "Camera: expected a field of view of at most 10 m sideways per m of depth",
+        ),
         ({"fx": 1e300}, "at most 1e\\+06 px"),
-        ({"width": 10**9, "height": 10**9}, "at most 33554432 px, not 1000000000x1000000000"),
+        ({"width": 10**9, "height": 10**9}, "at most 33554432 px, got 1000000000x1000000000"),
     ],
 )
 def test_camera_implausible_intrinsics_raise(wrong: dict[str, float], said: str) -> None:
@@ -246,11 +274,11 @@ def test_camera_accepts_crops_and_extreme_lenses() -> None:
 def test_pose_rigidity_check_tolerates_rounding() -> None:
     rounded = np.round(exp_se3(np.array([1, 2, 3, 0.3, -0.7, 0.2])), 4)
     Pose(rounded)
-    with pytest.raises(DataError, match="not a rigid transform"):
+    with pytest.raises(DataError, match=r"expected a rigid transform, got \|R R\^T - I\| = .*, det R ="):
         Pose(np.round(rounded, 1))
     sheared = rounded.copy()
     sheared[3, 0] = 0.1
-    with pytest.raises(DataError, match="not a rigid transform"):
+    with pytest.raises(DataError, match=r"expected a rigid transform, got \|R R\^T - I\| = .*, det R ="):
         Pose(sheared)
 
 
@@ -318,10 +346,10 @@ def test_deferred_truth_render_error_is_raised_on_access() -> None:
 
 @pytest.mark.parametrize("wrong", [np.ones((4, 3), np.int32), np.ones((3, 4), np.int64)], ids=["shape", "dtype"])
 def test_deferred_truth_invalid_image_raises(wrong: np.ndarray) -> None:
-    with pytest.raises(DataError, match=r"DeferredTruth\.instance_ids must"):
+    with pytest.raises(DataError, match=r"DeferredTruth\.instance_ids: expected"):
         _ = deferred(lambda: wrong).instance_ids
 
 
 def test_frame_deferred_truth_shape_mismatch_raises_unrendered() -> None:
-    with pytest.raises(DataError, match=r"frame 7: truth.instance_ids must have shape \(3, 4\), found \(2, 2\)"):
+    with pytest.raises(DataError, match=r"frame 7: truth\.instance_ids: expected shape \(3, 4\), got \(2, 2\)"):
         frame(truth=deferred(lambda: pytest.fail("rendered"), (2, 2)))

@@ -120,12 +120,15 @@ def test_nearest_rigid_keeps_exact_pose_unchanged() -> None:
 @pytest.mark.parametrize(
     ("matrix", "why"),
     [
-        (np.diag([1.0, 1.0, -1.0, 1.0]), "det R -1"),
-        (np.diag([1.0, 1.01, 1.0, 1.0]), "not rigid"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "det R = -1"),
+        (np.diag([1.0, 1.01, 1.0, 1.0]), "expected a rigid transform"),
         (np.zeros((4, 4)), "last row"),
         (np.diag([1.0, 1.0, 1.0, -1.0]), "last row"),
-        (np.full((4, 4), np.inf), "not finite"),
-        (np.array([[1e200, -1e200, 0, 0], [1e200, 1e200, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "not rigid"),
+        (np.full((4, 4), np.inf), "expected finite values"),
+        (
+            np.array([[1e200, -1e200, 0, 0], [1e200, 1e200, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+            "expected a rigid transform",
+        ),
     ],
 )
 def test_nearest_rigid_non_rigid_matrix_raises(matrix: np.ndarray, why: str) -> None:

@@ -146,7 +146,9 @@ def test_pipeline_refines_only_inexact_masks_and_checks_pixels(room: CornerRoom)
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
             return replace(clusters, pixels=clusters.pixels - 99)
 
-    with pytest.raises(DataError, match="pixels must lie in the image"):
+    with pytest.raises(
+        DataError, match=r"clusters: expected pixels in the image of .*x.*, got u in \[.*, .*\], v in \[.*, .*\]"
+    ):
         pipeline(refiner=MadeUp()).run(room)
     assert pipeline(detector=Exact(), refiner=MadeUp()).run(room).frames_skipped == 0
 
@@ -154,9 +156,9 @@ def test_pipeline_refines_only_inexact_masks_and_checks_pixels(room: CornerRoom)
 @pytest.mark.parametrize(
     ("stage", "verb", "said"),
     [
-        ("detector", "detect", "a detector must return Detections"),
-        ("tracker", "track", "a tracker must return a Pose"),
-        ("refiner", "refine", "a refiner must return PointClusters"),
+        ("detector", "detect", "expected Detections from the detector"),
+        ("tracker", "track", "expected a Pose from the tracker"),
+        ("refiner", "refine", "expected PointClusters from the refiner"),
     ],
 )
 def test_pipeline_stage_returning_none_raises(
@@ -164,7 +166,7 @@ def test_pipeline_stage_returning_none_raises(
 ) -> None:
     stages = pipeline(prefetch=0)
     monkeypatch.setattr(getattr(stages, stage), verb, lambda *_: None)
-    with pytest.raises(DataError, match=f"frame 0: {said}, found NoneType"):
+    with pytest.raises(DataError, match=f"frame 0: {said}, got NoneType"):
         stages.run(room)
 
 
@@ -179,13 +181,13 @@ def test_pipeline_limits_log_of_skipped_frames(caplog: pytest.LogCaptureFixture)
     result = pipeline().run(MostlyBroken(frames=40))
     assert result.frames_skipped == 39
     assert len(caplog.records) == 12
-    assert caplog.records[-1].message == "39 frames skipped in all"
+    assert caplog.records[-1].message == "39 frames skipped in total"
 
 
 def test_pipeline_without_usable_frame_raises() -> None:
-    with pytest.raises(DataError, match="none of the 1 frames can be used"):
+    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
         pipeline().run(CornerRoom(frames=1, unreadable=0))
-    with pytest.raises(DataError, match="no frames to map"):
+    with pytest.raises(DataError, match="expected at least 1 frame, got 0"):
         pipeline().run(CornerRoom(start=6))
 
 
@@ -205,8 +207,8 @@ def test_pipeline_empty_map_raises_with_frame_summary() -> None:
     with pytest.raises(DataError) as caught:
         pipeline(tracker=GivenPose(lost_from=0, lost_to=3), fuser=fuser).run(CornerRoom(unreadable=5))
     assert str(caught.value) == (
-        "corner_room: nothing was mapped: of 6 frames 1 cannot be used; 3 are lost, the first because: too few points "
-        "associate; 2 have no depth that is mapped, 50 to 60 m"
+        "corner_room: expected mapped frames, got none of 6: 1 unusable; 3 lost (first reason: too few points "
+        "associate); 2 without depth within 50 to 60 m"
     )
 
 

@@ -188,8 +188,8 @@ def test_provenance_of_runs_is_printed(places: list[Path]) -> None:
     [
         (["rooms"], [AP50], "ranks compares two folders or more, found 1"),
         (["rooms", "rooms/../rooms"], [AP50], "different folders, found one twice"),
-        (["rooms", "nowhere"], [AP50], "nowhere is not a folder with records of runs"),
-        (["rooms", "empty"], [AP50], "there is no complete run below .*empty"),
+        (["rooms", "nowhere"], [AP50], "nowhere: expected a folder of runs"),
+        (["rooms", "empty"], [AP50], "expected a completed run, got none"),
         (
             ["rooms", "flat"],
             ["instances.ap51"],
@@ -234,4 +234,4 @@ def test_script_error_is_one_line(tmp_path: Path) -> None:
     experiment(tmp_path / "rooms", {"a": (0.9,), "b": (0.8,), "c": (0.7,)})
     done = start(tmp_path, "rooms", "flat")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "error: flat is not a folder with records of runs\n"
+    assert done.stderr == "error: flat: expected a folder of runs\n"

@@ -29,12 +29,12 @@ def main() -> None:
 def compile_named(kernels: list[Kernel], words: list[str]) -> str:
     """Compile the missing kernels whose names contain one of the words (none = all), and return a summary.
 
-    Raises ConfigError if there is no such kernel, DataError if one cannot be compiled.
+    Raises ConfigError if no kernel matches, DataError if one cannot be compiled.
     """
     if words:
         kernels = [kernel for kernel in kernels if any(word in f"{kernel.module}.{kernel.name}" for word in words)]
     if not kernels:
-        raise ConfigError(f"there is no kernel with {' or '.join(words)} in its name")
+        raise ConfigError(f"kernels: expected part of a name, got {' or '.join(words)}; no name contains it")
     missing = [kernel for kernel in kernels if not kernel.is_compiled()]
     if missing:
         started = time.perf_counter()

@@ -98,10 +98,12 @@ def write_repository(stage: str, name: str, folder: Path) -> Path:
     """
     check_name(stage, name)
     if not folder.is_dir():
-        raise ConfigError(f"--in: there is no folder {folder}")
+        raise ConfigError(f"--in: expected a folder, got {folder}")
     place = folder / names_of(stage, name)["distribution"]
     if os.path.lexists(place):
-        raise ConfigError(f"{place} is there already; choose another name, or another folder with --in")
+        raise ConfigError(
+            f"{place}: expected a new folder, got an existing one; choose another name, or another folder with --in"
+        )
     try:
         with tempfile.TemporaryDirectory(prefix=".new-plugin-", dir=folder) as temporary:
             half = Path(temporary, "repository")
@@ -110,7 +112,7 @@ def write_repository(stage: str, name: str, folder: Path) -> Path:
                 (half / path).write_text(text, encoding="utf-8", newline="\n")
             half.rename(place)
     except OSError as error:
-        raise DataError(f"{place} could not be written: {error.strerror or error}") from error
+        raise DataError(f"{place}: expected a writable folder, got {error.strerror or error}") from error
     return place
 
 
@@ -118,22 +120,30 @@ def check_name(stage: str, name: str) -> None:
     """Raise ConfigError unless the name is valid for a module and a new option of the stage."""
     if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > LONGEST_NAME:
         raise ConfigError(
-            f"NAME must be words of a-z and 0-9 with _ between them, like my_{stage}, at most {LONGEST_NAME} "
-            f"characters; found {name!r}"
+            f"NAME: expected words of a-z and 0-9 joined by _ such as my_{stage}, at most {LONGEST_NAME} "
+            f"characters, got {name!r}"
         )
     if is_value(name):
-        raise ConfigError(f"NAME {name} is a value and no name on a command line or in YAML; choose another, my_{name}")
+        raise ConfigError(
+            f"NAME: expected a name, got the value {name} of the command line and YAML; choose another such "
+            f"as my_{name}"
+        )
     if keyword.iskeyword(name) or name in FOLDERS:
-        raise ConfigError(f"NAME {name} means something else in a Python package; choose another, like my_{name}")
+        raise ConfigError(
+            f"NAME: expected a name without a meaning in Python packages, got {name}; choose another such as my_{name}"
+        )
     if name in options_of(stage):
-        raise ConfigError(f"there is a {stage}={name} already: `instancemap plugins {stage} {name}` shows it")
+        raise ConfigError(
+            f"NAME: expected a new name, got the existing option {stage}={name}; `instancemap plugins "
+            f"{stage} {name}` shows it"
+        )
     class_name = names_of(stage, name)["class_name"]
     if any(re.search(rf"\b{class_name}\b", _template(stage, template)) for template in ("plugin.py", "test.py")):
-        raise ConfigError(f"NAME {name}: its class {class_name} would have the name of another; choose a longer one")
+        raise ConfigError(f"NAME: expected a unique class name, got {class_name} for {name}; choose a longer name")
 
 
 def is_value(name: str) -> bool:
-    """Whether Hydra, or a YAML file, takes the word for null, a truth value or a number."""
+    """Return whether Hydra or YAML parses the word as null, a boolean or a number."""
     on_a_line = OverridesParser.create().parse_override(f"option={name}").value()
     return not (isinstance(on_a_line, str) and isinstance(OmegaConf.create(f"option: {name}").option, str))
 

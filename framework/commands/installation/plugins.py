@@ -1,4 +1,4 @@
-"""`python -m framework plugins [STAGE [NAME]]`: what is registered for each stage, with documentation and parameters.
+"""`instancemap plugins [STAGE [NAME]]`: the plugins of each stage, with documentation and parameters.
 
 Options of installed packages (entry point `instancemap.configs`) and of --config-dir are listed, too.
 """
@@ -33,7 +33,7 @@ _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Parameter:
-    """One field of a plugin, with what its option's YAML says about it."""
+    """One parameter of a plugin, with the comment in the option's YAML."""
 
     name: str
     type: str
@@ -48,15 +48,15 @@ class Option:
     stage: str
     name: str
     target: str
-    provider: str  # who put it on Hydra's search path: main, or the third-party package
-    documentation: str  # the class's first line, and what an option that inherits changes; why it cannot be used, if so
+    provider: str  # provider in Hydra's search path: main, or the third-party package
+    documentation: str  # first line of the class, and the change of a derived option; the error of an unusable option
     parameters: tuple[Parameter, ...]
 
 
 def registered(*stages: str, only: str | None = None) -> list[Option]:
     """Return the options of these config groups by stage and name, or only those with the requested name."""
     with config_loader() as loader:
-        files = CachingConfigRepository(loader.repository)  # of all options: they share most of what they are made of
+        files = CachingConfigRepository(loader.repository)  # of all options, because they share most configs
         return [
             _option(files, stage, name)
             for stage in stages
@@ -88,7 +88,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
         plugin_class = find_class(GROUPS[stage], target)
         check_option(f"{stage} {target}", plugin_class, node)
     except (ConfigError, DataError, HydraException, OmegaConfBaseException, OSError, ValueError) as error:
-        return Option(stage, name, target, source.provider, f"cannot be used: {one_line(error)}", ())
+        return Option(stage, name, target, source.provider, f"unusable: {one_line(error)}", ())
     given: Any = OmegaConf.to_container(node, resolve=False)
     nested = {name: _nested(made_of, f"{stage}.{name}", plugin_class) for name in plugin_fields(plugin_class)}
     comments = {match["key"]: match["comment"] for text in texts for match in COMMENTED_KEY.finditer(text)}
@@ -157,7 +157,7 @@ def main() -> None:
         gc.enable()
         if asked.name and not options:
             there = ", ".join(options_of(asked.stage))
-            raise ConfigError(f"there is no {asked.stage}={asked.name}; the options are: {there}")
+            raise ConfigError(f"{asked.stage}: expected one of {there}, got {asked.name}")
         for stage in stages:
             print(f"{stage} ({GROUPS[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
             described = [describe(option) for option in options if option.stage == stage]

@@ -41,7 +41,9 @@ def job(config: DictConfig) -> None:
     log.info("%s", out)
     if found.faults:
         settings = " ".join(dict.fromkeys(finding.setting for finding in found.faults if finding.setting))
-        raise DataError(f"the recording will not map{f'; try {settings}' if settings else ''}")
+        raise DataError(
+            f"dataset: expected a recording that can be mapped, got errors{f'; try {settings}' if settings else ''}"
+        )
 
 
 def main() -> None:

@@ -45,7 +45,7 @@ def convert(source: Path, target: Path) -> None:
     image, depth, timestamp = target / "image", target / "depth", target / "timestamp.txt"
     for path in (image, depth, timestamp):
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-            raise DataError(f"{path} exists; remove it, or choose another folder")
+            raise DataError(f"{path}: expected an empty or missing folder; remove it, or choose another folder")
     image.mkdir(parents=True, exist_ok=True)
     depth.mkdir(exist_ok=True)
     color_times: dict[int, float] = {}
@@ -64,16 +64,16 @@ def convert(source: Path, target: Path) -> None:
         if depth_times:
             write_timestamps(timestamp, depth_times, color_times)
     if not number:
-        raise DataError(f"{source} has no color and depth images of the same time")
+        raise DataError(f"{source}: expected color and depth images of equal times, got none")
     left_out = {stream: count - number for stream, count in counts.items()}
     print(
-        f"{target}: {number} frames; skipped {left_out[Stream.COLOR]} color and {left_out[Stream.DEPTH]} depth images"
-        " that are damaged or have no partner"
+        f"{target}: {number} frames; skipped {left_out[Stream.COLOR]} color and {left_out[Stream.DEPTH]} "
+        "depth images, damaged or without a pair"
     )
     if contents.cut_off:
         raise DataError(
-            f"{contents.path} is truncated or damaged at byte {contents.end}: kept the frames up to"
-            f" image{number:05d}.png; download it again for the rest"
+            f"{contents.path}: expected a complete file, got one truncated or damaged at byte "
+            f"{contents.end}; kept the frames up to image{number:05d}.png; download it again for the rest"
         )
 
 

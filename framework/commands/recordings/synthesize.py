@@ -34,9 +34,9 @@ def main() -> None:
         names = parsed.scenes.split(",")
         unknown = [name for name in names if name not in SCENES]
         if unknown:
-            raise ConfigError(f"there is no scene {unknown[0]!r}; the scenes are: {', '.join(SCENES)}")
+            raise ConfigError(f"--scenes: expected some of {', '.join(SCENES)}, got {unknown[0]!r}")
         if parsed.jobs < 1:
-            raise ConfigError(f"jobs must be at least 1, found {parsed.jobs}")
+            raise ConfigError(f"--jobs: expected at least 1, got {parsed.jobs}")
         recording = BenchmarkSettings(parsed.seed, parsed.frames, parsed.rate, parsed.width, parsed.haste)
         write_scenes(parsed.directory, {name: SCENES[name] for name in names}, recording, parsed.jobs)
         root = parsed.directory.resolve()

@@ -35,13 +35,13 @@ def main() -> None:
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
         if not in_world(parsed.after, parsed.before):
-            message = "%s may not be in the world frame of %s: run it with localize_in=%s, or both with given poses"
+            message = "%s: expected the world frame of %s; run it with localize_in=%s, or both with given poses"
             log.warning(message, parsed.after, parsed.before, parsed.before)
         found = changes(visit_of(parsed.before), visit_of(parsed.after))
         if parsed.out is not None:
             write_json(parsed.out, [entry(change) for change in found])
         shown = [change for change in found if parsed.all or change.kind not in UNCHANGED]
-        print("\n".join(map(line, shown)) or "nothing has changed")
+        print("\n".join(map(line, shown)) or "no changes")
         rest = {kind: sum(change.kind is kind for change in found) for kind in UNCHANGED}
         print(f"{rest[Kind.STAYED]} stayed, {rest[Kind.NOT_SEEN]} not seen by the other run")
 

@@ -101,7 +101,7 @@ def summary(found: Reevaluation, transfer: Transfer) -> str:
 
 
 def _step(old: Any, new: Any) -> str:
-    texts = [f"{value:.3f}" if isinstance(value, float) else str(value or "not known") for value in (old, new)]
+    texts = [f"{value:.3f}" if isinstance(value, float) else str(value or "unknown") for value in (old, new)]
     return " -> ".join(texts if texts[0] != texts[1] else [repr(old), repr(new)])
 
 
@@ -114,5 +114,5 @@ def _find(roots: Sequence[Path]) -> tuple[list[Record], list[DataError]]:
         records |= {record.directory.resolve(): record for record in complete}
         failures |= {one.directory.resolve(): DataError(f"{one.directory}: {one.reason}") for one in others}
         if not complete and not others:
-            failures[root.resolve()] = DataError(f"{root}: there is no run at or below it")
+            failures[root.resolve()] = DataError(f"{root}: expected a run at or below it, got none")
     return list(records.values()), list(failures.values())

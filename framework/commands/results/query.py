@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
     parsed = arguments(parser)
     if parsed.top < 1:
-        parser.error(f"--top must be at least 1, found {parsed.top}")
+        parser.error(f"--top: expected at least 1, got {parsed.top}")
     with one_line_errors():
         from framework.api import query  # slow: after the arguments are checked
 
@@ -40,7 +40,7 @@ def main() -> None:
         if shown:
             print(table(shown, "similarity" if answer.by == "embeddings" else "match"))
         else:
-            print(f"nothing in this map is {parsed.text!r}")
+            print(f"no object matches {parsed.text!r}")
 
 
 def heading(answer: QueryResult, wanted: str | None) -> str:

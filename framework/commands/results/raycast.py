@@ -58,7 +58,7 @@ def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> N
         place = f"pose {' '.join(f'{value:g}' for value in pose)}"
     source = RunSource.of(contents)
     if source.camera is None:
-        log.warning("the camera of the run is unknown (%s); the view is that of a Kinect", source.why_not)
+        log.warning("the camera of the run is unknown (%s); rendering with the camera of a Kinect", source.why_not)
     objects = scene.instances()
     names = {key: scene.classes[int(one.class_probabilities.argmax())] for key, one in objects.items()}
     view = scene.render(source.camera or NOT_CAMERA, T_world_camera)
@@ -82,5 +82,5 @@ def pose_of_frame(contents: RunContents, frame: int | None) -> int:
     if not min(known) <= frame <= max(known):
         raise DataError(f"--frame: expected {min(known)} to {max(known)}, got {frame}")
     nearest = min(numbers, key=lambda number: abs(number - frame))
-    what = "is lost" if frame in lost else "was not mapped"
-    raise DataError(f"--frame: expected a mapped frame, got {frame}, which {what}; the nearest is {nearest}")
+    what = "a lost frame" if frame in lost else "a frame that was not mapped"
+    raise DataError(f"--frame: expected a mapped frame, got {frame} ({what}); the nearest is {nearest}")

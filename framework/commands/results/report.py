@@ -44,10 +44,10 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
 
     places = [directory.resolve() for directory in directories]
     if again := [place for k, place in enumerate(places) if place in places[:k]]:
-        raise DataError(f"{again[0]}: expected each run once")
+        raise DataError(f"{again[0]}: expected each run once, got it twice")
     if out is not None:
         if not out.parent.is_dir():
-            raise DataError(f"{out} could not be written: its folder does not exist")
+            raise DataError(f"{out}: expected a file in an existing folder; create {out.parent}")
         if out.exists():
             check_regular(out)
     runs = [RunContents.read(directory) for directory in directories]

@@ -65,7 +65,7 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
         values = _values(override)
         runs[override.get_key_element()] = len(values) or MANY
         if not values and override.value_type in COUNTED:
-            raise ConfigError(f"{override.input_line} has no value: the sweep would be empty")
+            raise ConfigError(f"{override.input_line}: expected at least one value, got none; the sweep would be empty")
         if override.key_or_group == "row" and rows:
             check_row(values, rows)
     return prod(runs.values())
@@ -82,12 +82,12 @@ def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
     for row in chosen:
         if row not in rows:
             close = get_close_matches(row, rows, n=1)
-            hint = f"; did you mean {close[0]}?" if close else "."
-            raise ConfigError(f"there is no row={row}{hint} The experiment has {', '.join(rows)}")
+            hint = f"; did you mean {close[0]}?" if close else ""
+            raise ConfigError(f"row: expected one of {', '.join(rows)}, got {row}{hint}")
 
 
 def error_of_first_run(words: Sequence[str]) -> HydraException | None:
-    """Return what is wrong with the first run of a sweep that an experiment starts; None = nothing.
+    """Return the error of the first run of a sweep started by an experiment; None = no error.
 
     If the experiment's config cannot be composed, Hydra takes the command line for a single run and reports its
     choices as errors. `words` is the command line.

@@ -76,7 +76,7 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
     log.info("%s: %d detections in %d frames of %s", path, results.count, results.frames, sequence.name)
     if precision.objects:
         log.info(
-            "mask AP50 %.2f, AP %.2f: the mean of %d classes, %d true objects of %d px or more",
+            "mask AP50 %.2f, AP %.2f: mean of %d classes, %d true objects of at least %d px",
             precision.ap50,
             precision.ap,
             sum(not math.isnan(ap) for ap in precision.ap50_by_class.values()),
@@ -105,7 +105,7 @@ def _written(
             try:
                 true_ids = None if frame.truth is None else frame.truth.instance_ids
             except FrameError as error:
-                log.warning("frame not compared with the ground truth: %s", error)
+                log.warning("frame skipped in the evaluation: %s", error)
                 continue
             if frame.truth is not None and true_ids is not None:
                 faults.add(frame.truth, found)

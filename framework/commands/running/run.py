@@ -86,7 +86,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     with signals_deferred(*ENDING) as interruption:
         with frozen_garbage_collector():
             result = pipeline.run_to_any_end(video, directory)
-        with interruption.second_ends_at_once("once the record is written"):
+        with interruption.second_ends_at_once("after the outputs are written"):
             fault = record.write(video, result, cache_metrics(pipeline.detector))
     if fault is None:
         return interruption

@@ -50,7 +50,7 @@ def job(config: DictConfig) -> None:
     refiner = build(ClusterRefiner, config.refiner)
     position, frame, detections = detected(sequence, detector, config.frame)
     if len(detections) == 0:
-        log.warning("frame %d of %s: nothing was detected, so there is nothing to refine", position, sequence.name)
+        log.warning("frame %d of %s: no detections, nothing to refine", position, sequence.name)
     hydra_config = HydraConfig.get()
     choices, overrides = hydra_config.runtime.choices, hydra_config.overrides.task
     number = "" if frame.index == position else f" (number {frame.index} of the video)"
@@ -70,8 +70,8 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
     if position is not None:
         if isinstance(position, bool) or not isinstance(position, int) or not 0 <= position < len(sequence):
             raise ConfigError(
-                f"frame must be in [0, {len(sequence) - 1}], a position among the frames of {sequence.name} that "
-                f"dataset.start, stop and stride choose; found {position!r}"
+                f"frame: expected a position in [0, {len(sequence) - 1}] among the selected frames of "
+                f"{sequence.name}, got {position!r}"
             )
         frame = sequence[position]
         return position, frame, detector.detect(frame)
@@ -87,7 +87,7 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
         if best is None or len(found) > len(best[2]):
             best = k, frame, found
     if best is None:
-        raise DataError(f"{sequence.name}: none of the {len(tried)} frames that were tried can be used: choose frame=K")
+        raise DataError(f"{sequence.name}: expected a usable frame, got none of {len(tried)}; set frame=K")
     return best
 
 

@@ -78,7 +78,7 @@ class PlaceCallback(Callback):
 def place_of(key: str, chosen: str) -> Path:
     """Return the chosen directory. Raises ConfigError for an empty name, which would be the working folder."""
     if not chosen.strip():
-        raise ConfigError(f"{key} is empty; {key}=. is the working folder")
+        raise ConfigError(f"{key}: expected a folder, got an empty name; set {key}=. for the working folder")
     return Path(chosen)
 
 

@@ -18,7 +18,12 @@ NO_READING = 65535  # uint16 that several sensors write instead of 0
 
 def check_max_depth(max_depth: float) -> None:
     """Raise ConfigError for an invalid range."""
-    require(math.isfinite(max_depth) and max_depth >= 0, "dataset.max_depth", max_depth, "0 (keep all) or positive m")
+    require(
+        math.isfinite(max_depth) and max_depth >= 0,
+        "dataset.max_depth",
+        max_depth,
+        "0 (keep all) or a positive value in m",
+    )
 
 
 @dataclass(frozen=True)

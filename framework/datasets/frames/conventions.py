@@ -64,8 +64,10 @@ class PoseReading:
     pose_delay: int = 0  # offset of the pose, frames, in [-1000, 1000]: image k has pose k + offset
 
     def __post_init__(self) -> None:
-        require(1e-6 <= self.pose_unit <= 1e6, "dataset.pose_unit", self.pose_unit, "in [1e-6, 1e6] m")
-        require(abs(self.pose_delay) <= LONGEST_DELAY, "dataset.pose_delay", self.pose_delay, "in [-1000, 1000]")
+        require(1e-6 <= self.pose_unit <= 1e6, "dataset.pose_unit", self.pose_unit, "a value in [1e-6, 1e6] m")
+        require(
+            abs(self.pose_delay) <= LONGEST_DELAY, "dataset.pose_delay", self.pose_delay, "a value in [-1000, 1000]"
+        )
 
     def pose(self, stored: Float64) -> Float64:
         """Return T_world_camera (4, 4) of a stored rigid transform (4, 4)."""
@@ -90,5 +92,9 @@ class DepthReading:
 
     def __post_init__(self) -> None:
         fine = self.depth_scale == 0 or COARSEST_DEPTH <= self.depth_scale <= FINEST_DEPTH
-        require(fine, "dataset.depth_scale", self.depth_scale, f"0 or in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}]")
-        require(abs(self.depth_delay) <= LONGEST_DELAY, "dataset.depth_delay", self.depth_delay, "in [-1000, 1000]")
+        require(
+            fine, "dataset.depth_scale", self.depth_scale, f"0 or a value in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}]"
+        )
+        require(
+            abs(self.depth_delay) <= LONGEST_DELAY, "dataset.depth_delay", self.depth_delay, "a value in [-1000, 1000]"
+        )

@@ -276,11 +276,11 @@ def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[Re
 
 def check_selection(start: int, stop: int, stride: int, frame_fraction: float = 1.0) -> None:
     """Raise ConfigError unless the parameters can select frames."""
-    require(start >= 0, "dataset.start", start, "0 or positive")
+    require(start >= 0, "dataset.start", start, "at least 0")
     above = f"above dataset.start ({start}), or {TO_THE_END} for the end"
     require(stop == TO_THE_END or stop > start, "dataset.stop", stop, above)
     require(stride >= 1, "dataset.stride", stride, "at least 1")
-    require(0 < frame_fraction <= 1, "dataset.frame_fraction", frame_fraction, "in (0, 1]")
+    require(0 < frame_fraction <= 1, "dataset.frame_fraction", frame_fraction, "a value in (0, 1]")
 
 
 def choose_frames(
@@ -293,7 +293,7 @@ def choose_frames(
     check_selection(start, stop, stride, frame_fraction)
     if start >= count:
         raise ConfigError(f"dataset.start is {start}, but the sequence has only {count} frames (0 to {count - 1})")
-    require(seed >= 0, "seed", seed, "0 or positive")
+    require(seed >= 0, "seed", seed, "at least 0")
     chosen = range(start, count if stop == TO_THE_END else min(stop, count), stride)
     if frame_fraction == 1:
         return chosen

@@ -27,7 +27,7 @@ class LabeledDepth:
 
 def check_truth_voxel(size: float) -> None:
     """Raise ConfigError for an implausible spacing of true points."""
-    require(1e-3 <= size <= 1, "dataset.ground_truth_spacing", size, "in [0.001, 1] m")
+    require(1e-3 <= size <= 1, "dataset.ground_truth_spacing", size, "a value in [0.001, 1] m")
 
 
 def fuse_scene_truth(

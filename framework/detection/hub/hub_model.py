@@ -16,7 +16,7 @@ from framework.files.json_file import read_json
 from framework.files.search_paths import expanded
 
 HUB_OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
-"""Environment variables: set to 1, nothing is downloaded from huggingface.co."""
+"""Environment variables that disable downloads from huggingface.co if set to 1."""
 
 CONFIG, PREPROCESSING = "config.json", "preprocessor_config.json"
 WHOLE, INDEX, PICKLED = "model.safetensors", "model.safetensors.index.json", "pytorch_model.bin"
@@ -43,7 +43,9 @@ def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
         _download(model, revision, more)
         cached = _cached(model, revision, more)
     if cached is None:
-        raise DataError(f"detector.model: {model} was downloaded, but the cache is not complete: try again")
+        raise DataError(
+            f"detector.model: expected a complete cache after the download of {model}, got missing files; try again"
+        )
     return cached
 
 
@@ -60,7 +62,9 @@ def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
     try:
         config = try_to_load_from_cache(model, CONFIG, revision=revision)
     except HFValidationError as error:
-        raise DataError(f"detector.model: {model} is neither a folder nor a model id: {in_one_line(error)}") from error
+        raise DataError(
+            f"detector.model: expected a folder or a model id, got {model}; {in_one_line(error)}"
+        ) from error
     if not isinstance(config, str):
         return None
     folder = Path(config).parent
@@ -76,7 +80,10 @@ def _listed(index: Path) -> list[str]:
     try:
         return [*read_json(index)["weight_map"].values()]
     except (DataError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"detector.model: {index} is damaged: delete {index.parents[2]}, and run again") from error
+        raise DataError(
+            f"detector.model: expected an index of weight files, got a damaged {index}; delete "
+            f"{index.parents[2]} and run again"
+        ) from error
 
 
 def _weights(names: Collection[str]) -> list[str]:
@@ -98,8 +105,8 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
     """Download the needed files with huggingface_hub, which writes each file atomically and shows progress."""
     if variable := forbidden_by():
         raise DataError(
-            f"detector.model: {model} is no folder, and {variable} forbids to download it: unset that, or give a local"
-            " folder"
+            f"detector.model: expected a local folder with {variable} set, got {model}; unset {variable} or "
+            "give a folder"
         )
     from huggingface_hub import HfApi, constants
 
@@ -109,7 +116,9 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
         files = {file.rfilename: file for file in info.siblings or ()}
         wanted = [CONFIG, PREPROCESSING, *_published(more, files), *(_weights(files) or [WHOLE])]
         if missing := [name for name in wanted if name not in files]:
-            raise DataError(f"detector.model: {model} on {constants.ENDPOINT} has no {' and no '.join(missing)}")
+            raise DataError(
+                f"detector.model: expected {' and '.join(missing)} in {model} on {constants.ENDPOINT}, got none"
+            )
         size = sum(files[name].size or 0 for name in wanted)
         license_ = next((t.removeprefix("license:") for t in info.tags or () if t.startswith("license:")), "unknown")
         log.info("downloading %s, %.0f MB, license %s, from %s into %s",
@@ -119,8 +128,8 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
         raise
     except Exception as error:  # huggingface_hub and the HTTP library below it have separate errors
         raise DataError(
-            f"detector.model: {model} is no folder, and could not be downloaded from {constants.ENDPOINT}: check the"
-            f" name and the network, or give a local folder; huggingface_hub reports: {in_one_line(error)}"
+            f"detector.model: expected a local folder or a download of {model} from {constants.ENDPOINT}, "
+            f"got an error ({in_one_line(error)}); check the name and the network, or give a local folder"
         ) from error
     for name, path in paths.items():
         _check(path, files[name])
@@ -139,8 +148,8 @@ def _check(path: Path, published: Any) -> None:
     path.resolve().unlink()  # the content, if the cache uses links
     path.unlink(missing_ok=True)
     raise DataError(
-        f"detector.model: {path.name} is not what was published: its sha256 is not {published.lfs.sha256}; it was"
-        " deleted: try again"
+        f"detector.model: expected sha256 {published.lfs.sha256} for {path.name}, got another one; the "
+        "file was deleted, try again"
     )
 
 
@@ -154,4 +163,6 @@ def read_part(parameter: str, folder: Path, what: str, auto_class: Any, **option
     try:
         return auto_class.from_pretrained(str(folder), local_files_only=True, **options)
     except Exception as error:  # transformers, tokenizers and safetensors raise many types on foreign files
-        raise DataError(f"{parameter}: {what} could not be read from {folder}: {in_one_line(error)}") from error
+        raise DataError(
+            f"{parameter}: expected {what} in {folder}, got an unreadable file: {in_one_line(error)}"
+        ) from error

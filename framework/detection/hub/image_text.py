@@ -40,7 +40,7 @@ class ImageTextFamily(NamedTuple):
 
     prompt: str  # template around a class name, as in the published evaluation
     padding: str  # of texts, as in training
-    lower: bool  # whether texts are in lower case
+    lower: bool  # true if texts are lowercased
     mean: tuple[float, ...]  # RGB, if the preprocessing file has none
     std: tuple[float, ...]
 
@@ -71,18 +71,18 @@ class ImageTextModel:
         transformers = imported_transformers()
         self._folder = find_model(model, revision, TOKENIZER)
         self._device = torch_device(device)
-        config = read_part("detector.model", self._folder, "its config.json", transformers.AutoConfig)
+        config = read_part("detector.model", self._folder, "config.json", transformers.AutoConfig)
         if config.model_type not in FAMILIES:
             raise ConfigError(
-                f"detector.model must be a CLIP or a SigLIP of a fixed size, found {model}, a {config.model_type}"
+                f"detector.model: expected CLIP or SigLIP with a fixed image size, got {model} ({config.model_type})"
             )
         self._family = FAMILIES[config.model_type]
         self.side = int(config.vision_config.image_size)
         if not 16 <= self.side <= LONGEST_SIDE:
-            raise DataError(f"detector.model: {self._folder} takes images of {self.side} px; expected 16 to 1024")
+            raise DataError(f"detector.model: expected images of 16 to 1024 px, got {self.side} px of {self._folder}")
         self._mean, self._std, self._factor = _normalization(self._folder / PREPROCESSING, self._family)
-        self._tokenizer = read_part("detector.model", self._folder, "its tokenizer", transformers.AutoTokenizer)
-        network = read_part("detector.model", self._folder, "its weights", transformers.AutoModel)
+        self._tokenizer = read_part("detector.model", self._folder, "the tokenizer", transformers.AutoTokenizer)
+        network = read_part("detector.model", self._folder, "the weights", transformers.AutoModel)
         self._network = ready(network, self._device, half_precision)
         self.space = _space(self._folder, model)
 
@@ -114,7 +114,8 @@ class ImageTextModel:
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
         if not np.isfinite(lengths).all() or (lengths == 0).any():
             raise DataError(
-                f"{self.space} computed an embedding that is not finite, or 0; set detector.half_precision=false"
+                f"{self.space}: expected finite embeddings other than 0, got NaN, infinity or 0; set "
+                "detector.half_precision=false"
             )
         return np.asarray(vectors / lengths, np.float32)
 
@@ -123,13 +124,13 @@ def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ..
     """Return mean, standard deviation, and the factor applied before them, from preprocessor_config.json."""
     content = read_json(path)
     if not isinstance(content, Mapping):
-        raise DataError(f"detector.model: {path} must hold an object")
+        raise DataError(f"detector.model: {path}: expected an object, got another value")
     mean, std = tuple(content.get("image_mean", family.mean)), tuple(content.get("image_std", family.std))
     factor = content.get("rescale_factor", 1 / 255)
     numbers = (*mean, *std, factor)
     if len(numbers) != 7 or not all(isinstance(x, int | float) and np.isfinite(x) for x in numbers) or 0 in std:
         raise DataError(
-            f"detector.model: {path}: image_mean, image_std and rescale_factor must be numbers, not {numbers}"
+            f"detector.model: {path}: expected numbers in image_mean, image_std and rescale_factor, got {numbers}"
         )
     return mean, std, float(factor)
 

@@ -38,11 +38,11 @@ class TextPromptedBoxes:
     ) -> None:
         transformers = imported_transformers()
         self.folder = find_model(model, revision, TOKENIZER)
-        config = read_part("detector.model", self.folder, "its config.json", transformers.AutoConfig)
+        config = read_part("detector.model", self.folder, "config.json", transformers.AutoConfig)
         if config.model_type != "owlv2":
-            raise ConfigError(f"detector.model must be an OWLv2, found {model}, a {config.model_type}")
-        tokenizer = read_part("detector.model", self.folder, "its tokenizer", transformers.AutoTokenizer)
-        network = read_part("detector.model", self.folder, "its weights", transformers.Owlv2ForObjectDetection)
+            raise ConfigError(f"detector.model: expected OWLv2, got {model} ({config.model_type})")
+        tokenizer = read_part("detector.model", self.folder, "the tokenizer", transformers.AutoTokenizer)
+        network = read_part("detector.model", self.folder, "the weights", transformers.Owlv2ForObjectDetection)
         tokens = tokenizer(
             [PROMPT.format(text) for text in texts],
             padding="max_length", max_length=MOST_TOKENS, truncation=True, return_tensors="pt",
@@ -66,7 +66,8 @@ class TextPromptedBoxes:
         probabilities = torch.sigmoid(output.logits[0].float()).cpu().numpy()
         if not (np.isfinite(boxes).all() and np.isfinite(probabilities).all()):
             raise DataError(
-                f"detector.model: the output of {self.folder} is not finite; try detector.half_precision=false"
+                f"detector.model: expected finite outputs of {self.folder}, got NaN or infinity; set "
+                "detector.half_precision=false"
             )
         return boxes.astype(np.float32), probabilities
 
@@ -77,13 +78,11 @@ class BoxPromptedMasks:
     def __init__(self, model: str, revision: str, device: torch.device, half_precision: bool) -> None:
         transformers = imported_transformers()
         self.folder = find_model(model, revision)
-        config = read_part("detector.mask_model", self.folder, "its config.json", transformers.AutoConfig)
+        config = read_part("detector.mask_model", self.folder, "config.json", transformers.AutoConfig)
         if config.model_type not in SAM_FAMILY:
-            raise ConfigError(
-                f"detector.mask_model must be a SAM, a SAM 2 or an EdgeTAM, found {model}, a {config.model_type}"
-            )
+            raise ConfigError(f"detector.mask_model: expected SAM, SAM 2 or EdgeTAM, got {model} ({config.model_type})")
         class_name, self._stretched = SAM_FAMILY[config.model_type]
-        network = read_part("detector.mask_model", self.folder, "its weights", getattr(transformers, class_name))
+        network = read_part("detector.mask_model", self.folder, "the weights", getattr(transformers, class_name))
         self._network = ready(network, device, half_precision)
         prompts = config.prompt_encoder_config
         side = prompts.image_size if self._stretched else config.vision_config.image_size
@@ -108,7 +107,8 @@ class BoxPromptedMasks:
         logits = output.pred_masks[0, :, 0].float()
         if not torch.isfinite(logits).all():
             raise DataError(
-                f"detector.mask_model: the output of {self._model} is not finite; try detector.half_precision=false"
+                f"detector.mask_model: expected finite outputs of {self._model}, got NaN or infinity; set "
+                "detector.half_precision=false"
             )
         whole = functional.interpolate(logits[None], (self._side, self._side), mode="bilinear", align_corners=False)
         inside = whole[..., : resized[1], : resized[0]]

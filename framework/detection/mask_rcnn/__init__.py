@@ -1,1 +1,1 @@
-"""Mask R-CNN: the network, and the files in which others publish its weights."""
+"""Mask R-CNN: the network, and readers of published weights."""

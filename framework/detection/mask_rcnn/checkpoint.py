@@ -51,7 +51,9 @@ def read_network(
         return from_detectron2(state, str(path), classes)
     if kind is CheckpointKind.TORCHVISION or "backbone.body.conv1.weight" in state:
         return from_torchvision(state, str(path), classes, norm_eps)
-    raise DataError(f"{path} has the weights of no Mask R-CNN of torchvision or detectron2 with a feature pyramid")
+    raise DataError(
+        f"{path}: expected a Mask R-CNN of torchvision or detectron2 with a feature pyramid, got other weights"
+    )
 
 
 def domain_of_network(path: Path) -> str:
@@ -66,10 +68,12 @@ def _read_torch(path: Path) -> dict[str, Tensor]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file can raise almost anything
         reason = str(error).splitlines() or [type(error).__name__]
-        raise DataError(f"{path} is damaged, or no file of weights alone: {reason[0]}") from error
+        raise DataError(
+            f"{path}: expected a file of weights only, got a damaged or another file: {reason[0]}"
+        ) from error
     state = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(tensor, Tensor) for tensor in state.values()):
-        raise DataError(f"{path} must hold a state_dict, names and tensors, by itself or as `model`")
+        raise DataError(f"{path}: expected a state_dict (names and tensors), alone or as `model`, got another object")
     return state
 
 
@@ -86,10 +90,12 @@ def from_torchvision(
     labels = len(required(tensors, "roi_heads.box_predictor.cls_score.bias", where))
     if classes is None:
         if labels != len(COCO_BY_ID):
-            raise DataError(f"{where}: {labels} labels are not COCO's {len(COCO_BY_ID)}: the classes must be given")
+            raise DataError(
+                f"{where}: expected COCO's {len(COCO_BY_ID)} labels, got {labels}; give the classes with --classes"
+            )
         tensors, classes = _without_gaps(tensors), COCO
     elif len(classes) != labels - 1:
-        raise DataError(f"{where}: the network has {labels - 1} classes, {len(classes)} were given")
+        raise DataError(f"{where}: expected {labels - 1} classes, got {len(classes)}")
     architecture = Architecture(
         classes=classes,
         backbone=_backbone(tensors, norm_eps, where),
@@ -130,4 +136,4 @@ def _backbone(tensors: Mapping[str, Tensor], norm_eps: float, where: str) -> Res
         if expected == depths and (name in WITH_BOTTLENECKS) == bottlenecks:
             width = len(required(tensors, "backbone.body.conv1.weight", where))
             return ResNetShape(name, width, norm_eps=norm_eps)
-    raise DataError(f"{where}: there is no residual network here with {depths} blocks")
+    raise DataError(f"{where}: expected a known residual network, got {depths} blocks")

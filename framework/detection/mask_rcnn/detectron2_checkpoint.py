@@ -60,10 +60,10 @@ def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str,
     tensors = {_renamed(name, where): tensor for name, tensor in state.items() if not re.fullmatch(NOT_WEIGHTS, name)}
     found = len(required(tensors, "roi_heads.mask_predictor.mask_fcn_logits.bias", where))
     if classes is None and found != len(COCO):
-        raise DataError(f"{where}: {found} classes are not COCO's {len(COCO)}: they must be given")
+        raise DataError(f"{where}: expected COCO's {len(COCO)} classes, got {found}; give the classes with --classes")
     classes = classes or COCO
     if len(classes) != found:
-        raise DataError(f"{where}: the network has {found} classes, {len(classes)} were given")
+        raise DataError(f"{where}: expected {found} classes, got {len(classes)}")
     stem = "backbone.body.conv1.weight"
     tensors[stem] = required(tensors, stem, where).flip(1)  # BGR to RGB
     _put_background_first(tensors, where)
@@ -92,13 +92,13 @@ def read_pickle(path: Path) -> dict[str, Tensor]:
         with path.open("rb") as file:
             content = ArraysOnly(file, encoding="latin1").load()
     except Exception as error:  # a damaged pickle can raise almost anything
-        raise DataError(f"{path} is no pickle of numpy arrays: {in_one_line(error)}") from error
+        raise DataError(f"{path}: expected a pickle of numpy arrays, got {in_one_line(error)}") from error
     state = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(array, np.ndarray) for array in state.values()):
-        raise DataError(f"{path} must hold a dictionary of numpy arrays, as detectron2 writes it")
+        raise DataError(f"{path}: expected a dictionary of numpy arrays, as written by detectron2, got another object")
     numeric = {name: array for name, array in state.items() if array.dtype.kind in "fiu"}
     if len(numeric) < len(state):
-        raise DataError(f"{path}: {min(state.keys() - numeric.keys())} is no array of numbers")
+        raise DataError(f"{path}: expected arrays of numbers, got {min(state.keys() - numeric.keys())}")
     return {str(name): torch.from_numpy(np.array(array)) for name, array in numeric.items()}
 
 
@@ -107,14 +107,14 @@ class ArraysOnly(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (allowed := ALLOWED.get((module.replace("numpy._core", "numpy.core"), name))) is None:
-            raise pickle.UnpicklingError(f"it wants to call {module}.{name}")
+            raise pickle.UnpicklingError(f"a call of {module}.{name}")
         return allowed
 
 
 def _encoded(text: str, encoding: str) -> bytes:
     """Return bytes as Python 3 pickles them in older protocols."""
     if encoding != "latin1":
-        raise pickle.UnpicklingError(f"it wants to encode as {encoding}")
+        raise pickle.UnpicklingError(f"an encoding as {encoding}")
     return text.encode("latin1")
 
 
@@ -137,7 +137,7 @@ def _renamed(name: str, where: str) -> str:
                 re.sub(theirs, ours, name),
                 count=1,
             )
-    raise DataError(f"{where} has the weights {name}, which are not of a Mask R-CNN with ResNet and feature pyramid")
+    raise DataError(f"{where}: expected a Mask R-CNN with ResNet and feature pyramid, got the weights {name}")
 
 
 def _check_input(state: Mapping[str, Tensor], where: str) -> None:
@@ -145,9 +145,7 @@ def _check_input(state: Mapping[str, Tensor], where: str) -> None:
     for name, expected in (("pixel_mean", PIXEL_MEAN[::-1]), ("pixel_std", PIXEL_STD)):
         if name in state and not torch.allclose(state[name].float().flatten(), torch.tensor(expected), atol=1e-2):
             found = [round(value, 3) for value in state[name].flatten().tolist()]
-            raise DataError(
-                f"{where}: {name} is {found}; only networks that start from MSRA's, with {expected}, are read"
-            )
+            raise DataError(f"{where}: {name}: expected {expected} as in networks that start from MSRA's, got {found}")
 
 
 def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
@@ -160,7 +158,7 @@ def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
         sides[level] = round(float((width * height).sqrt().mean()), 3)
         ratios = torch.tensor(Architecture.anchor_ratios, dtype=torch.float64)
         if len(anchors) != len(ratios) or not torch.allclose(height / width, ratios, rtol=1e-3):
-            raise DataError(f"{where}: the anchors of level {level} are not three of the ratios 0.5, 1 and 2")
+            raise DataError(f"{where}: expected three anchors of the ratios 0.5, 1 and 2 in level {level}, got others")
     return tuple(sides)
 
 
@@ -181,4 +179,4 @@ def _depth(tensors: Mapping[str, Tensor], where: str) -> str:
     for name in WITH_BOTTLENECKS:
         if DEPTHS[name][2] == blocks:
             return name
-    raise DataError(f"{where}: there is no residual network here with {blocks} blocks in res4")
+    raise DataError(f"{where}: expected a known residual network, got {blocks} blocks in res4")

@@ -57,7 +57,7 @@ def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: 
         try:
             save_file(tensors, temporary, metadata)
         except safetensors.SafetensorError as error:
-            raise DataError(f"{path} could not be written: {in_one_line(error)}") from error
+            raise DataError(f"{path}: expected a writable file, got {in_one_line(error)}") from error
 
 
 def load_network(path: Path) -> MaskRCNN:
@@ -67,7 +67,9 @@ def load_network(path: Path) -> MaskRCNN:
         names = file.keys()
         tensors = {name: file.get_tensor(name) for name in names}
         if file.metadata().get("tensors_sha256") != _digest(tensors):
-            raise DataError(f"{path} is damaged: its tensors differ from those written; get it again")
+            raise DataError(
+                f"{path}: expected the checksum of its tensors, got another one; the file is damaged, get it again"
+            )
     return filled(description.architecture, tensors, str(path))
 
 
@@ -86,14 +88,14 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
         with torch.device("meta"):  # no memory or random numbers for weights that are replaced
             network = MaskRCNN(architecture)
     except (KeyError, ValueError, RuntimeError) as error:
-        raise DataError(f"{where}: there is no such architecture: {in_one_line(error)}") from error
+        raise DataError(f"{where}: expected a known architecture, got {in_one_line(error)}") from error
     expected = _stored(network)
     given = {name: tensor for name, tensor in tensors.items() if not name.endswith(COUNTERS)}
     _check_names(expected.keys(), given.keys(), where)
     for name, tensor in given.items():
         if tensor.shape != expected[name].shape:
             wanted, found = (" x ".join(map(str, shape)) for shape in (expected[name].shape, tensor.shape))
-            raise DataError(f"{where}: {name} must be {wanted}, found {found}")
+            raise DataError(f"{where}: {name}: expected shape {wanted}, got {found}")
     _check_finite(given, where)
     counters = {name: torch.tensor(0) for name in network.state_dict() if name.endswith(COUNTERS)}
     network.load_state_dict({name: tensor.float() for name, tensor in given.items()} | counters, assign=True)
@@ -103,7 +105,7 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
 def required(tensors: Mapping[str, Tensor], name: str, where: str) -> Tensor:
     """Return the tensor `name`. Raises DataError, starting with the source `where`, if it is missing."""
     if name not in tensors:
-        raise DataError(f"{where} lacks the weights {name}: it is no Mask R-CNN with a feature pyramid")
+        raise DataError(f"{where}: expected the weights {name} of a Mask R-CNN with a feature pyramid, got none")
     return tensors[name]
 
 
@@ -112,16 +114,16 @@ def _stored(network: MaskRCNN) -> dict[str, Tensor]:
 
 
 def _check_names(expected: typing.AbstractSet[str], found: typing.AbstractSet[str], where: str) -> None:
-    for names, fault in ((expected - found, "lacks"), (found - expected, "has the unknown")):
+    for names, fault in ((expected - found, "missing"), (found - expected, "unknown")):
         if names:
             more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            raise DataError(f"{where} {fault} weights {min(names)}{more}: it is not of this network")
+            raise DataError(f"{where}: expected the weights of this network, got {fault} {min(names)}{more}")
 
 
 def _check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
     for name, tensor in tensors.items():
         if not torch.isfinite(tensor).all():
-            raise DataError(f"{where}: the weights {name} are not finite numbers")
+            raise DataError(f"{where}: {name}: expected finite weights, got NaN or infinity")
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:
@@ -136,16 +138,18 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
 
 def _opened(path: Path) -> Any:
     if not path.is_file():
-        raise DataError(f"there is no network {path}")
+        raise DataError(f"{path}: expected a network file, got none")
     try:
         return safetensors.safe_open(path, framework="pt")
     except (safetensors.SafetensorError, OSError) as error:
-        raise DataError(f"{path} is damaged, or no safetensors file: {in_one_line(error)}") from error
+        raise DataError(
+            f"{path}: expected a safetensors file, got a damaged or another file: {in_one_line(error)}"
+        ) from error
 
 
 def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescription:
     if not metadata or "architecture" not in metadata:
-        raise DataError(f"{path} is not a network file: its metadata have no architecture")
+        raise DataError(f"{path}: expected an architecture in the metadata, got none; it is not a network file")
     try:
         card = parse_json(path, metadata.get("card", "{}"))
         architecture = parse_json(path, metadata["architecture"])
@@ -158,25 +162,25 @@ def _parsed(kind: Any, value: Any, name: str) -> Any:
     """Return a value from JSON as the annotated type `kind`. Raises ValueError, in one line, for other types."""
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
-            raise ValueError(f"{name} must have fields, found {value!r}")
+            raise ValueError(f"{name}: expected fields, got {value!r}")
         kinds = typing.get_type_hints(kind)
         if unknown := sorted(value.keys() - kinds.keys()):
-            raise ValueError(f"{name} has the unknown field {unknown[0]}; was it written by a newer version?")
+            raise ValueError(f"{name}: expected known fields, got {unknown[0]}, perhaps of a newer version")
         fields = {field: _parsed(kinds[field], part, f"{name}.{field}") for field, part in value.items()}
         try:
             return typing.cast(Any, kind)(**fields)
         except TypeError as error:
-            raise ValueError(f"{name} is not complete: {error}") from error
+            raise ValueError(f"{name}: expected all fields; {error}") from error
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list):
-            raise ValueError(f"{name} must be a list, found {value!r}")
+            raise ValueError(f"{name}: expected a list, got {value!r}")
         kinds_of_parts = typing.get_args(kind)
         if kinds_of_parts[-1] is Ellipsis:
             kinds_of_parts = kinds_of_parts[:1] * len(value)
         if len(kinds_of_parts) != len(value):
-            raise ValueError(f"{name} must have {len(kinds_of_parts)} values, found {len(value)}")
+            raise ValueError(f"{name}: expected {len(kinds_of_parts)} values, got {len(value)}")
         return tuple(_parsed(part, v, name) for part, v in zip(kinds_of_parts, value, strict=True))
     accepted = (int, float) if kind is float else kind
     if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
-        raise ValueError(f"{name} must be {kind.__name__}, found {value!r}")
+        raise ValueError(f"{name}: expected {kind.__name__}, got {value!r}")
     return kind(value)

@@ -19,7 +19,7 @@ from framework.files.atomic_write import written_whole
 from framework.files.search_paths import candidates
 
 OFFLINE = "INSTANCEMAP_OFFLINE"
-"""Environment variable: set to anything, nothing is downloaded."""
+"""Environment variable that disables downloads if set."""
 
 TIMEOUT = 30.0  # s without an answer
 BLOCK = 1 << 20  # bytes
@@ -83,8 +83,8 @@ def find_network(weights: Path) -> Path:
     for candidate in candidates(weights):
         if candidate.is_file():
             return candidate.resolve()
-    searched = " and no ".join(str(candidate) for candidate in candidates(weights))
-    raise DataError(f"there is no network {searched}; give a file, or one of the published: {', '.join(PUBLISHED)}")
+    searched = " or ".join(str(candidate) for candidate in candidates(weights))
+    raise DataError(f"{weights}: expected a file or one of {', '.join(PUBLISHED)}, got none at {searched}")
 
 
 def check(published: PublishedNetwork) -> None:
@@ -92,11 +92,11 @@ def check(published: PublishedNetwork) -> None:
     try:
         found = published.digest_of(published.file)
     except OSError as error:
-        raise DataError(f"{published.file} could not be read: {error.strerror}") from error
+        raise DataError(f"{published.file}: expected a readable file, got {error.strerror}") from error
     if found != published.digest:
         raise DataError(
-            f"{published.file} is damaged: its {published.algorithm} begins with {found}, expected {published.digest};"
-            f" delete it, and it is downloaded again from {published.url}"
+            f"{published.file}: expected {published.algorithm} {published.digest}, got {found}; delete it to "
+            f"download it again from {published.url}"
         )
 
 
@@ -104,21 +104,18 @@ def download(published: PublishedNetwork) -> None:
     """Download the file into the cache with a progress bar, and write it atomically."""
     by_hand = f"download {published.url} and put it at {published.file}"
     if os.environ.get(OFFLINE):
-        raise DataError(f"there is no {published.file}, and {OFFLINE} forbids to download it: {by_hand}")
+        raise DataError(f"{published.file}: expected a file because {OFFLINE} forbids downloads, got none; {by_hand}")
     path = published.file
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DataError(f"{path.parent} could not be made: {error.strerror}") from error
+        raise DataError(f"{path.parent}: expected a writable folder, got {error.strerror}") from error
     with written_whole(path) as temporary:
         with temporary.open("wb") as file:
             file.writelines(_received(published, by_hand))
         found = published.digest_of(temporary)
         if found != published.digest:
-            raise DataError(
-                f"{published.url} is not what was published: its {published.algorithm} begins with {found},"
-                f" expected {published.digest}"
-            )
+            raise DataError(f"{published.url}: expected {published.algorithm} {published.digest}, got {found}")
 
 
 def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
@@ -138,6 +135,6 @@ def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
                 yield block
     except (OSError, http.client.HTTPException) as error:
         reason = in_one_line(getattr(error, "reason", None) or error)
-        raise DataError(f"{url} could not be downloaded ({reason}): {by_hand}") from error
+        raise DataError(f"{url}: expected a download, got {reason}; {by_hand}") from error
     if received < announced:
-        raise DataError(f"{url} ended after {received} of {announced} bytes: try again, or {by_hand}")
+        raise DataError(f"{url}: expected {announced} bytes, got {received}; try again, or {by_hand}")

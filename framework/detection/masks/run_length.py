@@ -40,7 +40,7 @@ def decode(counts: Sequence[bytes], shape: tuple[int, int]) -> Bool:
 def pack(lengths: Sequence[int], shape: tuple[int, int]) -> bytes:
     """Return run lengths as a packed string. Raises DataError unless they fill an image of `shape` (height, width)."""
     if not all(isinstance(length, int) and not isinstance(length, bool) for length in lengths):
-        raise DataError("the run lengths must be whole numbers")
+        raise DataError("run lengths: expected integers, got other values")
     _check_filled(np.array(lengths, np.float64), shape)
     packed: bytes = coco.frPyObjects({"size": list(shape), "counts": list(lengths)}, *shape)["counts"]
     return packed
@@ -55,12 +55,12 @@ def unpack(counts: bytes) -> Int64:
     """Return the run lengths (R,) of a packed string. Raises DataError for other strings."""
     codes = np.frombuffer(counts, np.uint8).astype(np.int64) - FIRST_CHARACTER
     if not len(codes) or codes.min() < 0 or codes.max() >= 2 * MORE or codes[-1] & MORE:
-        raise DataError("the run lengths are damaged: not a packed string of COCO's")
+        raise DataError("run lengths: expected a packed string of COCO, got a damaged one")
     ends = np.flatnonzero((codes & MORE) == 0)
     starts = np.concatenate([[0], ends[:-1] + 1])
     position = np.arange(len(codes)) - np.repeat(starts, ends - starts + 1)
     if position.max() >= LONGEST:
-        raise DataError("the run lengths are damaged: a number is longer than any image")
+        raise DataError("run lengths: expected numbers within the image size, got a larger one")
     numbers = np.add.reduceat((codes & (MORE - 1)) << (BITS * position), starts)
     numbers -= np.where(codes[ends] & SIGN, 1 << (BITS * (position[ends] + 1)), 0)
     lengths = numbers.copy()
@@ -74,4 +74,4 @@ def _check_filled(lengths: np.ndarray[tuple[int, ...], np.dtype[np.generic]], sh
     negative = bool(lengths.size) and float(lengths.min()) < 0
     if negative or int(lengths.sum()) != height * width:
         found = "a negative length" if negative else f"{int(lengths.sum())} px"
-        raise DataError(f"the run lengths must fill {width}x{height} = {height * width} px, found {found}")
+        raise DataError(f"run lengths: expected {width}x{height} = {height * width} px, got {found}")

@@ -154,7 +154,7 @@ def _in_float(operator: Operator, tensors: Tensors) -> Run:
     if kind == "Int8Quantize":
         return lambda x: x
     if kind not in (*CONVOLUTIONS, "Int8ConvTranspose", "Int8FC"):
-        raise DataError(f"graph.json: the operator {kind} is not known")
+        raise DataError(f"graph.json: expected a known operator, got {kind}")
     weight, bias = _weights(operator, tensors)
     if kind == "Int8FC":
         return lambda x: functional.linear(x.flatten(1), weight, bias)
@@ -180,7 +180,7 @@ def _int8_steps(
         on_integers = kind in CONVOLUTIONS and name not in outputs
         for blob in blobs:
             if on_integers and blob not in quantizations:
-                raise DataError(f"graph.json: {blob} goes into a convolution, and its integers have no scale")
+                raise DataError(f"graph.json: {blob}: expected a scale for the integers of a convolution, got none")
             if blob not in converted and (blob in in_integers) != on_integers:
                 converted[blob] = f"{blob}, converted"
                 convert = quantizations[blob].quantize if on_integers else quantizations[blob].dequantize

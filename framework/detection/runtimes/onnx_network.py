@@ -54,7 +54,7 @@ class OnnxNetwork:
         image, shape = _image_input(self.path, self._session.get_inputs())
         if image.type not in INPUT_DTYPES:
             wanted = ", ".join(INPUT_DTYPES.values())
-            raise DataError(f"{self.path}: the input must be one of {wanted}, found {_described(image)}")
+            raise DataError(f"{self.path}: expected one of {wanted} as input, got {_described(image)}")
         self._name = image.name
         self.dtype = INPUT_DTYPES[image.type]
         self.channels_last = shape[3] == 3 and shape[1] != 3  # (1, H, W, 3), as in networks from TensorFlow
@@ -70,11 +70,13 @@ class OnnxNetwork:
         try:
             arrays = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
         except Exception as error:  # onnxruntime's errors have no common base
-            raise DataError(f"{self.path} failed in onnxruntime: {in_one_line(error)}") from error
+            raise DataError(
+                f"{self.path}: expected a run in onnxruntime, got an error: {in_one_line(error)}"
+            ) from error
         outputs = {name: np.asarray(array, np.float32) for name, array in zip(names, arrays, strict=True)}
         for name, array in outputs.items():
             if not np.isfinite(array).all():
-                raise DataError(f"{self.path}: the output {name} holds values that are not finite")
+                raise DataError(f"{self.path}: expected finite values in the output {name}, got NaN or infinity")
         return outputs
 
 
@@ -99,18 +101,18 @@ class ImageNetwork:
         """Load the network. Raises ConfigError for a parameter out of its bounds, and the errors of `OnnxNetwork`."""
         path, device, black, white = detector.weights, detector.device, detector.black_level, detector.white_level
         require(len(detector.sha256) in (0, 64), "detector.sha256", detector.sha256, "64 hexadecimal digits, or empty")
-        allowed = f"0 (the network's own) or positive px, at most {LONGEST_SIDE}"
+        allowed = f"0 (size of the network) or a value in [1, {LONGEST_SIDE}] px"
         require(0 <= detector.input_size <= LONGEST_SIDE, "detector.input_size", detector.input_size, allowed)
-        require(0 <= detector.padding <= 255, "detector.padding", detector.padding, "in [0, 255]")
+        require(0 <= detector.padding <= 255, "detector.padding", detector.padding, "a value in [0, 255]")
         finite = bool(np.isfinite([black, white]).all())
-        require(finite and black != white, "detector.white_level", white, f"not {black}")
+        require(finite and black != white, "detector.white_level", white, f"a value other than {black}")
         require(device in ("auto", "cpu", "cuda"), "detector.device", device, "auto, cpu or cuda")
         onnx = "an ONNX file; convert a .tflite file with tf2onnx (docs/guides/detectors.md)"
         require(path.suffix.lower() != ".tflite", "detector.weights", path, onnx)
         self._network = OnnxNetwork(path, detector.sha256, device, detector.input_size)
         levels = f"{black} and {white}"
         fits = self._network.dtype != "uint8" or (black, white) == (0, 255)
-        require(fits, "detector.black_level and white_level", levels, "0 and 255 for a network of integers")
+        require(fits, "detector.black_level and white_level", levels, "0 and 255 for a network with integer input")
         self.shape = self._network.shape  # (height, width) px
         self.channels_last = self._network.channels_last  # the input is (1, H, W, 3)
         self.metadata = self._network.metadata
@@ -133,7 +135,7 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     onnxruntime = import_optional("onnxruntime", "runs ONNX files", "onnx")
     cuda = CUDA in onnxruntime.get_available_providers()
     if device == "cuda" and not cuda:
-        raise ConfigError("detector.device must be cpu or auto without onnxruntime-gpu and a GPU, found cuda")
+        raise ConfigError("detector.device: expected cpu or auto without onnxruntime-gpu and a GPU, got cuda")
     if cuda and device != "cpu":
         onnxruntime.preload_dlls()  # from pip's nvidia packages, which the dynamic linker does not search
     options = onnxruntime.SessionOptions()
@@ -145,9 +147,11 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # onnxruntime's errors have no common base
-        raise DataError(f"{path} is not an ONNX file that onnxruntime can load: {in_one_line(error)}") from error
+        raise DataError(
+            f"{path}: expected an ONNX file that onnxruntime can load, got an error: {in_one_line(error)}"
+        ) from error
     if device == "cuda" and CUDA not in session.get_providers():
-        raise ConfigError("detector.device must be cpu or auto where CUDA cannot be started, found cuda")
+        raise ConfigError("detector.device: expected cpu or auto because CUDA did not start, got cuda")
     return session
 
 
@@ -156,10 +160,10 @@ def _image_input(path: Path, inputs: Sequence[NodeArg]) -> tuple[NodeArg, Shape]
     found = ", ".join(map(_described, inputs))
     wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
     if len(inputs) != 1:
-        raise DataError(f"{path}: {wanted}, found {len(inputs)} inputs: {found}")
+        raise DataError(f"{path}: {wanted}, got {len(inputs)} inputs: {found}")
     shape = _shape(inputs[0])
     if len(shape) != 4 or shape[0] > 1 or 3 not in (shape[1], shape[3]):
-        raise DataError(f"{path}: {wanted}, found {found}")
+        raise DataError(f"{path}: {wanted}, got {found}")
     return inputs[0], shape
 
 
@@ -172,12 +176,14 @@ def _input_shape(
     if height and width:
         if input_size and (height, width) != (input_size, input_size):
             raise ConfigError(
-                f"detector.input_size must be 0 or the network's own, found {input_size}: {path} takes {described}"
+                f"detector.input_size: expected 0 or the size of the network ({described}), got {input_size} for {path}"
             )
         return height, width
     open_height, open_width = (input_size, input_size) if input_size else metadata.image_size
     if not (open_height and open_width):
-        raise ConfigError(f"detector.input_size must be given in px: {path} takes any size: {described}")
+        raise ConfigError(
+            f"detector.input_size: expected a size in px, got 0 for {path}, whose input has any size ({described})"
+        )
     return height or open_height, width or open_width
 
 
@@ -196,7 +202,9 @@ def find_file(path: Path) -> Path:
         if candidate.is_file():
             return candidate
     searched = " or ".join(str(candidate.resolve()) for candidate in candidates(path))
-    raise DataError(f"detector.weights: there is no file {searched}; put the network there, or name another")
+    raise DataError(
+        f"detector.weights: expected the file {searched}, got none; put the network there or set another path"
+    )
 
 
 def checked_hash(path: Path, sha256: str) -> str:
@@ -204,9 +212,9 @@ def checked_hash(path: Path, sha256: str) -> str:
     try:
         found = path_hash(path)
     except OSError as error:
-        raise DataError(f"detector.weights: {path} could not be read: {error.strerror}") from error
+        raise DataError(f"detector.weights: {path}: expected a readable file, got {error.strerror}") from error
     if sha256 and found != sha256.lower():
-        raise DataError(f"detector.weights: {path} has the sha256 {found}, expected {sha256}")
+        raise DataError(f"detector.weights: {path}: expected sha256 {sha256}, got {found}")
     return found
 
 

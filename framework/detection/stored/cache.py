@@ -44,7 +44,7 @@ class CacheMode(Enum):
 
 @runtime_checkable
 class ReadsFields(Protocol):
-    """A detector whose detections depend only on some fields of a frame, so that more frames share an entry."""
+    """Interface of detectors that read only some fields of a frame, so that more frames share an entry."""
 
     reads: tuple[str, ...]  # names of fields of Frame
 
@@ -59,7 +59,7 @@ class Fingerprinted(Protocol):
 
 @dataclass
 class CachedDetector(Detector):
-    """Returns stored detections, byte-identical, for frames that `detector` has seen before.
+    """Cache of byte-identical detections for frames already processed by `detector`.
 
     The key of an entry consists of the detector's fingerprint, its classes, and the fields of the frame that it reads.
     So another parameter, weight or image misses, and the same image in another video hits. Several processes may share
@@ -75,7 +75,9 @@ class CachedDetector(Detector):
     def __post_init__(self) -> None:
         self.classes, self.domain, self.reads = self.detector.classes, self.detector.domain, fields_read(self.detector)
         if unknown := set(self.reads) - set(FRAME_FIELDS):
-            raise ConfigError(f"{type(self.detector).__name__}.reads names no field of Frame: {', '.join(unknown)}")
+            raise ConfigError(
+                f"{type(self.detector).__name__}.reads: expected fields of Frame, got {', '.join(unknown)}"
+            )
         self.hits = 0
         self.misses = 0
         self._writes = self.mode is CacheMode.READ_WRITE
@@ -86,7 +88,8 @@ class CachedDetector(Detector):
                 self.entries.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise ConfigError(
-                    f"detection_cache_dir: {self.entries} could not be made: {error.strerror}; choose another folder"
+                    f"detection_cache_dir: expected a writable folder, got {self.entries} ({error.strerror}); choose "
+                    "another folder"
                 ) from error
 
     def detect(self, frame: Frame) -> Detections:
@@ -107,11 +110,13 @@ class CachedDetector(Detector):
         try:
             data = read_bytes(path, LARGEST_ENTRY)
         except DataError as error:
-            log.warning("detection cache: %s: detected again", error)
+            log.warning("detection cache: %s; detecting the frame again", error)
             return None
         content = data[CHECKSUM_BYTES:]
         if _checksum(path, content) != data[:CHECKSUM_BYTES]:
-            log.warning("detection cache: %s is damaged, or another entry's: detected again", path)
+            log.warning(
+                "detection cache: %s: expected a matching checksum, got another one; detecting the frame again", path
+            )
             return None
         return unpack(content, self.classes)
 
@@ -122,7 +127,7 @@ class CachedDetector(Detector):
                 temporary.write_bytes(_checksum(path, content) + content)
         except DataError as error:
             self._writes = False
-            log.warning("detection cache: %s; nothing more is stored in this run", error)
+            log.warning("detection cache: %s; storing nothing more in this run", error)
 
 
 def _checksum(path: Path, content: bytes) -> bytes:
@@ -142,7 +147,9 @@ def identity_of(detector: Detector) -> str:
     try:
         return detector.fingerprint()
     except AttributeError as error:  # plugins written when Detector had this method call super()
-        raise ConfigError(f"{type(detector).__name__}.fingerprint: {error}; call {fingerprint.__module__}'s") from error
+        raise ConfigError(
+            f"{type(detector).__name__}.fingerprint: {error}; call fingerprint() of {fingerprint.__module__}"
+        ) from error
 
 
 def with_cache(detector: Detector, config: DictConfig) -> Detector:
@@ -151,7 +158,7 @@ def with_cache(detector: Detector, config: DictConfig) -> Detector:
     named = "off" if asked is False else asked  # YAML reads an unquoted off as false
     modes = {mode.value: mode for mode in CacheMode}
     if named not in modes:
-        raise ConfigError(f"detection_cache must be one of {', '.join(modes)}, found {asked!r}")
+        raise ConfigError(f"detection_cache: expected one of {', '.join(modes)}, got {asked!r}")
     if modes[named] is CacheMode.OFF:
         return detector
     if config.detection_cache_dir is not None:

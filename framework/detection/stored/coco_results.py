@@ -37,16 +37,18 @@ MOST_DIGITS = 18  # of a frame number
 class CategoryIds(Enum):
     """The numbering of `category_id`."""
 
-    COCO_91 = "the ids of COCO's annotation files: 1 to 90, with gaps"
-    FROM_ONE = "the labels, from 1"
-    FROM_ZERO = "the labels, from 0"
+    COCO_91 = "ids of COCO's annotation files: 1 to 90, with gaps"
+    FROM_ONE = "indices of the labels, from 1"
+    FROM_ZERO = "indices of the labels, from 0"
 
     def of(self, labels: Sequence[str]) -> list[int]:
         """Return the id of each label. Raises ConfigError if the labels do not have these ids."""
         if self is not CategoryIds.COCO_91:
             return list(range(len(labels))) if self is CategoryIds.FROM_ZERO else list(range(1, len(labels) + 1))
         if tuple(labels) != COCO:
-            raise ConfigError("detector.category_ids must be FROM_ONE or FROM_ZERO where labels is not coco")
+            raise ConfigError(
+                "detector.category_ids: expected FROM_ONE or FROM_ZERO unless label_space is coco, got COCO"
+            )
         return [k for k, name in enumerate(COCO_BY_ID) if name != NO_CLASS]
 
 
@@ -58,7 +60,7 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
     """
     entries = read_json(path)
     if not isinstance(entries, list):
-        raise DataError(f"{path} must hold a list of results, as COCO's evaluation reads them, found an object")
+        raise DataError(f"{path}: expected a list of results in COCO's format, got an object")
     index = {name: k for k, name in enumerate(labels)}
     names: dict[int, str] | None = None
     found: list[StoredDetection] = []
@@ -66,7 +68,7 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
     for k, entry in enumerate(entries):
         where = f"{path}, entry {k}"
         if not isinstance(entry, Mapping):
-            raise DataError(f"{where}: expected an object, found {entry!r}")
+            raise DataError(f"{where}: expected an object, got {entry!r}")
         if names is None and entry.get("category_name") is None:
             names = dict(zip(ids.of(labels), labels, strict=True))
         with errors_of(where):
@@ -74,7 +76,10 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
             if isinstance(entry["image_id"], str):
                 image, frame = PurePosixPath(entry["image_id"]), found[-1].frame
                 if (other := folders.setdefault(frame, image.parent)) != image.parent:
-                    raise DataError(f"{image} and another image in {other}/ are both frame {frame}; split by sequence")
+                    raise DataError(
+                        f"{image}: expected one image for each frame, got another one of frame {frame} in {other}/; "
+                        "split by sequence"
+                    )
     return found
 
 
@@ -86,7 +91,9 @@ def _read_entry(
     elif type(entry.get("category_id")) is int and entry["category_id"] in names:
         label = names[entry["category_id"]]
     else:
-        raise DataError(f"category_id {entry.get('category_id')!r} is not the id of a label; see detector.category_ids")
+        raise DataError(
+            f"category_id: expected the id of a label, got {entry.get('category_id')!r}; see detector.category_ids"
+        )
     return StoredDetection(
         where=where,
         frame=_read_image_id(entry.get("image_id")),
@@ -105,7 +112,7 @@ def _read_image_id(found: Any) -> int:
     name = PurePosixPath(found if isinstance(found, str) else "")
     stem = "" if name.suffix[1:].isdigit() else name.stem  # 12.5 is no file name
     if not (stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS):
-        raise DataError(f"image_id must be the frame's number, or a file name that is one, found {found!r}")
+        raise DataError(f"image_id: expected the number of the frame, or a file name that is one, got {found!r}")
     return int(stem)
 
 
@@ -114,7 +121,7 @@ def _read_box(found: Any) -> Float32 | None:
         return None
     whole = isinstance(found, list) and len(found) == 4
     if not whole or not all(isinstance(x, int | float) and abs(x) <= MOST_PIXELS for x in found) or min(found[2:]) < 0:
-        raise DataError(f"bbox must be [x, y, width, height] px, at most {MOST_PIXELS}, found {found!r:.200}")
+        raise DataError(f"bbox: expected [x, y, width, height] px, at most {MOST_PIXELS}, got {found!r:.200}")
     x, y, width, height = found
     return np.array([x, y, x + width, y + height], np.float32)
 
@@ -124,15 +131,17 @@ def _read_segmentation(found: Any) -> Segmentation:
         return _read_polygons(found)
     size = found.get("size") if isinstance(found, Mapping) else None
     if not isinstance(size, list) or len(size) != 2 or not all(type(side) is int and side > 0 for side in size):
-        raise DataError("segmentation must be run lengths with their size [height, width], or a list of polygons")
+        raise DataError(
+            "segmentation: expected run lengths with size [height, width], or a list of polygons, got other values"
+        )
     shape = (size[0], size[1])
     if shape[0] * shape[1] > MOST_PIXELS:
-        raise DataError(f"segmentation.size is {shape[1]}x{shape[0]} px, more than the {MOST_PIXELS} of any image")
+        raise DataError(f"segmentation.size: expected at most {MOST_PIXELS} px, got {shape[1]}x{shape[0]} px")
     counts = found.get("counts")
     if isinstance(counts, list):
         return RunLengths(pack(counts, shape), shape)
     if not isinstance(counts, str) or not counts.isascii():
-        raise DataError("segmentation.counts must be a packed string or a list of run lengths")
+        raise DataError("segmentation.counts: expected a packed string or a list of run lengths, got another type")
     check(counts.encode(), shape)
     return RunLengths(counts.encode(), shape)
 
@@ -140,11 +149,11 @@ def _read_segmentation(found: Any) -> Segmentation:
 def _read_polygons(found: Sequence[Any]) -> Polygons:
     for outline in found:
         if not isinstance(outline, list) or len(outline) < 6 or len(outline) % 2:
-            raise DataError("a polygon must be a list x1, y1, x2, y2, ... of three points or more")
+            raise DataError("polygon: expected a list x1, y1, x2, y2, ... of three points or more, got other values")
         if not all(isinstance(x, int | float) and np.isfinite(x) for x in outline):
-            raise DataError("a polygon's coordinates must be numbers, px")
+            raise DataError("polygon: expected coordinates in px, got other values")
     if not found:
-        raise DataError("segmentation has no polygon")
+        raise DataError("segmentation: expected a polygon, got none")
     return Polygons(tuple(tuple(float(x) for x in outline) for outline in found))
 
 

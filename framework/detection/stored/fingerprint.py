@@ -18,7 +18,7 @@ LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transfo
 """Libraries whose version may change the last digits."""
 
 SHARED_SOURCES = ("detection/**/*.py", "vocabulary/label_spaces.*")  # in framework/: the code that detectors share
-NOT_GIVEN = Path()  # what `path: ""` in a config becomes
+NOT_GIVEN = Path()  # value of `path: ""` in a config
 
 
 def fingerprint(detector: object) -> str:
@@ -44,7 +44,9 @@ def _code(kind: type) -> Iterator[str]:
     for module in modules:
         source = getattr(sys.modules.get(module), "__file__", None)
         if source is None:
-            raise ConfigError(f"{kind.__qualname__} has no source file to identify it by: give it a fingerprint()")
+            raise ConfigError(
+                f"{kind.__qualname__}: expected a source file to identify it by, got none; implement fingerprint()"
+            )
         yield path_hash(Path(source))
     framework = Path(__file__).resolve().parents[2]
     for pattern in SHARED_SOURCES:
@@ -58,7 +60,9 @@ def _code(kind: type) -> Iterator[str]:
 
 def _parameters(detector: object) -> Iterator[str]:
     if not dataclasses.is_dataclass(detector):
-        raise ConfigError(f"{type(detector).__qualname__} is not a dataclass: give it a fingerprint()")
+        raise ConfigError(
+            f"{type(detector).__qualname__}: expected a dataclass, got another class; implement fingerprint()"
+        )
     for field in dataclasses.fields(detector):
         value = getattr(detector, field.name)
         if isinstance(value, Path):
@@ -90,5 +94,5 @@ def content_hash(path: Path) -> str:
     found = next((candidate for candidate in candidates(path) if candidate.exists()), None)
     if found is None:
         looked = " and ".join(str(candidate) for candidate in candidates(path))
-        raise ConfigError(f"there is no {looked}, by which the detector would be identified: give it a fingerprint()")
+        raise ConfigError(f"{looked}: expected a file to identify the detector by, got none; implement fingerprint()")
     return path_hash(found)

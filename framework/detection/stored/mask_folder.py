@@ -36,7 +36,9 @@ class InstanceOfImage(Segmentation):
     def mask(self, shape: tuple[int, int]) -> Bool:
         ids = _read_ids(self.path)
         if ids.shape != shape:
-            raise DataError(f"the image is {ids.shape[1]}x{ids.shape[0]} px, but the frame {shape[1]}x{shape[0]} px")
+            raise DataError(
+                f"image: expected {shape[1]}x{shape[0]} px (as the frame), got {ids.shape[1]}x{ids.shape[0]} px"
+            )
         return np.asarray(ids == self.id, np.bool_)
 
 
@@ -51,21 +53,23 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
     images: dict[int, Path] = {}
     for path in sorted(folder.glob("*.png")):
         if not (path.stem.isascii() and path.stem.isdigit()):
-            raise DataError(f"{path}: expected the frame's number as the name, such as 000012.png")
+            raise DataError(f"{path}: expected the number of the frame as the name, such as 000012.png")
         frame = int(path.stem)
         if images.setdefault(frame, path) != path:
-            raise DataError(f"{path} and {images[frame].name} are both of frame {frame}; keep one of them")
+            raise DataError(
+                f"{path}: expected one image of frame {frame}, got {images[frame].name} as well; keep one of them"
+            )
         description = path.with_suffix(".json")
         ids: set[int] = set()
         entries = read_json(description)
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise DataError(f"{description} must hold a list of objects with id, class and score")
+            raise DataError(f"{description}: expected a list of objects with id, class and score, got other values")
         for k, entry in enumerate(entries):
             where = f"{description}, entry {k}"
             with errors_of(where):
                 instance = _read_id(entry.get("id"))
                 if instance in ids:
-                    raise DataError(f"id {instance} is there twice")
+                    raise DataError(f"id: expected unique ids, got {instance} twice")
                 ids.add(instance)
                 label, score = read_label(entry.get("class"), index), read_score(entry.get("score"))
                 probabilities = read_probabilities(entry.get("class_probabilities"), index)
@@ -74,11 +78,11 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
                 )
     alone = [path for path in sorted(folder.glob("*.json")) if not path.with_suffix(".png").exists()]
     if alone:
-        raise DataError(f"{alone[0]} has no image {alone[0].stem}.png next to it")
+        raise DataError(f"{alone[0]}: expected an image {alone[0].stem}.png next to it, got none")
     return found
 
 
 def _read_id(found: object) -> int:
     if type(found) is not int or not 0 < found <= LARGEST_ID:
-        raise DataError(f"id must be a whole number from 1 to {LARGEST_ID}, found {found!r}")
+        raise DataError(f"id: expected an integer in [1, {LARGEST_ID}], got {found!r}")
     return found

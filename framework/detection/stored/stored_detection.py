@@ -36,8 +36,8 @@ class RunLengths(Segmentation):
     def mask(self, shape: tuple[int, int]) -> Bool:
         if self.shape != shape:
             raise DataError(
-                f"the mask is {self.shape[1]}x{self.shape[0]} px, but the frame {shape[1]}x{shape[0]} px:"
-                " it must be of the sequence's own resolution"
+                f"mask: expected {shape[1]}x{shape[0]} px (as the frame), got {self.shape[1]}x{self.shape[0]} "
+                "px; use masks at the resolution of the sequence"
             )
         return np.asarray(decode([self.counts], shape)[0], np.bool_)
 
@@ -54,7 +54,9 @@ class Polygons(Segmentation):
             max(max(outline[::2]) - width, max(outline[1::2]) - height, -min(outline)) for outline in self.outlines
         )
         if outside > 1:  # px; outlines from annotation tools slightly exceed the image
-            raise DataError(f"a polygon reaches {outside:g} px out of the image of {width}x{height} px")
+            raise DataError(
+                f"polygon: expected points in the image of {width}x{height} px, got {outside:g} px outside of it"
+            )
         runs = coco.merge(coco.frPyObjects([list(outline) for outline in self.outlines], height, width))
         return np.asarray(decode([runs["counts"]], shape)[0], np.bool_)
 
@@ -76,14 +78,17 @@ class StoredDetection:
 def read_score(found: Any) -> float:
     """Return a score in [0, 1]. Raises DataError for other values."""
     if isinstance(found, bool) or not isinstance(found, int | float) or not 0 <= found <= 1:
-        raise DataError(f"score must be a number in [0, 1], found {found!r}")
+        raise DataError(f"score: expected a number in [0, 1], got {found!r}")
     return float(found)
 
 
 def read_label(found: Any, index: Mapping[str, int]) -> str:
     """Return a name of the label space. Raises DataError for other values."""
     if not isinstance(found, str) or found not in index:
-        raise DataError(f"{found!r} is not one of the {len(index)} labels: set detector.label_space to the file's own")
+        raise DataError(
+            f"label: expected one of the {len(index)} names in detector.label_space, got {found!r}; set "
+            "detector.label_space to that of the file"
+        )
     return found
 
 
@@ -97,18 +102,21 @@ def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
     if isinstance(found, Mapping):
         unknown = [name for name in found if name not in index]
         if unknown:
-            raise DataError(f"class_probabilities: not among the {len(index)} labels: {', '.join(map(repr, unknown))}")
+            raise DataError(
+                f"class_probabilities: expected the {len(index)} names in detector.label_space, got "
+                f"{', '.join(map(repr, unknown))}"
+            )
         given: Sequence[Any] = [found.get(name, 0.0) for name in index]
     elif isinstance(found, list):
         given = found
     else:
-        raise DataError(f"class_probabilities must be a list or an object, found {found!r}")
+        raise DataError(f"class_probabilities: expected a list or an object, got {found!r}")
     if len(given) != len(index):
-        raise DataError(f"class_probabilities must have {len(index)} values, one for each label, found {len(given)}")
+        raise DataError(f"class_probabilities: expected {len(index)} values, one for each label, got {len(given)}")
     if not all(isinstance(p, int | float) and 0 <= p <= LARGEST for p in given):  # rejects NaN
-        raise DataError("class_probabilities must be numbers, 0 or more and about 1 together")
+        raise DataError("class_probabilities: expected numbers of at least 0 with a sum of 1, got other values")
     row = np.array(given, np.float32)
     total = float(row.sum(dtype=np.float64))
     if abs(total - 1) > ROUNDED_SUM:
-        raise DataError(f"class_probabilities must sum to 1, found {total:g}")
+        raise DataError(f"class_probabilities: expected a sum of 1, got {total:g}")
     return row if abs(total - 1) <= PROBABILITY_TOLERANCE else np.asarray(row / np.float32(total), np.float32)

@@ -33,16 +33,16 @@ VOTES_ACROSS = 320  # pixels of an image row that vote; more take time without a
 class InstanceSource(Enum):
     """The source of the instances that the pixels of a frame vote for."""
 
-    SURFACE_LOOKUP = "the voxels at the measured surface"
-    RAYCAST = "the object indices of the map, ray-cast from the pose of the frame"
+    SURFACE_LOOKUP = "voxels at the measured surface"
+    RAYCAST = "object indices of the map, ray-cast from the pose of the frame"
 
 
 class OverlapRule(Enum):
     """The denominator of an overlap."""
 
-    SMALLER = "the smaller of cluster and instance: a part of an object still finds the whole"
-    IOU = "all pixels of either"
-    CLUSTER = "the cluster: a small part of an object finds it, the whole may not"
+    SMALLER = "size of the smaller of cluster and instance, so that a part of an object matches the whole"
+    IOU = "number of pixels in either"
+    CLUSTER = "size of the cluster: a small part of an object matches it, the reverse may not"
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 
 @dataclass
 class Association:
-    """Clusters update matched instances or create new ones; instances that are detected as one are merged."""
+    """Association of clusters with instances, and merging of instances detected as one."""
 
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP  # source of the compared instances
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
@@ -263,7 +263,7 @@ class Association:
                     return  # the overlaps are outdated now; other pairs will be detected again
 
     def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
-        """Return whether the classes of two instances allow a merge: a book is not the table that it lies on."""
+        """Return whether the classes of two instances allow a merge: a book on a table is not the table."""
         known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
         return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
 
@@ -278,7 +278,7 @@ def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str,
     """
     if known and known != found:
         raise DataError(
-            f"the map has {len(known)} classes and this frame's clusters have {len(found)} "
-            "others; use one detector, or map them to one label space"
+            f"detector: expected the classes of the map ({len(known)}), got {len(found)} other ones in the "
+            "frame's clusters; use one detector, or map all detectors to one label space"
         )
     return found

@@ -160,7 +160,7 @@ def upright_box(points: Float32, up: Float64) -> Box:
 
 def oriented_box(points: Float32) -> Box:
     """Return the box along the principal axes of the convex hull of points (M, 3) m, which may be coplanar (Open3D)."""
-    import open3d as o3d  # takes half a second and 170 MB; most maps know gravity
+    import open3d as o3d  # takes half a second and 170 MB, and most maps have gravity
 
     four = np.resize(points, (max(len(points), 4), 3))  # Qhull needs four; repeated points change nothing
     box = o3d.geometry.OrientedBoundingBox.create_from_points(

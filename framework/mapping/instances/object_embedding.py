@@ -35,8 +35,8 @@ class ObjectEmbedding:
     def __add__(self, other: ObjectEmbedding) -> ObjectEmbedding:
         if self.sum.shape != other.sum.shape:
             raise DataError(
-                f"an object has embeddings of {len(self.sum)} numbers and of {len(other.sum)} in the same space; "
-                "map again with one model"
+                f"embeddings of one space: expected equal lengths, got {len(self.sum)} and {len(other.sum)} "
+                "numbers; map again with one model"
             )
         return ObjectEmbedding(self.sum + other.sum, self.weight + other.weight, self.count + other.count)
 
@@ -66,8 +66,8 @@ def agreed_space(known: str, found: str) -> str:
     """
     if known and known != found:
         raise DataError(
-            f"the map has embeddings of {known}, and the detections of this frame of {found}; use the "
-            "model of the map, or map again"
+            f"detector: expected embeddings of {known} (as in the map), got {found}; use the model of the "
+            "map, or map again"
         )
     return found
 
@@ -91,29 +91,31 @@ def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, d
         return "", {}
     space = plain.values[SPACE]
     if not isinstance(space, str) or not 0 < len(space) <= LONGEST_SPACE:
-        raise DataError(f"{plain.name}.{SPACE} must be 1 to {LONGEST_SPACE} characters, found {space!r:.60}")
+        raise DataError(f"{plain.name}.{SPACE}: expected 1 to {LONGEST_SPACE} characters, got {space!r:.60}")
     missing = [name for name in ARRAYS if name not in arrays]
     if missing:
-        raise DataError(f"it names an embedding space and has no {', '.join(missing)}")
+        raise DataError(f"expected {', '.join(missing)} with an embedding space, got none")
     ids, sums, weights, counts = (arrays[name] for name in ARRAYS)
     n = len(ids) if ids.ndim else 0
     dimension = sums.shape[1] if sums.ndim == 2 else 0
     if not 1 <= dimension <= LONGEST_EMBEDDING:
-        raise DataError(f"embedding_sums must be (M, D) with D from 1 to {LONGEST_EMBEDDING}, found {sums.shape}")
+        raise DataError(f"embedding_sums: expected (M, D) with D in [1, {LONGEST_EMBEDDING}], got {sums.shape}")
     check_array("embedding_ids", ids, (n,), np.int32)
     check_array("embedding_sums", sums, (n, dimension), np.float64)
     check_array("embedding_weights", weights, (n,), np.float64)
     check_array("embedding_counts", counts, (n,), np.int64)
     if len(np.unique(ids)) < n:
-        raise DataError("embedding_ids has an instance twice")
+        raise DataError("embedding_ids: expected unique instances, got duplicates")
     if n and not (weights.min() > 0 and weights.max() <= MOST_WEIGHT):
-        raise DataError(f"embedding_weights must be in (0, {MOST_WEIGHT:g}], found {weights.min()} to {weights.max()}")
+        raise DataError(
+            f"embedding_weights: expected values in (0, {MOST_WEIGHT:g}], got {weights.min()} to {weights.max()}"
+        )
     if n and not (counts.min() >= 1 and counts.max() <= LARGEST_COUNT):
-        raise DataError(f"embedding_counts must be at least 1, found {counts.min()}")
+        raise DataError(f"embedding_counts: expected at least 1, got {counts.min()}")
     with np.errstate(over="ignore"):  # of invalid values
         lengths = np.linalg.norm(sums / weights[:, None], axis=1)
     if n and lengths.max() > 1 + 1e-3:
-        raise DataError(f"embedding_sums must be no longer than their weights, found {lengths.max():.4g} of one")
+        raise DataError(f"embedding_sums: expected lengths of at most their weights, got {lengths.max():.4g} of one")
     return space, {
         int(k): ObjectEmbedding(sums[i], float(weights[i]), int(counts[i])) for i, k in enumerate(ids.tolist())
     }

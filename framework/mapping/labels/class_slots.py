@@ -91,7 +91,7 @@ def _all(value: int, number: Any) -> Any:
 
 
 class _Slots:
-    """Emits LLVM instructions for vectors of CLASS_SLOTS numbers, with the `context` and `builder` of an intrinsic."""
+    """Emitter of LLVM vector instructions on CLASS_SLOTS numbers, with the `context` and `builder` of an intrinsic."""
 
     def __init__(self, context: Any, builder: Any) -> None:
         self.context = context

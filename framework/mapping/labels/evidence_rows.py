@@ -52,7 +52,7 @@ class NewVoxels(NamedTuple):
 
 
 class EvidenceRows:
-    """Owns the label evidence of a grid and grows it. The kernels work on `self.evidence`."""
+    """Owner of the growing label evidence of a grid. The kernels work on `self.evidence`."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class EvidenceRows:
     def begin(self, classes: int) -> None:
         """Set the number of classes before the first update. Raises DataError if there are too many."""
         if classes > NO_CLASS:
-            raise DataError(f"a map tells {NO_CLASS} classes apart, and the detector has {classes}")
+            raise DataError(f"detector: expected at most {NO_CLASS} classes, got {classes}")
         if self.storage is Storage.EXACT:
             self._class_slots = max(classes, 1)
             self._free()
@@ -149,7 +149,7 @@ class EvidenceRows:
 
     def _free(self) -> None:
         self._labeled = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))
-        self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS: a voxel of the row may know instance k
+        self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS: a voxel of the row may name instance k
         scores = np.int16 if self.storage is Storage.COMPACT else np.int64
         shapes = self._instance_slots, self._instance_slots, self._class_slots, self._class_slots
         kinds = zip(SLOTS, (np.int32, np.float32, np.uint8, scores), shapes, strict=True)

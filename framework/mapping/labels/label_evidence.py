@@ -83,7 +83,7 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
         if c > names:
             np.put_along_axis(unnamed, named, 0, axis=1)
             mean = unnamed.sum(axis=1, keepdims=True) / (c - names)
-        else:  # all are named: what is common to all classes is no evidence
+        else:  # all are named: a term common to all classes is no evidence
             mean = unnamed.min(axis=1, keepdims=True, initial=1.0)
         relative = evidence - np.log(np.maximum(mean, 1e-6))
     bits = np.zeros((len(evidence), NO_CLASS + 1), np.uint8)

@@ -29,7 +29,7 @@ from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VoxelHashing
 
 OTHER_CLASS = 0.3  # Bhattacharyya coefficient below which two distributions are of different objects
-EXACT_BITS = 16  # by which class scores of exact storage are finer
+EXACT_BITS = 16  # factor by which class scores of exact storage are finer
 
 
 class LabelRule(NamedTuple):
@@ -93,7 +93,10 @@ class LabeledVoxels:
     def continued(self, scene: SceneMap, rule: LabelRule) -> InstanceMap:
         """Prepare a stored map for new frames. Raises ConfigError if it has other parameters or another rule."""
         if not isinstance(scene, InstanceMap):
-            raise ConfigError(f"fuser: expected the kind of fuser that made the {type(scene).__name__}, got another")
+            raise ConfigError(
+                f"fuser: expected the type that made the stored {type(scene).__name__}, got another one; choose "
+                "that fuser"
+            )
         own = self.new_map(rule)
         parameters: dict[str, tuple[object, object]] = {
             "fuser.voxel_size": (f"{scene.volume.voxel_size:g}", f"{own.volume.voxel_size:g}"),
@@ -108,8 +111,8 @@ class LabeledVoxels:
         for name, (stored, given) in parameters.items():
             if stored != given:
                 raise ConfigError(
-                    f"{name}: expected {stored} (as in the stored map), got {given}; set it to {stored}, or "
-                    "start a new map"
+                    f"{name}: expected {stored} (as in the stored map), got {given}; set it to {stored}, or start a "
+                    "new map"
                 )
         scene.confirmation = self.confirmation
         scene.instance_class = self.instance_class
@@ -149,7 +152,7 @@ class LabeledVoxels:
         )
 
     def supported_instances(self, table: InstanceTable, matches: Matches) -> Bool:
-        """Return (N, ids + 1) whether an instance lies on the object of each cluster, as a book on a table.
+        """Return (N, ids + 1) whether the object of each cluster supports an instance, as a table supports a book.
 
         Such an instance is confirmed, is of another class, and most of its visible part is under the cluster, in at
         most half of the cluster's pixels. A detector's mask of the large object covers it, and is no evidence for its

@@ -9,7 +9,7 @@ of its list, so that operations on lists are cheap. For two overlapping masks, c
     . 1 1        0 3 3                2      0, 1        1
                                       3      1           3           offsets[4] = 4
 
-The pixels that two clusters share tell whether they are duplicates of one object, and which one is on top.
+The pixels shared by two clusters determine duplicates of one object, and the occlusion order.
 """
 
 from __future__ import annotations

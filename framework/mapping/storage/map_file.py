@@ -36,7 +36,7 @@ SHARE_OF_MEMORY = 0.5  # of the machine, that a loaded map may take
 def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     """Write an .npz for np.load, lightly compressed, without timestamps."""
     if not isinstance(cast(object, path), str | Path):
-        raise DataError(f"a map is saved to a path, found {path!r:.60}")
+        raise DataError(f"map file: expected a path, got {path!r:.60}")
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
     with (
         written_whole(Path(path)) as temporary,
@@ -57,10 +57,10 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
         header = _header(archive)
         found = header.values.get("format")
         if found != expected_format:
-            raise DataError(f"it has map format {found!r:.60}, this version reads {expected_format}")
+            raise DataError(f"expected map format {expected_format}, got {found!r:.60}")
         damaged = archive.testzip()
         if damaged is not None:
-            raise DataError(f"the checksum of {damaged} does not hold; the file is damaged")
+            raise DataError(f"{damaged}: checksum mismatch; the file is damaged")
         there = set(archive.namelist())
         optional = [name for name in ARRAYS if f"{name}.npy" in there]
         return header, {name: _array(archive, name) for name in dict.fromkeys((*names, *optional))}
@@ -87,7 +87,9 @@ def faults_of(path: Path | str) -> Iterator[None]:
     except InstanceMapError as error:
         raise DataError(f"{path}: {error}; map again") from error
     except Exception as error:  # zipfile and numpy raise many kinds for damaged archives
-        raise DataError(f"{path} is not a map that can be read: {in_one_line(error)}; map again") from error
+        raise DataError(
+            f"{path}: expected a map file, got unreadable data ({in_one_line(error)}); map again"
+        ) from error
 
 
 @contextmanager
@@ -96,15 +98,18 @@ def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
     with zipfile.ZipFile(path) as archive:
         unpacked = sum(info.file_size for info in archive.infolist())
         if unpacked > SHARE_OF_MEMORY * machine_memory():
-            raise DataError(f"it has {unpacked} bytes unpacked, more than half of this machine's {machine_memory()}")
+            raise DataError(
+                f"expected at most half of this machine's {machine_memory()} bytes of memory, got {unpacked} "
+                "unpacked bytes"
+            )
         yield archive
 
 
 def _header(archive: zipfile.ZipFile) -> MapHeader:
     info = archive.getinfo(f"{HEADER}.npy")
     if info.file_size > LARGEST_HEADER:
-        raise DataError(f"its header has {info.file_size} bytes, more than {LARGEST_HEADER}")
-    return MapHeader.of(parse_json("its header", _array(archive, HEADER).tobytes()))
+        raise DataError(f"header: expected at most {LARGEST_HEADER} bytes, got {info.file_size}")
+    return MapHeader.of(parse_json("header", _array(archive, HEADER).tobytes()))
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Array:
@@ -116,7 +121,7 @@ def _array(archive: zipfile.ZipFile, name: str) -> Array:
         shape, _, dtype = read(member)
         claimed = member.tell() + math.prod(shape) * dtype.itemsize
     if claimed != info.file_size or min(shape, default=0) < 0:
-        raise DataError(f"{name} claims to be {shape} of {dtype}, and has {info.file_size} bytes")
+        raise DataError(f"{name}: expected {shape} of {dtype}, got {info.file_size} bytes")
     with archive.open(info) as member:
         return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
 
@@ -139,7 +144,7 @@ def check_known(name: str, array: Array, known: Iterable[int]) -> None:
     """Raise DataError unless all values of the array, which kernels use as indices, are known."""
     unknown = array[~np.isin(array, list(known))]
     if unknown.size:
-        raise DataError(f"{name} has {unknown[0]}, which is none of the map's")
+        raise DataError(f"{name}: expected values in the map, got {unknown[0]}")
 
 
 def check_numbers(name: str, numbers: Array, count: int) -> None:
@@ -147,17 +152,19 @@ def check_numbers(name: str, numbers: Array, count: int) -> None:
     used = numbers[numbers != -1]
     beyond = used[(used < 0) | (used >= count)]
     if beyond.size:
-        raise DataError(f"{name} has {beyond[0]}, which is none of the map's")
+        raise DataError(f"{name}: expected values in the map, got {beyond[0]}")
     if used.size != count or not np.array_equal(np.bincount(used, minlength=count), np.ones(count)):
-        raise DataError(f"{name} must have each of the {count} numbers once")
+        raise DataError(f"{name}: expected each of the {count} numbers once")
 
 
 def check_blocks(coords: Any) -> None:
     """Raise DataError unless blocks (B, 3) are unique and in range."""
     if len(coords) and np.abs(coords, dtype=np.int64).max() >= FARTHEST_BLOCK:
-        raise DataError(f"block_coords must be within {FARTHEST_BLOCK} of 0, found {coords.min()} to {coords.max()}")
+        raise DataError(
+            f"block_coords: expected values within {FARTHEST_BLOCK} of 0, got {coords.min()} to {coords.max()}"
+        )
     if len(np.unique(coords, axis=0)) < len(coords):
-        raise DataError("block_coords has a block twice")
+        raise DataError("block_coords: expected unique blocks, got duplicates")
 
 
 def plain_table(table: InstanceTable) -> dict[str, Any]:
@@ -196,7 +203,7 @@ def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> Insta
     for entry in plain.parts("instances"):
         record = _record(entry, table.last_id, classes)
         if record.id in table.records:
-            raise DataError(f"{entry.name}.id is {record.id}, as that of another instance")
+            raise DataError(f"{entry.name}.id: expected a unique id, got {record.id} twice")
         table.records[record.id] = record
     table.embedding_space, embeddings = read_embeddings(plain, arrays)
     check_known("embedding_ids", np.array(list(embeddings), np.int32), table.records)
@@ -208,7 +215,7 @@ def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> Insta
 def _record(entry: MapHeader, last_id: int, classes: int) -> InstanceRecord:
     evidence = entry.items("class_evidence")
     if len(evidence) != classes or not classes or not all(type(value) in (int, float) for value in evidence):
-        raise DataError(f"{entry.name}.class_evidence must be {classes} numbers, one a class, found {evidence!r:.60}")
+        raise DataError(f"{entry.name}.class_evidence: expected {classes} numbers, one per class, got {evidence!r:.60}")
     record = InstanceRecord(
         id=entry.whole("id", 1, last_id),
         class_evidence=np.array(evidence, np.float64),
@@ -220,12 +227,14 @@ def _record(entry: MapHeader, last_id: int, classes: int) -> InstanceRecord:
         detections=entry.whole("detections"),
     )
     if not np.abs(record.class_evidence).max() <= MOST_EVIDENCE:
-        raise DataError(f"{entry.name}.class_evidence must be within {MOST_EVIDENCE:g} of 0, found {evidence!r:.60}")
+        raise DataError(
+            f"{entry.name}.class_evidence: expected values within {MOST_EVIDENCE:g} of 0, got {evidence!r:.60}"
+        )
     return record
 
 
 def _span(name: str, found: object) -> list[int]:
     if not isinstance(found, list) or len(found) != 2:
-        raise DataError(f"{name} must have the first and the last frame of each span, found {found!r:.60}")
+        raise DataError(f"{name}: expected the first and last frame of each span, got {found!r:.60}")
     first = whole(name, found[0], -LARGEST_COUNT)
     return [first, whole(name, found[1], first)]

@@ -12,7 +12,7 @@ from framework.errors import DataError
 
 MOST_CLASSES = 10_000  # that a map names; LVIS has 1,200
 LONGEST_NAME = 200  # characters of a class
-LARGEST_COUNT = 2**53  # of frames, evictions and the like: the integers that JSON readers represent exactly
+LARGEST_COUNT = 2**53  # of frames and evictions: the integers that JSON readers represent exactly
 
 Option = TypeVar("Option", bound=Enum)
 
@@ -28,7 +28,7 @@ class MapHeader:
     def of(cls, found: object, name: str = "header") -> MapHeader:
         """Return a value that must be an object."""
         if not isinstance(found, dict):
-            raise DataError(f"{name} must be an object, found {found!r:.60}")
+            raise DataError(f"{name}: expected an object, got {found!r:.60}")
         return cls(found, name)
 
     def part(self, key: str) -> MapHeader:
@@ -56,7 +56,7 @@ class MapHeader:
         return float(found)
 
     def whole(self, key: str, low: int = 0, high: int = LARGEST_COUNT) -> int:
-        """Return a whole number in [low, high]."""
+        """Return an integer in [low, high]."""
         return whole(f"{self.name}.{key}", self._value(key), low, high)
 
     def flag(self, key: str) -> bool:
@@ -83,15 +83,15 @@ class MapHeader:
 
     def _value(self, key: str) -> Any:
         if key not in self.values:
-            raise DataError(f"{self.name} has no {key!r}")
+            raise DataError(f"{self.name}: expected the key {key!r}, got none")
         return self.values[key]
 
     def _fault(self, key: str, expected: str, found: object) -> DataError:
-        return DataError(f"{self.name}.{key} must be {expected}, found {found!r:.60}")
+        return DataError(f"{self.name}.{key}: expected {expected}, got {found!r:.60}")
 
 
 def whole(name: str, found: object, low: int = 0, high: int = LARGEST_COUNT) -> int:
-    """Return a whole number in [low, high]. Raises DataError, naming it, for anything else."""
+    """Return an integer in [low, high]. Raises DataError with its name for other values."""
     if isinstance(found, bool) or not isinstance(found, int) or not low <= found <= high:
-        raise DataError(f"{name} must be a whole number in [{low}, {high}], found {found!r:.60}")
+        raise DataError(f"{name}: expected an integer in [{low}, {high}], got {found!r:.60}")
     return found

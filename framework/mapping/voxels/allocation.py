@@ -20,11 +20,11 @@ from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, FARTHEST_BLO
 
 MOST_SAMPLES = 4096  # along the band of a reading, half a block apart; 6 by default
 REPEATS = 8  # mean times that a chunk may report a block; it remembers the latest ones
-FEWEST_KEYS = 2**20  # that a frame may always ask for, 8 MB; the budget of the map limits smaller requests
+FEWEST_KEYS = 2**20  # minimum limit of a frame, 8 MB; the budget of the map limits smaller requests
 
 
 class Allocator:
-    """Finds the blocks that a frame updates, and allocates new ones."""
+    """Allocation of the blocks updated by a frame."""
 
     def __init__(self, voxels: VoxelGrid, sensor: Sensor) -> None:
         self.voxels = voxels
@@ -73,14 +73,14 @@ class Allocator:
         samples = 1 + int(np.ceil(4 * band * longest / block_size))
         if samples > MOST_SAMPLES:
             raise MapFullError(
-                f"the truncation band of a reading is {samples // 2} blocks deep, more than {MOST_SAMPLES // 2}: raise "
-                "fuser.voxel_size, or lower fuser.truncation_slope"
+                f"fuser.truncation_slope: expected a truncation band of at most {MOST_SAMPLES // 2} blocks, got "
+                f"{samples // 2}; raise fuser.voxel_size or lower fuser.truncation_slope"
             )
         reach = float(np.abs(T_world_camera[:3, 3]).max()) + (farthest + band) * longest
         if reach >= FARTHEST_BLOCK * block_size:
             raise FrameError(
-                f"the camera sees {reach:.6g} m from the origin, and a map of {self.voxels.grid.voxel_size:g} m voxels "
-                f"ends at {FARTHEST_BLOCK * block_size:.6g} m"
+                f"tracker: expected surfaces within {FARTHEST_BLOCK * block_size:.6g} m of the origin "
+                f"(fuser.voxel_size={self.voxels.grid.voxel_size:g} m), got {reach:.6g} m"
             )
         counts, view, size = np.zeros(CHUNKS, np.int64), pinhole(camera, T_world_camera), np.float32(block_size)
         while True:
@@ -89,9 +89,9 @@ class Allocator:
                 break
             if counts.sum() > max(REPEATS * self.voxels.max_blocks, FEWEST_KEYS):
                 raise MapFullError(
-                    f"the map is full: one frame asks for {counts.sum() // REPEATS} blocks or more, and the map has at "
-                    f"most {self.voxels.max_blocks}; raise fuser.voxel_size or fuser.max_blocks, or lower "
-                    "fuser.max_depth"
+                    f"the map is full: expected at most {self.voxels.max_blocks} blocks, got "
+                    f"{counts.sum() // REPEATS} or more for one frame; raise fuser.voxel_size or fuser.max_blocks, "
+                    "or lower fuser.max_depth"
                 )
             self._found = np.empty((CHUNKS, 2 * int(counts.max())), np.int64)
         keys = np.concatenate([self._found[chunk, :n] for chunk, n in enumerate(counts)])

@@ -13,7 +13,7 @@ from framework.mapping.voxels.voxel_walk import ray_direction
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
 WORD = 64  # bits
 RECENT = 1024  # block keys that a chunk remembers, to report each block about once
-PROBES = 4  # pixels along each side of a block in the image that tell whether the frame sees through it
+PROBES = 4  # pixels along each side of a block in the image to determine whether the frame sees through it
 
 
 @device

@@ -41,7 +41,7 @@ def _near_lists(blocks: int) -> tuple[UInt16, Int32]:
 
 
 class Integrator:
-    """Integrates frames into a grid."""
+    """Integration of frames into a grid."""
 
     def __init__(self, voxels: VoxelGrid, sensor: Sensor) -> None:
         self.voxels = voxels
@@ -51,11 +51,11 @@ class Integrator:
         self._near_voxel, self._near_pixel = reserved(voxels.max_blocks, _near_lists)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without what the next frame overwrites."""
+        """Return the state without buffers of a single frame."""
         return {**vars(self), "_near_voxel": self._near_voxel[:0], "_near_pixel": self._near_pixel[:0]}
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> SeenBlocks:
-        """Integrate one frame and return what it saw within near_band m of the measured surface.
+        """Integrate one frame and return the voxels within near_band m of the measured surface.
 
         Raises MapFullError if the block budget is reached; the frame is then not integrated.
         """

@@ -26,19 +26,19 @@ NO_BLOCKS = np.zeros(0, np.int32)
 
 
 class TsdfVolume:
-    """Voxels, the integrator that writes them, and their surface, updated as blocks change."""
+    """Voxels, their integrator, and their surface, updated as blocks change."""
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
         self.sensor = sensor
         self.voxels = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
         self.integrator = Integrator(self.voxels, sensor)
         self.gravity_estimator = GravityEstimator()
-        self._nets: SurfaceNets | None = None  # created by the first mesh: runs without one pay nothing
+        self._nets: SurfaceNets | None = None  # created by the first mesh
         self._mesh: InstanceMesh | None = None
         self._gravity: Gravity | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without what is derived from the voxels."""
+        """Return the state without data derived from the voxels."""
         return {**vars(self), "_nets": None, "_mesh": None}
 
     @property
@@ -51,7 +51,7 @@ class TsdfVolume:
         return self.voxels.block_count * BLOCK_VOXELS
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near: float) -> SeenBlocks:
-        """Integrate one frame and return what it saw within `near` m of the measured surface.
+        """Integrate one frame and return the voxels within `near` m of the measured surface.
 
         Raises MapFullError if the block budget is reached; the frame is then not integrated.
         """

@@ -86,7 +86,7 @@ def reserved(most: int, make: Callable[[int], Made]) -> Made:
 
 
 class VoxelGrid:
-    """Owns the arrays of the grid and grows them. The kernels work on `self.grid`."""
+    """Owner of the growing arrays of the grid. The kernels work on `self.grid`."""
 
     def __init__(self, voxel_size: float, max_truncation: float, max_blocks: int) -> None:
         self.max_blocks = max_blocks

@@ -27,7 +27,7 @@ MIN_NODE = 32  # points of a node with children
 class Initialization(Enum):
     """The first responsibilities of the Gaussians of level 1."""
 
-    MASKS = "the masks, as in the paper"
+    MASKS = "masks, as in the paper"
     K_MEANS = "k-means over the frame's points from the masks' means, which the paper argues against"
 
 

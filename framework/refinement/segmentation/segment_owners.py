@@ -64,8 +64,8 @@ def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
     farthest = np.linalg.norm(transform(T_world_camera, points_camera) - points_world, axis=1).max()
     if farthest > TOLERANCE:
         raise DataError(
-            f"frame {frame.index}: the clusters' points lie up to {farthest:.3g} m off the depth readings at their "
-            f"pixels, expected at most {TOLERANCE:g} m: they must come from this frame"
+            f"frame {frame.index}: expected cluster points within {TOLERANCE:g} m of the frame's depth "
+            f"readings, got {farthest:.3g} m; refine clusters of this frame only"
         )
     return T_world_camera
 

@@ -21,12 +21,12 @@ def test_experiment_rows_give_overrides() -> None:
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ({"mine": None}, r"rows.mine must be a list of overrides, like \[refiner=identity\], found None"),
-        ({"mine": "refiner=kmeans"}, "rows.mine must be a list of overrides, .* found 'refiner=kmeans'"),
-        ({"mine": {"refiner": "kmeans"}}, "rows.mine must be a list"),
-        ({"mine": [{"refiner": "kmeans"}]}, "rows.mine must be a list"),
-        (["refiner=kmeans"], "rows must have names with overrides"),
-        ("mine", "rows must have names with overrides"),
+        ({"mine": None}, r"rows\.mine: expected a list of overrides, got None"),
+        ({"mine": "refiner=kmeans"}, r"rows\.mine: expected a list of overrides, got 'refiner=kmeans'"),
+        ({"mine": {"refiner": "kmeans"}}, r"rows\.mine: expected a list of overrides"),
+        ({"mine": [{"refiner": "kmeans"}]}, r"rows\.mine: expected a list of overrides"),
+        (["refiner=kmeans"], "rows: expected names with overrides"),
+        ("mine", "rows: expected names with overrides"),
     ],
 )
 def test_invalid_experiment_rows_raise_one_line(rows: Any, message: str) -> None:

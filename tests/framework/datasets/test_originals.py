@@ -135,7 +135,7 @@ def test_openni_1_recording_is_converted_and_mapped(
     assert [sequence[k].timestamp for k in range(3)] == pytest.approx([0.01168, 0.045049, 0.078419], abs=2e-6)
     assert (result.frames, result.frames_skipped, result.frames_lost) == (3, 0, 0)
     check_map_shows_its_frames(sequence, result)
-    with pytest.raises(DataError, match="none of the 3 frames has a true pose; add the sequence's poses"):
+    with pytest.raises(DataError, match="expected true poses, got none for the 3 frames; add the poses"):
         run(*overrides, "tracker=ground_truth")
 
 
@@ -303,7 +303,7 @@ def test_frames_in_motion_capture_gap_are_skipped(
         assert [tracked.timestamp for tracked in result.tracked] == [time for time in times if time not in GAP]
         results[type(tracker)] = result
     said = [record.message for record in caplog.records if record.name == "framework.runtime.run_log"]
-    told = f"2 of {len(times)} frames skipped, as no pose is given for them; the first: frame {times.index(GAP[0])}"
+    told = f"2 of {len(times)} frames skipped because they have no pose; the first: frame {times.index(GAP[0])}"
     assert [message.startswith(told) for message in said] == [True, True]
     for ours, theirs in zip(results[GroundTruth].tracked, results[TrajectoryFile].tracked, strict=True):
         # one interpolates, the other takes the nearest, at 0.3 m/s up to 20 ms away
@@ -315,8 +315,8 @@ def test_run_inside_motion_capture_gap_raises_one_line(originals: Path, tmp_path
     first = [recorded.timestamp for recorded in sequence.contents.frames].index(GAP[0])
     alone = TumRgbd(sequence.folder, start=first, stop=first + 1)
     for tracker, message in (
-        (GroundTruth(), "none of the 1 frames has a true pose"),
-        (TrajectoryFile(sequence.folder / "groundtruth.txt"), "no pose is given for any of the 1 frames"),
+        (GroundTruth(), "expected true poses, got none for the 1 frames;"),
+        (TrajectoryFile(sequence.folder / "groundtruth.txt"), "expected poses, got none for the 1 frames"),
     ):
         with pytest.raises(DataError, match=f"{FREIBURG1_RPY}: {message}") as caught:
             given_poses(tracker, alone)

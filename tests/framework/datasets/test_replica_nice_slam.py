@@ -78,7 +78,9 @@ def test_invalid_pose_raises_for_its_frame(root: Path) -> None:
     stretched = pose_at(1)
     stretched[0] *= 1.1
     write_poses(root / "room0", [pose_at(0), stretched, pose_at(2)])
-    assert "traj.txt, line 2: the pose is not rigid" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+    assert "traj.txt, line 2: pose: expected a rigid transform, got |R R^T - I| =" in fault_of(
+        ReplicaNiceSlam(root, scene="room0"), 1
+    )
     write_poses(root / "room0", [pose_at(0), np.full((4, 4), np.nan), pose_at(2)])
     assert "traj.txt, line 2: the pose is not finite" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
     text = (root / "room0/traj.txt").read_text()

@@ -128,9 +128,9 @@ def test_rounded_rotation_is_made_rigid(folder: Path) -> None:
         ("1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, found 3"),
         ("1 0 0 0\n0 one 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, found 'one'"),
         ("1 0 0 0\n0 1 0 0\n0 0 nan 0\n0 0 0 1\n", "pose.txt: the pose is not finite"),
-        ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "pose.txt: the pose is not rigid"),
-        ("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt: the pose is not rigid"),
-        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", "pose.txt: the last row of the pose is not 0 0 0 1"),
+        ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "pose.txt: pose: expected a rigid transform, got |R R^T - I| ="),
+        ("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt: pose: expected a rigid transform, got |R R^T - I| ="),
+        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", "pose.txt: pose: expected the last row 0 0 0 1"),
     ],
 )
 def test_invalid_pose_raises_for_its_frame(folder: Path, text: str | None, message: str) -> None:

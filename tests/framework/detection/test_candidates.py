@@ -103,18 +103,26 @@ def test_decode_ssd_without_detections_is_empty():
     [
         (OutputLayout.yolo, {"y": np.zeros((1, 20, 8))}, r"7 columns .*\(1, 20, 8\).* \(perhaps yolo_objectness\)"),
         (OutputLayout.yolo_objectness, {"y": np.zeros((1, 7, 20))}, r"8 columns .*\(1, 7, 20\).* \(perhaps yolo\)"),
-        (OutputLayout.yolox, {"y": np.zeros((1, 20, 8))}, "has 126 candidates, the network's output has 20"),
+        (
+            OutputLayout.yolox,
+            {"y": np.zeros((1, 20, 8))},
+            r"detector\.layout: expected 126 candidates of a YOLOX with input .*x.*",
+        ),
         (
             OutputLayout.yolo,
             {"y": np.zeros((1, 9, 7)), "z": np.zeros(1)},
-            r"must have one output, found y \(1, 9, 7\), z \(1,\)",
+            r"detector\.layout: expected one output, got",
         ),
-        (OutputLayout.yolo, {"y": np.full((1, 9, 7), 3.0)}, r"scores must be in \[0, 1\], found 3 to 3"),
-        (OutputLayout.ssd_unit, {"boxes": np.zeros((9, 4))}, r"outputs named boxes .* found boxes \(9, 4\)"),
+        (OutputLayout.yolo, {"y": np.full((1, 9, 7), 3.0)}, r"\.scores: expected values in \[0, 1\], got 3 to 3"),
+        (
+            OutputLayout.ssd_unit,
+            {"boxes": np.zeros((9, 4))},
+            r"detector\.layout: expected outputs boxes \(K, 4\) and either scores .*, got boxes \(9, 4\)",
+        ),
         (
             OutputLayout.ssd_unit,
             {"boxes": np.zeros((2, 4)), "labels": np.array([4, 1]), "scores": np.ones(2)},
-            "labels must be 1 to 3, found 4",
+            r"detector\.label_space: expected labels 1 to 3, got",
         ),
     ],
 )

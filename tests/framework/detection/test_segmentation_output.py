@@ -112,7 +112,10 @@ def test_detect_layout_without_detections_defers_unit(count):
 
 def test_detect_layout_inverted_corners_raise():
     boxes = cells()[50:53]
-    with pytest.raises(DataError, match=r"ends before it begins: set detector\.box_format=CENTER"):
+    with pytest.raises(
+        DataError,
+        match=r"detector\.box_format: expected corners with x1 <= x2 and y1 <= y2, got others in a confident detection",
+    ):
         seen(detections(boxes, 0.9, 1))
     _, output = seen(detections(boxes, 0.9, 1), boxes=BoxKind.CENTER)
     np.testing.assert_allclose(output.candidates.boxes, as_corners(boxes), atol=1e-4)
@@ -145,7 +148,7 @@ def test_detect_layout_given_box_format_is_kept():
 def test_detect_layout_ambiguous_prototype_axes_raise():
     square = {"shape": (16, 16), "maps": np.zeros((1, 4, 4, 4), np.float32)}
     boxes = cells() / 6
-    with pytest.raises(DataError, match=r"may be \(1, M, h, w\) or \(1, h, w, M\): export for another size"):
+    with pytest.raises(DataError, match=r"ambiguous \(1, M, h, w\) or \(1, h, w, M\)"):
         seen(dense(boxes), **square)
     assert not seen(dense(boxes), **square, metadata=ULTRALYTICS)[0].channels_last
     assert seen(dense(boxes), **square, metadata=ULTRALYTICS, input_channels_last=True)[0].channels_last
@@ -157,16 +160,16 @@ MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells()
 @pytest.mark.parametrize(
     ("table", "given", "message"),
     [
-        (dense(MIXED), {}, r"may be corners or center and size .*detector\.box_format=CENTER or CORNER"),
-        (dense(cells() / 8), {}, "neither in px of its input 64x96 nor in 0..1"),
+        (dense(MIXED), {}, r"got ambiguous boxes \(.* could be corners\); set detector\.box_format=CENTER or CORNER"),
+        (dense(cells() / 8), {}, r"detector\.weights: expected boxes in px of the input 64x96 or in 0\.\.1"),
         (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 126\): set detector.objectness=true"),
         (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 126\): set detector.objectness=false"),
-        (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression inside, .*other detector\.label_space"),
-        (detections(as_corners(cells()), 0.9, 3), {}, r"labels from 0 to 2, found 3 to 3: choose other detector"),
-        (detections(as_corners(cells()), 1.5, 1), {}, r"scores must be in \[0, 1\], found 0 to 1.5"),
-        (np.zeros((1, 11, 11)), {}, "as many candidates as columns, 11"),
-        (dense(cells()), {"maps": np.zeros((1, 4, 16, 16))}, r"16, 16\) have other proportions; its input is 64x96"),
-        (dense(cells())[0], {}, r"must have two outputs, .*, found output0 \(11, 126\)"),
+        (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression .*another detector\.label_space"),
+        (detections(as_corners(cells()), 0.9, 3), {}, r"label_space: expected labels 0 to 2 .*, got 3 to 3"),
+        (detections(as_corners(cells()), 1.5, 1), {}, r"detector\.layout: expected scores in \[0, 1\], got 0 to 1\.5"),
+        (np.zeros((1, 11, 11)), {}, "expected different numbers of candidates and columns, got 11 of both"),
+        (dense(cells()), {"maps": np.zeros((1, 4, 16, 16))}, r"64x96, got .*16, 16\) with other proportions"),
+        (dense(cells())[0], {}, r"expected two outputs, .*, got output0 \(11, 126\)"),
     ],
 )  # fmt: skip
 def test_detect_layout_ambiguous_outputs_raise(table, given, message):

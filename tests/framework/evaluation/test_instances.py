@@ -68,7 +68,7 @@ def test_average_precision_matches_manual_result():
     """Ranked hits 1 0 1 1 0 of 5 truths: precision 1, 1/2, 2/3, 3/4, 3/5; envelope at the hits 1, 3/4, 3/4."""
     assert average_precision(np.array([1, 0, 1, 1, 0], bool), 5) == pytest.approx((1 + 0.75 + 0.75) / 5)
     assert average_precision(np.zeros(0, bool), 3) == 0.0
-    with pytest.raises(ValueError, match="without a true instance"):
+    with pytest.raises(ValueError, match="average precision: expected at least one true instance, got none"):
         average_precision(np.zeros(0, bool), 0)
 
 
@@ -220,7 +220,7 @@ def test_evaluate_empty_map_or_truth_is_handled():
 
 def test_inconsistent_predictions_raise():
     truth = scene([(1, 100)], {1: "chair"})
-    with pytest.raises(DataError, match="labeled 6"):
+    with pytest.raises(DataError, match="got the label 6"):
         prediction(truth, [(6, 10)], {5: ("chair", 1.0)})
     with pytest.raises(DataError, match="not finite"):
         prediction(truth, [(5, 10)], {5: ("chair", float("nan"))})

@@ -146,7 +146,7 @@ def test_map_figure_inconsistent_objects_are_not_drawn(
 ) -> None:
     list_objects(maps / "dataset.scene=011,row=part,seed=0", "bed", vertices)
     texts(maps)
-    assert "they are not of one run; run it again" in caplog.text
+    assert "the files are of different runs, run it again" in caplog.text
 
 
 def test_map_figure_has_one_line_per_seed(tmp_path: Path) -> None:
@@ -201,10 +201,10 @@ def test_stage_times_figure_averages_sequences(tmp_path: Path, caplog: pytest.Lo
 @pytest.mark.parametrize(
     ("figure", "said"),
     [
-        ({"kind": "pie"}, "figure.kind must be one of stage_times, maps, found 'pie'"),
-        ({"kind": "stage_times", "zoom": True}, "figure.zoom=true needs figure.kind=maps"),
+        ({"kind": "pie"}, r"figure\.kind: expected one of stage_times, maps, got 'pie'"),
+        ({"kind": "stage_times", "zoom": True}, r"figure\.zoom: expected figure\.kind=maps with zoom=true"),
         ({"colour": "red"}, "figure: Key 'colour'"),
-        ("maps", "figure must have keys and values"),
+        ("maps", "figure: expected keys and values"),
     ],
 )
 def test_figure_choice_invalid_settings_raise_one_line_error(figure: Any, said: str) -> None:
@@ -214,19 +214,21 @@ def test_figure_choice_invalid_settings_raise_one_line_error(figure: Any, said: 
 
 
 def test_write_figure_without_data_raises_one_line_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="is not a folder"):
+    with pytest.raises(DataError, match="expected a folder of runs"):
         write_figure(tmp_path / "nowhere")
-    with pytest.raises(DataError, match=r"has no multirun.yaml: pictures are of experiments"):
+    with pytest.raises(DataError, match=r"expected the folder of an experiment, got none with multirun\.yaml"):
         write_figure(tmp_path)
     root = experiment(tmp_path / "none")
-    with pytest.raises(DataError, match="has no block `figure:`"):
+    with pytest.raises(DataError, match="expected a block `figure:`, got none"):
         write_figure(root)
     for kind, name in (("maps", "mesh.ply"), ("stage_times", "timings.csv")):
         root = experiment(tmp_path / kind, kind=kind)
-        with pytest.raises(DataError, match="there is no complete run below"):
+        with pytest.raises(DataError, match="expected a completed run, got none"):
             write_figure(root)
         (run(root, "whole", "011") / name).write_text("")
-        with pytest.raises(DataError, match="can be read; the log says why"):
+        with pytest.raises(
+            DataError, match=r"timings\.csv: expected a readable file, got none; the log lists the reasons"
+        ):
             write_figure(root)
         assert not list(root.glob("figure.*"))
 
@@ -240,7 +242,7 @@ def test_figures_command_prints_paths_and_errors(
     said = capsys.readouterr()
     assert ended.value.code == 1
     assert said.out.splitlines() == [str(maps / "figure.png"), str(maps / "figure.pdf")]
-    assert said.err.splitlines()[-1] == f"error: {maps / 'nowhere'} is not a folder with records of runs"
+    assert said.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs"
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError("a worker died"), KeyboardInterrupt()])

@@ -105,7 +105,7 @@ def test_non_regular_file_raises_without_blocking(tmp_path: Path, read: Callable
 
 def test_labels_from_named_pipe_raise(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "labels.txt")
-    with pytest.raises(ConfigError, match="labels must be one of"):
+    with pytest.raises(ConfigError, match=r"labels: expected one of .*, or a text file with one name per line"):
         read_labels(str(tmp_path / "labels.txt"))
 
 

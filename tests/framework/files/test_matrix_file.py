@@ -34,7 +34,7 @@ def test_one_matrix_per_line_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("1 2 3", "line 1: expected 16 numbers, found 3"), (ROWS.replace("\n", " x "), "line 1: .* found 20")],
+    [("1 2 3", "line 1: expected 16 numbers, got 3"), (ROWS.replace("\n", " x "), "line 1: .* found 20")],
 )
 def test_invalid_matrix_line_error_gives_line_number(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "traj.txt").write_text(text)
@@ -58,5 +58,7 @@ def test_intrinsics_matrix_gives_pinhole_camera_or_raises() -> None:
         with pytest.raises(DataError, match=r"^here: expected intrinsics"):
             PrintedMatrix("here", wrong).camera(640, 480)
     K[0, 0] = -585
-    with pytest.raises(DataError, match=r"^here: Camera: fx, fy must be positive"):
+    with pytest.raises(
+        DataError, match=r"^here: Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy ="
+    ):
         PrintedMatrix("here", K).camera(640, 480)

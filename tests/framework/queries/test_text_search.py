@@ -127,7 +127,7 @@ def test_query_command_prints_method_and_matches(
     assert (answer["by"], answer["space"], [one["id"] for one in answer["objects"]]) == ("names", None, [1])
     assert len(answer["objects"][0]["size"]) == 3
     _, out, _ = asked(monkeypatch, capsys, str(run_without), f"a {absent} bed")
-    assert f"nothing in this map is 'a {absent} bed'" in out
+    assert f"no object matches 'a {absent} bed'" in out
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_query_invalid_arguments_raise_before_reading(question: dict[str, Any], 
 
 
 def test_query_unanswerable_request_raises(embedded: Map, run_without: Path) -> None:
-    with pytest.raises(DataError, match=r"query: there is no nowhere/map.npz: expected the directory of a run"):
+    with pytest.raises(DataError, match=r"query: expected the directory of a run, got .* without"):
         query("nowhere", "bed")
     with pytest.raises(DataError, match="has no embeddings: run with detector=with_embeddings"):
         query(run_without, "bed", model="clip")

@@ -200,5 +200,5 @@ def test_neighborhood_without_clusters_or_depth_is_empty():
 
 
 def test_ring_out_of_range_raises() -> None:
-    with pytest.raises(ConfigError, match=r"Ring.max_ring must be in \[20, 80\], found 12"):
+    with pytest.raises(ConfigError, match=r"Ring\.max_ring: expected a value in \[20, 80\], got 12"):
         Ring(min_ring=20)

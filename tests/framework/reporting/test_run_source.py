@@ -69,9 +69,12 @@ def test_run_contents_frames_without_pose_are_lost(directory: Path) -> None:
 @pytest.mark.parametrize(
     ("dataset", "said"),
     [
-        ({"_target_": "tests.support.scenes.corner_room.LiveRoom"}, "as it came from a camera"),
-        ({"_target_": "tests.support.scenes.corner_room.CornerRoom", "start": 1}, "is not the one that was mapped"),
-        ({"_target_": "os.system"}, "no registered option"),
+        ({"_target_": "tests.support.scenes.corner_room.LiveRoom"}, "the run mapped a live camera"),
+        (
+            {"_target_": "tests.support.scenes.corner_room.CornerRoom", "start": 1},
+            "the first frame differs from the one of the run",
+        ),
+        ({"_target_": "os.system"}, "expected the _target_ of a registered option of"),
         ({"_target_": "tests.support.scenes.corner_room.CornerRoom", "scene": "${oc.env:HOME}"}, "not resolved"),
     ],
 )
@@ -93,7 +96,7 @@ def test_run_source_changed_truth_is_rejected_with_reason(directory: Path) -> No
     (directory / "metrics.json").write_text(json.dumps(metrics))
     truth, why = RunSource.of(RunContents.read(directory)).scene_truth()
     assert truth is None
-    assert "no longer those" in why
+    assert "the ground-truth instances differ from those used in the run" in why
 
 
 def test_footage_has_images_true_positions_and_clarity(mapped: Path) -> None:

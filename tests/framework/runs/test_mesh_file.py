@@ -41,10 +41,10 @@ def test_read_mesh_foreign_ply_raises_one_line_error(tmp_path: Path) -> None:
     shades = dict.fromkeys(("red", "green", "blue"), mesh.colors[:, 0])
     labels = {"instance": mesh.instance_ids, "class": mesh.class_ids}
     for properties, comments, said in [
-        (shades, ("classes chair",), "no property 'instance' of int32"),
+        (shades, ("classes chair",), "expected the vertex property 'instance' of int32"),
         (shades | labels | {"class": mesh.class_ids.astype(np.float32)}, ("classes chair",), "no property 'class'"),
-        (labels, ("classes chair",), "no property 'red' of uint8"),
-        (shades | labels, (), "one line 'comment classes ...', found 0"),
+        (labels, ("classes chair",), "expected the vertex property 'red' of uint8, got none"),
+        (shades | labels, (), "expected one line 'comment classes ...', got 0"),
         (shades | labels, ("classes chair", "classes bed"), "found 2"),
     ]:
         write_ply(path, mesh.vertices, mesh.triangles, properties, comments)

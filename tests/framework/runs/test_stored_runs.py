@@ -55,19 +55,27 @@ def test_read_record_returns_config_and_metrics(directory: Path) -> None:
         ("metrics.json", '{"seed": 0', "metrics.json cannot be read"),
         ("metrics.json", "[" * 100_000, "metrics.json cannot be read"),
         ("metrics.json", "\xff", "metrics.json cannot be read"),
-        ("metrics.json", "[1, 2]", "metrics.json must hold an object, found list"),
-        ("metrics.json", '{"fps": [1]}', "metrics.json must be flat, found more below 'fps'"),
-        ("metrics.json", '{"instances.ap50": "best"}', "instances.ap50 must be a number or null, found 'best'"),
-        ("metrics.json", '{"trajectory.ate_rmse_m": NaN}', "trajectory.ate_rmse_m must be a number or null, found nan"),
-        ("metrics.json", '{"fps": 1e999}', "fps must be a number or null, found inf"),
-        ("metrics.json", '{"frames": true}', "frames must be a number or null, found True"),
-        ("metrics.json", "{}", "is not of the config beside it"),
-        ("config.yaml", "seed: 4", "is not of the config beside it"),
-        ("config.yaml", "", "is not of the config beside it"),
+        ("metrics.json", "[1, 2]", r"metrics\.json: expected an object, got list"),
+        ("metrics.json", '{"fps": [1]}', r"metrics\.json: expected flat values, got nested ones below 'fps'"),
+        ("metrics.json", '{"instances.ap50": "best"}', r"instances\.ap50: expected a number or null, got 'best'"),
+        (
+            "metrics.json",
+            '{"trajectory.ate_rmse_m": NaN}',
+            r"trajectory\.ate_rmse_m: expected a number or null, got nan",
+        ),
+        ("metrics.json", '{"fps": 1e999}', "fps: expected a number or null, got inf"),
+        ("metrics.json", '{"frames": true}', "frames: expected a number or null, got True"),
+        ("metrics.json", "{}", "expected the config_hash of the config next to it, got another one"),
+        ("config.yaml", "seed: 4", "expected the config_hash of the config next to it, got another one"),
+        ("config.yaml", "", "expected the config_hash of the config next to it, got another one"),
         ("config.yaml", "seed: [", "config.yaml cannot be read"),
-        ("config.yaml", "word", "is not of the config beside it"),
-        ("config.yaml", "- 1", "config.yaml must hold keys and values"),
-        ("config.yaml", "fuser: {true: 1, voxel_size: 2}", "is not of the config beside it"),
+        ("config.yaml", "word", "expected the config_hash of the config next to it, got another one"),
+        ("config.yaml", "- 1", r"config\.yaml: expected keys and values, got a list"),
+        (
+            "config.yaml",
+            "fuser: {true: 1, voxel_size: 2}",
+            "expected the config_hash of the config next to it, got another one",
+        ),
     ],
 )
 def test_read_record_invalid_file_raises_one_line_error(directory: Path, name: str, content: str, said: str) -> None:
@@ -83,22 +91,22 @@ def test_read_record_invalid_file_raises_one_line_error(directory: Path, name: s
 
 def test_read_record_without_config_raises(directory: Path) -> None:
     (directory / "config.yaml").unlink()
-    with pytest.raises(DataError, match=r"config.yaml is missing"):
+    with pytest.raises(DataError, match=r"config.yaml: expected a file, got none"):
         read_record(directory)
 
 
 @pytest.mark.parametrize(
     ("files", "reason"),
     [
-        ({}, "not complete: running, or killed"),
-        ({"instancemap.log": "12:00:00 INFO    mapping\n"}, "not complete: running, or killed"),
+        ({}, "incomplete: running or killed"),
+        ({"instancemap.log": "12:00:00 INFO    mapping\n"}, "incomplete: running or killed"),
         (
             {"instancemap.log": "12:00:00 INFO    mapping\n12:00:01 ERROR   fuser: bad\nTraceback\n  x\n"},
             "failed: fuser: bad",
         ),
         (
             {"instancemap.log": "12:00:01 ERROR   fuser: bad\n12:00:02 INFO    mapping again\n"},
-            "not complete: running, or killed",
+            "incomplete: running or killed",
         ),
         ({"metrics.partial.json": '{"partial": "interrupted by Ctrl-C"}'}, "partial: interrupted by Ctrl-C"),
         ({"metrics.partial.json": "{"}, r"cannot be read"),
@@ -126,7 +134,7 @@ def test_find_records_ignores_other_files(directory: Path) -> None:
 def test_is_recorded_same_config_is_true(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     assert is_recorded(directory, OmegaConf.create(CONFIG | {"debug": True}))
-    assert caplog.messages == [f"kept: the complete record in {directory}"]
+    assert caplog.messages == [f"skipped: the completed run in {directory}"]
 
 
 def test_is_recorded_logs_missing_map_files(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -134,13 +142,16 @@ def test_is_recorded_logs_missing_map_files(directory: Path, caplog: pytest.LogC
     (directory / "map.npz").unlink()
     (directory / "mesh.ply").unlink()
     assert is_recorded(directory, OmegaConf.create(CONFIG))
-    assert f"{directory} has lost mesh.ply, map.npz; skip_completed=false would make it again" in caplog.messages
+    assert (
+        f"{directory}: expected mesh.ply, map.npz, got none; set skip_completed=false to run it again"
+        in caplog.messages
+    )
 
 
 def test_is_recorded_other_config_is_false(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     assert not is_recorded(directory, OmegaConf.create(CONFIG | {"seed": 4}))
-    assert caplog.messages == [f"run again: the record in {directory} is of another config"]
+    assert caplog.messages == [f"run again: the config of the run in {directory} differs"]
 
 
 @pytest.mark.parametrize("theirs", [{"git_commit": "1234567890"}, {"git_dirty": True}])
@@ -151,7 +162,7 @@ def test_is_recorded_other_code_is_true_with_warning(
     assert is_recorded(directory, OmegaConf.create(CONFIG))
     [told] = caplog.records
     assert told.levelno == logging.WARNING
-    assert "this is abcdef0" in told.getMessage()
+    assert "the current commit is abcdef0" in told.getMessage()
 
 
 SETTINGS = {"threads": 4, "prefetch": 2, "detection_cache": "off"}
@@ -180,7 +191,7 @@ def test_is_recorded_speed_experiment_needs_same_settings(
     caplog.clear()
     assert not is_recorded(directory, OmegaConf.create(config | changed | about_speed))
     assert caplog.messages == [
-        f"run again: the times in {directory} are of other settings or another machine: "
+        f"run again: the times in {directory} were measured with other settings or on another machine: "
         "threads=4, prefetch=2, detection_cache=off, processor=a, cpus=4"
     ]
 
@@ -215,7 +226,7 @@ def test_is_recorded_changed_weights_or_data_is_false(
         change()
         caplog.clear()
         assert not is_recorded(directory, OmegaConf.create(config))
-        assert caplog.messages == [f"run again: weights or data have changed since the record in {directory}"]
+        assert caplog.messages == [f"run again: weights or data changed since the run in {directory}"]
     record_of(directory, config, monkeypatch)
     (tmp_path / "data" / "another room").mkdir()
     (tmp_path / "data" / "another room" / "0.png").write_bytes(b"depth")

@@ -39,16 +39,16 @@ def test_read_timings_old_stage_gets_current_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("", "line 1: expected frame,stage,milliseconds, found ''"),
-        ("a,b\n", "line 1: expected frame,stage,milliseconds, found 'a,b'"),
-        ("frame,stage,milliseconds\n", "has no times"),
-        ("frame,stage,milliseconds\n0,fusion,1\n0,fusion\n", "line 3: .* found '0,fusion'"),
-        ("frame,stage,milliseconds\n0,fusion,nan\n", "line 2: .* found '0,fusion,nan'"),
+        ("", "line 1: expected frame,stage,milliseconds, got ''"),
+        ("a,b\n", "line 1: expected frame,stage,milliseconds, got 'a,b'"),
+        ("frame,stage,milliseconds\n", "expected at least one time, got none"),
+        ("frame,stage,milliseconds\n0,fusion,1\n0,fusion\n", "line 3: .* got '0,fusion'"),
+        ("frame,stage,milliseconds\n0,fusion,nan\n", "line 2: .* got '0,fusion,nan'"),
         ("frame,stage,milliseconds\n0,fusion,-1\n", "line 2: "),
         ("frame,stage,milliseconds\n1e3,fusion,1\n", "line 2: "),
         (f"frame,stage,milliseconds\n{10**18},fusion,1\n", "line 2: "),
         (f"frame,stage,milliseconds\n{'9' * 5000},fusion,1\n", "line 2: "),
-        ('frame,stage,milliseconds\n0,"' + "x" * 200000, "cannot be read: field larger"),
+        ('frame,stage,milliseconds\n0,"' + "x" * 200000, "expected a readable file, got field larger"),
         ("frame,stage,milliseconds\n0,\x00,1\n0,fusion\n", "line 3: "),
     ],
 )

@@ -117,7 +117,7 @@ def test_stream_of_unsupported_video_raises() -> None:
     class Neither(RGBDVideo):
         name = "neither"
 
-    with pytest.raises(DataError, match="Neither must be an RGBDSequence or a LiveVideo"):
+    with pytest.raises(DataError, match=r"dataset: expected an RGBDSequence or a LiveVideo, got .*Neither"):
         stream_of(Neither(), lambda: False)
 
 
@@ -153,7 +153,7 @@ def test_fast_live_video_drops_and_counts_frames(prefetch: int, caplog: pytest.L
     indices = [frame.index for frame in result.tracked]
     assert indices == sorted(set(indices))
     assert indices[-1] == 59, "the last frame is the newest for good"
-    assert caplog.messages == [f"{result.live.frames_dropped} frames dropped: they came while others were mapped"]
+    assert caplog.messages == [f"{result.live.frames_dropped} frames dropped because mapping fell behind"]
 
 
 def test_live_video_frames_are_not_queued() -> None:
@@ -230,11 +230,11 @@ def test_failed_live_video_keeps_partial_map() -> None:
 
 
 def test_live_video_without_usable_frame_raises() -> None:
-    with pytest.raises(DataError, match="live_room: no frame came"):
+    with pytest.raises(DataError, match="live_room: expected at least one frame, got none"):
         pipeline().run(LiveRoom(frames_sent=0))
-    with pytest.raises(DataError, match="none of the 1 frames can be used"):
+    with pytest.raises(DataError, match="expected usable frames, got none of 1"):
         pipeline().run(LiveRoom(frames_sent=1, unreadable=0))
-    with pytest.raises(DataError, match="none of its frames has a true pose"):
+    with pytest.raises(DataError, match="expected true poses, got none for its frames;"):
         pipeline(tracker=GivenPose()).run(Handed())
 
 

@@ -31,13 +31,13 @@ def test_first_signal_is_deferred_and_second_raises(number: signal.Signals, capf
         assert interruption.asked is not None
         assert interruption.asked.number == number
         signal.raise_signal(number)  # between two steps: what the first has made must reach the second
-        with pytest.raises(Interrupted) as second, interruption.second_ends_at_once("once the record is written"):
+        with pytest.raises(Interrupted) as second, interruption.second_ends_at_once("after the outputs are written"):
             signal.raise_signal(number)
         assert second.value.number == number
         with pytest.raises(Interrupted):
             interruption.check()
     said = "interrupted by Ctrl-C" if number == signal.SIGINT else f"ended by {number.name}"
-    assert capfd.readouterr().err == f"{said}: ending after this frame; a second time ends at once\n"
+    assert capfd.readouterr().err == f"{said}: stopping after this frame; a second signal stops immediately\n"
     assert signal.getsignal(number) is signal.SIG_DFL
 
 

@@ -11,8 +11,8 @@ from framework.tables.comparison import TableChoice
 @pytest.mark.parametrize(
     ("node", "said"),
     [
-        ({"columns": []}, "table.columns must name at least one key"),
-        ({"average_over": [], "columns": ["fps"]}, "table.average_over must name at least one key"),
+        ({"columns": []}, r"table\.columns: expected at least one key, got none"),
+        ({"average_over": [], "columns": ["fps"]}, r"table\.average_over: expected at least one key, got none"),
         (
             {"columns_by": "dataset.scene", "group_by": "dataset.scene", "columns": ["fps"]},
             "columns_by=dataset.scene, table.group_by=dataset.scene",
@@ -27,19 +27,22 @@ from framework.tables.comparison import TableChoice
         ),
         (
             {"columns_by": "dataset.scene", "columns": ["fps", "frames"]},
-            "must name one figure, .* found 2; table.group_by=",
+            r"table\.columns: expected one metric across .*, got 2; set table\.group_by=.* to show several",
         ),
-        ({"published": "table4", "columns": ["fps"]}, "table.published must be null or one of table1, table2, table3"),
-        ({"published": "table3", "columns": ["fps"]}, "a table with another layout: columns_by, found rows"),
+        ({"published": "table4", "columns": ["fps"]}, r"table\.published: expected null or one"),
+        (
+            {"published": "table3", "columns": ["fps"]},
+            r"table\.published: expected numbers for the layout rows, got columns_by of",
+        ),
         (
             {"published": "table1", "group_by": "dataset.scene", "columns": ["fps"]},
-            "another layout: rows, found group_by",
+            r"table\.published: expected numbers for the layout group_by, got rows of",
         ),
         ({"names": ["ours"], "columns": ["fps"]}, "table: "),
         ({"colums": ["fps"]}, "colums"),
         ({"columns": "fps"}, "table: "),
-        ([], "table must have keys and values"),
-        ("fps", "table must have keys and values"),
+        ([], "table: expected keys and values"),
+        ("fps", "table: expected keys and values"),
     ],
 )
 def test_table_choice_invalid_settings_raise(node: object, said: str) -> None:

@@ -308,7 +308,10 @@ def test_table_notes_count_older_records(sweep: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [("table: [", "cannot be read"), ("table: {columns: [], average_over: [seed]}", "table.columns must name")],
+    [
+        ("table: [", "cannot be read"),
+        ("table: {columns: [], average_over: [seed]}", r"table\.columns: expected one metric across"),
+    ],
 )
 def test_write_tables_invalid_experiment_raises_one_line_error(sweep: Path, content: str, said: str) -> None:
     (sweep / "multirun.yaml").write_text(content)
@@ -318,9 +321,9 @@ def test_write_tables_invalid_experiment_raises_one_line_error(sweep: Path, cont
 
 
 def test_write_tables_without_complete_run_raises_reason(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="there is no complete run below"):
+    with pytest.raises(DataError, match="expected a completed run, got none"):
         write_tables(tmp_path)
-    with pytest.raises(DataError, match="is not a folder"):
+    with pytest.raises(DataError, match="expected a folder of runs"):
         write_tables(tmp_path / "nowhere")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "metrics.partial.json").write_text('{"partial": "the map is full"}')
@@ -366,4 +369,4 @@ def test_tables_command_prints_table_or_error(sweep: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("# ablation_x")
     wrong = completed(CHECKOUT, "tables", str(sweep), "nowhere")
-    assert (wrong.returncode, wrong.stderr) == (1, "error: nowhere is not a folder with records of runs\n")
+    assert (wrong.returncode, wrong.stderr) == (1, "error: nowhere: expected a folder of runs\n")

@@ -51,5 +51,5 @@ def test_published_tables_agree_on_sequence_means() -> None:
 
 
 def test_read_published_unknown_table_raises() -> None:
-    with pytest.raises(ConfigError, match="one of table1, table2, table3, found table4"):
+    with pytest.raises(ConfigError, match="one of table1, table2, table3, got table4"):
         read_published("table4")

@@ -37,7 +37,7 @@ def test_empty_frame_has_no_detections_and_missing_truth_raises():
 
 
 def test_invalid_parameter_raises():
-    with pytest.raises(ConfigError, match=r"detector\.min_pixels must be at least 1 px, found 0"):
+    with pytest.raises(ConfigError, match=r"detector\.min_pixels: expected at least 1 px, got 0"):
         GroundTruthDetector(min_pixels=0)
 
 

@@ -153,7 +153,9 @@ def test_overflow_raises(tmp_path):
     network.roi_heads.box_head.fc6.weight.data.fill_(3e38)
     save_network(network, tmp_path / "wild.safetensors", {})
     detector = MaskRCNNDetector(weights=tmp_path / "wild.safetensors", device="cpu")
-    with pytest.raises(DataError, match=r"^wild\.safetensors computed numbers that are not finite$"):
+    with pytest.raises(
+        DataError, match=r"^detector\.weights: expected finite outputs of .*wild\.safetensors, got NaN or infinity$"
+    ):
         detector.detect(noise(7))
 
 
@@ -178,17 +180,17 @@ def test_half_precision_agrees_with_single_precision(path):
 @pytest.mark.parametrize(
     ("parameters", "fault"),
     [
-        ({"score_threshold": 1.0}, r"detector\.score_threshold must be in \[0, 1\), found 1.0"),
-        ({"nms_iou": 0.0}, r"detector\.nms_iou must be in \(0, 1\]"),
-        ({"agnostic_nms_iou": 1.1}, r"detector\.agnostic_nms_iou must be in \(0, 1\]"),
-        ({"proposals_before_nms": 0}, r"detector\.proposals_before_nms must be at least 1"),
-        ({"proposals": 0}, r"detector\.proposals must be at least 1"),
-        ({"max_detections": 0}, r"detector\.max_detections must be at least 1"),
-        ({"short_side": 31}, r"detector\.short_side must be at least 32 px, or 0"),
-        ({"long_side": -1}, r"detector\.long_side must be at least 32 px, or 0"),
-        ({"short_side": 200, "long_side": 100}, r"detector\.long_side must be at least 200 px, found 100"),
-        ({"mask_threshold": 1.0}, r"detector\.mask_threshold must be in \(0, 1\)"),
-        ({"device": "tpu"}, r"detector\.device must be auto, cpu or cuda"),
+        ({"score_threshold": 1.0}, r"detector\.score_threshold: expected a value in \[0, 1\), got 1\.0"),
+        ({"nms_iou": 0.0}, r"detector\.nms_iou: expected a value in \(0, 1\]"),
+        ({"agnostic_nms_iou": 1.1}, r"detector\.agnostic_nms_iou: expected a value in \(0, 1\]"),
+        ({"proposals_before_nms": 0}, r"detector\.proposals_before_nms: expected a value in \[1, "),
+        ({"proposals": 0}, r"detector\.proposals: expected a value in \[1, "),
+        ({"max_detections": 0}, r"detector\.max_detections: expected a value in \[1, "),
+        ({"short_side": 31}, r"detector\.short_side: expected 0 or a value in \[32"),
+        ({"long_side": -1}, r"detector\.long_side: expected 0 or a value in \[32"),
+        ({"short_side": 200, "long_side": 100}, r"detector\.long_side: expected at least 200 px, got 100"),
+        ({"mask_threshold": 1.0}, r"detector\.mask_threshold: expected a value in \(0, 1\)"),
+        ({"device": "tpu"}, r"detector\.device: expected auto, cpu or cuda"),
     ],
 )
 def test_invalid_parameter_raises(path, parameters, fault):
@@ -198,11 +200,15 @@ def test_invalid_parameter_raises(path, parameters, fault):
 
 def test_missing_or_damaged_weights_raise_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(DataError, match=r"^detector\.weights: there is no network .*resnet50_fpn_coco") as caught:
+    with pytest.raises(
+        DataError, match=r"^detector\.weights: .*: expected a file or one of .*resnet50_fpn_coco"
+    ) as caught:
         MaskRCNNDetector(weights=Path("no/such.pth"), device="cpu")
     assert "\n" not in str(caught.value)
     (tmp_path / "bad.safetensors").write_bytes(b"bad")
-    with pytest.raises(DataError, match=r"^detector\.weights: .*bad\.safetensors is damaged"):
+    with pytest.raises(
+        DataError, match=r"^detector\.weights: .*bad\.safetensors: expected sha256 .*\.\.\., got .*\.\.\."
+    ):
         MaskRCNNDetector(weights=Path("bad.safetensors"), device="cpu")
 
 

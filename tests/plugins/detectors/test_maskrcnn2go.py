@@ -120,7 +120,7 @@ def test_missing_int8_kernels_fall_back_to_float(monkeypatch, caplog):
     monkeypatch.setattr(maskrcnn2go, "has_int8_kernels", lambda: False)
     caplog.set_level("INFO")
     detector = MaskRCNN2Go(device="cpu")
-    assert "the network runs in float" in caplog.text
+    assert "detector.int8: expected a CPU with VNNI for exact 8-bit convolutions, got none" in caplog.text
     assert detector.fingerprint() != here
     frame = shared_picture("redkitchen", 0)
     np.testing.assert_array_equal(
@@ -206,7 +206,7 @@ def test_missing_weights_raise_one_line_with_path(tmp_path, monkeypatch):
     with pytest.raises(DataError) as caught:
         MaskRCNN2Go(weights=Path("no/such/folder"), device="cpu")
     message = str(caught.value)
-    assert message.startswith("detector.weights: there is no folder")
+    assert message.startswith("detector.weights: expected the folder")
     assert str(tmp_path / "no/such/folder") in message
     assert all(name in message for name in SHA256)
     assert "\n" not in message

@@ -126,7 +126,7 @@ def test_box_without_depth_is_dropped_and_logged_once(tmp_path, caplog):
         assert len(detector.detect(blind)) == 0
         assert detector.boxes_without_depth == dropped
     assert len(detector.detect(frame())) == 1
-    assert caplog.messages == ["frame 7: 1 of 1 boxes have too little depth for a mask and are dropped, 1 so far"]
+    assert caplog.messages == ["frame 7: dropped 1 of 1 boxes with too little depth for a mask, 1 so far"]
 
 
 def test_nms_keeps_better_of_overlapping_boxes(tmp_path):
@@ -231,5 +231,5 @@ def test_config_defaults_fit_yolox_nano(shared, nano):
 
 
 def test_missing_weights_parameter_raises_with_url():
-    with pytest.raises(ConfigError, match=r"must be given: detector\.weights=\.\.\.; yolox_nano\.onnx .* https://"):
+    with pytest.raises(ConfigError, match=r"got none; set detector\.weights=\.\.\.; yolox_nano\.onnx .* https://"):
         registered.built("detector", "onnx_boxes")

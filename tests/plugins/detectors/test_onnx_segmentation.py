@@ -84,7 +84,7 @@ def test_tensorflow_export_with_channels_last_is_decoded(tmp_path):
 
 
 def test_tflite_file_error_names_converter(tmp_path):
-    with pytest.raises(ConfigError, match=r"detector\.weights must be an ONNX file; .* tf2onnx .*n\.tflite"):
+    with pytest.raises(ConfigError, match=r"detector\.weights: expected an ONNX file; .* tf2onnx .*n\.tflite"):
         OnnxSegmentation(weights=tmp_path / "n.tflite", device="cpu")
 
 
@@ -120,15 +120,21 @@ def test_different_class_names_in_file_are_logged(tmp_path, caplog):
     onnx.helper.set_model_props(model, {"names": "{0: 'chair', 1: 'fork', 2: 'wall'}"})
     onnx.save(model, tmp_path / "named.onnx")
     OnnxSegmentation(weights=tmp_path / "named.onnx", label_space=str(tmp_path / "labels.txt"), device="cpu")
-    assert "named.onnx names 1 of its 3 classes differently" in caplog.text
+    assert "named.onnx: 1 of its 3 classes differ from detector.label_space=" in caplog.text
     assert "1 is 'fork', not 'cup'" in caplog.text
 
 
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"output1": np.zeros((1, 3, 40, 40))}, "must have 10 columns"),
-        ({"output1": np.zeros((1, 40, 40))}, r"outputs, \(1, 4 \+ classes \+ M, K\) or .*, found output0"),
+        (
+            {"output1": np.zeros((1, 3, 40, 40))},
+            r"detector\.label_space: expected 10 columns for box, classes and .* coefficients",
+        ),
+        (
+            {"output1": np.zeros((1, 40, 40))},
+            r"expected two outputs, \(1, 4 \+ classes \+ M, K\) or .*, got output0",
+        ),
         ({"more": np.zeros((1, 2))}, r"found output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
     ],
 )

@@ -133,7 +133,7 @@ def test_foreign_labels_map_to_coco_or_are_dropped(tmp_path: Path, caplog: pytes
         found = detected(tmp_path, *entries, label_space="nyu40")
     assert [found.classes[k] for k in found.class_probabilities.argmax(axis=1)] == ["couch"]
     assert found.class_probabilities.max() == pytest.approx(0.9)
-    assert "1 of 2 detections are of no class of COCO's and are dropped: wall" in caplog.text
+    assert "dropped 1 of 2 detections of classes that COCO does not have: wall" in caplog.text
 
 
 def test_detections_are_sorted_and_filtered_by_score(tmp_path: Path) -> None:
@@ -199,13 +199,16 @@ def test_mask_folder_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("listed", "said"),
     [
-        ([{"id": 0, "class": "tv", "score": 0.5}], "id must be a whole number from 1 to 65535, found 0"),
-        ([{"id": 7, "class": "television", "score": 0.5}], "'television' is not one of the 80 labels"),
-        ([{"id": 7, "class": "tv"}], "score must be a number"),
-        ({"id": 7}, "must hold a list"),
+        ([{"id": 0, "class": "tv", "score": 0.5}], r"id: expected an integer in \[1, 65535\], got 0"),
+        (
+            [{"id": 7, "class": "television", "score": 0.5}],
+            r"label: expected one of the 80 names in detector\.label_space, got .*'television'",
+        ),
+        ([{"id": 7, "class": "tv"}], r"score: expected a number in \[0, 1\]"),
+        ({"id": 7}, "expected a list of results in COCO's format, got an object"),
         (
             [{"id": 7, "class": "tv", "score": 0.5}, {"id": 7, "class": "bed", "score": 1}],
-            "entry 1: id 7 is there twice",
+            "entry 1: id: expected unique ids, got 7 twice",
         ),
     ],
 )
@@ -227,7 +230,7 @@ def test_mask_folder_with_unpaired_file_raises(tmp_path: Path) -> None:
 
 def test_mask_folder_with_duplicate_frame_raises(tmp_path: Path) -> None:
     write_folder(write_folder(tmp_path), name="3")
-    with pytest.raises(DataError, match=r"3\.png and 000003\.png are both of frame 3"):
+    with pytest.raises(DataError, match=r"3\.png: expected one image of frame .*, got 000003\.png as well"):
         Precomputed(tmp_path)
 
 
@@ -235,7 +238,7 @@ def test_mask_folder_with_duplicate_frame_raises(tmp_path: Path) -> None:
     ("ids", "error"), [(np.zeros((6, 9), np.uint16), DataError), (np.zeros((6, 8), np.uint8), FrameError)]
 )
 def test_mask_image_with_wrong_size_or_type_raises(tmp_path: Path, ids: np.ndarray, error: type[DataError]) -> None:
-    with pytest.raises(error, match=r"000003\.(png|json).*(9x6 px, but the frame 8x6 px|uint8)"):
+    with pytest.raises(error, match=r"000003\.(png|json).*(8x6 px \(as the frame\), got 9x6 px|uint8)"):
         Precomputed(write_folder(tmp_path, ids)).detect(frame(3))
 
 
@@ -245,27 +248,30 @@ def test_mask_image_with_wrong_size_or_type_raises(tmp_path: Path, ids: np.ndarr
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"image_id": "left.png"}, "image_id must be the frame's number"),
+        ({"image_id": "left.png"}, "image_id: expected the number of the frame, or a file name that is one"),
         ({"image_id": -1}, "image_id"),
         ({"image_id": True}, "image_id"),
-        ({"image_id": "0.5"}, "image_id must be the frame's number"),
-        ({"category_name": "chiar"}, "'chiar' is not one of the 80 labels"),
-        ({"category_name": None, "category_id": 12}, "category_id 12 is not the id of a label"),
+        ({"image_id": "0.5"}, "image_id: expected the number of the frame, or a file name that is one"),
+        ({"category_name": "chiar"}, "label: expected one of the 80 names in detector.label_space, got"),
+        ({"category_name": None, "category_id": 12}, "category_id: expected the id of a label, got 12"),
         ({"category_name": None}, "category_id None"),
-        ({"score": 1.5}, "score must be a number in [0, 1], found 1.5"),
+        ({"score": 1.5}, "score: expected a number in [0, 1], got 1.5"),
         ({"score": None}, "score"),
-        ({"segmentation": None}, "segmentation must be run lengths"),
+        (
+            {"segmentation": None},
+            "segmentation: expected run lengths with size [height, width], or a list of polygons, got other values",
+        ),
         ({"segmentation": {"size": [6, 8], "counts": "\u00e9"}}, "packed string"),
-        ({"segmentation": {"size": [6, 8], "counts": PACKED[:-1]}}, "must fill 8x6 = 48 px, found 40 px"),
-        ({"segmentation": {"size": [6, 9], "counts": PACKED}}, "must fill 9x6 = 54 px, found 48 px"),
+        ({"segmentation": {"size": [6, 8], "counts": PACKED[:-1]}}, "run lengths: expected 8x6 = 48 px, got 40 px"),
+        ({"segmentation": {"size": [6, 9], "counts": PACKED}}, "run lengths: expected 9x6 = 54 px, got 48 px"),
         ({"segmentation": {"size": [6], "counts": PACKED}}, "size"),
-        ({"segmentation": {"size": [6, 8], "counts": [3, 4]}}, "must fill"),
+        ({"segmentation": {"size": [6, 8], "counts": [3, 4]}}, "run lengths: expected"),
         ({"segmentation": [[1, 2, 3, 4]]}, "three points"),
-        ({"segmentation": []}, "no polygon"),
-        ({"bbox": [1, 2, 3]}, "bbox must be"),
-        ({"class_probabilities": [0.5, 0.5]}, "must have 80 values, one for each label, found 2"),
-        ({"class_probabilities": {"chair": 0.5}}, "must sum to 1, found 0.5"),
-        ({"class_probabilities": {"chair": 1.5, "couch": -0.5}}, "0 or more"),
+        ({"segmentation": []}, "segmentation: expected a polygon, got none"),
+        ({"bbox": [1, 2, 3]}, "bbox: expected [x, y, width, height] px, at most"),
+        ({"class_probabilities": [0.5, 0.5]}, "class_probabilities: expected 80 values, one for each label, got 2"),
+        ({"class_probabilities": {"chair": 0.5}}, "class_probabilities: expected a sum of 1, got 0.5"),
+        ({"class_probabilities": {"chair": 1.5, "couch": -0.5}}, "Frame.index: expected an integer of at least 0"),
         ({"class_probabilities": {"sofa": 1.0}}, "'sofa'"),
     ],
 )
@@ -281,7 +287,7 @@ def test_invalid_result_entry_raises_one_line(tmp_path: Path, changes: dict[str,
     ("content", "said"),
     [
         ("[{]", "is not valid JSON"),
-        ('{"annotations": []}', "must hold a list"),
+        ('{"annotations": []}', "expected a list of results in COCO's format, got an object"),
         ("[]", "no detection"),
         ("[3]", "entry 0"),
     ],
@@ -296,16 +302,21 @@ def test_invalid_or_missing_result_file_raises(tmp_path: Path, content: str, sai
 
 def test_result_file_with_two_sequences_raises(tmp_path: Path) -> None:
     path = write(tmp_path, entry(image_id="kitchen/000002.png"), entry(image_id="hall/000002.png"))
-    with pytest.raises(DataError, match=r"entry 1: hall/000002\.png and another image in kitchen/ are both frame 2"):
+    with pytest.raises(
+        DataError,
+        match=r"entry 1: hall/000002\.png: expected one image for each frame, got another one of frame .* in kitchen/",
+    ):
         Precomputed(path)
 
 
 def test_mask_with_wrong_frame_size_raises(tmp_path: Path) -> None:
     detector = Precomputed(write(tmp_path, entry()))
-    with pytest.raises(DataError, match=r"entry 0: frame 0: the mask is 8x6 px, but the frame 16x12 px"):
+    with pytest.raises(DataError, match=r"entry 0: frame 0: mask: expected 16x12 px \(as the frame\), got 8x6 px"):
         detector.detect(frame(camera=CAMERA.scaled(2)))
     detector = Precomputed(write(tmp_path, entry(segmentation=[[0, 0, 12, 0, 12, 6]])))
-    with pytest.raises(DataError, match=r"entry 0: frame 0: a polygon reaches 4 px out of the image of 8x6 px"):
+    with pytest.raises(
+        DataError, match="entry 0: frame 0: polygon: expected points in the image of 8x6 px, got 4 px outside of it"
+    ):
         detector.detect(frame())
 
 
@@ -314,7 +325,10 @@ def test_result_file_of_other_sequence_raises(tmp_path: Path) -> None:
     strange = Precomputed(path)
     for index in (0, 1, 3, 4):
         assert len(strange.detect(frame(index))) == 0
-    with pytest.raises(DataError, match=r"frames 2 to 5, and for none of those asked for so far, up to 6"):
+    with pytest.raises(
+        DataError,
+        match=r"got .* frames 2 to 5 and none for the frames requested so far, up to 6",
+    ):
         strange.detect(frame(6))
     fitting = Precomputed(path)
     assert [len(fitting.detect(frame(k))) for k in (2, 6, 900)] == [1, 0, 0]
@@ -325,7 +339,7 @@ def test_possible_sequence_mismatch_warns_once(tmp_path: Path, caplog: pytest.Lo
     for index in range(100):
         detector.detect(frame(index))
     assert [record.levelname for record in caplog.records] == ["WARNING"]
-    assert "for none of the first 30 frames" in caplog.text
+    assert "for expected usable frames, got none of first 30" in caplog.text
 
 
 def test_coco_91_ids_with_other_label_space_raise(tmp_path: Path) -> None:
@@ -340,8 +354,8 @@ def test_invalid_parameter_raises(tmp_path: Path) -> None:
 
 
 def test_no_usable_class_or_duplicate_label_raises(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="none of the 1 detections is of a class"):
+    with pytest.raises(DataError, match="expected detections of COCO's classes, got none of 1"):
         Precomputed(write(tmp_path, entry(category_name="wall")), label_space="nyu40")
     (tmp_path / "labels.txt").write_text("chair\nchair\n")
-    with pytest.raises(ConfigError, match="has a name twice"):
+    with pytest.raises(ConfigError, match=r"detector\.label_space: expected unique names, got duplicates in"):
         Precomputed(write(tmp_path, entry()), label_space=str(tmp_path / "labels.txt"))

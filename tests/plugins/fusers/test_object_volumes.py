@@ -318,7 +318,9 @@ def test_pixel_outside_image_or_other_classes_raise(frames: list[Frame]) -> None
     frame = frames[0]
     clusters = clusters_of(frame, masks_of(frame))
     fuser = fuse(new_fuser(), frame, [])
-    with pytest.raises(DataError, match="must lie in the image"):
+    with pytest.raises(
+        DataError, match=r"clusters: expected pixels in the image of .*x.*, got u in \[.*, .*\], v in \[.*, .*\]"
+    ):
         fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, pixels=clusters.pixels + 200))
     with pytest.raises(DataError, match="others"):
         fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, classes=("a", "b", "c")))

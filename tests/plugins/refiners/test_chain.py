@@ -53,7 +53,9 @@ def test_link_with_pixels_outside_image_raises() -> None:
             return replace(clusters, pixels=clusters.pixels - 9)
 
     frame, clusters = line()
-    with pytest.raises(DataError, match=r"image of 8x8, found u in \[-9, -9\]"):
+    with pytest.raises(
+        DataError, match=r"clusters: expected pixels in the image of 8x8, got u in \[-9, -9\], v in \[.*, .*\]"
+    ):
         Chain({"first": MadeUp(), "second": LargestComponent()}).refine(clusters, frame)
 
 
@@ -89,7 +91,7 @@ def test_overrides_set_remove_replace_and_add_links(overrides: list[str], links:
     [
         (["refiner.links.gmm_em.std_flor=1"], "Could not override|std_flor"),
         (["refiner.links.gmm_em.std_floor=-1"], "links.gmm_em: refiner plugins.refiners.gmm_em.GmmEm"),
-        (["refiner.links=3"], "expected plugins by name, found 3|Could not|merge"),
+        (["refiner.links=3"], "expected plugins by name, got 3|Could not|merge"),
     ],
 )
 def test_error_names_link(overrides: list[str], said: str) -> None:

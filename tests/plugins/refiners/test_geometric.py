@@ -160,7 +160,7 @@ def test_result_does_not_depend_on_thread_count():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"cell_size": 0}, "Geometric.cell_size must be in"),
+        ({"cell_size": 0}, r"Geometric\.cell_size: expected a value in"),
         ({"noise_factor": float("nan")}, "noise_factor .* found nan"),
         ({"max_angle": 90.0}, "Geometric.max_angle"),
         ({"min_overlap": 1.0}, "Geometric.min_overlap"),

@@ -132,8 +132,8 @@ def test_result_does_not_depend_on_thread_count():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"levels": 0}, "GmmTree.levels must be in"),
-        ({"children": 1}, "GmmTree.children must be in"),
+        ({"levels": 0}, r"GmmTree\.levels: expected a value in"),
+        ({"children": 1}, r"GmmTree\.children: expected a value in"),
         ({"min_support": 1.0}, "GmmTree.min_support"),
     ],
 )

@@ -200,8 +200,8 @@ def test_unassigned_points_stay():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"plane_distance": -0.1}, "PlaneRemoval.plane_distance must be in"),
-        ({"max_cluster_fraction": 1.5}, r"PlaneRemoval.max_cluster_fraction must be in \[0, 1\], found 1.5"),
+        ({"plane_distance": -0.1}, r"PlaneRemoval\.plane_distance: expected a value in"),
+        ({"max_cluster_fraction": 1.5}, r"PlaneRemoval\.max_cluster_fraction: expected a value in \[0, 1\], got 1\.5"),
         ({"inverse_depth_noise": float("nan")}, "PlaneRemoval.inverse_depth_noise"),
         ({"max_tilt": 200.0}, "PlaneRemoval.max_tilt"),
     ],

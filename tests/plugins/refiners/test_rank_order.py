@@ -102,7 +102,7 @@ def test_result_does_not_depend_on_thread_count():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"neighbors": 1}, r"RankOrder.neighbors must be in \[2, 254\], found 1"),
+        ({"neighbors": 1}, r"RankOrder\.neighbors: expected a value in \[2, 254\], got 1"),
         ({"neighbors": 255}, "RankOrder.neighbors"),
         ({"threshold": float("nan")}, "RankOrder.threshold"),
         ({"max_points": 9}, "RankOrder.max_points"),

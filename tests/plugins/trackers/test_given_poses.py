@@ -40,11 +40,11 @@ def poses_of_a_file(folder: Path) -> PoseTracker:
 TRACKERS = pytest.mark.parametrize(
     ("tracker", "first"),
     [
-        (true_poses, "frame 0 has no true pose at 0.000 s"),
+        (true_poses, "frame 0: expected a true pose at 0.000 s, got none"),
         (
             poses_of_a_file,
-            "frame 0: poses.txt has no pose at 0.000 s, the nearest is 0.033 s away, farther than "
-            "tracker.max_time_difference",
+            "frame 0: poses.txt: expected a pose within tracker.max_time_difference of 0.000 s, "
+            "got the nearest 0.033 s away",
         ),
     ],
 )
@@ -63,7 +63,7 @@ def test_frames_without_pose_are_skipped_with_one_warning(
         np.testing.assert_allclose(frame.pose.T_world_camera, pose_at(frame.index), atol=1e-9)
     assert len(fuser.scene.vertices) == len(POSED)
     assert [record.message for record in caplog.records] == [
-        f"3 of 9 frames skipped, as no pose is given for them; the first: {first}"
+        f"3 of 9 frames skipped because they have no pose; the first: {first}"
     ]
 
 
@@ -106,8 +106,8 @@ def test_run_without_poses_raises_one_line(
     with pytest.raises(DataError) as caught:
         pipeline(tracker(tmp_path)).run(room)
     assert str(caught.value) == (
-        f"corner_room: no pose is given for any of the 1 frames; the first: {first}; add the sequence's poses, "
-        "or choose a tracker that needs none, tracker=voxel_hashing_icp"
+        f"corner_room: expected poses, got none for the 1 frames; the first: {first}; "
+        "add the poses of the sequence, or set tracker=voxel_hashing_icp, which needs none"
     )
     assert not caplog.records
 
@@ -120,5 +120,5 @@ def test_sequence_without_poses_raises_before_reading() -> None:
         def __getitem__(self, k: int) -> Frame:
             raise AssertionError("it was read")
 
-    with pytest.raises(DataError, match="corner_room: none of the 6 frames has a true pose; add the sequence's poses"):
+    with pytest.raises(DataError, match="corner_room: expected true poses, got none for the 6 frames; add the poses"):
         pipeline(GroundTruth()).run(Unposed())

@@ -39,8 +39,11 @@ def test_frame_without_pose_raises_with_reason(path: Path) -> None:
     tracker = TrajectoryFile(path)
     with pytest.raises(NoPoseError) as caught:
         tracker.track(CornerRoom()[3], SCENE)
-    why = "frame 3: other_slam.txt has no pose at 0.100 s, the nearest is 0.029 s away"
-    assert str(caught.value) == f"{why}, farther than tracker.max_time_difference"
+    why = (
+        "frame 3: other_slam.txt: expected a pose within tracker.max_time_difference of 0.100 s, "
+        "got the nearest 0.029 s away"
+    )
+    assert str(caught.value) == why
 
 
 def test_first_pose_without_ground_truth_is_identity(path: Path) -> None:
@@ -87,7 +90,7 @@ def test_time_offset_aligns_clocks(tmp_path: Path) -> None:
         ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "line 2: timestamps must grow, found 0 after 1"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 2: timestamps must grow, found 1 after 1"),
         ("1 0 0 0\n", "line 1: expected 8 numbers"),
-        ("# nothing\n", "holds no pose"),
+        ("# nothing\n", "expected poses in TUM format, got none"),
     ],
 )
 def test_invalid_trajectory_raises_one_line(tmp_path: Path, text: str, message: str) -> None:

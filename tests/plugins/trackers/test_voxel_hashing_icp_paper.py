@@ -157,7 +157,7 @@ def test_frame_after_implausible_step_is_lost() -> None:
     frames = walked(8)
     assert not run(paper_tracker(), [frames[0], frames[4]])[1].lost
     poses = run(paper_tracker("tracker.max_translation=0.002"), [frames[0], frames[4]])
-    assert "not plausible" in poses[1].reason
+    assert "implausible step of" in poses[1].reason
 
 
 def test_frame_of_single_wall_is_lost() -> None:
@@ -181,9 +181,9 @@ def test_linear_weights_alone_change_poses_little() -> None:
     ("overrides", "message"),
     [
         (["tracker.residual_weights=HUBER"], "residual_weights"),
-        (["tracker.max_intensity_difference=0"], r"max_intensity_difference must be in \[0\.001, 1\]"),
-        (["tracker.color_levels=0"], r"color_levels must be in \[1, 3\]"),
-        (["tracker.depth_weight=0"], "color_levels must be 3 without depth, found 2"),
+        (["tracker.max_intensity_difference=0"], r"max_intensity_difference: expected a value in \[0\.001, 1\]"),
+        (["tracker.color_levels=0"], r"color_levels: expected a value in \[1, 3\]"),
+        (["tracker.depth_weight=0"], "color_levels: expected 3 without depth, got 2"),
     ],
 )
 def test_invalid_parameter_raises(overrides: list[str], message: str) -> None:

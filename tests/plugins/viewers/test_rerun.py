@@ -247,16 +247,16 @@ def test_missing_rerun_package_names_extra(monkeypatch: pytest.MonkeyPatch) -> N
     find_spec = importlib.util.find_spec
     there = {"rerun": None}
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: there.get(name, find_spec(name, *rest)))
-    with pytest.raises(ConfigError, match=r"rerun, .* is missing: pip install instancemap\[viewer\]$"):
+    with pytest.raises(ConfigError, match=r"viewer: expected the package rerun, got none$"):
         build_viewer("rerun")
 
 
 @pytest.mark.parametrize(
     ("parameter", "said"),
     [
-        ("frame_interval=0", r"frame_interval must be in \[1, 1e\+06\], found 0"),
-        ("mesh_interval=nan", "mesh_interval must be in"),
-        ("memory_limit=lots", "memory_limit must be like 2GB or 25%, found lots"),
+        ("frame_interval=0", r"frame_interval: expected a value in \[1, 1e\+06\], got 0"),
+        ("mesh_interval=nan", "mesh_interval: expected a value in"),
+        ("memory_limit=lots", "memory_limit: expected a size such as 2GB or 25%, got lots"),
         ("mode=WINDOWS", "mode"),
         ("port=80", "port must be in"),
     ],
@@ -272,7 +272,9 @@ def begun(viewer: RerunViewer, directory: Path) -> None:
 
 def test_unwritable_recording_raises(tmp_path: Path) -> None:
     (tmp_path / "recording.rrd").mkdir()
-    with pytest.raises(ConfigError, match=r"viewer: .*recording.rrd cannot be written: .*Is a directory"):
+    with pytest.raises(
+        ConfigError, match=r"viewer\.file: expected a writable file, got .*viewer: .*recording\.rrd: .*Is a directory"
+    ):
         begun(RerunViewer(), tmp_path)
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be written"):
@@ -283,7 +285,7 @@ def test_window_mode_without_display_raises(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(ConfigError, match=r"needs a screen, and there is none: viewer\.mode=BROWSER or RECORD"):
+    with pytest.raises(ConfigError, match=r"viewer\.mode: expected a screen for WINDOW, got none"):
         begun(RerunViewer(mode=Mode.WINDOW), tmp_path)
 
 
@@ -292,7 +294,7 @@ def test_occupied_port_raises(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(ConfigError, match=rf"viewer: port {port} cannot be had: set viewer\.port"):
+        with pytest.raises(ConfigError, match=rf"viewer: viewer\.port: expected a free port, got {port}"):
             begun(RerunViewer(mode=Mode.BROWSER, port=port), tmp_path)
 
 

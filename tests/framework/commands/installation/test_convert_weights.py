@@ -46,8 +46,8 @@ def test_convert_weights_torchvision_keeps_classes_and_eps(tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("source", "target", "fault"),
     [
-        ("absent.pkl", "out.safetensors", "there is no network"),
-        ("broken.pkl", "out.safetensors", "broken.pkl is no pickle of numpy arrays"),
+        ("absent.pkl", "out.safetensors", "expected a network file, got none"),
+        ("broken.pkl", "out.safetensors", "broken.pkl: expected a pickle of numpy arrays"),
         ("broken.pkl", "out.pth", "out.pth: expected a file name that ends in .safetensors"),
     ],
 )

@@ -54,7 +54,7 @@ def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("gmm_em", "there is a refiner=gmm_em already"),
+        ("gmm_em", "NAME: expected a new name, got the existing option refiner=gmm_em"),
         ("../up", "found '../up'"),
         ("/tmp/x", "found '/tmp/x'"),
         ("My", "found 'My'"),
@@ -62,13 +62,13 @@ def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> No
         ("a__b", "found 'a__b'"),
         ("2d", "found '2d'"),
         ("x" * (LONGEST_NAME + 1), f"at most {LONGEST_NAME} characters"),
-        ("class", "means something else"),
-        ("conf", "means something else"),
-        ("null", "NAME null is a value"),
-        ("nan", "NAME nan is a value"),
-        ("on", "NAME on is a value"),
-        ("config_error", "its class ConfigError would have the name of another"),
-        ("cluster_refiner", "its class ClusterRefiner would have the name of another"),
+        ("class", "NAME: expected a name without a meaning in Python packages"),
+        ("conf", "NAME: expected a name without a meaning in Python packages"),
+        ("null", "NAME: expected a name, got the value null of the command line and YAML"),
+        ("nan", "NAME: expected a name, got the value nan of the command line and YAML"),
+        ("on", "NAME: expected a name, got the value on of the command line and YAML"),
+        ("config_error", "NAME: expected a unique class name, got ConfigError for"),
+        ("cluster_refiner", "NAME: expected a unique class name, got ClusterRefiner for"),
     ],
 )
 def test_new_plugin_invalid_name_raises(name: str, said: str) -> None:
@@ -84,7 +84,7 @@ def test_new_plugin_failure_keeps_existing_files(tmp_path: Path, monkeypatch: py
     with pytest.raises(ConfigError, match="is there already"):
         write_repository("refiner", "mine", tmp_path)
     assert (made / "README.md").read_text() == "my own"
-    with pytest.raises(ConfigError, match="--in: there is no folder"):
+    with pytest.raises(ConfigError, match="--in: expected a folder"):
         write_repository("refiner", "other", tmp_path / "nowhere")
     (tmp_path / "instancemap-linked").symlink_to(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match="is there already"):

@@ -49,7 +49,7 @@ PACKAGE = {
 
             def __post_init__(self) -> None:
                 if not 0 <= self.score <= 1:
-                    raise ConfigError(f"score must be in [0, 1], found {self.score}")
+                    raise ConfigError(f"score: expected a value in [0, 1], got {self.score}")
                 self.classes = ("chair",)
 
             def detect(self, frame: Frame) -> Detections:
@@ -132,9 +132,9 @@ def test_plugins_lists_options_of_installed_package(environment: dict[str, str],
         "      score: float = 1.0  # in [0, 1], of the one object",
         "",
     ]
-    assert "cannot be used: detector acme.missing.Detector: there is no module acme.missing" in done.stdout
+    assert "unusable: detector acme.missing.Detector: unknown module acme.missing" in done.stdout
     at = lines.index("  acme_orphan  [from acme-detectors]")
-    assert lines[at + 1].startswith("      cannot be used: ")
+    assert lines[at + 1].startswith("unusable:")
     assert "acme_nobody" in lines[at + 1]
 
 
@@ -146,20 +146,20 @@ def test_installed_package_option_runs(environment: dict[str, str], tmp_path: Pa
     assert '"instances.count": 1' in (tmp_path / "run" / "metrics.json").read_text()
     unregistered = run(environment, tmp_path, "framework", *places, *fakes, "detector._target_=acme.another.Anothr")
     assert (
-        "no registered option of detector has this _target_; did you mean 'acme.another.Another'?"
+        "detector: expected the _target_ of a registered option of detector, got acme.another.Anothr; did you mean"
         in unregistered.stderr
     )
     typo = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_everthing")
     assert "did you mean acme_everything?" in typo.stderr
     wrong = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_by_part", "detector.score=2")
-    assert "score must be in [0, 1], found 2.0" in wrong.stderr
+    assert "score: expected a value in [0, 1], got 2.0" in wrong.stderr
     assert len(wrong.stderr.splitlines()) == 1
 
 
 def test_plugins_unknown_option_error_is_one_line(environment: dict[str, str], tmp_path: Path) -> None:
     done = run(environment, tmp_path, "framework", "plugins", "detector", "acme_nothing")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("error: there is no detector=acme_nothing; the options are: acme_")
+    assert done.stderr.startswith("error: detector: expected one of acme_")
     assert len(done.stderr.splitlines()) == 1
 
 
@@ -176,11 +176,11 @@ def test_describe_option_formats_parameters_like_yaml() -> None:
 
 FAULTY_OPTIONS = {
     "no_yaml": ("a: [1,\n", "no_yaml.yaml cannot be read: "),
-    "list": ("- 1\n", "list.yaml: expected keys and values, found a list"),
+    "list": ("- 1\n", "list.yaml: expected keys and values, got a list"),
     "no_text": ("\udcff", "no_text.yaml could not be read as text: "),
     "no_class": ("_target_: plugins.detectors.none.NoDetection\n", "has no NoDetection; did you mean 'NoDetections'?"),
     "a_refiner": ("_target_: plugins.refiners.identity.Identity\n", "expected a class that implements Detector"),
-    "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "there is no parameter 'score'"),
+    "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "unknown parameter"),
     "no_number": (
         "_target_: plugins.detectors.simulated.SimulatedDetector\nmin_pixels: many\nseed: ${seed}\n",
         "min_pixels: Value 'many' of type 'str' could not be converted to Integer",
@@ -198,7 +198,7 @@ def test_plugins_faulty_options_are_listed_with_reason(tmp_path: Path, monkeypat
     monkeypatch.setattr(composition, "_added", [tmp_path])
     found = {option.name: option for option in registered("detector")}
     for name, (_, said) in FAULTY_OPTIONS.items():
-        assert found[name].documentation.startswith("cannot be used: ")
+        assert found[name].documentation.startswith("unusable:")
         assert said in found[name].documentation
         assert "\n" not in found[name].documentation
     assert found["own"].provider == "command-line"

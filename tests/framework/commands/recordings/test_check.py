@@ -33,7 +33,10 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
     assert done.returncode == 1
     assert "WRONG  poses: they are T_camera_world" in done.stdout
     assert "; set dataset.pose_kind=T_CAMERA_WORLD" in done.stdout
-    assert "ERROR   the recording will not map; try dataset.pose_kind=T_CAMERA_WORLD" in done.stderr
+    assert (
+        "ERROR   dataset: expected a recording that can be mapped, got errors; try dataset.pose_kind=T_CAMERA_WORLD"
+        in done.stderr
+    )
     assert "Traceback" not in done.stderr
     picture = cv2.imread(str(tmp_path / "outputs" / "check.png"))
     assert picture is not None
@@ -46,9 +49,9 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("out=2024",), "out must be a path"),
-        (("out=check.jpg",), "out must end in .png"),
-        (("out=nowhere/check.png",), "there is no folder"),
+        (("out=2024",), "out: expected a path"),
+        (("out=check.jpg",), "out: expected a name that ends in"),
+        (("out=nowhere/check.png",), "out: expected a file in an existing folder, got"),
         (("dataset=rgbd_folder", "dataset.root=nowhere"), "dataset.root: the folder nowhere"),
         (("dataset=rgbd_folder", "dataset.root=.", "dataset.camera_axes=UNITY"), "camera_axes"),
     ],

@@ -97,7 +97,7 @@ def test_convert_oni_existing_output_is_not_overwritten(tmp_path, monkeypatch, s
     (tmp_path / "011" / file).parent.mkdir(parents=True)
     (tmp_path / "011" / file).write_bytes(b"mine")
     deliver(monkeypatch, 4)
-    with pytest.raises(DataError, match="exists; remove it, or choose another folder"):
+    with pytest.raises(DataError, match="expected an empty or missing folder; remove it, or choose another folder"):
         convert_oni.convert(source, tmp_path / "011")
     assert names(tmp_path / "011") == [file]
 
@@ -127,13 +127,13 @@ def test_convert_oni_truncated_recording_names_last_image(tmp_path, monkeypatch,
         command(monkeypatch, source, tmp_path / "011")
     assert names(tmp_path / "011") == written(3)
     fault = capsys.readouterr().err.splitlines()[-1]
-    assert fault.startswith(f"error: {source} is truncated or damaged at byte ")
+    assert fault.startswith(f"error: {source}: expected a complete file, got one truncated or damaged at byte")
     assert "up to image00003.png; download it again" in fault
 
 
 def test_convert_oni_recording_without_frames_raises(tmp_path, monkeypatch, source):
     deliver(monkeypatch, 0)
-    with pytest.raises(DataError, match="no color and depth images of the same time"):
+    with pytest.raises(DataError, match="expected color and depth images of equal times, got none"):
         convert_oni.convert(source, tmp_path / "011")
     assert names(tmp_path / "011") == []
 

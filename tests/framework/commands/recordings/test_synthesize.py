@@ -22,9 +22,9 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--scenes", "bedroom,011"], "there is no scene '011'; the scenes are: living_chairs, bedroom"),
-        (["--scenes", ""], "there is no scene ''"),
-        (["--jobs", "0"], "jobs must be at least 1"),
+        (["--scenes", "bedroom,011"], "scenes: expected some of living_chairs, bedroom, got '011'"),
+        (["--scenes", ""], "scenes: expected some of"),
+        (["--jobs", "0"], "--jobs: expected at least 1"),
         (["--frames", "0"], "frames must be at least 1"),
         (["--seed", "-1"], "seed must be at least 0"),
         (["--width", "30"], "width must be a multiple of 4"),

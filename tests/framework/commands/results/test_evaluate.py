@@ -123,7 +123,7 @@ def test_evaluate_other_truth_requires_option(stored: Path, command) -> None:
     status, out, err = command(stored)
     assert (status, out) == (1, "")
     assert (
-        "the true instances of tests.support.scenes.corner_room.CornerRoom are not those that the run was compared with"
+        "expected the ground truth used in the run, got other instances of tests.support.scenes.corner_room.CornerRoom"
         in err
     )
     assert metrics_of(stored)["truth_sha256"] == "0" * 64
@@ -186,16 +186,19 @@ def _truncated_mesh(directory: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (_another_config, "is not of the config beside it"),
+        (_another_config, "expected the config_hash of the config next to it, got another one"),
         (_interrupted, "partial: interrupted by Ctrl-C"),
-        (_one_instance_less, "lists 1 instances, but metrics.json counts 2"),
-        (_another_id, "gives instance 77"),
-        (_another_size, "vertices, but"),
+        (_one_instance_less, "instances (as in metrics.json), got 1"),
+        (_another_id, "vertices of instance"),
+        (_another_size, "vertices of instance"),
         (_truncated_mesh, "mesh.ply, byte"),
         (lambda directory: (directory / "mesh.ply").unlink(), "mesh.ply"),
         (lambda directory: (directory / "instances.json").unlink(), "instances.json could not be read"),
-        (lambda directory: _with_dataset(directory, truth=False), "true instances that the dataset has no longer"),
-        (lambda directory: _with_dataset(directory, colour=1), "there is no parameter 'colour'"),
+        (
+            lambda directory: _with_dataset(directory, truth=False),
+            "expected the ground truth of its metrics, got a dataset without instances",
+        ),
+        (lambda directory: _with_dataset(directory, colour=1), "unknown parameter"),
     ],
 )
 def test_evaluate_unusable_run_is_refused_and_others_continue(
@@ -217,7 +220,7 @@ def test_evaluate_unusable_run_is_refused_and_others_continue(
 def test_evaluate_folder_without_runs_is_refused(stored: Path, tmp_path: Path, command) -> None:
     status, out, err = command(tmp_path / "nothing", stored)
     assert (status, out) == (1, f"{stored}: unchanged\n")
-    assert err == f"refused: {tmp_path / 'nothing'}: there is no run at or below it\n"
+    assert err == f"refused: {tmp_path / 'nothing'}: expected a run at or below it, got none\n"
 
 
 def test_evaluate_runs_with_same_truth_load_it_once(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,7 +244,7 @@ def test_evaluate_run_restarted_meanwhile_is_unchanged(stored: Path, command, mo
     monkeypatch.setattr(CornerRoom, "scene_truth", begins_again)
     status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert "the run has begun again meanwhile" in err
+    assert "expected an unchanged file, got a new one" in err
     assert not (stored / "metrics.json").exists()
 
 
@@ -266,7 +269,7 @@ def test_evaluate_process_reports_results_and_status(mapped: Path, tmp_path: Pat
         timeout=120,
     )
     assert done.stdout == "run: unchanged\n", done.stderr
-    assert done.stderr == "refused: absent: there is no run at or below it\n"
+    assert done.stderr == "refused: absent: expected a run at or below it, got none\n"
     assert done.returncode == 1
 
 
@@ -302,7 +305,7 @@ def test_evaluate_does_not_execute_code_in_record(started: list[str], stored: Pa
     )
     assert (done.returncode, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
-    assert "dataset brought.Brought: no registered option of dataset has this _target_" in done.stderr
+    assert "dataset: expected the _target_ of a registered option of" in done.stderr
 
 
 def test_evaluate_stored_config_cannot_read_environment(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -310,5 +313,5 @@ def test_evaluate_stored_config_cannot_read_environment(stored: Path, command, m
     _with_dataset(stored, scene="${oc.env:SECRET}")
     status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert "stored resolved, and this one is not: dataset.scene=${oc.env:SECRET}" in err
+    assert "config of the run: expected resolved values, got dataset.scene=${oc.env:SECRET}" in err
     assert "hunter2" not in err

@@ -35,7 +35,7 @@ def test_detect_output_is_read_by_precomputed(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "found.labels.txt"]
     assert "frame skipped: frame 1" in done.stderr
     assert "10 detections in 5 frames of corner_room" in done.stderr
-    assert "mask AP50 1.00, AP 1.00: the mean of 2 classes, 10 true objects" in done.stderr
+    assert "mask AP50 1.00, AP 1.00: mean of 2 classes, 10 true objects of at least" in done.stderr
     said = dict(re.findall(r"INFO +(.*?)  +(\S+)$", done.stderr, re.MULTILINE))
     assert (said["found"], said["mask IoU"], said["class right"], said["false detections an image"]) == (
         *("1.00", "1.00", "1.00", "0.00"),
@@ -69,9 +69,9 @@ def test_detect_output_is_read_by_pycocotools(tmp_path: Path) -> None:
     ("overrides", "said"),
     [
         ([], "out: expected a file name, got none; set out=detections.json"),
-        (["out=absent/found.json"], "there is no folder"),
-        (["out=2024"], "out must be a path; quote what looks like a number, found 2024"),
-        (["out=[a,b]"], "out must be a path; quote what looks like a number, found ['a', 'b']"),
+        (["out=absent/found.json"], "out: expected a file in an existing folder, got"),
+        (["out=2024"], "out: expected a path (in quotes if it looks like a number), got 2024"),
+        (["out=[a,b]"], "out: expected a path (in quotes if it looks like a number), got ['a', 'b']"),
     ],
 )
 def test_detect_errors_are_one_line(tmp_path: Path, overrides: list[str], said: str) -> None:
@@ -112,6 +112,6 @@ class PartlyTrueRoom(CornerRoom):
 
 def test_frame_without_rendered_truth_is_detected(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_detections(tmp_path / "found.json", NoDetections(), PartlyTrueRoom())
-    assert "frame not compared with the ground truth: frame 2 has no pose" in caplog.text
+    assert "frame skipped in the evaluation: frame 2 has no pose" in caplog.text
     with pytest.raises(DataError, match="expected usable frames, got none of 1"):
         write_detections(tmp_path / "found.json", SphereDetector(), PartlyTrueRoom(start=2, stop=3))

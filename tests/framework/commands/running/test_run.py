@@ -75,7 +75,7 @@ def test_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, ba
     status, stderr = end(process)
     assert status == 128 + number
     assert "Traceback" not in stderr
-    assert f"ended by {number.name}: ending after this frame; a second time ends at once" in stderr
+    assert f"ended by {number.name}: stopping after this frame; a second signal stops immediately" in stderr
     assert stderr.splitlines()[-1] == f"ended by {number.name}"
     assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
     assert figures(place)["partial"] == f"ended by {number.name}"
@@ -155,7 +155,7 @@ def test_signal_during_saving_completes_record(tmp_path: Path, number: signal.Si
     process.send_signal(number)
     status, stderr = end(process)
     assert status == 0, stderr
-    assert "ending once the record is written; a second time ends at once" in stderr
+    assert "stopping after the outputs are written; a second signal stops immediately" in stderr
     assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.json"}
     assert not (place / "metrics.partial.json").exists()
 
@@ -174,7 +174,7 @@ def test_second_signal_during_saving_leaves_complete_files(tmp_path: Path) -> No
     assert left >= {*SMALL, "mesh.ply", "metrics.partial.json"}
     assert left.isdisjoint({"map.npz", "metrics.json"})
     assert not list(place.glob(".*partial*"))
-    assert figures(place)["partial"] == "its record was not finished"
+    assert figures(place)["partial"] == "the outputs were not completed"
 
 
 LIVE = ("dataset=live", "dataset.frames_sent=100000", "fuser.capacity=100000", "fuser.note=note")

@@ -35,7 +35,7 @@ def test_show_refinement_draws_one_frame(tmp_path: Path) -> None:
 def test_show_refinement_without_detections_draws_frame(tmp_path: Path) -> None:
     done = start(tmp_path, "refiner=gmm_em", "detector=none", "out=refinement.png")
     assert done.returncode == 0, done.stderr
-    assert "nothing was detected" in done.stderr
+    assert "no detections, nothing to refine" in done.stderr
     assert (tmp_path / "refinement.png").exists()
 
 
@@ -43,9 +43,9 @@ def test_show_refinement_without_detections_draws_frame(tmp_path: Path) -> None:
     ("overrides", "said"),
     [
         ([], "out: expected a file name, got none; set out=refinement.png"),
-        (["out=absent/refinement.png"], "there is no folder"),
-        (["out=refinement.jpg"], "out must end in .png, found refinement.jpg"),
-        (["out=r.png", "frame=6"], "frame must be in [0, 5], a position among the frames of corner_room"),
+        (["out=absent/refinement.png"], "out: expected a file in an existing folder, got"),
+        (["out=refinement.jpg"], "out: expected a name that ends in .png, got refinement.jpg"),
+        (["out=r.png", "frame=6"], "frame: expected a position in [0, 5] among the selected frames of"),
         (["out=r.png", "frame=1", "dataset.unreadable=1"], "frame 1: depth/000001.png is truncated"),
     ],
 )
@@ -83,13 +83,13 @@ def test_show_refinement_skips_unusable_frames() -> None:
     assert position == 1
     with pytest.raises(FrameError, match="truncated"):
         detected(CornerRoom(unreadable=0), SphereDetector(), 0)
-    with pytest.raises(DataError, match="none of the 1 frames that were tried can be used"):
+    with pytest.raises(DataError, match="expected a usable frame, got none of 1"):
         detected(CornerRoom(frames=1, unreadable=0), SphereDetector(), None)
 
 
 @pytest.mark.parametrize("position", [-1, 6, "first", 1.0, True])
 def test_show_refinement_invalid_position_raises(position: object) -> None:
-    with pytest.raises(ConfigError, match=r"frame must be in \[0, 5\]"):
+    with pytest.raises(ConfigError, match=r"frame: expected a position in \[0, 5\] among the selected frames"):
         detected(CornerRoom(), SphereDetector(), position)
 
 

@@ -114,7 +114,7 @@ def test_sweep_with_other_launcher_keeps_completed_runs(
     before = recorded(directory)
     again = end(begin(directory, "row=half", "seed=1,2,3", SLOW, "threads=2"))
     assert again.returncode == 0, again.stderr
-    assert again.stderr.count("kept: the complete record in") == 3
+    assert again.stderr.count("skipped: the completed run in") == 3
     assert recorded(directory) == before
 
 
@@ -144,7 +144,7 @@ def test_killed_sweep_resumes_to_same_table(
     end(second)
 
     third = end(begin(tmp_path, *BY_JOBLIB, *SIX))
-    assert third.stderr.count("kept: the complete record in") >= len(kept)
+    assert third.stderr.count("skipped: the completed run in") >= len(kept)
     after = recorded(tmp_path)
     assert set(after) == RUNS
     assert {name: after[name] for name in kept} == kept
@@ -185,7 +185,7 @@ def test_plain_sweep_is_resumed(tmp_path: Path) -> None:
         "viewer=none",
     )
     done, second = swept(tmp_path, "seed=1,2,3", "skip_completed=true", "debug=false", *harmless)
-    assert done.stderr.count("kept: the complete record in") == 2
+    assert done.stderr.count("skipped: the completed run in") == 2
     assert set(second) == {*first, "seed=3,tracker=fake"}
     assert {name: second[name] for name in first} == first
 
@@ -198,7 +198,7 @@ def test_sweep_over_neutral_settings_has_separate_folders(tmp_path: Path) -> Non
     assert set(first) == {"threads=1,tracker=fake", "threads=2,tracker=fake"}
     done, second = swept(tmp_path, "threads=1,2", "skip_completed=true", *BY_JOBLIB)
     assert second == first
-    assert done.stderr.count("kept: the complete record in") == 2
+    assert done.stderr.count("skipped: the completed run in") == 2
 
 
 @pytest.mark.parametrize("signal_sent", [signal.SIGINT, signal.SIGTERM])
@@ -243,8 +243,8 @@ def test_sweep_signal_leaves_partial_record_of_active_runs(
         process.send_signal(signal_sent)
     done = end(process)
     assert done.returncode == 128 + signal_sent
-    ending = "once the runs in work have left their records" if n_jobs > 1 else "after this frame"
-    assert done.stderr.count(f"ending {ending}; a second time ends at once") == 1
+    ending = "stopping after the active runs have written their outputs" if n_jobs > 1 else "after this frame"
+    assert done.stderr.count(f"stopping {ending}; a second signal stops immediately") == 1
     assert done.stderr.splitlines()[-1] in ("interrupted by Ctrl-C", "ended by SIGTERM")
     assert "Traceback" not in done.stderr
     partial = list((tmp_path / PLACE).glob("*/metrics.partial.json"))
@@ -296,7 +296,7 @@ def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
     first.communicate()
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("waiting for process") == 2
-    assert done.stderr.count("kept: the complete record in") == 2
+    assert done.stderr.count("skipped: the completed run in") == 2
     assert "mapping" not in done.stderr
 
 

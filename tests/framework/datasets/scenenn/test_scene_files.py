@@ -76,7 +76,7 @@ def test_lost_frame_is_unusable(path):
     path.write_text(LOST + PUBLISHED)
     log = read_trajectory_log(path)
     assert list(log.poses) == [0, 6]
-    assert log.unusable == {1259: "the pose is not rigid: |R R^T - I| is 1, det R 0"}
+    assert log.unusable == {1259: "pose: expected a rigid transform, got |R R^T - I| = 1, det R = 0"}
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_empty_trajectory_has_no_poses(path):
 @pytest.mark.parametrize(
     ("line", "new", "message"),
     [
-        (1, "0 0", "line 1: expected the header of a frame, frame frame frame.1, found '0 0'"),
+        (1, "0 0", "line 1: expected the header of a frame, frame frame frame.1, got '0 0'"),
         (1, "0 0 1 2", "line 1: expected the header"),
         (1, "-1 -1 0", "line 1: expected the header"),
         (6, "6.5 6 7", "line 6: expected the header"),

@@ -124,7 +124,7 @@ def test_hub_model_sharded_weights_download_missing_shard(hub):
     assert find_model("somebody/something", "main") == folder
     assert hub.sent == ["model-00002-of-00002.safetensors"]
     (folder / "model.safetensors.index.json").write_text("[]")
-    assert f"is damaged: delete {folder.parents[1]}, and run again" in fault()
+    assert "detector.model: expected an index of weight files, got a damaged" in fault()
 
 
 def test_hub_tokenizer_in_one_or_two_files_is_found(hub):
@@ -144,7 +144,7 @@ def test_hub_tokenizer_in_one_or_two_files_is_found(hub):
 
 def test_hub_model_with_wrong_hash_is_discarded(hub):
     hub.served["model.safetensors"] = bytes(len(WEIGHTS))
-    assert "model.safetensors is not what was published" in fault()
+    assert "model.safetensors: expected" in fault()
     hub.served.clear()
     assert (find_model("somebody/something", "main") / "model.safetensors").read_bytes() == WEIGHTS
 
@@ -152,7 +152,7 @@ def test_hub_model_with_wrong_hash_is_discarded(hub):
 @pytest.mark.parametrize("value", ["1", "true"])
 def test_hub_model_offline_makes_no_requests(hub, monkeypatch, value):
     monkeypatch.setenv("HF_HUB_OFFLINE", value)
-    assert "HF_HUB_OFFLINE forbids to download it: unset that, or give a local folder" in fault()
+    assert "unset HF_HUB_OFFLINE or give a folder" in fault()
     assert not hub.sent
     monkeypatch.setenv("HF_HUB_OFFLINE", "0")
     folder = find_model("somebody/something", "main")
@@ -162,11 +162,11 @@ def test_hub_model_offline_makes_no_requests(hub, monkeypatch, value):
 
 def test_hub_model_errors_are_one_line(hub):
     assert "check the name and the network" in fault("somebody/else")
-    assert "is neither a folder nor a model id" in fault("no//such")
+    assert "detector.model: expected a folder or a model id, got" in fault("no//such")
     del hub.files["preprocessor_config.json"]
-    assert "has no preprocessor_config.json" in fault()
+    assert "expected preprocessor_config.json in" in fault()
     del hub.files["model.safetensors"]
-    assert "has no preprocessor_config.json and no model.safetensors" in fault()
+    assert "expected preprocessor_config.json and model.safetensors in" in fault()
 
 
 def test_hub_model_local_folder_is_returned_unchanged(tmp_path):

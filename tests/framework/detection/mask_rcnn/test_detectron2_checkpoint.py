@@ -219,24 +219,26 @@ def test_detectron2_stored_anchors_are_read():
     sides = from_detectron2(state, "here").architecture.anchor_sides
     assert sides == pytest.approx((32, 48, 128, 256, 512), abs=0.1)
     state[f"{cells}.1"] = torch.tensor([[-24.0, -24, 24, 24]])
-    with pytest.raises(DataError, match="the anchors of level 1 are not three"):
+    with pytest.raises(DataError, match=r"expected three anchors of the ratios 0\.5, 1 and 2 in level 1, got others"):
         from_detectron2(state, "here")
 
 
 def test_detectron2_unsupported_networks_raise():
     state = as_tensors(synthetic_state())
     with pytest.raises(
-        DataError, match=r"^here: pixel_std is \[57.375, 57.12, 58.395\]; only networks that start from MSRA"
+        DataError,
+        match=r"^here: pixel_std: expected .* as in networks that start from MSRA's, got \[57\.375, 57\.12, 58\.395\]",
     ):
         from_detectron2(state | {"pixel_std": torch.tensor([57.375, 57.12, 58.395])}, "here")
     with pytest.raises(
-        DataError, match=r"^here has the weights roi_heads\.box_head\.conv1\.norm\.weight, which are not"
+        DataError,
+        match=r"^here: expected a Mask R-CNN .*, got the weights roi_heads\.box_head\.conv1\.norm\.weight",
     ):
         from_detectron2(state | {"roi_heads.box_head.conv1.norm.weight": torch.zeros(1)}, "here")
     with pytest.raises(DataError, match=r"^here lacks weights backbone.body.layer4.2.conv3.weight"):
         from_detectron2({k: v for k, v in state.items() if k != "backbone.bottom_up.res5.2.conv3.weight"}, "here")
     nine = as_tensors(synthetic_state(classes=9))
-    with pytest.raises(DataError, match=r"^here: 9 classes are not COCO's 80"):
+    with pytest.raises(DataError, match=r"^here: expected COCO's .* classes, got 9"):
         from_detectron2(nine, "here")
     assert from_detectron2(nine, "here", COCO[:9]).architecture.classes == COCO[:9]
 
@@ -276,7 +278,7 @@ def test_pickle_with_old_numpy_module_names_is_read(tmp_path):
 def test_pickle_with_code_raises_without_execution(tmp_path):
     path, touched = tmp_path / "model.pkl", tmp_path / "touched"
     path.write_bytes(pickle.dumps({"model": {"a": np.zeros(1), "b": Runs(touched)}}))
-    with pytest.raises(DataError, match=r"model\.pkl is no pickle of numpy arrays: it wants to call") as caught:
+    with pytest.raises(DataError, match=r"model\.pkl: expected a pickle of numpy arrays, got a call of") as caught:
         read_pickle(path)
     assert "\n" not in str(caught.value)
     assert not touched.exists()
@@ -287,12 +289,15 @@ def test_pickle_with_code_raises_without_execution(tmp_path):
 @pytest.mark.parametrize(
     ("content", "fault"),
     [
-        (b"", "is no pickle of numpy arrays"),
-        (b"not a pickle", "is no pickle of numpy arrays"),
-        (pickle.dumps({"model": {"a": np.zeros(9)}})[:-20], "is no pickle of numpy arrays"),
-        (pickle.dumps(["a"]), "must hold a dictionary of numpy arrays"),
-        (pickle.dumps({"model": {"a": "text"}}), "must hold a dictionary of numpy arrays"),
-        (pickle.dumps({"model": {"a": np.array(["text"])}}), "a is no array of numbers"),
+        (b"", "expected a pickle of numpy arrays"),
+        (b"not a pickle", "expected a pickle of numpy arrays"),
+        (pickle.dumps({"model": {"a": np.zeros(9)}})[:-20], "expected a pickle of numpy arrays"),
+        (pickle.dumps(["a"]), "expected a dictionary of numpy arrays, as written by detectron2, got another object"),
+        (
+            pickle.dumps({"model": {"a": "text"}}),
+            "expected a dictionary of numpy arrays, as written by detectron2, got another object",
+        ),
+        (pickle.dumps({"model": {"a": np.array(["text"])}}), "expected arrays of numbers, got a"),
     ],
 )
 def test_pickle_damaged_raises(tmp_path, content, fault):
@@ -318,13 +323,19 @@ def test_pth_with_invalid_content_raises(tmp_path):
     for content in (None, b"<html>", b""):
         if content is not None:
             path.write_bytes(content)
-        with pytest.raises(DataError, match=r"model\.pth is damaged, or no file of weights alone") as caught:
+        with pytest.raises(
+            DataError, match=r"model\.pth: expected a file of weights only, got a damaged or another file:"
+        ) as caught:
             read_network(path)
         assert "\n" not in str(caught.value)
     assert not touched.exists()
     torch.save({"model": {"a": torch.zeros(1)}}, path)
-    with pytest.raises(DataError, match="no Mask R-CNN of torchvision or detectron2"):
+    with pytest.raises(
+        DataError, match="expected a Mask R-CNN of torchvision or detectron2 with a feature pyramid, got other weights"
+    ):
         read_network(path)
     torch.save([1], path)
-    with pytest.raises(DataError, match="must hold a state_dict"):
+    with pytest.raises(
+        DataError, match=r"expected a state_dict \(names and tensors\), alone or as `model`, got another object"
+    ):
         read_network(path)

@@ -72,7 +72,7 @@ def test_network_file_non_finite_weights_are_not_written(tmp_path):
 
 
 def test_network_file_missing_raises(tmp_path):
-    assert_one_line(tmp_path / "absent.safetensors", "there is no network")
+    assert_one_line(tmp_path / "absent.safetensors", "expected a network file, got none")
 
 
 def test_network_file_truncated_raises(tmp_path):
@@ -94,21 +94,24 @@ def test_network_file_with_flipped_bit_raises(tmp_path):
 def test_network_file_without_architecture_raises(tmp_path):
     path = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(1)}, path)
-    assert_one_line(path, "no architecture")
+    assert_one_line(path, "expected an architecture in the metadata, got none")
 
 
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
-        (lambda fields: fields | {"color_space": "BGR"}, "architecture has the unknown field color_space"),
+        (lambda fields: fields | {"color_space": "BGR"}, "architecture: expected known fields, got"),
         (lambda fields: {k: v for k, v in fields.items() if k != "classes"}, "'classes'"),
-        (lambda fields: fields | {"fpn_channels": "8"}, "architecture.fpn_channels must be int, found '8'"),
-        (lambda fields: fields | {"sampling_ratio": True}, "architecture.sampling_ratio must be int, found True"),
-        (lambda fields: fields | {"pixel_mean": [1.0, 2.0]}, "architecture.pixel_mean must have 3 values, found 2"),
-        (lambda fields: fields | {"classes": "chair"}, "architecture.classes must be a list"),
-        (lambda fields: fields | {"backbone": "resnet18"}, "architecture.backbone must have fields"),
-        (lambda fields: fields | {"backbone": fields["backbone"] | {"name": "vgg"}}, "no such architecture: 'vgg'"),
-        (lambda fields: fields | {"head_features": 17}, "fc6.bias must be 17, found 16"),
+        (lambda fields: fields | {"fpn_channels": "8"}, "architecture.fpn_channels: expected int, got '8'"),
+        (lambda fields: fields | {"sampling_ratio": True}, "architecture.sampling_ratio: expected int, got True"),
+        (lambda fields: fields | {"pixel_mean": [1.0, 2.0]}, "architecture.pixel_mean: expected 3 values, got 2"),
+        (lambda fields: fields | {"classes": "chair"}, "architecture.classes: expected a list"),
+        (lambda fields: fields | {"backbone": "resnet18"}, "architecture.backbone: expected fields"),
+        (
+            lambda fields: fields | {"backbone": fields["backbone"] | {"name": "vgg"}},
+            "expected a known architecture, got 'vgg'",
+        ),
+        (lambda fields: fields | {"head_features": 17}, "fc6.bias: expected 17, got 16"),
     ],
 )
 def test_network_file_invalid_architecture_raises(tmp_path, change, fault):
@@ -135,12 +138,14 @@ def test_network_weights_mismatch_raises():
         filled(
             TINY, {k: v for k, v in tensors.items() if "backbone.body.bn1.b" not in k and "fc7.bias" not in k}, "here"
         )
-    with pytest.raises(DataError, match=r"^here has the unknown weights extra: "):
+    with pytest.raises(DataError, match=r"^here: expected the weights of this network, got unknown extra$"):
         filled(TINY, tensors | {"extra": torch.zeros(1)}, "here")
     wrong = tensors | {"rpn.head.cls_logits.weight": torch.zeros(3, 9, 1, 1)}
     with pytest.raises(
-        DataError, match=re.escape("here: rpn.head.cls_logits.weight must be 3 x 8 x 1 x 1, found 3 x 9")
+        DataError, match=re.escape(r"here: rpn\.head\.cls_logits\.weight: expected 3 x 8 x 1 x 1, got 3 x 9")
     ):
         filled(TINY, wrong, "here")
-    with pytest.raises(DataError, match=r"^here: the weights rpn.head.cls_logits.bias are not finite"):
+    with pytest.raises(
+        DataError, match=r"^here: rpn\.head\.cls_logits\.bias: expected finite weights, got NaN or infinity"
+    ):
         filled(TINY, tensors | {"rpn.head.cls_logits.bias": torch.full((3,), torch.inf)}, "here")

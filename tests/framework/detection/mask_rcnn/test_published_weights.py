@@ -83,7 +83,7 @@ def test_published_network_md5_hash_is_accepted(server, monkeypatch):
 
 def test_published_network_with_wrong_hash_is_discarded(server, cache, monkeypatch):
     offer(monkeypatch, f"{server.address}/network.pth", "00000000")
-    assert f"sha256 begins with {SHA256[:8]}, expected 00000000" in fault()
+    assert f"expected sha256 00000000, got begins with {SHA256[:8]}" in fault()
     assert not list(cache.iterdir())
 
 
@@ -98,7 +98,7 @@ def test_published_network_truncated_download_is_restarted(server, cache, monkey
 def test_published_network_truncated_download_is_discarded(server, cache, monkeypatch):
     offer(monkeypatch, f"{server.address}/cut.pth")
     message = fault()
-    assert f"ended after {len(CONTENT) - 1000} of {len(CONTENT)} bytes" in message
+    assert f"expected {len(CONTENT)} bytes, got {len(CONTENT) - 1000}" in message
     assert str(cache / "cut.pth") in message
     assert not list(cache.iterdir())
 

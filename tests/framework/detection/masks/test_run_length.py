@@ -63,7 +63,7 @@ def test_run_length_without_masks_is_empty() -> None:
         (b"1", "found 1 px"),
         (b"!!", "packed string"),
         (b"04o", "packed string"),  # ends in the middle of a number
-        (b"0" + b"o" * 30 + b"0", "longer than any image"),
+        (b"0" + b"o" * 30 + b"0", "run lengths: expected numbers within the image size, got a larger one"),
         (b"O8I", "negative"),
     ],
 )
@@ -76,7 +76,7 @@ def test_run_length_malformed_string_raises(counts: bytes, said: str) -> None:
 def test_run_length_of_other_image_size_raises() -> None:
     counts = encode(np.ones((1, 4, 6), np.bool_))[0]
     check(counts, (6, 4))  # as many pixels: the size beside it must tell
-    with pytest.raises(DataError, match="must fill 5x4 = 20 px, found 24 px"):
+    with pytest.raises(DataError, match="run lengths: expected 5x4 = 20 px, got 24 px"):
         check(counts, (4, 5))
 
 

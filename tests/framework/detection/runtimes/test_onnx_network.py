@@ -45,10 +45,14 @@ def test_onnx_network_dynamic_input_requires_size(tmp_path):
     network = OnnxNetwork(path, "", "cpu", 32)
     assert network.shape == (32, 32)
     assert network(np.ones((32, 32, 3), np.float32))["doubled"].shape == (1, 3, 32, 32)
-    with pytest.raises(ConfigError, match=r"detector\.input_size must be given in px: .*\(1, 3, any, any\) float32"):
+    with pytest.raises(
+        ConfigError, match=r"detector\.input_size: expected a size in px, got 0 for .*, whose input has any size "
+    ):
         OnnxNetwork(path, "", "cpu", 0)
     fixed = doubling_network(tmp_path / "f.onnx", (1, 3, 8, 8))
-    with pytest.raises(ConfigError, match=r"detector\.input_size must be 0 or the network's own, found 32"):
+    with pytest.raises(
+        ConfigError, match=r"detector\.input_size: expected 0 or the size of the network \(.*\), got .* for"
+    ):
         OnnxNetwork(fixed, "", "cpu", 32)
 
 
@@ -81,7 +85,9 @@ def test_onnx_network_cuda_unavailable_raises(tmp_path):
     if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
         pytest.skip("onnxruntime has CUDA here")
     path = doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8))
-    with pytest.raises(ConfigError, match=r"detector\.device must be cpu or auto .*, found cuda"):
+    with pytest.raises(
+        ConfigError, match=r"detector\.device: expected cpu or auto without onnxruntime-gpu and a GPU, got cuda"
+    ):
         OnnxNetwork(path, "", "cuda", 0)
 
 
@@ -99,15 +105,15 @@ def test_cuda_libraries_are_loaded_before_session(tmp_path, monkeypatch, device,
 
 
 def test_onnx_file_missing_or_invalid_raises(tmp_path):
-    with pytest.raises(DataError, match=r"detector\.weights: there is no file .*absent\.onnx"):
+    with pytest.raises(DataError, match=r"detector\.weights: expected the file .*, got none"):
         find_file(tmp_path / "absent.onnx")
     path = doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8))
-    with pytest.raises(DataError, match=r"n\.onnx has the sha256 [0-9a-f]{64}, expected 0{64}"):
+    with pytest.raises(DataError, match=r"n\.onnx: expected sha256 0{64}, got [0-9a-f]{64}"):
         OnnxNetwork(path, "0" * 64, "cpu", 0)
     sha256 = OnnxNetwork(path, "", "cpu", 0).sha256
     assert OnnxNetwork(path, sha256.upper(), "cpu", 0).sha256 == sha256
     path.write_bytes(b"no network")
-    with pytest.raises(DataError, match=r"n\.onnx is not an ONNX file"):
+    with pytest.raises(DataError, match=r"n\.onnx: expected an ONNX file that onnxruntime can load, got an error:"):
         OnnxNetwork(path, "", "cpu", 0)
 
 
@@ -123,7 +129,9 @@ def test_onnx_network_rejected_by_onnxruntime_names_file(tmp_path):
             graph, opset_imports=[helper.make_opsetid("", 13), helper.make_opsetid("nobody", 1)]
         ).SerializeToString()
     )
-    with pytest.raises(DataError, match=r"n\.onnx is not an ONNX file that onnxruntime can load: ") as refused:
+    with pytest.raises(
+        DataError, match=r"n\.onnx: expected an ONNX file that onnxruntime can load, got an error:"
+    ) as refused:
         OnnxNetwork(path, "", "cpu", 0)(np.zeros((8, 8, 3), np.float32))
     assert "\n" not in str(refused.value)
 
@@ -165,7 +173,7 @@ def test_onnx_network_damaged_file_error_is_one_line(tmp_path):
         try:
             OnnxNetwork(path, "", "cpu", 0)
         except DataError as error:
-            assert str(error).startswith(f"{path} is not an ONNX file that onnxruntime can load: ")
+            assert str(error).startswith(f"{path}: expected an ONNX file that onnxruntime can load, got an error:")
             assert "\n" not in str(error)
             refused += 1
     assert refused > 0.9 * len(damaged)
@@ -182,7 +190,7 @@ def test_onnx_network_non_finite_output_raises(tmp_path):
     )
     network = OnnxNetwork(path, "", "cpu", 0)
     network(np.ones((4, 4, 3), np.float32))
-    with pytest.raises(DataError, match="the output y holds values that are not finite"):
+    with pytest.raises(DataError, match="expected finite values in the output y, got NaN or infinity"):
         network(np.zeros((4, 4, 3), np.float32))
 
 

@@ -205,7 +205,9 @@ def test_frame_hash_covers_fields_read_by_detector(room: CornerRoom) -> None:
         "camera": replace(frame, camera=replace(CAMERA, fx=90.0001)),
         "T_world_camera": replace(frame, T_world_camera=None),
         "truth": replace(frame, truth=FrameTruth(ids, frame.truth.class_names)),
-        "truth names": replace(frame, truth=FrameTruth(frame.truth.instance_ids, {1: None, 2: "couch"})),
+        "expected the classes of the ground truth": replace(
+            frame, truth=FrameTruth(frame.truth.instance_ids, {1: None, 2: "couch"})
+        ),
         "no truth": replace(frame, truth=None),
     }
     assert len({frame_hash(other, FRAME_FIELDS) for other in (frame, *changed.values())}) == len(changed) + 1
@@ -318,7 +320,7 @@ def test_cache_non_regular_entry_warns_and_detects_again(
     make(entry)
     assert_same(expected, CachedDetector(Noise(), tmp_path).detect(room[0]))
     assert f"{entry}" in caplog.records[0].message
-    assert "detected again" in caplog.records[0].message
+    assert "detection cache:" in caplog.records[0].message
 
 
 def test_cache_read_only_writes_nothing(room: CornerRoom, tmp_path: Path) -> None:
@@ -347,7 +349,7 @@ def test_cache_full_disk_stops_storing_but_not_run(
         detector.detect(frame)
     assert detector.misses == 6
     assert len(caplog.records) == 1
-    assert "No space left on device; nothing more is stored in this run" in caplog.text
+    assert "No space left on device; storing nothing more in this run" in caplog.text
 
 
 def test_cache_unusable_folder_raises(tmp_path: Path) -> None:
@@ -425,12 +427,14 @@ def test_cache_off_returns_detector_itself(off: str) -> None:
 
 @pytest.mark.parametrize("chosen", ["7", "[a]", "''"])
 def test_cache_invalid_folder_option_raises(chosen: str) -> None:
-    with pytest.raises(ConfigError, match="detection_cache_dir must be a path; quote"):
+    with pytest.raises(
+        ConfigError, match=r"detection_cache_dir: expected a path \(in quotes if it looks like a number\)"
+    ):
         with_cache(Noise(), config("detection_cache=read_write", f"detection_cache_dir={chosen}"))
 
 
 def test_cache_unknown_mode_raises() -> None:
-    with pytest.raises(ConfigError, match="detection_cache must be one of off, read_write, read_only, found 'on'"):
+    with pytest.raises(ConfigError, match="detection_cache: expected one of off, read_write, read_only, got 'on'"):
         with_cache(Noise(), config("detection_cache=on"))
 
 

@@ -106,16 +106,19 @@ def second(folder: Path, pattern: str) -> Path:
 SPOILT_CAMERAS = {
     "3D Scanner App": [
         (lambda c: c.pop("intrinsics"), "intrinsics must be a list of 9 numbers"),
-        (lambda c: c.update(cameraPoseARFrame=[0] * 16), "the last row of the pose is not 0 0 0 1"),
+        (lambda c: c.update(cameraPoseARFrame=[0] * 16), "pose: expected the last row 0 0 0 1"),
         (lambda c: c.update(cameraPoseARFrame=[1, 2]), "cameraPoseARFrame must be a list of 16 numbers"),
-        (lambda c: c.update(intrinsics=[0] * 9), "fx, fy must be positive"),
+        (
+            lambda c: c.update(intrinsics=[0] * 9),
+            "Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy =",
+        ),
         (lambda c: c.update(time="now"), "time must be a number, found now"),
     ],
     "Polycam": [
         (lambda c: c.pop("fx"), "the key 'fx' is missing"),
-        (lambda c: c.update(t_00=3), "the pose is not rigid"),
+        (lambda c: c.update(t_00=3), "pose: expected a rigid transform, got |R R^T - I| ="),
         (lambda c: c.update(t_23=None), "t_23 must be a number, found None"),
-        (lambda c: c.update(fx=-1), "fx, fy must be positive"),
+        (lambda c: c.update(fx=-1), "Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy ="),
     ],
 }
 

@@ -71,7 +71,10 @@ def spoil_row(folder: Path, number: int, change) -> None:
         (lambda words: [words[0], " 1.5", *words[2:]], r"odometry.csv, line 3: a frame is a whole number, found '1.5'"),
         (lambda words: [words[0], " 000077", *words[2:]], r"rgb.mp4 ends, or is damaged, before frame 77"),
         (lambda words: ["99.0", *words[1:]], r"000001.png is of 99.000000 s, not later than the frame before"),
-        (lambda words: [*words[:9], " -5.0", *words[10:]], r"line 3: Camera: fx, fy must be positive"),
+        (
+            lambda words: [*words[:9], " -5.0", *words[10:]],
+            "line 3: Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy =",
+        ),
     ],
 )
 def test_damaged_odometry_row_loses_its_frame(folder: Path, tmp_path: Path, change, said: str) -> None:

@@ -60,13 +60,13 @@ def test_merged_instances_combine_embeddings() -> None:
 @pytest.mark.parametrize(
     ("embeddings", "space", "fault"),
     [
-        (np.eye(2, 3, dtype=np.float32), "", "embedding_space must name"),
-        (None, "words@1", "there are none, and embedding_space is 'words@1'"),
-        (np.eye(3, dtype=np.float32), "words@1", r"must have shape \(2, any\), found \(3, 3\)"),
-        (np.eye(2, 3), "words@1", "must be an array of float32"),
-        (np.full((2, 3), 0.4, np.float32), "words@1", "each row must be a unit vector, or 0, found one of length 0.69"),
+        (np.eye(2, 3, dtype=np.float32), "", "expected a name in embedding_space, got an empty one"),
+        (None, "words@1", "expected embeddings for embedding_space 'words@1', got none"),
+        (np.eye(3, dtype=np.float32), "words@1", r"truth\.instance_ids: expected shape \(2, any\), got \(3, 3\)"),
+        (np.eye(2, 3), "words@1", "expected an array"),
+        (np.full((2, 3), 0.4, np.float32), "words@1", r"expected unit vectors or 0 in each row, got length 0\.69"),
         (np.full((2, 3), np.nan, np.float32), "words@1", "not finite"),
-        (np.zeros((2, 0), np.float32), "words@1", "1 to 65536 columns, found 0"),
+        (np.zeros((2, 0), np.float32), "words@1", "expected 1 to 65536 columns, got 0"),
         (np.eye(2, 3, dtype=np.float32), "w" * 301, "at most 300 characters"),
     ],
 )
@@ -138,24 +138,28 @@ def test_resumed_map_accumulates_embeddings(tmp_path: Path) -> None:
 def test_embeddings_of_other_space_raise() -> None:
     fuser = mapped("bayesian_tsdf", embeddings=EMBEDDINGS)
     frame = room().frame(walk(4)[0], 9)
-    with pytest.raises(DataError, match=r"the map has embeddings of words@1, and .* of words@2"):
+    with pytest.raises(DataError, match=r"detector: expected embeddings of words@1 \(as in the map\)"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=EMBEDDINGS, space="words@2")
-    with pytest.raises(DataError, match="of 2 numbers and of 3 in the same space"):
+    with pytest.raises(DataError, match="embeddings of one space: expected equal lengths, got 2 and 3 numbers"):
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=np.eye(3))
 
 
 @pytest.mark.parametrize(
     ("array", "value", "fault"),
     [
-        ("embedding_ids", np.int32([1, 1]), "an instance twice"),
-        ("embedding_ids", np.int32([1, 77]), "embedding_ids has 77"),
-        ("embedding_ids", np.int32([1, 2, 3]), "embedding_sums must have shape"),
-        ("embedding_sums", np.float32([[1, 0], [0, 1]]), "embedding_sums must be an array of float64"),
-        ("embedding_sums", np.float64([1, 0]), r"embedding_sums must be \(M, D\)"),
-        ("embedding_sums", np.float64([[900, 0], [0, 1]]), "no longer than their weights"),
-        ("embedding_weights", np.float64([0, 1]), r"embedding_weights must be in \(0, 1e\+12\]"),
-        ("embedding_counts", np.int64([0, 1]), "embedding_counts must be at least 1"),
-        ("embedding_counts", None, "names an embedding space and has no embedding_counts"),
+        ("embedding_ids", np.int32([1, 1]), "embedding_ids: expected unique instances, got duplicates"),
+        ("embedding_ids", np.int32([1, 77]), "embedding_ids: expected values in the map, got 77"),
+        ("embedding_ids", np.int32([1, 2, 3]), "embedding_sums: expected shape"),
+        ("embedding_sums", np.float32([[1, 0], [0, 1]]), "embedding_sums: expected an array"),
+        ("embedding_sums", np.float64([1, 0]), r"embedding_sums: expected \(M, D\) with D in \[1, .*\]"),
+        (
+            "embedding_sums",
+            np.float64([[900, 0], [0, 1]]),
+            "embedding_sums: expected lengths of at most their weights, got .* of one",
+        ),
+        ("embedding_weights", np.float64([0, 1]), r"embedding_weights: expected values in \(0, 1e\+12\], got .* to"),
+        ("embedding_counts", np.int64([0, 1]), "embedding_counts: expected at least 1"),
+        ("embedding_counts", None, "expected embedding_counts with an embedding space, got none"),
     ],
 )
 def test_damaged_embeddings_in_file_raise(tmp_path: Path, array: str, value: np.ndarray | None, fault: str) -> None:

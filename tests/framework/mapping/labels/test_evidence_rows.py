@@ -69,7 +69,7 @@ def test_merge_updates_all_labeled_voxels(count: int) -> None:
 
 
 def test_evidence_rows_with_256_classes_raise() -> None:
-    with pytest.raises(DataError, match="255 classes apart, and the detector has 256"):
+    with pytest.raises(DataError, match="at most 255 classes, got 256"):
         EvidenceRows(VoxelGrid(0.01, 0.05, 10)).begin(256)
 
 

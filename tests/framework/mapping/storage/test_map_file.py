@@ -67,5 +67,5 @@ def test_map_file_changed_byte_raises(saved: Path) -> None:
 
 
 def test_map_file_of_other_format_raises(saved: Path) -> None:
-    with pytest.raises(DataError, match="it has map format 7, this version reads 8"):
+    with pytest.raises(DataError, match="expected map format 8, got 7"):
         read_map(saved, 8, list(ARRAYS))

@@ -156,10 +156,20 @@ def test_readings_outside_sensor_range_allocate_no_blocks(depth: float) -> None:
             {"voxel_size": 1e-4, "truncation_slope": 1.0, "max_depth": 1000.0},
             0.0,
             MapFullError,
-            "blocks deep, more than",
+            r"fuser\.truncation_slope: expected a truncation band of at most .* blocks",
         ),
-        ({"voxel_size": 1e-4, "truncation": 50.0}, 0.0, MapFullError, "one frame asks for [0-9]+ blocks or more"),
-        ({"voxel_size": 1e-3}, 9e3, FrameError, "sees 90[0-9.]+ m from the origin"),
+        (
+            {"voxel_size": 1e-4, "truncation": 50.0},
+            0.0,
+            MapFullError,
+            r"the map is full: expected at most .* blocks, got \[0-9\]\+ or more for one frame",
+        ),
+        (
+            {"voxel_size": 1e-3},
+            9e3,
+            FrameError,
+            r"tracker: expected surfaces within .* m of the origin \(fuser\.voxel_size=.* m\), got 90\[0-9\.\]\+ m",
+        ),
     ],
 )
 def test_frame_exceeding_limits_raises_before_allocation(
