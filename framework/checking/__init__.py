@@ -10,7 +10,7 @@ class Verdict(Enum):
     """Effect of a finding on mapping."""
 
     FINE = "ok"
-    UNKNOWN = "?"  # the recording does not show it
+    UNKNOWN = "?"  # the recording is not informative
     NOTE = "note"  # the recording can be mapped, with worse results
     FAULT = "WRONG"  # the recording cannot be mapped with these settings
 
@@ -22,7 +22,7 @@ class Finding:
     verdict: Verdict
     subject: str
     text: str
-    setting: str = ""  # the fix, KEY=VALUE for the command line; "" = there is no such parameter
+    setting: str = ""  # the fix, KEY=VALUE for the command line; "" = no parameter fixes it
 
     def __str__(self) -> str:
         line = f"{self.verdict.value:<6} {self.subject}: {self.text}"

@@ -1,4 +1,4 @@
-"""Pairs of frames with matched points, which measure poses."""
+"""Pairs of frames with matched points, for pose estimation."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from framework.interfaces import RGBDSequence
 from framework.tracking.absolute_pose import AbsolutePoseEstimator
 from framework.tracking.features import FeatureExtractor, Features, match
 
-MAX_RATIO = 0.8  # of a match's distance to that of the second best (Lowe 2004)
-FEWEST_POINTS = 30  # of a pair
-STEPS = (1, 2, 4, 8, 16, 32)  # frames from the first of a pair to the second
+MAX_RATIO = 0.8  # maximum ratio of a match's distance to that of the second best (Lowe 2004)
+FEWEST_POINTS = 30  # minimum number of matches of a pair
+STEPS = (1, 2, 4, 8, 16, 32)  # frames between the first and the second of a pair
 FARTHEST_APART = 0.25  # of the image's width: after a larger motion, larger steps are not tried
 
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """Two frames and M matched points."""
+    """Two frames with M matched points."""
 
     first: Frame
     second: Frame
@@ -34,12 +34,12 @@ class MatchedPair:
 
     @property
     def motion(self) -> float:
-        """The median motion of the points in px."""
+        """Median motion of the points in px."""
         return float(np.median(np.linalg.norm(self.pixels_second - self.pixels_first, axis=1)))
 
 
 class Matcher:
-    """Finds `MatchedPair`s in a sequence. Frames that cannot be read are in no pair."""
+    """Matcher of frame pairs in a sequence. Unreadable frames are skipped."""
 
     def __init__(self, sequence: RGBDSequence) -> None:
         self.sequence = sequence
@@ -48,7 +48,7 @@ class Matcher:
         self._features = lru_cache(maxsize=4 * len(STEPS))(self._extract)
 
     def pairs(self, starts: Sequence[int], steps: Sequence[int] = STEPS) -> Iterator[MatchedPair]:
-        """Yield the pairs from each position in `starts`, until two frames have too little in common."""
+        """Yield the pairs from each position in `starts`, until two frames have too little overlap."""
         for k in starts:
             for step in steps:
                 pair = self.pair(k, step)

@@ -1,6 +1,6 @@
-"""Detection of poses that belong to frames a little earlier or later.
+"""Detection of a delay between poses and images.
 
-Only a camera whose motion changes shows a delay: the pairs of frames must differ with other delays.
+A delay is only observable if the camera's motion changes: the pairs of frames must differ with other delays.
 """
 
 from __future__ import annotations
@@ -16,42 +16,42 @@ from framework.checking.pose_fit import ALIKE, POOR, SHORTEST_MOTION, PoseFit, e
 from framework.data import Float64
 
 LONGEST_DELAY = 6  # frames, in both directions; one more is tried: an error that still falls there has no minimum
-CLEARLY = 0.75  # times the mean error without delay, at most; wrong delays of real recordings have 0.88 and more
-TELLS = 1 / 640  # of the image's width: pairs whose errors differ by less are not counted
-MOST = 0.75  # of the counted pairs must improve
-FEWEST_PAIRS = 5  # that are counted
+CLEARLY = 0.75  # maximum ratio to the mean error without delay; wrong delays of real recordings have 0.88 or more
+TELLS = 1 / 640  # of the image's width: minimum error difference of a counted pair
+MOST = 0.75  # minimum fraction of the counted pairs that improve
+FEWEST_PAIRS = 5  # minimum number of counted pairs
 
 
 @dataclass(frozen=True)
 class PoseDelay:
-    """Poses that come late."""
+    """A delay of the poses."""
 
     frames: int  # delay; negative = early
     error: float  # px, mean over the pairs with the poses as stored
     delayed_error: float  # px, with the poses shifted by the delay
     pairs: int
-    alike: tuple[int, ...]  # other delays that fit as well
+    alike: tuple[int, ...]  # other delays that fit equally well
 
     def finding(self, applied: int, step: float) -> Finding:
         """Return the finding for a recording read with the delay `applied`, with frames `step` seconds apart."""
-        count, (when, where) = abs(self.frames), ("late", "later") if self.frames > 0 else ("early", "before")
+        count, (when, where) = abs(self.frames), ("late", "later") if self.frames > 0 else ("early", "earlier")
         frames = f"{count} frame{'s' * (count > 1)}"
         text = (
-            f"they come {frames} {when} ({count * step:.3f} s): in {self.pairs} pairs of frames, points are off by "
-            f"{self.error:.1f} px on average, and by {self.delayed_error:.1f} px with the poses of {frames} {where}"
+            f"{frames} {when} ({count * step:.3f} s): mean reprojection error of {self.pairs} pairs of frames is "
+            f"{self.error:.1f} px, and {self.delayed_error:.1f} px with the poses of {frames} {where}"
         )
         if self.alike:
             others = " or ".join(f"dataset.pose_delay={applied + other}" for other in self.alike)
-            text += f"; {others} fits as well, as the camera moves"
+            text += f"; {others} fits this camera motion equally well"
         return Finding(Verdict.FAULT, "poses", text, f"dataset.pose_delay={applied + self.frames}")
 
 
 def find_delay(
     pairs: Sequence[MatchedPair], poses: Sequence[Float64 | None], fits: Sequence[PoseFit]
 ) -> PoseDelay | None:
-    """Return the delay of the pairs' poses in the best of some readings, or None if there is no clear delay.
+    """Return the delay of the pairs' poses in the best of some readings, or None without a clear delay.
 
-    `poses` (F) are the stored poses (4, 4) of all frames by `Frame.index`, None = not known.
+    `poses` (F) are the stored poses (4, 4) of all frames by `Frame.index`, None = unknown.
     """
     known = {k: T for k, T in enumerate(poses) if T is not None}
     delays = range(-LONGEST_DELAY - 1, LONGEST_DELAY + 2)

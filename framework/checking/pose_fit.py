@@ -1,4 +1,4 @@
-"""Fit of a recording's poses to its images, in each convention that poses may be stored in."""
+"""Fit of a recording's poses to its images, in each supported pose convention."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from framework.data import Float64
 from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseReading, QuaternionOrder
 from framework.geometry import inverse, project, transform
 
-UNSEEN = 1.0  # of the image's width: the largest error, also of points behind the camera
-SHORTEST_BASELINE = 0.02  # of the median depth: shorter motions do not show the scale
-FEWEST_PAIRS = 3  # that are informative
-SHORTEST_MOTION = 0.01  # of the image's width: pairs that move less fit with any poses
-POOR = 0.2  # of the motion: a larger error is not that of good poses; real recordings have 0.01 to 0.06
-ALIKE, ALIKE_PX = 1.15, 0.2  # times and px, within which two errors are equal
-CLEARLY = 0.5  # times the error as stored, at most, of another reading
-UNCERTAIN = 0.07  # of the factor, at least: the poses and depth of real recordings are not more exact
-NOT_WORSE = 1.3  # times the error: a camera that only rotates hardly shows the scale
-WRONG_SCALE = 2.5  # times too far or too near: rotating about the camera leaves the scale uncertain up to 1.6 times
+UNSEEN = 1.0  # of the image's width: maximum error, also used for points behind the camera
+SHORTEST_BASELINE = 0.02  # of the median depth: minimum motion for a scale estimate
+FEWEST_PAIRS = 3  # minimum number of informative pairs
+SHORTEST_MOTION = 0.01  # of the image's width: pairs with less motion fit any poses
+POOR = 0.2  # of the motion: maximum error of valid poses; real recordings have 0.01 to 0.06
+ALIKE, ALIKE_PX = 1.15, 0.2  # ratio and px within which two errors count as equal
+CLEARLY = 0.5  # maximum ratio of another reading's error to the error as stored
+UNCERTAIN = 0.07  # minimum uncertainty of the factor: poses and depth of real recordings are not more accurate
+NOT_WORSE = 1.3  # error ratio: pure rotation hardly constrains the scale
+WRONG_SCALE = 2.5  # minimum ratio of a wrong scale: rotation leaves the scale uncertain by up to 1.6 times
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
 PLAUSIBLE = (0.2, 12.0)  # m, the median depth of a room
 
 
 @dataclass(frozen=True)
 class PoseFit:
-    """Agreement of the poses with the pairs, in one reading."""
+    """Agreement of the poses with the pairs in one reading."""
 
     reading: PoseReading
     depth_factor: float  # applied to all depths
@@ -39,7 +39,7 @@ class PoseFit:
 
     @property
     def error(self) -> float:
-        """The median error in px."""
+        """Median error in px."""
         return float(np.median(self.errors))
 
 
@@ -50,7 +50,7 @@ def readings(pose_unit: float = 1.0) -> Iterator[PoseReading]:
 
 
 def fit(pairs: Sequence[MatchedPair], reading: PoseReading, depth_factor: float | None = None) -> PoseFit:
-    """Return the fit of a reading to pairs with poses; None as the factor = estimate it."""
+    """Return the fit of a reading to pairs with poses; depth_factor=None estimates the factor."""
     motions = [motion_of(pair, reading) for pair in pairs]
     factor, within = (depth_factor, 1.0) if depth_factor else _depth_factor(pairs, motions)
     errors = np.array([error_of(pair, motion, factor) for pair, motion in zip(pairs, motions, strict=True)])
@@ -71,7 +71,7 @@ def motion_between(T_world_first: Float64, T_world_second: Float64, reading: Pos
 
 
 def _depth_factor(pairs: Sequence[MatchedPair], motions: Sequence[Float64]) -> tuple[float, float]:
-    """Return the ratio of the poses' translations to those of the images, and its uncertainty; 1 and 1 if not known."""
+    """Return the ratio of the translations of poses and images, and its uncertainty; 1 and 1 if unknown."""
     ratios = []
     for pair, T_second_first in zip(pairs, motions, strict=True):
         seen, moved = np.linalg.norm(pair.T_second_first[:3, 3]), np.linalg.norm(T_second_first[:3, 3])
@@ -104,13 +104,15 @@ class PoseJudgment:
 
 
 def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, median_depth: float) -> PoseJudgment:
-    """Check stored poses against the images, and find the reading that fits.
+    """Check stored poses against the images, and select the best reading.
 
-    `given` is the reading that is set, `depth_scale` the units per meter of depth, `median_depth` the result in m.
+    `given` is the configured reading, `depth_scale` the depth units per meter, `median_depth` the result in m.
     """
     informative = [pair for pair in pairs if pair.motion > SHORTEST_MOTION * pair.first.camera.width]
     if len(informative) < FEWEST_PAIRS:
-        text = f"too few pairs of frames move enough to check the poses ({len(informative)})"
+        text = (
+            f"expected at least {FEWEST_PAIRS} pairs of frames with motion to check the poses, got {len(informative)}"
+        )
         return PoseJudgment((Finding(Verdict.UNKNOWN, "poses", text),), None, None)
     motion = float(np.median([pair.motion for pair in informative]))
     as_given = fit(informative, given, 1.0)
@@ -121,22 +123,22 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     now = as_given.error
     reading = best.reading if now > POOR * motion and best.error < CLEARLY * now else given
     chosen = _with_plain_factor(informative, reading)
-    measured = f"in {len(informative)} pairs of frames that move {motion:.0f} px, points are off by {now:.1f} px"
+    measured = f"median error of {now:.1f} px in {len(informative)} pairs of frames with a motion of {motion:.0f} px"
     if reading == given and now <= POOR * motion and chosen.depth_factor == 1.0:
-        return PoseJudgment((Finding(Verdict.FINE, "poses", f"they fit: {measured}"),), as_given, as_given, others)
+        return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
     if chosen.error > POOR * motion:
-        text = f"they do not fit the images, in any axes: {measured}"
-        finding = Finding(Verdict.FAULT, "poses", text, "tracker=voxel_hashing_icp, which needs none")
+        text = f"inconsistent with the images in any axes: {measured}"
+        finding = Finding(Verdict.FAULT, "poses", text, "tracker=voxel_hashing_icp, which needs no poses")
         return PoseJudgment((finding,), as_given, best, others)
     findings = []
     if reading != given:
-        text = f"they are {_named(reading)}: {measured}, and {chosen.error:.1f} px when they are read so"
+        text = f"stored as {_named(reading)}: {measured}, and {chosen.error:.1f} px in this convention"
         settings = {_settings(one.reading, given) for one in alike if one.reading not in (reading, given)}
         if settings:
-            text += f"; {' or '.join(sorted(map(' '.join, settings)))} fits as well, as the camera moves"
+            text += f"; {' or '.join(sorted(map(' '.join, settings)))} fits this camera motion equally well"
         findings.append(Finding(Verdict.FAULT, "poses", text, " ".join(_settings(reading, given))))
     else:
-        text = f"they fit with the right scale: {measured}, and {chosen.error:.1f} px then"
+        text = f"valid with the correct scale: {measured}, and {chosen.error:.1f} px with the correct scale"
         findings.append(Finding(Verdict.FINE, "poses", text))
     if chosen.depth_factor != 1.0:
         findings.append(_scale_finding(chosen, depth_scale, median_depth))
@@ -155,13 +157,13 @@ def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> 
     low, high = PLAUSIBLE
     factor = chosen.depth_factor
     if low <= median_depth <= high and not low <= median_depth * factor <= high:
-        text = f"they move {factor:.3g} times as far as the images, whose median depth is {median_depth:.2f} m"
+        text = f"translations are {factor:.3g} times those of the images at a median depth of {median_depth:.2f} m"
         unit = chosen.reading.pose_unit * 10.0 ** round(np.log10(1 / factor))
         return Finding(Verdict.FAULT, "poses", text, f"dataset.pose_unit={unit:g}")
     scale = depth_scale / factor
     fitting = [usual for usual in USUAL_SCALES if abs(np.log(usual / scale)) < np.log(chosen.factor_within)]
     setting = fitting[0] if fitting else float(f"{scale:.3g}")
-    text = f"by the poses, it is {factor:.3g} times as much: {depth_scale:g} units are not a meter"
+    text = f"expected {scale:.3g} units per m according to the poses, got {depth_scale:g}"
     return Finding(Verdict.FAULT, "depth", text, f"dataset.depth_scale={setting:g}")
 
 
@@ -175,13 +177,13 @@ def _named(reading: PoseReading) -> str:
 
 
 def _equal_to_best(fits: Sequence[PoseFit]) -> list[PoseFit]:
-    """Return the best fit and those equal to it: for a camera that only pans, some axes are the same."""
+    """Return the best fit and those equal to it: for a panning camera, some axes are equivalent."""
     least = min(one.error for one in fits)
     return [one for one in fits if one.error <= ALIKE * least + ALIKE_PX]
 
 
 def _settings(reading: PoseReading, given: PoseReading) -> tuple[str, ...]:
-    """Return the parameters in which the readings differ."""
+    """Return the parameters that differ between the readings."""
     names = ("pose_kind", "camera_axes", "quaternion_order")
     changed = [name for name in names if getattr(reading, name) != getattr(given, name)]
     return tuple(f"dataset.{name}={getattr(reading, name).name}" for name in changed)

@@ -1,4 +1,4 @@
-"""The check of a recording before it is mapped."""
+"""Check of a recording before mapping."""
 
 from __future__ import annotations
 
@@ -22,14 +22,16 @@ from framework.interfaces import RGBDSequence, RGBDVideo
 
 CHECKED_FRAMES = 12  # spread over the sequence
 QUICK_STARTS, QUICK_STEPS = (0.1, 0.35, 0.6, 0.85), (1, 4, 16)  # fractions of the sequence; frames from there
-MOST_MISSING = 0.7  # of the pixels without a reading, for a good map
-MOST_BEYOND = 0.3  # of the readings beyond the mapped range, for a good map
-WIDEST_EDGE = 12 / 640  # of the image's width, of sharp color edges; real recordings have 4 to 9 px of 640
-EDGE_WINDOW = 15 / 640  # of the width, for the contrast of an edge
-FASTEST = 0.2  # of the image's width from frame to frame, that trackers follow
-TYPICAL = 0.5, 4.5  # m, the median depth of most rooms; real recordings have 1 to 3.5
-SHOWN_MOTION = 0.06  # of the image's width, of the pair in the figure: enough to see errors
-LONGEST_GAP = 0.5  # s between frames, and five times the usual
+MOST_MISSING = 0.7  # maximum fraction of pixels without a reading, for a good map
+MOST_BEYOND = 0.3  # maximum fraction of readings beyond the mapped range, for a good map
+WIDEST_EDGE = (
+    12 / 640
+)  # of the image's width: maximum width of sharp color edges; real recordings have 4 to 9 px of 640
+EDGE_WINDOW = 15 / 640  # of the image's width, for the contrast of an edge
+FASTEST = 0.2  # of the image's width: maximum motion per frame for the trackers
+TYPICAL = 0.5, 4.5  # m, median depth of most rooms; real recordings have 1 to 3.5
+SHOWN_MOTION = 0.06  # of the image's width: motion of the pair in the figure, enough to make errors visible
+LONGEST_GAP = 0.5  # s between frames; a gap is also at least five times the usual interval
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +46,7 @@ class RecordingCheck:
     by_delay: tuple[EdgeAlignment, ...]
     poses: PoseJudgment
     pair: MatchedPair | None  # in the figure, with the stored poses
-    meant: MatchedPair | None  # the pair with the delay of the poses removed
+    meant: MatchedPair | None  # the pair without the delay of the poses
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -54,7 +56,7 @@ class RecordingCheck:
 def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     """Check some frames of a sequence and their neighbors for mapping up to `farthest` meters.
 
-    Raises DataError if none of the frames can be read.
+    Raises DataError if no frame is readable.
     """
     given, depth_delay = PoseReading(), 0
     if isinstance(sequence, Recording):
@@ -66,7 +68,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     frames, errors = _read(sequence, chosen)
     findings = []
     if errors:
-        text = f"{len(errors)} of {len(chosen)} cannot be read; the first: {errors[0]}"
+        text = f"{len(errors)} of {len(chosen)} cannot be read; first error: {errors[0]}"
         findings.append(Finding(Verdict.NOTE, "frames", text))
     depth_finding, median_depth = _check_depth(frames, farthest, _scale_of(sequence))
     longest = registration.LONGEST_DELAY
@@ -88,7 +90,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     if any(frame.T_world_camera is not None for frame in frames):
         judgment, pose_delay = _judge_poses(sequence, posed, given, median_depth)
     else:
-        no_poses = Finding(Verdict.FINE, "poses", "the recording has none: the camera is tracked")
+        no_poses = Finding(Verdict.FINE, "poses", "none in the recording; the camera is tracked")
         judgment, pose_delay = PoseJudgment((no_poses,), None, None), 0
     if not any(finding.subject == "depth" for finding in judgment.findings):  # poses measure it more exactly
         findings.append(depth_finding)
@@ -98,7 +100,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     camera = sequence.camera
     summary = (
         f"{sequence.name}: {count} frames of {camera.width}x{camera.height} px, fx {camera.fx:.4g} px; "
-        f"{len(frames)} were checked, with their neighbors"
+        f"checked {len(frames)} frames and their neighbors"
     )
     shown = min(posed or pairs, key=lambda pair: abs(pair.motion - SHOWN_MOTION * camera.width), default=None)
     meant = delayed(shown, _stored_poses(sequence), pose_delay) if shown is not None and pose_delay else shown
@@ -162,7 +164,7 @@ class DelayedDepth(RGBDSequence):
 
     def __getitem__(self, k: int) -> Frame:
         if not 0 <= k + self.delay < len(self.sequence):
-            raise FrameError(f"frame {k}: no depth image is {self.delay} frames away")
+            raise FrameError(f"frame {k}: expected a depth image at an offset of {self.delay} frames, got none")
         return replace(self.sequence[k], depth=self.sequence[k + self.delay].depth)
 
 
@@ -171,7 +173,7 @@ def _is_posed(pair: MatchedPair) -> bool:
 
 
 def _scale_of(sequence: RGBDSequence) -> float:
-    """Units per meter of stored depth."""
+    """Return the units per meter of stored depth."""
     return sequence.contents.depth_scale if isinstance(sequence, Recording) else 1.0
 
 
@@ -183,7 +185,7 @@ def _read(sequence: RGBDSequence, chosen: Sequence[int]) -> tuple[list[Frame], l
         except FrameError as error:
             errors.append(error)
     if not frames:
-        raise DataError(f"none of the {len(chosen)} checked frames can be read; the first: {errors[0]}")
+        raise DataError(f"expected readable frames, got none of {len(chosen)} checked; first error: {errors[0]}")
     return frames, errors
 
 
@@ -191,20 +193,20 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
     """Return the finding, and the median depth in m."""
     readings = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
     if not len(readings):
-        return Finding(Verdict.FAULT, "depth", "there is not a single reading"), 0.0
+        return Finding(Verdict.FAULT, "depth", "no readings in any checked frame"), 0.0
     median = float(np.median(readings))
     missing = 1 - len(readings) / sum(frame.depth.size for frame in frames)
     beyond = float((readings > farthest).mean())
     text = (
         f"median {median:.2f} m, {100 * missing:.0f} % of the pixels without a reading, "
-        f"{100 * beyond:.0f} % of the readings beyond the {farthest:g} m that are mapped"
+        f"{100 * beyond:.0f} % of the readings beyond the mapped range of {farthest:g} m"
     )
     low, high = PLAUSIBLE
     if not low <= median <= high:
         low, high = TYPICAL
         fitting = [usual for usual in USUAL_SCALES if low <= median * scale / usual <= high]
         setting = f"dataset.depth_scale={fitting[0]:g}" if fitting else ""
-        return Finding(Verdict.FAULT, "depth", f"{text}: this is no room", setting), median
+        return Finding(Verdict.FAULT, "depth", f"{text}; implausible for a room", setting), median
     poor = missing > MOST_MISSING or beyond > MOST_BEYOND
     return Finding(Verdict.NOTE if poor else Verdict.FINE, "depth", text), median
 
@@ -212,14 +214,14 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
 def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
     """Return the finding about the motion from frame to frame, `steps` in fractions of the width."""
     if not neighbors:
-        return Finding(Verdict.UNKNOWN, "motion", "there is only one frame")
+        return Finding(Verdict.UNKNOWN, "motion", "unknown with a single frame")
     lost = neighbors - len(steps)
     if not len(steps):
-        text = f"none of {neighbors} pairs of neighboring frames has enough in common, or enough texture"
-        return Finding(Verdict.NOTE, "motion", f"{text}: trackers will lose the camera")
-    text = f"{width * np.median(steps):.0f} px from frame to frame, {width * steps.max():.0f} px at most"
+        text = f"none of {neighbors} pairs of neighboring frames has enough overlap and texture"
+        return Finding(Verdict.NOTE, "motion", f"{text}; tracking will fail")
+    text = f"median of {width * np.median(steps):.0f} px per frame, maximum of {width * steps.max():.0f} px"
     if lost:
-        text += f"; {lost} of {neighbors} pairs of neighbors have too little in common"
+        text += f"; {lost} of {neighbors} pairs of neighboring frames have too little overlap"
     fast = float(np.median(steps)) > FASTEST or lost > neighbors // 2
     return Finding(Verdict.NOTE if fast else Verdict.FINE, "motion", text)
 
@@ -227,15 +229,15 @@ def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
 def _check_sharpness(frames: Sequence[Frame]) -> Finding:
     """Return the finding about the width of color edges: contrast by gradient, at the strongest ones."""
     widths = [_edge_width(frame) for frame in frames]
-    text = f"edges are {np.median(widths):.1f} px wide, and {max(widths):.1f} px in the worst of {len(frames)} frames"
+    text = f"median edge width of {np.median(widths):.1f} px, maximum of {max(widths):.1f} px in {len(frames)} frames"
     blurred = sum(width > WIDEST_EDGE * frames[0].camera.width for width in widths)
     if blurred > len(frames) // 3:
-        return Finding(Verdict.NOTE, "sharpness", f"{text}: move the camera slower, or add light")
+        return Finding(Verdict.NOTE, "sharpness", f"{text}; move the camera more slowly, or add light")
     return Finding(Verdict.FINE, "sharpness", text)
 
 
 def _edge_width(frame: Frame) -> float:
-    """Return the median width in px."""
+    """Return the median width of color edges in px."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     window = np.ones((max(3, round(EDGE_WINDOW * frame.camera.width)),) * 2, np.uint8)
     contrast = cv2.subtract(cv2.dilate(gray, window), cv2.erode(gray, window)).astype(np.float32)
@@ -254,5 +256,5 @@ def _check_times(sequence: RGBDSequence) -> list[Finding]:
     gaps = int((steps > max(LONGEST_GAP, 5 * usual)).sum())
     text = f"{1 / usual:.3g} Hz for {times[-1] - times[0]:.1f} s"
     if gaps:
-        return [Finding(Verdict.NOTE, "time", f"{text}, with {gaps} gaps, the longest of {steps.max():.1f} s")]
+        return [Finding(Verdict.NOTE, "time", f"{text}, with {gaps} gaps of up to {steps.max():.1f} s")]
     return [Finding(Verdict.FINE, "time", text)]

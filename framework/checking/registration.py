@@ -1,6 +1,6 @@
-"""Registration of color and depth in space and time: depth edges must lie on color edges.
+"""Check of the registration of color and depth in space and time: depth edges must coincide with color edges.
 
-Depth edges are compared with the gradient of color, shifted, zoomed, and taken from frames nearby.
+Depth edges are compared with color gradients: shifted, scaled, and from nearby frames.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from framework.data import Bool, Float32, Frame
 from framework.errors import FrameError
 from framework.interfaces import RGBDSequence
 
-WIDTH = 320  # px, of the images that are compared
-LONGEST_SHIFT = 16  # of these px, in both directions
+WIDTH = 320  # px, of the compared images
+LONGEST_SHIFT = 16  # px of WIDTH, in both directions
 LONGEST_DELAY = 6  # frames, in both directions
 ZOOMS = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.11, 1.18, 1.25)  # of the depth image about its center
 DEPTH_STEP = 0.05  # of the depth: a larger step is an edge
 STRONG = 200.0  # Sobel units: stronger gradients are clipped, so that a lamp does not dominate
 FEWEST_FRAMES = 3
 FEWEST_EDGES = 20.0  # px of WIDTH: frames with fewer are not counted
-CLEARLY = 1.2  # times the agreement as stored, that another one must have
-LARGEST_SHIFT = 0.007  # of the image's width, from lenses and rolling shutters; real recordings have 0.003
-WEAKEST = 0.25  # standard deviations of the gradient at depth edges: chance
+CLEARLY = 1.2  # minimum ratio of another alignment's strength to the strength as stored
+LARGEST_SHIFT = 0.007  # of the image's width, due to lenses and rolling shutters; real recordings have 0.003
+WEAKEST = 0.25  # standard deviations: minimum strength above chance
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ class EdgeAlignment:
 
     @property
     def moved(self) -> bool:
-        """True if the edges fit best at another place."""
+        """True if the edges fit best with a shift."""
         return max(map(abs, self.shift)) > LARGEST_SHIFT
 
 
 class EdgeComparison:
-    """Compares the edges of chosen frames of a sequence, without those that cannot be read."""
+    """Comparison of color and depth edges in selected frames of a sequence; unreadable frames are skipped."""
 
     def __init__(self, sequence: RGBDSequence, chosen: Sequence[int]) -> None:
         self.sequence = sequence
@@ -54,7 +54,7 @@ class EdgeComparison:
         self._edges = lru_cache(maxsize=None)(self._find_edges)
 
     def alignments(self, candidates: Iterable[tuple[int, float]]) -> list[EdgeAlignment]:
-        """Return the alignment of each delay and zoom that has enough edges."""
+        """Return the alignment of each delay and zoom with enough edges."""
         found = []
         for delay, zoom in candidates:
             pairs = [(k, k + delay) for k in self.chosen if 0 <= k + delay < len(self.sequence)]
@@ -118,37 +118,37 @@ def depth_edges(depth: Float32) -> Bool:
 def judge(
     by_delay: Sequence[EdgeAlignment], by_zoom: Sequence[EdgeAlignment], applied_delay: int, step: float
 ) -> tuple[Finding, int]:
-    """Return the finding, and by how many frames the depth images are late.
+    """Return the finding, and the delay of the depth images in frames.
 
-    `by_zoom` is of the best delay, and `applied_delay` is the one in use. `step` is the image motion from frame to
-    frame in fractions of its width: a shift of less than half of it may come from another moment.
+    `by_zoom` is for the best delay, and `applied_delay` is the configured delay. `step` is the image motion per frame
+    in fractions of the width: a shift of less than half of it may be caused by a time offset.
     """
     subject = "color and depth"
     here = next((alignment for alignment in by_delay if alignment.delay == 0), None)
     if here is None:
-        return Finding(Verdict.UNKNOWN, subject, "too few frames or depth edges to compare"), 0
+        return Finding(Verdict.UNKNOWN, subject, "too few frames or depth edges for a comparison"), 0
     best = max(by_delay, key=lambda alignment: alignment.strength)
     clearly = best.strength > CLEARLY * here.strength or (here.moved and not best.moved)
     if best.delay and clearly and best.strength > WEAKEST:
-        text = f"depth images come {abs(best.delay)} frames {'late' if best.delay > 0 else 'early'}"
+        text = f"depth images are {abs(best.delay)} frames {'late' if best.delay > 0 else 'early'}"
         return Finding(Verdict.FAULT, subject, text, f"dataset.depth_delay={applied_delay + best.delay}"), best.delay
     zoomed = max(by_zoom, key=lambda alignment: alignment.strength, default=here)
     if zoomed.strength < WEAKEST:
-        return Finding(Verdict.UNKNOWN, subject, "their edges do not match; the images may lack contrast"), 0
+        return Finding(Verdict.UNKNOWN, subject, "edges do not match; the images may lack contrast"), 0
     if zoomed.strength < CLEARLY * here.strength:
         zoomed = here
     apart = max(map(abs, zoomed.shift))
     if zoomed.zoom == 1.0 and zoomed.moved and apart <= step / 2:
         text = (
-            f"their edges lie {100 * apart:.1f} % of the width apart, and the image moves {100 * step:.1f} % a frame: "
-            "they are not of the same moment, or not registered; check where the camera is slower"
+            f"edges are {100 * apart:.1f} % of the width apart, with an image motion of {100 * step:.1f} % per frame: "
+            "not synchronized or not registered; check a part with slower camera motion"
         )
         return Finding(Verdict.NOTE, subject, text), 0
     if zoomed.zoom != 1.0 or zoomed.moved:
         x, y = (100 * fraction for fraction in zoomed.shift)
         text = (
-            f"depth is not registered to color: its edges fit best {x:+.1f} % of the width to the right and {y:+.1f} % "
-            f"down, {zoomed.zoom:g} times as large; have the camera's driver align depth to color"
+            f"depth is not registered to color: edges fit best {x:+.1f} % of the width to the right and {y:+.1f} % "
+            f"down, scaled by {zoomed.zoom:g}; enable the alignment of depth to color in the camera's driver"
         )
         return Finding(Verdict.FAULT, subject, text), 0
-    return Finding(Verdict.FINE, subject, "their edges match, and are of the same frame"), 0
+    return Finding(Verdict.FINE, subject, "edges match without a delay"), 0

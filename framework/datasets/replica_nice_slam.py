@@ -28,10 +28,12 @@ class ReplicaNiceSlam(Recording):
     def open(self) -> Contents:
         path = self.folder.absolute().parent / "cam_params.json"  # not resolved: a scene may be a link
         if not path.is_file():
-            raise DataError(f"{path} is missing: it is next to the scenes' folders, such as dataset.scene=room0")
+            expected = "expected camera parameters next to the scene folders, got no such file"
+            raise DataError(f"{path}: {expected}; set dataset.scene to a scene folder, such as room0")
         content = read_json_object(path).get("camera")
         if not isinstance(content, dict):
-            raise DataError(f'{path} must hold {{"camera": {{{", ".join(CAMERA_KEYS)}}}}}')
+            expected = f'expected {{"camera": {{{", ".join(CAMERA_KEYS)}}}}}'
+            raise DataError(f"{path}: {expected}, got {type(content).__name__}")
         camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
         results, poses = self.folder / "results", read_matrix_lines(self.folder / "traj.txt")
         images = paired_images(numbered_images(results, (".jpg",)), numbered_images(results, (".png",)))
@@ -40,6 +42,6 @@ class ReplicaNiceSlam(Recording):
             if k < len(poses):
                 frames.append(RecordedFrame.posed(pair, k / FRAME_RATE, poses[k].pose))
             else:
-                why = f"{pair.color_name}: traj.txt has {len(poses)} poses and none for it"
-                frames.append(RecordedFrame(pair, k / FRAME_RATE, error=why))
+                error = f"{pair.color_name}: expected a pose in traj.txt, got none among its {len(poses)} poses"
+                frames.append(RecordedFrame(pair, k / FRAME_RATE, error=error))
         return Contents(camera, path, depth_scale, frames)

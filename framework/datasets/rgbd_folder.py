@@ -1,17 +1,17 @@
-"""A folder of color and depth images, the format for users' own data.
+"""Folder of color and depth images: the format for your own data.
 
     camera.json         {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}; meters = value / depth_scale;
                         "distortion": [k1, k2, p1, p2, k3], optional, of the lens of all images: undistorted when read
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw
-    gravity.txt         optional; x y z, a line per frame: up in its camera, from a sensor; nan nan nan = not known
-    instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class is one
-                                            of COCO's names, or null = not known
+    gravity.txt         optional; x y z, one line per frame: up in its camera, from a sensor; nan nan nan = unknown
+    instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class is a
+                                            COCO name, or null = unknown
 
-Files of a frame have the same number in their names. The numbers may start anywhere and have gaps. Names with times,
-such as 1305031102.175304.png, are refused. Line k of poses.txt and gravity.txt, not counting comments and empty lines,
-is the k-th frame in ascending order.
+Files of a frame have the same number in their names. The numbers may start anywhere and have gaps. Names with
+timestamps, such as 1305031102.175304.png, are invalid. Line k of poses.txt and gravity.txt, not counting comments and
+empty lines, belongs to the k-th frame in ascending order.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from framework.files.image_files import read_uint16
 from framework.files.number_lines import read_gravity
 from framework.files.tum_trajectory import TumLine, read_tum_lines
 
-LARGEST_ID = 2**16 - 1  # of an instance: its image holds uint16
+LARGEST_ID = 2**16 - 1  # of an instance: instance images are uint16
 
 Entry = TypeVar("Entry")
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class RgbdFolder(Recording):
-    """An RGB-D video in a folder of images, with poses and instance ground truth if there are files for them."""
+    """An RGB-D video in a folder of images, with optional poses and instance ground truth."""
 
     ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m
 
@@ -55,8 +55,8 @@ class RgbdFolder(Recording):
     def open(self) -> Contents:
         path = self.folder / "camera.json"
         if not path.is_file():
-            needs = "an RGB-D folder needs camera.json, color/ and depth/ (see docs/tutorials/own_data.md)"
-            raise DataError(f"{path} is missing; {needs}")
+            expected = "expected a camera next to color/ and depth/, got no such file"
+            raise DataError(f"{path}: {expected}; see docs/tutorials/own_data.md")
         camera, depth_scale, distortion = read_camera(path)
         color = numbered_images(self.folder / "color", (".jpg", ".jpeg", ".png"))
         depth = numbered_images(self.folder / "depth", (".png",))
@@ -78,7 +78,7 @@ class RgbdFolder(Recording):
         ids: Int32 = self.calibration.labels(read_uint16(path), path).astype(np.int32)
         unknown = [int(i) for i in np.flatnonzero(np.bincount(ids.ravel())) if i and i not in self._class_names]
         if unknown:
-            raise FrameError(f"{path}: instance {unknown[0]} is not in {self.folder / 'instances.json'}")
+            raise FrameError(f"{path}: expected instances of {self.folder / 'instances.json'}, got {unknown[0]}")
         return FrameTruth(ids, self._class_names)
 
     def own_scene_truth(self) -> SceneTruth | None:
@@ -98,7 +98,7 @@ class RgbdFolder(Recording):
                     raise FrameError(f"frame {index}: {recorded.error}")
                 depth, truth = self.metric_depth(index), self.truth_in(index)
             except FrameError as error:
-                log.warning("ground truth: left out %s", error)
+                log.warning("ground truth: frame skipped: %s", error)
                 continue
             if truth is not None and recorded.T_world_camera is not None:
                 yield LabeledDepth(depth, truth.instance_ids, self.camera, recorded.T_world_camera)
@@ -109,7 +109,7 @@ class RgbdFolder(Recording):
         if self.named_truth is not None or (not is_there(folder) and not is_there(names)):
             return {}, []
         if not is_there(names):
-            raise DataError(f"{folder} is there, but {names} is missing: it names the class of each instance")
+            raise DataError(f"{names}: expected the class of each instance in {folder}, got no such file")
         class_names = read_class_names(names, LARGEST_ID)
         images = numbered_images(folder, (".png",))
         _check_same_frames(color, images)
@@ -123,7 +123,7 @@ def _recorded(images: StoredImages, index: int, line: TumLine | None, up: Float6
 
 
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
-    """Raise DataError, with the first frame that has no partner, unless both have the same frame numbers."""
+    """Raise DataError, with the first unmatched frame, unless both have the same frame numbers."""
     unmatched = sorted(color.keys() ^ other.keys())
     if not unmatched:
         return
@@ -131,8 +131,8 @@ def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
     alone, missing = (color, other) if first in color else (other, color)
     folder_alone, folder_missing = (next(iter(files.values())).parent for files in (alone, missing))
     raise DataError(
-        f"{folder_alone} holds {len(alone)} images and {folder_missing} {len(missing)}: frame {first} "
-        f"({alone[first].name}) is not in {folder_missing.name}/; {len(unmatched)} frames have no partner"
+        f"{folder_missing}: expected the frames of {folder_alone} ({len(alone)} images), got {len(missing)} images and "
+        f"none for frame {first} ({alone[first].name}); {len(unmatched)} frames unmatched"
     )
 
 
@@ -142,6 +142,5 @@ def _read_optional(path: Path, read: Callable[[Path], list[Entry]], name: str, f
         return None
     entries = read(path)
     if len(entries) != frames:
-        found = f"{path} holds {len(entries)} {name}, but color/ holds {frames} frames"
-        raise DataError(f"{found}: one line a frame is needed")
+        raise DataError(f"{path}: expected one line per frame, got {len(entries)} {name} for {frames} frames in color/")
     return entries

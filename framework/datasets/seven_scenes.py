@@ -1,11 +1,11 @@
-"""7-Scenes (Shotton et al., CVPR 2013): handheld Kinect videos of seven places, with KinectFusion's poses.
+"""7-Scenes (Shotton et al., CVPR 2013): handheld Kinect videos of seven scenes, with KinectFusion poses.
 
     chess/seq-01/frame-000000.color.png     8-bit color
     chess/seq-01/frame-000000.depth.png     uint16, mm along z; 0 or 65535 = no reading
     chess/seq-01/frame-000000.pose.txt      T_world_depthcamera, four lines of four numbers, m
 
 Color and depth are published unregistered, with the intrinsics of the depth camera only. Without registration, masks
-are off by 30 px and more.
+are offset by 30 px or more.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class SevenScenes(Recording):
         names = (_IMAGE_NAME.fullmatch(path.name) for path in self.folder.iterdir())
         numbers = sorted({int(match[1]) for match in names if match})
         if not numbers:
-            raise DataError(f"{self.folder} holds no frame-000000.color.png; dataset.scene is like chess/seq-01")
+            expected = "expected frame-000000.color.png and other frames, got none"
+            raise DataError(f"{self.folder}: {expected}; set dataset.scene to a sequence such as chess/seq-01")
         frames = [_recorded(self.folder, number) for number in numbers]
         return Contents(COLOR_CAMERA, "the camera of 7-Scenes", DEPTH_SCALE, frames)
 
@@ -56,7 +57,7 @@ def _recorded(folder: Path, number: int) -> RecordedFrame:
 
 
 def _color_pose(path: Path) -> Float64:
-    """T_world_camera (4, 4) of the color camera. Raises DataError, with the file, if it is not valid."""
+    """Return T_world_camera (4, 4) of the color camera. Raises DataError, with the file, if it is not valid."""
     T_depthcamera_camera = np.eye(4)
     T_depthcamera_camera[0, 3] = BASELINE
     return read_matrix(path).pose() @ T_depthcamera_camera
@@ -65,8 +66,8 @@ def _color_pose(path: Path) -> Float64:
 def register(raw: UInt16) -> UInt16:
     """Return depth (H, W) of the color camera in mm, the nearest reading in each pixel.
 
-    An image of another size is returned unchanged, so that the reader rejects its size. The color camera sees more than
-    the depth camera: the border has no reading, and the image shrinks without holes.
+    An image of another size is returned unchanged, so that the reader rejects its size. The color camera has a wider
+    field of view: the border has no reading, and the image shrinks without holes.
     """
     if raw.shape != DEPTH_CAMERA.shape:
         return raw

@@ -1,13 +1,13 @@
-"""TUM RGB-D (Sturm et al., IROS 2012): Kinect videos with poses from motion capture.
+"""TUM RGB-D (Sturm et al., IROS 2012): Kinect videos with motion-capture poses.
 
-    rgb.txt, depth.txt      a line per image, `timestamp filename`, s; `#` begins a comment
+    rgb.txt, depth.txt      one line per image, `timestamp filename`, s; `#` begins a comment
     rgb/, depth/            8-bit color and uint16 depth along z, registered to color, 5000 units per meter; 0 = none
     groundtruth.txt         optional; TUM format, T_world_camera of the color camera, about 100 poses a second
-    camera.json             of other recordings in this layout: intrinsics, depth scale and distortion, with the
+    camera.json             for other recordings in this layout: intrinsics, depth scale and distortion, with the
                             same keys as in an RGB-D folder; read if the folder's name does not contain freiburg
 
-The published correction factors of depth are already applied. Color and depth of freiburg1 and freiburg2 have the lens
-distortion of the color camera, of 5 px and more in half of the pixels; both are undistorted when read. freiburg3 was
+The published depth correction factors are already applied. Color and depth of freiburg1 and freiburg2 have the lens
+distortion of the color camera, 5 px or more in half of the pixels; both are undistorted when read. freiburg3 was
 published undistorted.
 """
 
@@ -68,7 +68,7 @@ class TumRgbd(Recording):
     """A sequence of TUM RGB-D, or another recording in its layout.
 
     Color and depth are associated by time: the closest pairs first, each image once. The true pose is interpolated at
-    the time of the color image. It is not known if no pose is within `max_time_difference`.
+    the time of the color image. It is unknown if no pose is within `max_time_difference`.
     """
 
     intrinsics: Intrinsics = Intrinsics.AUTO  # intrinsics of the color camera
@@ -87,8 +87,8 @@ class TumRgbd(Recording):
         pairs = associate(color_times, depth_times, self.max_time_difference)
         if not pairs:
             raise DataError(
-                f"{self.folder}: no image of rgb.txt has one of depth.txt within dataset.max_time_difference "
-                f"({self.max_time_difference:g} s)"
+                f"{self.folder}: expected images of rgb.txt and depth.txt within dataset.max_time_difference "
+                f"({self.max_time_difference:g} s), got none"
             )
         if len(pairs) < len(color):
             log.info("%s: %d of %d color images have no depth image", self.name, len(color) - len(pairs), len(color))
@@ -101,7 +101,7 @@ class TumRgbd(Recording):
         return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None)
 
     def _stored_camera(self) -> tuple[StoredCamera, Path | str]:
-        """Return the camera, and the file or parameter that selects it."""
+        """Return the camera, and its source: a file or a parameter."""
         intrinsics, own = self.intrinsics, self.folder / "camera.json"
         if intrinsics is Intrinsics.AUTO:
             named = re.search(r"freiburg[123]", self.name)
@@ -109,8 +109,9 @@ class TumRgbd(Recording):
                 return read_camera(own), own
             if not named:
                 raise ConfigError(
-                    f"dataset.intrinsics: the folder's name {self.name} has no freiburg1, freiburg2 or freiburg3 in it;"
-                    f" choose one of these in upper case or ROS_DEFAULT, or write {own} with {', '.join(CAMERA_KEYS)}"
+                    f"dataset.intrinsics: expected freiburg1, freiburg2 or freiburg3 in the folder's name, got "
+                    f"{self.name}; set one of these in upper case or ROS_DEFAULT, or write {own} with "
+                    f"{', '.join(CAMERA_KEYS)}"
                 )
             intrinsics = Intrinsics(named[0])
         return PUBLISHED[intrinsics], f"dataset.intrinsics={intrinsics.name}"
@@ -129,20 +130,20 @@ Timed = TypeVar("Timed", ListedImage, TumLine)
 
 @dataclass(frozen=True)
 class Trajectory:
-    """True poses at any time."""
+    """True poses, interpolated at any time."""
 
-    lines: Sequence[TumLine]  # in order of time; some may be no pose
+    lines: Sequence[TumLine]  # in order of time; some may be invalid poses
     timestamps: Float64  # (L,) s, of the lines
     max_time_difference: float  # s
 
     @classmethod
     def of(cls, path: Path, lines: Sequence[TumLine], max_difference: float) -> Trajectory:
-        """Return the trajectory of the lines of a file; of lines with the same timestamp, it has the first."""
+        """Return the trajectory from the lines of a file; of lines with the same timestamp, the first is used."""
         ordered = sorted(_first_of_each(path, lines, "poses"), key=lambda line: line.timestamp)
         return cls(ordered, np.array([line.timestamp for line in ordered]), max_difference)
 
     def at(self, timestamp: float) -> Float64 | None:
-        """Return T_world_camera (4, 4), None = not known. Raises DataError if a line that it needs is no pose."""
+        """Return T_world_camera (4, 4), None = unknown. Raises DataError if a required line is not a valid pose."""
         after = int(np.searchsorted(self.timestamps, timestamp, side="right"))
         around = range(max(after - 1, 0), min(after + 1, len(self.lines)))
         if not any(abs(self.timestamps[k] - timestamp) <= self.max_time_difference for k in around):
@@ -177,23 +178,25 @@ def associate(first: Sequence[float], second: Sequence[float], max_difference: f
 
 
 def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]:
-    """Return the items without those that repeat a timestamp: association is quadratic in their number."""
+    """Return the first item of each timestamp: association is quadratic in the number of duplicates."""
     at: dict[float, Timed] = {}
     for item in items:
         at.setdefault(item.timestamp, item)
     if len(at) < len(items):
         repeated = len(items) - len(at)
-        log.warning("%s: %d %s are left out, as one before has the same timestamp", path, repeated, name)
+        log.warning(
+            "%s: expected unique timestamps; skipped %d %s with an earlier one's timestamp", path, repeated, name
+        )
     return list(at.values())
 
 
 def _read_list(path: Path) -> list[ListedImage]:
     """Return the images of a list. Raises DataError for a line that is not `timestamp filename`."""
-    lines = read_lines(path, missing="is missing: it lists the images' times, a line each: timestamp filename")
+    lines = read_lines(path, missing="expected lines of `timestamp filename`, got no such file")
     numbered = [(n, line.strip()) for n, line in enumerate(lines, start=1)]
     images = [_listed(path, n, line) for n, line in numbered if line and not line.startswith("#")]
     if not images:
-        raise DataError(f"{path} lists no image")
+        raise DataError(f"{path}: expected a list of images, got none")
     return _first_of_each(path, images, "images")
 
 
@@ -204,5 +207,5 @@ def _listed(path: Path, number: int, line: str) -> ListedImage:
     except ValueError:
         timestamp = math.nan
     if not names or not math.isfinite(timestamp) or not names[0].isprintable() or len(names[0]) > LONGEST_NAME:
-        raise DataError(f"{path}, line {number}: expected `timestamp filename`, found {line[:SHOWN]!r}")
+        raise DataError(f"{path}, line {number}: expected `timestamp filename`, got {line[:SHOWN]!r}")
     return ListedImage(timestamp, path.parent / names[0])

@@ -1,1 +1,1 @@
-"""A stored run as files of other programs: meshes, scenes for simulators, floor plans, a scene graph."""
+"""Export of a stored run: meshes, scenes for simulators, floor plans and a scene graph."""

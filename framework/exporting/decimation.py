@@ -1,4 +1,7 @@
-"""Cuts, joins and decimates meshes. Decimation keeps the texture of flat surfaces, and is fast for huge maps."""
+"""Cutting, joining and decimation of meshes.
+
+Decimation keeps the texture of flat surfaces and is fast for huge maps.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, Int64
 
-OBJECTS_SHARE = 0.5  # of the triangles, for objects
+OBJECTS_SHARE = 0.5  # fraction of the triangles for objects
 FEWEST = 4  # triangles of a closed surface
 QUADRIC_STEP = 2.5  # quadric decimation is quadratic in the ratio of triangles: larger meshes are clustered first
 LEFT_TO_QUADRIC = 1.8  # ratio of triangles after clustering and after quadric decimation

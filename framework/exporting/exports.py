@@ -1,4 +1,4 @@
-"""Exports of a run: the files and their contents."""
+"""Exports of a run."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Chosen:
             value = getattr(self, name)
             require(low <= value <= high, name, value, f"a value in [{low:g}, {high:g}]")
         if self.triangles is not None and self.triangles < 4:
-            raise DataError(f"triangles must be at least 4, found {self.triangles}")
+            raise DataError(f"triangles: expected at least 4, got {self.triangles}")
 
     @classmethod
     def named(cls, objects: Sequence[str | int] = (), **choices: Any) -> Chosen:
@@ -74,7 +74,8 @@ class Chosen:
             if name in choices:
                 choices[name] = one_of(kind, name, choices[name])
         if unknown := choices.keys() - {field.name for field in fields(cls)}:
-            raise ConfigError(f"export has no choice {min(unknown)!r}; it has {', '.join(f.name for f in fields(cls))}")
+            known = ", ".join(f.name for f in fields(cls))
+            raise ConfigError(f"export: expected options in {known}, got {min(unknown)!r}")
         return cls(tuple(map(str, objects)), **choices)
 
 
@@ -85,7 +86,8 @@ def one_of(kind: type[Option], name: str, value: object) -> Option:
     """Return the member with this value. Raises ConfigError, which lists all values."""
     found = next((option for option in kind if option.value == value), None)
     if found is None:
-        raise ConfigError(f"{name} must be one of {', '.join(option.value for option in kind)}, found {value!r:.60}")
+        known = ", ".join(option.value for option in kind)
+        raise ConfigError(f"{name}: expected one of {known}, got {value!r:.60}")
     return found
 
 
@@ -126,16 +128,16 @@ def export(
 
 
 def _check_known(run: Path, room: UprightRoom, formats: Sequence[ExportFormat]) -> None:
-    """Raise DataError if a run lacks the up direction or floor height that a format needs."""
+    """Raise DataError if a run lacks the up direction or floor height required by a format."""
     flat = [one.value for one in formats if one not in MESHES]
     if not room.up_known and flat:
-        raise DataError(f"{run} has no up direction, which {flat[0]} needs: set --up X Y Z --floor M")
+        raise DataError(f"{run}: expected an up direction for {flat[0]}, got none; set --up X Y Z --floor M")
     if not room.up_known:
-        log.warning("%s has no up direction: the world's z is used; set another with --up X Y Z", run)
+        log.warning("%s: no up direction; using the world's z axis; set another with --up X Y Z", run)
     elif not room.floor_known and ExportFormat.FLOORPLAN in formats:
-        raise DataError(f"{run} has no floor height, which floorplan needs: set --floor M")
+        raise DataError(f"{run}: expected a floor height for floorplan, got none; set --floor M")
     elif not room.floor_known and ExportFormat.GRAPH in formats:
-        log.warning("%s has no floor height: the graph omits floor, walls and rooms", run)
+        log.warning("%s: no floor height; the graph omits floor, walls and rooms; set --floor M", run)
 
 
 def _write_surfaces(room: UprightRoom, formats: Sequence[ExportFormat], directory: Path, chosen: Chosen) -> list[Path]:
@@ -143,7 +145,7 @@ def _write_surfaces(room: UprightRoom, formats: Sequence[ExportFormat], director
     files: dict[str, list[Part]] = {}
     if not chosen.objects:
         if not len(room.mesh.triangles):
-            raise DataError("nothing was mapped: there is no surface to export")
+            raise DataError("map: expected a surface to export, got an empty map")
         files["scene"] = parts(room, chosen.triangles)
     files |= {f"objects/{part.name}": [part.alone] for part in object_parts(room, chosen.triangles)}
     written = []

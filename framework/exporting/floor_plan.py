@@ -28,20 +28,20 @@ TONES = {
     "wall": WALL,
     "occupied": OCCUPIED,
     "free": FREE,
-    "floor, not all air above it seen": FLOOR,
-    "not seen": UNSEEN,
+    "floor, space above partly unobserved": FLOOR,
+    "unobserved": UNSEEN,
 }
 DPI = 150
-TINT = 0.6  # share of an object's color in its cells
+TINT = 0.6  # fraction of an object's color in its cells
 DARKER = 0.65  # factor of an outline's color
 LONGER_SIDE, SHORTEST_SIDE = 9.0, 4.5  # of the plan, inches
 FOOT = 0.72  # height of the legend, inches
 EDGE = 0.15  # inches
 TEXT_PT, SMALL_PT = 8.0, 7.0
 BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # possible lengths of the scale bar, m
-BAR_SHARE = 0.25  # maximum length of the scale bar by the plan's width
+BAR_SHARE = 0.25  # maximum length of the scale bar, as a fraction of the plan's width
 MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1), (-0.6, -1))
-"""Offsets of a name that are tried, in its own widths and heights."""
+"""Candidate offsets of a name, in its own widths and heights."""
 COORDINATES = "meters in the room: x, y; z is up, and the floor at 0. They are not longitude and latitude."
 DIGITS = 4  # decimal places, of meters
 

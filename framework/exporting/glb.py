@@ -1,7 +1,7 @@
 """Binary glTF 2.0: a node for each object, with its data in `extras`, and one for the rest of the room.
 
 y is up. Colors are linear. Appearance is unlit (KHR_materials_unlit), because it contains the light; colors of objects
-or classes are lit. The rest of the room is one-sided, so that one can look into it from outside.
+or classes are lit. The rest of the room is one-sided, so that its inside is visible from outside.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from framework.exporting.object_meshes import Coloring, Part, linear, part_color
 from framework.rendering.surface import Surface
 
 T_GLTF_ROOM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-COLOR = "_LINEAR"  # attribute for trimesh, whose own 8-bit colors are too coarse for dark linear ones
+COLOR = "_LINEAR"  # attribute for trimesh: its own 8-bit colors are too coarse for dark linear colors
 UNLIT = "KHR_materials_unlit"
 UNSIGNED_SHORT = 5123
 

@@ -1,4 +1,4 @@
-"""Splits a room into objects, each upright at the origin of its own frame, and the rest of the room."""
+"""Objects of a room, each upright at the origin of its own frame, and the rest of the room."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def object_part(room: UprightRoom, one: RoomObject) -> Part:
 
 
 def rest(room: UprightRoom) -> Part:
-    """Return the rest of the room, with the triangles between objects, so that there is no gap."""
+    """Return the rest of the room, with the triangles between objects, to avoid gaps."""
     owner = _marked(room.mesh, room.objects)
     corners = owner[room.mesh.triangles]
     outside = (corners[:, 0] == 0) | (corners != corners[:, :1]).any(axis=1)

@@ -1,15 +1,15 @@
 """Occupancy of the floor for robots: free, occupied or unknown.
 
-A map stores only voxels near surfaces, so it does not contain most of the free space. The surface is therefore rendered
-from poses along the whole trajectory. A cell is free if
+A map stores only voxels near surfaces and thus omits most of the free space. The surface is therefore rendered from
+poses along the whole trajectory. A cell is free if
 
-- the floor was seen there,
+- the floor was observed there,
 - no surface is between `CLEARANCE` and the robot's height,
-- the cameras looked through all space between these heights.
+- all space between these heights was observed as free.
 
 A cell with a surface between these heights is occupied, all others are unknown. A run does not contain the camera's
-field of view; a Kinect's is used (`queries.changes.EYE`). Glass and mirrors are invisible to depth cameras and may be
-called free.
+field of view; that of a Kinect is used (`queries.changes.EYE`). Glass and mirrors are invisible to depth cameras and
+may be classified as free.
 """
 
 from __future__ import annotations
@@ -69,12 +69,13 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
     """Return the plan of a room with a known floor height; cell size and robot height in m. Raises DataError."""
     found = surface_points(room, resolution / 2)
     if not len(found.points):
-        raise DataError("nothing was mapped: there is no floor to plan")
+        raise DataError("map: expected a surface for the plan, got an empty map")
     low, high = found.points[:, :2].min(axis=0).astype(np.float64), found.points[:, :2].max(axis=0).astype(np.float64)
     origin = (np.floor(low / resolution) - 1) * resolution
     columns, rows = (np.floor((high - origin) / resolution) + 2).astype(np.int64).tolist()
     if rows * columns > MOST_CELLS:
-        raise DataError(f"a plan of {columns} x {rows} cells is too large: raise the resolution of {resolution:g} m")
+        found = f"{columns} x {rows} cells of {resolution:g} m"
+        raise DataError(f"plan: expected at most {MOST_CELLS} cells, got {found}; raise the resolution")
     column, row = np.floor((found.points[:, :2] - origin) / resolution).astype(np.int64).T
     number = row * columns + column  # (P,) cell of each point
     heights = found.points[:, 2]
@@ -103,7 +104,7 @@ def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
 
 
 def looked_through(room: UprightRoom, places: Float64) -> Bool:
-    """Return (P,) true if a camera of the run looked through a place (P, 3) m of the room."""
+    """Return (P,) true if the run observed free space at a point (P, 3) m of the room."""
     through = np.zeros(len(places), np.bool_)
     rasterizer = Rasterizer(room.mesh.vertices, room.mesh.triangles)
     for k in np.unique(np.linspace(0, len(room.poses) - 1, LOOKS).round().astype(int)) if len(room.poses) else []:

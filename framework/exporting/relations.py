@@ -1,7 +1,7 @@
 """Spatial relations between objects, by geometry alone: on, in, next to, attached to a wall.
 
-Contact surfaces are hidden: the table under a cup is not in the map. An object is therefore on another one that has a
-level surface around its foot at the height of its base, or whose top is there.
+Contact surfaces are hidden: the table under a cup is not in the map. An object is therefore on another object with a
+level surface around its foot at the height of its base, or with its top at that height.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from framework.exporting.upright_room import RoomObject, UprightRoom, surface_po
 SPACING = 0.02  # of surface points, m
 CELL = 0.03  # cell size of footprints, m
 TOUCHING = 0.05  # maximum distance of a base from its support, m: depth is noisy at edges
-ON_FLOOR = 0.10  # maximum height of the seen part of an object on the floor, m; thin legs are incomplete
+ON_FLOOR = 0.10  # maximum height of the observed part of an object above the floor, m; thin legs are incomplete
 FOOT = 0.10  # height of the foot above the base, m
 AROUND = 2  # width of the ring around a foot, cells
 COVERED = 0.35  # minimum fraction of the ring with a level surface at the base
@@ -33,8 +33,8 @@ ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in a bowl, an
 MAX_NEIGHBOR_DISTANCE = 0.3  # m
 ON_WALL = 0.10  # maximum distance from a wall, m
 HANGING = 0.7  # minimum fraction of points near a wall
-STRAY = 2.0  # % of a surface at its lower and upper end that may be noise
-MOST_POINTS = 3000  # of an object for distances
+STRAY = 2.0  # %, fraction of a surface at its lower and upper end treated as noise
+MOST_POINTS = 3000  # maximum number of points of an object for distances
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def _standing(thing: _Thing, things: list[_Thing], plan: Plan | None) -> Relatio
 
 
 def _carries(below: _Thing, above: _Thing) -> float:
-    """Return how well one object supports another, in [0, 1]; 0 = not at all."""
+    """Return the support score of one object for another, in [0, 1]; 0 = no support."""
     if below.base >= above.base or below.tree.n < 1:
         return 0.0
     near = below.level & (np.abs(below.points[:, 2] - above.base) <= TOUCHING)

@@ -1,7 +1,7 @@
-"""Rooms: the known floor of a plan, separated by walls with openings of at most a door.
+"""Rooms of a plan: its known floor, separated by walls with openings of at most a door.
 
-The parts that are farther than half a door from every wall are the interiors of rooms; they grow until they meet in the
-doors. Only walls separate rooms, not furniture or unseen places: without visible walls there is one room.
+Areas farther than half a door from every wall are the interiors of rooms; they are grown until they meet in the doors.
+Only walls separate rooms, not furniture or unobserved areas: without observed walls, the plan has one room.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from framework.data import Bool, Float64, Int32
 from framework.exporting.occupancy import Plan
 
 DOOR = 1.0  # m, the widest opening that separates rooms; most doors have 0.7 to 0.95
-GAP = 0.3  # maximum width of unseen gaps that are filled, m
+GAP = 0.3  # maximum width of filled gaps, m
 LEAST_INSIDE = 0.5  # minimum interior of a room, m^2
 
 

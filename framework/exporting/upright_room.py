@@ -1,7 +1,7 @@
-"""A stored run in a frame that stands upright on the floor: its surface, its objects, and points on the surface.
+"""A stored run in an upright frame on the floor: its surface, its objects, and points on the surface.
 
-The room frame is in meters, z up, the floor at z = 0: the world, rotated by the smallest angle that makes it upright,
-and translated along z. If the world's z is up, x and y are the world's.
+The room frame is in meters, z up, the floor at z = 0: the world, rotated by the smallest angle to upright, and
+translated along z. If the world's z is up, x and y are the world's.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LONGEST_NAME = 60  # characters of a class in names of files and nodes
 UP = np.array([0.0, 0.0, 1.0])
 HIGHEST = 1e4  # limit of the floor height, m; vertices are float32
 SPECK = 0.01  # fraction of an object's vertices: loose pieces at depth edges would widen its box
-MOST_POINTS = 2**24  # of a room; 100 m^2 of surface have 4 million at 1 cm voxels
+MOST_POINTS = 2**24  # limit of a room; 100 m^2 of surface have 4 million at 1 cm voxels
 LEVEL = float(np.cos(np.radians(30.0)))  # minimum z of the normal of a supporting surface
 UPRIGHT = float(np.sin(np.radians(20.0)))  # maximum |z| of the normal of a wall
 SHORTEST_UP = 1e-6  # minimum length of an up direction
@@ -107,11 +107,13 @@ class UprightRoom:
             by_id = [one for one in self.objects if str(one.id) == word]
             by_class = [one for one in self.objects if one.class_name == word]
             if not by_id and not by_class:
-                raise DataError(f"there is no object {word!r} in this run{_hint(word, self.objects)}")
+                raise DataError(f"object: expected an id or class of this run, got {word!r}{_hint(word, self.objects)}")
             of_class = [one for one in by_class if one.confidence >= min_confidence]
             if not by_id and not of_class:
                 best = max(one.confidence for one in by_class)
-                raise DataError(f"no {word!r} has a confidence of {min_confidence:g}; the highest is {best:.2f}")
+                raise DataError(
+                    f"object: expected a confidence >= {min_confidence:g} of {word!r}, got at most {best:.2f}"
+                )
             found |= {one.id: one for one in (*by_id, *of_class)}
         return replace(self, objects=tuple(found[key] for key in sorted(found)))
 
@@ -217,7 +219,7 @@ def _direction(where: str, figures: Mapping[str, Any]) -> Float64 | None:
 
 def _height(name: str, value: float | None) -> float | None:
     if value is not None and not abs(value) <= HIGHEST:
-        raise DataError(f"{name}, the floor, must be a height within {HIGHEST:g} m, found {value!r:.60}")
+        raise DataError(f"{name}: expected a floor height in [-{HIGHEST:g}, {HIGHEST:g}] m, got {value!r:.60}")
     return value
 
 
@@ -225,21 +227,21 @@ def _unit(name: str, values: Sequence[Any]) -> Float64:
     vector = np.array(values, np.float64)
     length = float(np.linalg.norm(vector))
     if vector.shape != (3,) or not np.isfinite(vector).all() or length < SHORTEST_UP:
-        raise DataError(f"{name} must be three numbers, a direction, found {values!r:.60}")
+        raise DataError(f"{name}: expected a direction of 3 numbers, got {values!r:.60}")
     return vector / length
 
 
 def _hint(word: str, objects: Sequence[RoomObject]) -> str:
     names = sorted({one.class_name for one in objects})
     if not names:
-        return ", which has none"
+        return "; the run has no objects"
     close = get_close_matches(word, names, n=1)
-    return f"; did you mean {close[0]!r}?" if close else f"; it has {', '.join(names)}, and their ids"
+    return f"; did you mean {close[0]!r}?" if close else f"; classes: {', '.join(names)}"
 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """P points on a room's surface, evenly spread whatever the size of its triangles."""
+    """P points on a room's surface, evenly spread regardless of triangle sizes."""
 
     points: Float32  # (P, 3) m, room
     normal_z: Float32  # (P,) of the unit normal
@@ -257,7 +259,7 @@ class SurfacePoints:
 
 
 def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
-    """Return the centers of a room's triangles, which are split into pieces with sides of at most `spacing` m.
+    """Return the centers of a room's triangles after splitting them into pieces with sides of at most `spacing` m.
 
     Raises DataError for more than MOST_POINTS.
     """
@@ -267,7 +269,8 @@ def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
     cuts = np.maximum(np.ceil(longest / spacing), 1)
     if float((cuts**2).sum()) > MOST_POINTS:
         raise DataError(
-            f"the surface is too large for points {spacing:g} m apart: raise the resolution, or map with larger voxels"
+            f"surface: expected at most {MOST_POINTS} points at a spacing of {spacing:g} m, got more; raise the "
+            "resolution, or map with larger voxels"
         )
     normals = room.surface.face_normals
     normal_z = (normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-20)).astype(np.float32)

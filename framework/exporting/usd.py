@@ -25,8 +25,8 @@ from framework.errors import DataError
 from framework.exporting.object_meshes import Coloring, Part, linear, part_colors
 from framework.files.atomic_write import written_whole
 
-MISSING = "USD files need the package usd-core: pip install instancemap[usd]"
-NOT_WRITTEN = "USD could not write it"
+MISSING = "usd: expected the package usd-core, got none; run pip install instancemap[usd]"
+NOT_WRITTEN = "the USD library failed to write the stage"
 THINNEST = 0.002  # minimum side of a collision box, m: an object seen from one side may be flat
 GRAVITY = 9.81  # m/s^2
 

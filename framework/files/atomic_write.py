@@ -1,4 +1,4 @@
-"""Atomic writes, and reads up to a size."""
+"""Atomic writes and size-limited reads."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ def written_whole(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        why = error.strerror or f"{error}; the disk may be full"  # NumPy only reports the number of items
-        raise DataError(f"{path} could not be written: {why}") from error
+        reason = error.strerror or f"{error}; the disk may be full"  # NumPy only reports the number of items
+        raise DataError(f"{path}: cannot be written: {reason}") from error
     finally:
         with suppress(OSError):  # the disk may be read-only
             temporary.unlink(missing_ok=True)
 
 
 def is_there(path: Path) -> bool:
-    """Return true if an optional file exists, including broken links and folders, which its reader reports."""
+    """Return True if an optional file exists, including broken links and folders, which its reader reports."""
     return os.path.lexists(path)
 
 
@@ -58,10 +58,10 @@ def check_regular(path: Path) -> os.stat_result:
     try:
         found = path.stat()
     except (OSError, ValueError) as error:
-        raise DataError(f"{path} could not be read: {getattr(error, 'strerror', None) or error}") from error
+        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
-        raise DataError(f"{path} is no file but {kind}")
+        raise DataError(f"{path}: expected a regular file, got {kind}")
     return found
 
 
@@ -69,11 +69,11 @@ def read_bytes(path: Path, most: int) -> bytes:
     """Read a file of at most `most` bytes. Raises DataError."""
     size = check_regular(path).st_size
     if size > most:
-        raise DataError(f"{path} has {size} bytes, more than the {most} that such a file can have")
+        raise DataError(f"{path}: expected at most {most} bytes, got {size}")
     try:
         return path.read_bytes()
     except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:
@@ -81,4 +81,4 @@ def read_text(path: Path, most: int = MOST_TEXT) -> str:
     try:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{path} could not be read as text: {error}") from error
+        raise DataError(f"{path}: expected UTF-8 text: {error}") from error

@@ -32,7 +32,7 @@ def new_directory(wanted: str) -> str:
                 number += 1
                 path = Path(f"{wanted}_{number}")
     except OSError as error:
-        raise DataError(f"the directory {path} could not be made: {error.strerror}") from error
+        raise DataError(f"{path}: directory cannot be created: {error.strerror}") from error
 
 
 @contextmanager
@@ -49,11 +49,11 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
         except Timeout as error:
             owner = holder(directory) or "another process"
             if not wait:
-                raise DataError(f"{directory} is in use by {owner}; wait until it has ended, or end it") from error
-            log.warning("waiting for %s, which is at work in %s", owner, directory)
+                raise DataError(f"{directory}: in use by {owner}; wait for it to exit, or stop it") from error
+            log.warning("%s: in use by %s; waiting for it to exit", directory, owner)
             lock.acquire()
     except OSError as error:
-        log.warning("%s cannot be locked (%s): start nothing else there meanwhile", directory, error.strerror)
+        log.warning("%s: cannot be locked (%s); do not start other runs in it", directory, error.strerror)
     try:
         with written_whole(directory / HOLDER) as temporary:
             temporary.write_text(f"{holder_name(os.getpid())}\n")
@@ -63,7 +63,7 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
 
 
 def is_locked(directory: Path) -> bool:
-    """Return true if a process has locked `directory`."""
+    """Return True if a process has locked `directory`."""
     if not (directory / LOCK).exists():
         return False
     lock = FileLock(directory / LOCK, fallback_to_soft=False)

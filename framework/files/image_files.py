@@ -1,4 +1,4 @@
-"""Images, read strictly: a damaged file is an error.
+"""Strict image readers: a damaged file is an error.
 
 Pillow checks headers and the checksums of PNG, but accepts truncated files, so the end marker is checked here. libjpeg
 fills in what it cannot decode with a warning that OpenCV does not report; simplejpeg raises an error.
@@ -38,10 +38,10 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
         try:
             return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB", strict=True), np.uint8)
         except ValueError as error:
-            raise FrameError(f"{name} is damaged: {in_one_line(error)}") from error
+            raise FrameError(f"{name}: damaged image: {in_one_line(error)}") from error
     image = _decode_png(name, data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image.dtype != np.uint8:
-        raise FrameError(f"{name}: color must be 8 bits a channel, found {image.dtype}")
+        raise FrameError(f"{name}: expected color with 8 bits per channel, got {image.dtype}")
     return np.asarray(image, np.uint8)
 
 
@@ -65,9 +65,7 @@ def _decode_channel(name: Path | str, data: bytes, dtype: type[np.generic]) -> A
     image = _decode_png(name, data, cv2.IMREAD_UNCHANGED)
     if image.dtype != dtype or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise FrameError(
-            f"{name} must be a PNG with one channel of {dtype.__name__}, found {channels} of {image.dtype}"
-        )
+        raise FrameError(f"{name}: expected a PNG with 1 channel of {dtype.__name__}, got {channels} of {image.dtype}")
     return image
 
 
@@ -84,7 +82,7 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
     except cv2.error:
         image = None
     if image is None:
-        raise FrameError(f"{name} could not be decoded: the file is damaged")
+        raise FrameError(f"{name}: cannot be decoded; the file is damaged")
     return np.asarray(image)
 
 
@@ -94,24 +92,24 @@ def check_image(name: Path | str, data: bytes) -> None:
     Decoders allocate what the header declares, which may be 10^10 px in a damaged file.
     """
     if not data:
-        raise FrameError(f"{name} is empty")
+        raise FrameError(f"{name}: expected an image, got an empty file")
     kind: type[ImageFile]
     if data.startswith(PNG_START):
         kind, ended = PngImageFile, data.rfind(PNG_END) >= 0
     elif data.startswith(JPEG_START):
         kind, ended = JpegImageFile, data.rstrip(JPEG_PADDING).endswith(JPEG_END)
     else:
-        raise FrameError(f"{name} is neither a JPEG nor a PNG file")
+        raise FrameError(f"{name}: expected a JPEG or PNG file, got another format")
     if not ended:
-        raise FrameError(f"{name} is truncated: it ends after {len(data)} bytes without its end marker")
+        raise FrameError(f"{name}: truncated image: no end marker in its {len(data)} bytes")
     try:
         image = kind(io.BytesIO(data))  # Image.open warns of large images and has its own limit
         width, height = image.size
         pictures = getattr(image, "n_frames", 1)
         image.verify()
     except Exception as error:  # Pillow has no base exception
-        raise FrameError(f"{name} is damaged: {in_one_line(error)}") from error
+        raise FrameError(f"{name}: damaged image: {in_one_line(error)}") from error
     if pictures > 1:
-        raise FrameError(f"{name} is an animation of {pictures} pictures; a frame is one")
+        raise FrameError(f"{name}: expected a single image, got an animation of {pictures}")
     if not 0 < width * height <= MOST_PIXELS:
-        raise FrameError(f"{name} claims to be {width}x{height} px; it is damaged, or larger than {MOST_PIXELS} px")
+        raise FrameError(f"{name}: expected an image of 1 to {MOST_PIXELS} px, got {width}x{height} px")

@@ -1,4 +1,4 @@
-"""JSON files, read strictly up to a size and depth."""
+"""Strict JSON files of limited size and depth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
 
 DEEPEST = 50  # nested objects and lists
-TOO_DEEP = f"it is not valid JSON for us: lists and objects more than {DEEPEST} deep"
+TOO_DEEP = f"expected JSON with at most {DEEPEST} nested lists and objects, got more"
 MOST_BITS = 63  # of an integer: times in ns have 61, and libraries support no more
 
 
@@ -32,17 +32,17 @@ def parse_json(where: object, content: bytes | str) -> Any:
     try:
         found = json.loads(content, parse_int=_whole, object_pairs_hook=_once)
     except RecursionError as error:
-        raise DataError(f"{where} cannot be read: {TOO_DEEP}") from error
+        raise DataError(f"{where}: {TOO_DEEP}") from error
     except (ValueError, MemoryError) as error:
-        raise DataError(f"{where} cannot be read: it is not valid JSON: {in_one_line(error)}") from error
+        raise DataError(f"{where}: expected valid JSON: {in_one_line(error)}") from error
     if not _is_shallow(found):
-        raise DataError(f"{where} cannot be read: {TOO_DEEP}")
+        raise DataError(f"{where}: {TOO_DEEP}")
     return found
 
 
 def _whole(digits: str) -> int:
     if len(digits) > MOST_BITS or (value := int(digits)).bit_length() > MOST_BITS:
-        raise ValueError(f"{digits[:20]}... is a whole number of {len(digits)} digits, more than {MOST_BITS} bits hold")
+        raise ValueError(f"expected integers of at most {MOST_BITS} bits, got {digits[:20]}... of {len(digits)} digits")
     return value
 
 
@@ -51,12 +51,12 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for k, (key, _) in enumerate(pairs) if key in {before for before, _ in pairs[:k]})
-        raise ValueError(f"the key {twice!r} is twice in an object")
+        raise ValueError(f"duplicate key {twice!r} in an object")
     return found
 
 
 def _is_shallow(content: Any) -> bool:
-    """Return true if content is at most DEEPEST deep, without recursion."""
+    """Return True if content is at most DEEPEST deep, without recursion."""
     level = [content] if isinstance(content, list | dict) else []
     for _ in range(DEEPEST):
         nodes = [node.values() if isinstance(node, dict) else node for node in level]

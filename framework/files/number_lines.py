@@ -26,10 +26,10 @@ SHORTEST, LONGEST = 1e-6, 1e6  # of a direction, in any unit
 _NO_NUMBER = re.compile(r"[+-]?(1\.#\w+|nan\(\w+\))", re.ASCII | re.IGNORECASE)
 
 
-def read_lines(path: Path, missing: str = "does not exist") -> list[str]:
-    """Return the lines of a text file. Raises DataError; `missing` is the message for a file that does not exist."""
+def read_lines(path: Path, missing: str = "expected a text file, got no such file") -> list[str]:
+    """Return the lines of a text file. Raises DataError; `missing` is the message for a nonexistent file."""
     if not path.exists():
-        raise DataError(f"{path} {missing}")
+        raise DataError(f"{path}: {missing}")
     return read_text(path).splitlines()
 
 
@@ -42,13 +42,13 @@ def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> li
     """Parse the words of a line as `count` numbers, which may be NaN. Raises DataError with `where` and `names`."""
     expected = f"{where}: expected {count} numbers{f' ({names})' if names else ''}"
     if len(words) != count:
-        raise DataError(f"{expected}, found {len(words)}")
+        raise DataError(f"{expected}, got {len(words)}")
     values = []
     for word in words:
         try:
             values.append(number(word))
         except ValueError as error:
-            raise DataError(f"{expected}, found {word[:SHOWN]!r}") from error
+            raise DataError(f"{expected}, got {word[:SHOWN]!r}") from error
     return values
 
 
@@ -74,13 +74,13 @@ def _direction(where: str, words: Sequence[str]) -> Float64 | None:
         return None
     length = math.hypot(*values)
     if not SHORTEST <= length <= LONGEST:
-        raise DataError(f"{where}: expected a direction, or nan nan nan where none is known, found {' '.join(words)!r}")
+        raise DataError(f"{where}: expected a direction, or nan nan nan if unknown, got {' '.join(words)!r}")
     return np.array(values) / length
 
 
 @dataclass(frozen=True)
 class PrintedMatrix:
-    """A matrix of a file, which is checked when it is used as a pose or camera."""
+    """A matrix from a file, validated when it is used as a pose or camera."""
 
     where: str  # file, and line if it contains several
     values: Float64  # (4, 4), may be NaN
@@ -94,7 +94,9 @@ class PrintedMatrix:
         """Return the pinhole camera with this intrinsic matrix for images of this size. Raises DataError."""
         (fx, _, cx, _), (_, fy, cy, _) = self.values[:2].tolist()
         if not np.allclose(self.values, [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]]):
-            raise DataError(f"{self.where}: expected intrinsics, fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0 / 0 0 0 1")
+            found = " / ".join(" ".join(f"{value:g}" for value in row) for row in self.values)
+            expected = "expected intrinsics fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0 / 0 0 0 1"
+            raise DataError(f"{self.where}: {expected}, got {found}")
         with errors_of(self.where):
             return Camera(width, height, fx, fy, cx, cy)
 
@@ -103,7 +105,7 @@ def read_matrix(path: Path) -> PrintedMatrix:
     """Read a file with one matrix: four lines of four numbers. Raises DataError."""
     lines = _numbered_lines(path)
     if len(lines) != 4:
-        raise DataError(f"{path}: expected 4 lines of 4 numbers, found {len(lines)} lines")
+        raise DataError(f"{path}: expected 4 lines of 4 numbers, got {len(lines)} lines")
     return PrintedMatrix(str(path), np.array([numbers(where, words, 4) for where, words in lines]))
 
 

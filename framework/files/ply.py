@@ -41,7 +41,7 @@ def read_ply(path: Path) -> PlyMesh:
     """
     header, elements = read_elements(path, read_bytes(path, LARGEST_FILE))
     if "vertex" not in elements:
-        raise DataError(f"{path}, line {header.lines}: the header has no element 'vertex'")
+        raise DataError(f"{path}, line {header.lines}: expected an element 'vertex' in the header, got none")
     vertices = _vertices(path, elements["vertex"])
     triangles = _triangles(path, elements["face"], len(vertices)) if "face" in elements else np.empty((0, 3), np.int32)
     properties = {name: values for name, values in elements["vertex"].scalars.items() if name not in AXES}
@@ -58,7 +58,7 @@ def write_ply(
     _check_mesh(path, vertices, triangles)
     row = _vertex_dtype(path, len(vertices), properties)
     if any("\n" in comment or "\r" in comment for comment in comments):
-        raise DataError(f"{path}: a comment of a PLY file is one line")
+        raise DataError(f"{path}: expected comments of one line, got one with a line break")
     rows = np.empty(len(vertices), row)
     for axis, name in enumerate(AXES):
         rows[name] = vertices[:, axis]
@@ -86,20 +86,20 @@ def write_ply(
 def _vertices(path: Path, rows: Element) -> Float32:
     missing = [axis for axis in AXES if axis not in rows.scalars]
     if missing:
-        raise DataError(f"{path}: element 'vertex' has no property {missing[0]!r} with one number")
+        raise DataError(f"{path}: element 'vertex': expected a scalar property {missing[0]!r}, got none")
     with np.errstate(over="ignore"):  # a value too large for float32 is not finite
         vertices = np.stack([rows.scalars[axis].astype(np.float32) for axis in AXES], axis=1)
     if not np.isfinite(vertices).all():
         k = int(np.argmin(np.isfinite(vertices).all(axis=1)))
         found = " ".join(f"{rows.scalars[axis][k]:g}" for axis in AXES)
-        raise DataError(f"{path}, {rows.place(k)}: vertex {k} is not finite: {found}")
+        raise DataError(f"{path}, {rows.place(k)}: vertex {k}: expected finite coordinates, got {found}")
     return vertices
 
 
 def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
     name = next((name for name in INDICES if name in rows.lists), None)
     if name is None:
-        raise DataError(f"{path}: element 'face' has no list named {' or '.join(INDICES)}")
+        raise DataError(f"{path}: element 'face': expected a list {' or '.join(INDICES)}, got none")
     indices, lengths = rows.lists[name]
     if indices.dtype.kind == "f":
         raise DataError(f"{path}: {name}: expected integers, got {indices.dtype}")
@@ -110,7 +110,8 @@ def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
     if corners.size and (corners.min() < 0 or corners.max() >= vertices):
         wrong = int(np.argmax((corners < 0) | (corners >= vertices)))
         k = int(np.searchsorted(np.cumsum(lengths), wrong, side="right"))
-        raise DataError(f"{path}, {rows.place(k)}: face {k} has vertex {corners[wrong]}, but there are {vertices}")
+        expected = f"expected vertex indices in [0, {vertices})"
+        raise DataError(f"{path}, {rows.place(k)}: face {k}: {expected}, got {corners[wrong]}")
     return _fans(corners.astype(np.int32, copy=False), lengths)
 
 
@@ -131,12 +132,13 @@ def _starts(lengths: Int64) -> Int64:
 def _check_mesh(path: Path, vertices: Float32, triangles: Int32) -> None:
     for name, array, dtype in (("vertices", vertices, np.float32), ("triangles", triangles, np.int32)):
         if array.dtype != dtype or array.ndim != 2 or array.shape[1] != 3:
-            raise DataError(f"{path}: {name} must be (N, 3) of {np.dtype(dtype)}, found {array.shape} of {array.dtype}")
+            expected = f"expected (N, 3) of {np.dtype(dtype)}"
+            raise DataError(f"{path}: {name}: {expected}, got {array.shape} of {array.dtype}")
     if not np.isfinite(vertices).all():
-        raise DataError(f"{path}: the vertices are not all finite")
+        raise DataError(f"{path}: vertices: expected finite coordinates, got NaN or infinity")
     if triangles.size and (triangles.min() < 0 or triangles.max() >= len(vertices)):
         raise DataError(
-            f"{path}: triangles must be of vertices in [0, {len(vertices)}), found {triangles.min()} to "
+            f"{path}: triangles: expected vertex indices in [0, {len(vertices)}), got {triangles.min()} to "
             f"{triangles.max()}"
         )
 
@@ -145,11 +147,11 @@ def _vertex_dtype(path: Path, vertices: int, properties: Mapping[str, Array]) ->
     fields = [(axis, "<f4") for axis in AXES]
     for name, values in properties.items():
         if name.split() != [name] or not name.isascii() or name in AXES:
-            raise DataError(f"{path}: {name!r} cannot be the name of a property beside x, y and z")
+            expected = "expected a property name of one ASCII word other than x, y and z"
+            raise DataError(f"{path}: {expected}, got {name!r}")
         if values.shape != (vertices,) or values.dtype.char not in TYPE_NAMES:
             raise DataError(
-                f"{path}: the property {name} must be ({vertices},) of a type that PLY has, "
-                f"found {values.shape} of {values.dtype}"
+                f"{path}: property {name}: expected ({vertices},) of a PLY type, got {values.shape} of {values.dtype}"
             )
         fields.append((name, values.dtype.newbyteorder("<").str))
     return np.dtype(fields)

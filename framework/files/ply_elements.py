@@ -1,4 +1,4 @@
-"""The elements of a PLY file: the tables that its header announces, in any of the three encodings."""
+"""Elements of a PLY file: the tables declared in its header, in any of the three encodings."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def read_elements(path: Path, data: bytes) -> tuple[Header, dict[str, Element]]:
     """Return the header of a file with this content, and its elements by name with their rows.
 
     Raises:
-        DataError: The file is damaged or does not contain what its header announces; names the line or byte.
+        DataError: The file is damaged or does not match its header; names the line or byte.
     """
     header = _parse_header(path, data)
     body = _Body(path, data, header)
@@ -99,7 +99,8 @@ def _parse_header(path: Path, data: bytes) -> Header:
         except ValueError as error:
             raise DataError(f"{path}, line {number}: {error}") from error
     if not format_name:
-        raise DataError(f"{path}, line {len(lines)}: the header has no line 'format', one of {', '.join(FORMATS)}, 1.0")
+        expected = f"expected a header line 'format', one of {', '.join(FORMATS)}, 1.0"
+        raise DataError(f"{path}, line {len(lines)}: {expected}, got none")
     header = Header(format_name, tuple(elements), tuple(comments), len(lines), sum(map(len, lines)))
     _check_size(path, header, len(data) - header.size)
     return header
@@ -108,13 +109,14 @@ def _parse_header(path: Path, data: bytes) -> Header:
 def _header_lines(path: Path, data: bytes) -> list[bytes]:
     """Return the lines up to `end_header`, with their line ends."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
-        raise DataError(f"{path}, line 1: expected 'ply', got {shown(data[:16].decode('latin-1'))}: not a PLY file")
+        raise DataError(f"{path}, line 1: expected a PLY file, got {shown(data[:16].decode('latin-1'))}")
     lines = data[:LARGEST_HEADER].splitlines(keepends=True)
     for k, line in enumerate(lines):
         if line.strip() == b"end_header":
             return lines[: k + 1]
     searched = min(len(data), LARGEST_HEADER)
-    raise DataError(f"{path}, line {len(lines)}: the first {searched} bytes have no line 'end_header'")
+    expected = f"expected a line 'end_header' in the first {searched} bytes"
+    raise DataError(f"{path}, line {len(lines)}: {expected}, got none")
 
 
 def _with_property(element: Element, declaration: list[str]) -> Element:
@@ -137,16 +139,17 @@ def _with_property(element: Element, declaration: list[str]) -> Element:
 
 def _dtype(name: str) -> np.dtype[Any]:
     if name not in TYPES:
-        raise ValueError(f"unknown type {shown(name)}, expected one of {', '.join(TYPES)}")
+        raise ValueError(f"expected a type in {', '.join(TYPES)}, got {shown(name)}")
     return np.dtype(TYPES[name])
 
 
 def _check_size(path: Path, header: Header, body: int) -> None:
-    """Raise DataError if the rows cannot fit into a body of so many bytes, so that no array exceeds the file's size."""
+    """Raise DataError if the rows do not fit into a body of `body` bytes, which limits arrays to the file's size."""
     least = 0
     for element in header.elements:
         if element.rows and not element.properties:
-            raise DataError(f"{path}, line {header.lines}: element {shown(element.name)} has rows but no properties")
+            where = f"{path}, line {header.lines}: element {shown(element.name)}"
+            raise DataError(f"{where}: expected properties, got none for {element.rows} rows")
         if header.format == "ascii":
             row = 2 * len(element.properties)  # a digit and a separator each
         else:
@@ -155,7 +158,7 @@ def _check_size(path: Path, header: Header, body: int) -> None:
     if least > body + (header.format == "ascii"):  # the last line needs no end
         announced = ", ".join(f"{element.rows} {shown(element.name)}" for element in header.elements[:4])
         raise DataError(
-            f"{path}, byte {header.size}: expected at least {least} bytes for {announced}, got {body}: "
+            f"{path}, byte {header.size}: expected at least {least} bytes for {announced}, got {body}; "
             "the file is truncated or its header is wrong"
         )
 
@@ -189,12 +192,12 @@ class _Body:
         return self._ragged(element)
 
     def check_end(self) -> None:
-        """Raise DataError if numbers follow the rows that the header announces."""
+        """Raise DataError if numbers follow the last row declared in the header."""
         if self._position < self._end and (self._text or bytes(self._data[self._position :]).strip()):
             count = self._end - self._position
             raise DataError(
-                f"{self._path}, {self._place(self._position)}: {count} {'numbers' if self._text else 'bytes'} follow "
-                "the last row that the header announces"
+                f"{self._path}, {self._place(self._position)}: expected the end of the file after the last row, "
+                f"got {count} more {'numbers' if self._text else 'bytes'}"
             )
 
     def _split_lines(self, lines: list[bytes], before: int) -> None:
@@ -202,7 +205,8 @@ class _Body:
         starts, numbers = array("q"), array("q")
         for number, line in enumerate(lines, start=before + 1):
             if len(line) > LONGEST_LINE:
-                raise DataError(f"{self._path}, line {number}: the line is longer than {LONGEST_LINE} bytes")
+                expected = f"expected at most {LONGEST_LINE} bytes in a line"
+                raise DataError(f"{self._path}, line {number}: {expected}, got {len(line)}")
             found = line.split()
             if found:
                 starts.append(len(words))
@@ -235,7 +239,9 @@ class _Body:
                 count = self._view(column.count, position, 1, 1, 0)
                 length = int(count[0, 0]) if count.size and np.isfinite(count[0, 0]) else 0
                 if length < 0:
-                    raise DataError(f"{self._path}, {self._place(position)}: {where} has a list of {length} numbers")
+                    raise DataError(
+                        f"{self._path}, {self._place(position)}: {where}: expected a list length >= 0, got {length}"
+                    )
                 position += self._size(column.count)
             lengths.append(length)
             position += length * self._size(column.dtype)
@@ -247,8 +253,8 @@ class _Body:
             raise DataError(f"{self._path}, {self._place(start)}: {where}: expected {expected} numbers, got {found}")
         if position > self._end:
             raise DataError(
-                f"{self._path}, {self._place(self._end)}: the file ends in {where}, "
-                f"but its header announces {element.rows} rows"
+                f"{self._path}, {self._place(self._end)}: expected {element.rows} rows as in the header, "
+                f"got the end of the file in {where}"
             )
         return lengths
 
@@ -261,7 +267,7 @@ class _Body:
         return np.ndarray((rows, length), stored, self._data, start * unit, (stride * unit, stored.itemsize))
 
     def _rows_are_alike(self, element: Element, lengths: list[int]) -> bool:
-        """Return true if the lists of all rows are as long as those of the first one."""
+        """Return True if the lists of all rows are as long as those of the first one."""
         stride = self._stride(element, lengths)
         end = self._position + element.rows * stride
         if not element.rows or end > self._end:
@@ -333,9 +339,9 @@ class _Body:
         return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(int(starts[row])))
 
     def _native(self, column: Property, stored: npt.NDArray[Any], positions: Int64 | None) -> Array:
-        """Return the numbers, one after the other, in the column's type; scalars have memory of their own.
+        """Return the numbers, flattened, in the column's type; scalars own their memory.
 
-        Raises DataError if a text file has a number that the type does not hold.
+        Raises DataError if a number of a text file is out of the type's range.
         """
         if self._text and positions is not None and column.dtype.kind != "f":
             limits = np.iinfo(column.dtype)
@@ -349,5 +355,5 @@ class _Body:
 
 
 def shown(text: str) -> str:
-    """Return a word of the file, quoted for an error of one line."""
+    """Return a word of the file, quoted and shortened for a one-line error."""
     return repr(text if len(text) <= 40 else text[:37] + "...")

@@ -1,4 +1,4 @@
-"""Search paths of the files that parameters name, and the config folder."""
+"""Search paths of files in parameters, and the config folder."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
-from framework.files.number_lines import COMMENT, numbers, read_lines
+from framework.files.number_lines import COMMENT, SHOWN, numbers, read_lines
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | due to rounding
@@ -25,7 +25,7 @@ QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | due to rounding
 
 @dataclass(frozen=True)
 class TumLine:
-    """One line of a TUM file, which is checked when it is used as a pose."""
+    """One line of a TUM file, validated when it is used as a pose."""
 
     path: Path
     number: int  # of the line in the file, from 1
@@ -49,9 +49,10 @@ def rigid_pose(place: str, position: Sequence[float], quat_xyzw: Sequence[float]
     """Return T_world_camera (4, 4) of a position (3,) m and a quaternion. Raises DataError that begins with `place`."""
     norm = math.hypot(*quat_xyzw)
     if not all(map(math.isfinite, (*position, norm))):
-        raise DataError(f"{place}: the pose is not finite")
+        found = " ".join(f"{value:g}" for value in (*position, *quat_xyzw))
+        raise DataError(f"{place}: expected a finite pose, got {found}")
     if abs(norm - 1) > QUATERNION_TOLERANCE:
-        raise DataError(f"{place}: the quaternion qx qy qz qw has length {norm:.4g}, expected 1")
+        raise DataError(f"{place}: expected a quaternion qx qy qz qw of length 1, got {norm:.4g}")
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
     T_world_camera[:3, 3] = position
@@ -66,14 +67,14 @@ def read_tum(path: Path) -> tuple[Float64, Float64]:
     lines = read_tum_lines(path)
     for before, line in pairwise(lines):
         if line.timestamp <= before.timestamp:
-            raise line.fault(f"timestamps must grow, found {line.timestamp:.12g} after {before.timestamp:.12g}")
+            raise line.fault(f"expected a timestamp > {before.timestamp:.12g} s, got {line.timestamp:.12g} s")
     timestamps = np.array([line.timestamp for line in lines], np.float64)
     return timestamps, np.array([line.pose() for line in lines], np.float64).reshape(-1, 4, 4)
 
 
 def read_tum_lines(path: Path) -> list[TumLine]:
     """Return the lines of a TUM file without comments. Raises DataError for a line without eight numbers."""
-    lines = read_lines(path, missing="does not exist: expected a trajectory in TUM format")
+    lines = read_lines(path, missing="expected a trajectory in TUM format, got no such file")
     words = [COMMENT.sub("", line).split() for line in lines]
     return [_line(path, number, found) for number, found in enumerate(words, start=1) if found]
 
@@ -84,7 +85,7 @@ def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence
     Raises DataError for different lengths, a pose that is not rigid, or a failed write.
     """
     if len(timestamps) != len(poses):
-        raise DataError(f"{path}: {len(timestamps)} timestamps for {len(poses)} poses; there must be equally many")
+        raise DataError(f"{path}: expected a timestamp for each pose, got {len(timestamps)} for {len(poses)} poses")
     for k, T in enumerate(poses):
         check_rigid(f"{path}: pose {k}", T)
     T_all = np.array(poses, np.float64).reshape(-1, 4, 4)
@@ -98,5 +99,5 @@ def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence
 def _line(path: Path, number: int, words: list[str]) -> TumLine:
     values = numbers(f"{path}, line {number}", words, len(COLUMNS.split()), COLUMNS)
     if not math.isfinite(values[0]):
-        raise DataError(f"{path}, line {number}: the timestamp is not finite")
+        raise DataError(f"{path}, line {number}: expected a finite timestamp, got {words[0][:SHOWN]!r}")
     return TumLine(path, number, values[0], tuple(values[1:4]), tuple(values[4:]))

@@ -1,4 +1,4 @@
-"""YAML files, checked before they are loaded: a few lines of aliases can expand to gigabytes."""
+"""YAML files, validated before loading: a few lines of aliases can expand to gigabytes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from framework.files.atomic_write import read_text
 
 LARGEST_FILE = 2**22  # bytes; the config of a run has 3 KB, that of a sweep 20
 DEEPEST = 50  # nested mappings and lists
-TOO_DEEP = f"its mappings and lists are more than {DEEPEST} deep"
+TOO_DEEP = f"expected at most {DEEPEST} nested mappings and lists, got more"
 MOST_VALUES = 200_000  # keys and values after the expansion of aliases
 
 _EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled one is ten times as fast
@@ -36,7 +36,7 @@ def yaml_faults(path: Path) -> Iterator[None]:
     try:
         yield
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, OverflowError) as error:
-        raise DataError(f"{path} cannot be read: {in_one_line(error)}") from error
+        raise DataError(f"{path}: cannot be read: {in_one_line(error)}") from error
 
 
 def _events(where: object, text: str) -> Iterator[Any]:
@@ -57,7 +57,8 @@ def check_yaml(where: object, text: str) -> None:
     for event in _events(where, text):
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchors:
-                raise DataError(f"{where}: *{event.anchor} stands for nothing, or for what it is in")
+                expected = f"expected an anchor &{event.anchor} that ends before its alias"
+                raise DataError(f"{where}: {expected}, got none")
             counts[-1] += anchors[event.anchor]
         elif isinstance(event, yaml.ScalarEvent):
             counts[-1] += 1
@@ -72,4 +73,4 @@ def check_yaml(where: object, text: str) -> None:
         if len(counts) > DEEPEST:
             raise DataError(f"{where}: {TOO_DEEP}")
         if counts[-1] > MOST_VALUES:
-            raise DataError(f"{where}: it stands for more than {MOST_VALUES} keys and values")
+            raise DataError(f"{where}: expected at most {MOST_VALUES} keys and values with aliases expanded, got more")

@@ -1,1 +1,1 @@
-"""Recordings of phones and sensors, in the formats of their apps and drivers, become RGB-D folders."""
+"""Import of phone and sensor recordings as RGB-D folders."""

@@ -1,4 +1,4 @@
-"""Resampling of depth to the pixels of a color image, from another camera or a coarser image."""
+"""Resampling of depth to a color image, from another camera or a lower resolution."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, UInt8
 from framework.importing.depth_resampling_kernels import move_readings, upsample
 
-FINEST = 0.9  # of the depth camera's focal length in px: at its own, rounding would leave lines without readings
+FINEST = 0.9  # of the depth camera's focal length in px: at 1.0, rounding would leave lines without readings
 
 
 @dataclass(frozen=True)
 class DepthRegistration:
-    """Registration of depth to a color camera at another place: the nearest reading in each pixel."""
+    """Registration of depth to a color camera with another pose: the nearest reading in each pixel."""
 
     depth: Camera
     color: Camera
@@ -36,10 +36,10 @@ class DepthRegistration:
 def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, target_color: UInt8) -> Float32:
     """Return depth (H, W) in m of the camera `target` from depth (h, w) in m of the whole image of `camera`.
 
-    `color` and `target_color` are the images (., ., 3) of the two cameras, which have the same pose. Where the four
-    readings around a pixel are of one surface, their inverses are interpolated, which is exact for a plane. Elsewhere
-    the pixel takes one of the four, that with the nearest and most similar color (the weights of joint bilateral
-    upsampling, Kopf et al., SIGGRAPH 2007), so that no reading lies between two surfaces. A hole stays a hole.
+    `color` and `target_color` are the images (., ., 3) of the two cameras, which have the same pose. If the four
+    readings around a pixel belong to one surface, their inverses are interpolated, which is exact for a plane.
+    Otherwise the pixel gets the reading with the nearest and most similar color (weights of joint bilateral
+    upsampling, Kopf et al., SIGGRAPH 2007), so that no reading lies between two surfaces. Holes are kept.
     """
     height, width = depth.shape
     guide = np.asarray(cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,4 +1,4 @@
-"""Writes a source as an RGB-D folder for `dataset=rgbd_folder`."""
+"""Writer of RGB-D folders for `dataset=rgbd_folder`."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from framework.importing.phones.image_rotation import QUARTER, Turn
 from framework.importing.source import SURE, UNSURE, DeviceFrame, Source
 
 DEPTH_SCALE = 1000.0  # units per meter
-LONGER_SIDE = 640  # px, of the written images by default, as trackers and detectors are tuned for
+LONGER_SIDE = 640  # px, default for written images; trackers and detectors are tuned for it
 JPEG_QUALITY = 95  # percent
 
 
 @dataclass(frozen=True)
 class Writing:
-    """Options of the written folder."""
+    """Options of the RGB-D folder writer."""
 
-    width: int = 0  # px, of the images before rotation, at most as stored; 0 = the longer side gets LONGER_SIDE
+    width: int = 0  # px, of the images before rotation, at most as stored; 0 = LONGER_SIDE for the longer side
     stride: int = 1  # use every stride-th frame
-    confidence: int = 1  # 0, 1 or 2: depth of a lower confidence is dropped, where it is known
+    confidence: int = 1  # 0, 1 or 2: minimum confidence of depth, if the recording has confidence
     turn: int = 0  # degrees clockwise, 0, 90, 180 or 270, of the written images
 
     def __post_init__(self) -> None:
@@ -46,7 +46,7 @@ class Writing:
 
     @property
     def turned(self) -> Turn:
-        """The rotation of the images."""
+        """Rotation of the images."""
         return Turn(self.turn // QUARTER)
 
     def camera(self, stored: Camera) -> Camera:
@@ -57,7 +57,7 @@ class Writing:
 
 @dataclass
 class Written:
-    """The frames of a source after writing."""
+    """Result of writing a source."""
 
     timestamps: list[float] = field(default_factory=list)  # s, of the written frames
     poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of them, none without poses
@@ -66,7 +66,7 @@ class Written:
 
     def __str__(self) -> str:
         count = f"{len(self.timestamps)} frames"
-        return f"{count}; left out are {len(self.errors)}, the first: {self.errors[0]}" if self.errors else count
+        return f"{count}; skipped {len(self.errors)}, first error: {self.errors[0]}" if self.errors else count
 
 
 def check_new(directory: Path) -> None:
@@ -74,19 +74,19 @@ def check_new(directory: Path) -> None:
     if directory.is_dir() and not any(directory.iterdir()):
         return
     if directory.exists() or directory.is_symlink():
-        raise DataError(f"{directory} is there already, and not empty; choose another folder, or remove it")
+        raise DataError(f"{directory}: expected a new or empty folder, got an existing one; set another or remove it")
 
 
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     """Write the frames, then their poses and up directions, and camera.json last.
 
-    Frames that cannot be used are skipped. Raises DataError if `directory` is not empty, no frame can be used, or a
-    file cannot be written.
+    Unusable frames are skipped. Raises DataError if `directory` is not empty, no frame is usable, or a file cannot be
+    written.
     """
     check_new(directory)
     written = Written()
     turn = writing.turned
-    camera = None  # the focal length of phones varies: all frames are resampled to the first one's
+    camera = None  # the focal length of phones varies: all frames are resampled to the first camera
     for number, frame in _frames(source, writing.stride, written):
         if camera is None:
             camera = writing.camera(frame.camera)
@@ -106,7 +106,8 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
             written.poses.append(turn.pose(frame.T_world_camera))
         written.ups.append(frame.up)
     if camera is None:
-        raise DataError(f"no frame can be used; the first: {written.errors[0] if written.errors else 'there is none'}")
+        reason = f"first error: {written.errors[0]}" if written.errors else "the recording has no frames"
+        raise DataError(f"expected usable frames, got none; {reason}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
     if any(up is not None for up in written.ups):
@@ -118,15 +119,16 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
 
 
 def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int, DeviceFrame]]:
-    """Return the number and content of each usable frame; the errors of the others go to `written`."""
+    """Yield the number and content of each usable frame; collect the errors of the others in `written`."""
     chosen = islice(enumerate(source.frames), 0, None, stride)
     for number, stored in tqdm(chosen, total=-(-source.count // stride), unit=" frames", disable=None):
         try:
             frame = stored()
             if source.posed and frame.T_world_camera is None:
-                raise DataError(f"{frame.name} has no pose")
+                raise DataError(f"{frame.name}: expected a pose, got none")
             if written.timestamps and frame.timestamp <= written.timestamps[-1]:
-                raise DataError(f"{frame.name} is of {frame.timestamp:.6f} s, not later than the frame before")
+                expected = f"expected a timestamp > {written.timestamps[-1]:.6f} s"
+                raise DataError(f"{frame.name}: {expected}, got {frame.timestamp:.6f} s")
         except DataError as error:
             written.errors.append(str(error))
         else:

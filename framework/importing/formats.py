@@ -1,4 +1,4 @@
-"""The formats that can be imported, and their detection."""
+"""Supported import formats and their detection."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ FORMATS = (
 
 
 def open_source(path: Path, topics: Topics | None = None) -> Source:
-    """Open the recording at `path`. Raises DataError if its format is not known, or it cannot be read.
+    """Open the recording at `path`. Raises DataError for an unknown format or an unreadable recording.
 
-    `topics` are those of a ROS bag that types and names do not identify.
+    `topics` are topics of a ROS bag that types and names do not identify.
     """
     if not path.exists():
-        raise DataError(f"{path} does not exist")
+        raise DataError(f"{path}: expected a recording, got no such file or folder")
     if path.suffix.lower() == ".zip":
-        raise DataError(f"{path} must be unpacked first; then name the folder")
+        raise DataError(f"{path}: expected a folder or recording, got a zip archive; unpack it")
     folders = [entry for entry in path.iterdir() if entry.is_dir()] if path.is_dir() else []
     for place in (path, *(folders if len(folders) == 1 else [])):  # a zipped folder often has another around it
         for kind in FORMATS:
@@ -37,7 +37,7 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
             if kind.has_topics:
                 return kind.open(place, topics or Topics())
             if topics and topics.given:
-                raise ConfigError(f"{path} has no topics: {', '.join(topics.given)} are for ROS bags")
+                raise ConfigError(f"{', '.join(topics.given)}: expected a ROS bag for topics, got {path}")
             return kind.open(place)
     known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
-    raise DataError(f"{path} is of no format that can be imported. These are: {known}")
+    raise DataError(f"{path}: expected a supported format, got an unknown one; supported: {known}")

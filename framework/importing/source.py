@@ -1,4 +1,4 @@
-"""Recordings of devices that can be imported: frames as stored, depth often coarser than color."""
+"""Device recordings for import: frames as stored, with depth often coarser than color."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from framework.datasets.frames.conventions import CameraAxes, PoseReading
 from framework.errors import FrameError, errors_of
 from framework.geometry import nearest_rigid
 
-SMALLEST_SIDE = 2  # px, of a depth image that can be resampled
-UNSURE, FAIRLY_SURE, SURE = 0, 1, 2  # confidence, as ARKit's low, medium and high
+SMALLEST_SIDE = 2  # px, minimum of a depth image for resampling
+UNSURE, FAIRLY_SURE, SURE = 0, 1, 2  # ARKit's low, medium and high confidence
 
 _ARKIT = PoseReading(camera_axes=CameraAxes.OPENGL)
 
 
 @dataclass(frozen=True)
 class DeviceFrame:
-    """One frame as it was stored. Raises FrameError if its parts do not fit."""
+    """One frame as stored. Raises FrameError for inconsistent parts."""
 
     name: Path | str  # its file, for messages
     timestamp: float  # s
@@ -36,14 +36,16 @@ class DeviceFrame:
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.timestamp):
-            raise FrameError(f"{self.name}: the timestamp is not finite")
+            raise FrameError(f"{self.name}: expected a finite timestamp, got {self.timestamp}")
         if self.color.shape[:2] != self.camera.shape:
             found, expected = (f"{width}x{height}" for height, width in (self.color.shape[:2], self.camera.shape))
-            raise FrameError(f"{self.name}: color is {found}, the camera's is {expected}")
+            raise FrameError(f"{self.name}: expected color of {expected} px as in the camera, got {found} px")
         if min(self.depth.shape) < SMALLEST_SIDE:
-            raise FrameError(f"{self.name}: depth is {self.depth.shape[1]}x{self.depth.shape[0]} px, too small")
+            expected = f"expected depth of at least {SMALLEST_SIDE}x{SMALLEST_SIDE} px"
+            raise FrameError(f"{self.name}: {expected}, got {self.depth.shape[1]}x{self.depth.shape[0]} px")
         if self.confidence is not None and self.confidence.shape != self.depth.shape:
-            raise FrameError(f"{self.name}: confidence has the shape {self.confidence.shape}, depth {self.depth.shape}")
+            expected = f"expected confidence of shape {self.depth.shape} as depth"
+            raise FrameError(f"{self.name}: {expected}, got {self.confidence.shape}")
 
 
 StoredFrame = Callable[[], DeviceFrame]  # reads a frame; raises DataError if it cannot be used
@@ -51,23 +53,23 @@ StoredFrame = Callable[[], DeviceFrame]  # reads a frame; raises DataError if it
 
 @dataclass(frozen=True)
 class Source:
-    """A recording that can be imported. Its frames must be read in order, and may be skipped."""
+    """A recording for import. Read its frames in order; frames may be skipped."""
 
-    format: str  # for the user
+    format: str  # name for messages
     frames: Iterable[StoredFrame]  # in order of time
     count: int  # of the frames
-    posed: bool  # it has poses; a frame without one is skipped then
+    posed: bool  # True if the recording has poses; frames without a pose are then skipped
     distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of recordings."""
+    """A recording format."""
 
     name: str  # for the command line
-    needs: str  # what identifies it, for the user
+    needs: str  # characteristic files, for messages
     recognized: Callable[[Path], bool]  # True for a recording in this format
-    open: Callable[..., Source]  # of the path, and of the topics if it has some; raises DataError, with the file
+    open: Callable[..., Source]  # takes the path, and the topics for formats with topics; raises DataError
     has_topics: bool = False
 
 
@@ -86,10 +88,10 @@ def arkit_up(T_world_camera: Float64) -> Float64:
 
 
 def meters(raw: NDArray[np.uint16]) -> Float32:
-    """Return depth (h, w) in m of stored millimeters, with 0 for 65535, which several sensors write for no reading."""
+    """Convert stored millimeters to depth (h, w) in m; 65535, no reading of several sensors, becomes 0."""
     return np.where(raw == np.iinfo(np.uint16).max, 0, raw).astype(np.float32) / np.float32(1000)
 
 
 def readings(depth: NDArray[np.floating]) -> Float32:
-    """Return stored meters (h, w) as float32, with 0 for values that are not positive and finite."""
+    """Convert stored meters (h, w) to float32; values that are not positive and finite become 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

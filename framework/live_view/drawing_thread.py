@@ -1,8 +1,8 @@
 """A thread that draws a run without blocking the pipeline.
 
-Frames that arrive during drawing are drawn next; of pictures and maps only the newest. The thread does not read the
-map, which the fuser may be writing: the pipeline's thread takes snapshots between two frames. The time for snapshots
-and for drawing is limited to fixed fractions, however large the map is.
+Frames that arrive during drawing are drawn next; only the newest picture and map are drawn. The thread does not read
+the map, because the fuser may be writing it: the pipeline's thread takes snapshots between two frames. The time for
+snapshots and for drawing is limited to fixed fractions, however large the map is.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Drawing(Protocol):
     """Receiver of updates. All calls come from one thread."""
 
     def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: FrameUpdate | None) -> None:
-        """Draw the frames since the last call, the reasons of skipped ones, and the newest picture if it is new."""
+        """Draw the frames since the last call, the reasons for skipped ones, and the newest picture if it is new."""
 
     def draw_map(self, snapshot: MapSnapshot) -> None:
         """Draw the current map."""
@@ -75,7 +75,7 @@ class Drawing(Protocol):
 
 @dataclass
 class _Pending:
-    """What has not been drawn yet."""
+    """Data that have not been drawn yet."""
 
     notes: list[FrameNote] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
@@ -84,7 +84,7 @@ class _Pending:
 
 
 class DrawingThread:
-    """Draws the picture of every `frame_interval`-th frame, and the map at intervals of at least `map_interval` s."""
+    """Thread that draws every `frame_interval`-th picture, and the map at intervals of at least `map_interval` s."""
 
     def __init__(self, scene: SceneMap, drawing: Drawing, frame_interval: int, map_interval: float) -> None:
         self._scene, self._drawing, self._frame_interval = scene, drawing, frame_interval
@@ -133,7 +133,7 @@ class DrawingThread:
         self._wanted.set()
         self._thread.join(LAST_S)
         if self._thread.is_alive():
-            log.warning("viewer: drawing did not finish within %g s", LAST_S)
+            log.warning("viewer: expected the last drawing within %g s, got a timeout", LAST_S)
 
     def _take_snapshot(self) -> None:
         if self._failed or self._last is None or not self._scene.statistics.voxels:
@@ -180,14 +180,14 @@ class DrawingThread:
     def _give_up(self, error: Exception) -> None:
         """Disable the viewer; the run continues."""
         if not self._failed:
-            log.warning("viewer: it failed, and the run goes on without it: %s", in_one_line(error))
+            log.warning("viewer: disabled after an error; the run continues: %s", in_one_line(error))
         with self._lock:
             self._failed = True
             self._pending = _Pending()
 
 
 class Pace:
-    """Limits an operation to once per `interval` s and to a fraction of the time that `clock` measures."""
+    """Rate limiter: once per `interval` s, and at most a fraction of the time measured by `clock`."""
 
     def __init__(self, interval: float, share: float, clock: Callable[[], float] = time.perf_counter) -> None:
         self.interval = interval  # s

@@ -45,5 +45,5 @@ class GuardedViewer(Viewer):
             yield
         except Exception as error:
             if not self._failed:
-                log.warning("viewer: it failed, and the run goes on without it: %s", in_one_line(error))
+                log.warning("viewer: disabled after an error; the run continues: %s", in_one_line(error))
             self._failed = True

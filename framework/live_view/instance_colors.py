@@ -14,7 +14,7 @@ TINT = 0.6  # fraction of the instance's color in that of its vertices; the rest
 
 
 class InstanceColors:
-    """The palette of overview.png, by instance."""
+    """Palette of overview.png, by instance."""
 
     def __init__(self) -> None:
         self._centroids: dict[int, Float64] = {}  # (3,) m, when it was first seen
@@ -46,7 +46,7 @@ class InstanceColors:
         return colors
 
 
-MOST_POINTS = 8_000  # of the map, that are projected into a frame
+MOST_POINTS = 8_000  # maximum number of map points projected into a frame
 NEAR = 0.05  # maximum distance of a point from the depth reading, relative to depth
 LEAST_SHARE = 0.3  # minimum fraction of the points under a mask that belong to its instance
 

@@ -1,4 +1,4 @@
-"""The changed regions of a growing mesh."""
+"""Changed regions of a growing mesh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draws a run into a rerun recording (rerun-sdk 0.41)."""
+"""Drawing of a run into a rerun recording (rerun-sdk 0.41)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LEAST_TURN = 0.01  # minimum change of the up direction, of a unit vector
 
 
 class RerunDrawing:
-    """A `Drawing` that logs to a recording stream. The parameters are those of `RerunViewer`."""
+    """A `Drawing` that logs to a recording stream, with the parameters of `RerunViewer`."""
 
     def __init__(
         self, recording: rr.RecordingStream, stride: int, jpeg_quality: int, region: float, min_confidence: float
@@ -115,12 +115,12 @@ class RerunDrawing:
         T_view_camera = T_world_camera.copy()
         T_view_camera[:3] = turned(up, self._forward) @ T_world_camera[:3]
         self._recording.send_blueprint(at.layout(T_view_camera))
-        self._recording.log(at.LOG, self._rr.TextLog("mapping begins", level="INFO"))
+        self._recording.log(at.LOG, self._rr.TextLog("mapping started", level="INFO"))
 
     def _note(self, note: FrameNote) -> None:
         self._set_time(note.index, note.timestamp)
         if note.pose.lost:
-            reason = note.pose.reason or "the tracker gave no reason"
+            reason = note.pose.reason or "no reason from the tracker"
             self._recording.log(at.LOG, self._rr.TextLog(f"lost: {reason}", level="WARN"))
             self._end_piece()
             return

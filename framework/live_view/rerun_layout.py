@@ -36,14 +36,14 @@ STAGE_COLORS = {
 """RGB by stage, as in a report."""
 
 TIMES_SHOWN = 300  # frames before the current one
-EYE_BACK, EYE_ABOVE = 1.2, 0.8  # m, from the first camera to the eye
-AIM_FORWARD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to the target of the eye
+EYE_BACK, EYE_ABOVE = 1.2, 0.8  # m, from the first camera to the view's position
+AIM_FORWARD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to the view's target
 
 
 def layout(T_view_camera: Float64 | None = None) -> rrb.Blueprint:
     """Return the layout: map and stage times on the left, frame and depth on the right.
 
-    The eye is behind the first camera at `T_view_camera`, z up; None = unknown.
+    The view's position is behind the first camera at `T_view_camera`, z up; None = unknown.
     """
     import rerun.blueprint as rrb
 

@@ -21,14 +21,14 @@ POLL_S = 0.05
 def program() -> str:
     """Return the path of rerun's executable. Raises OSError if it is missing.
 
-    The `rerun` script in Python's bin folder is only a launcher, whose end does not end the executable.
+    The `rerun` script in Python's bin folder is only a launcher: stopping it does not stop the executable.
     """
     found = importlib.util.find_spec("rerun_cli")
     places = [Path(place) for place in (found and found.submodule_search_locations) or ()]
     places += [place / "Rerun.app" / "Contents" / "MacOS" for place in places]
     path = shutil.which("rerun", path=os.pathsep.join(map(str, places)))
     if path is None:
-        raise OSError("rerun's program is missing: pip install --force-reinstall rerun-sdk")
+        raise OSError("rerun: expected its executable, got none; run pip install --force-reinstall rerun-sdk")
     return path
 
 
@@ -46,7 +46,7 @@ def open_window(port: int, memory_limit: str) -> None:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         env=os.environ | {"RUST_LOG": "error"},
-        start_new_session=True,  # it survives the run, also after Ctrl-C
+        start_new_session=True,  # keeps running after the run, also after Ctrl-C
     )
     _wait_for(viewer, port)
 
@@ -76,7 +76,7 @@ def page_server() -> Iterator[str]:
 
 
 def listens(port: int) -> bool:
-    """Return whether a program listens on a port of this machine."""
+    """Return True if a program listens on a port of this machine."""
     with socket.socket() as probe:
         return probe.connect_ex((HERE, port)) == 0
 
@@ -93,7 +93,7 @@ def _wait_for(process: subprocess.Popen[bytes], port: int) -> None:
     deadline = time.monotonic() + TIMEOUT_S
     while not listens(port):
         if process.poll() is not None:
-            raise OSError(f"it ended with status {process.returncode}")
+            raise OSError(f"rerun exited with status {process.returncode}")
         if time.monotonic() > deadline:
-            raise OSError(f"it does not answer within {TIMEOUT_S:g} s")
+            raise OSError(f"rerun did not respond within {TIMEOUT_S:g} s")
         time.sleep(POLL_S)

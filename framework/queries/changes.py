@@ -1,9 +1,9 @@
 """Changes between two visits of a place: objects that appeared, vanished or moved, with probabilities.
 
-The map of each visit is rendered from the poses of its camera. An object of the other visit is gone where the camera
-saw through its surface, and present where it saw a surface and the same object. It is not seen where the camera never
-looked or was occluded. Both maps must share one world frame: the second was made with `localize_in=` of the first, or
-both with given poses.
+The map of each visit is rendered from the poses of its camera. An object of the other visit is absent if the camera
+observed free space at its surface, and present if it observed a surface and the same object. It is unobserved if it was
+occluded or outside of all views. Both maps must share one world frame: map the second with `localize_in=` of the first,
+or both with given poses.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from framework.interfaces import SceneMap
 
 LOOKS = 60  # evenly spaced poses of a visit from which its map is rendered
 EYE = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)  # assumed camera of a visit: half the resolution of a Kinect
-SAMPLED = 400  # vertices of an object
-BEHIND, BEHIND_SHARE = 0.06, 0.02  # m and m per m of depth: distance of a surface behind a point that is seen through
-LEAST_SEEN = 0.3  # fraction of an object's vertices that the other visit must have observed
+SAMPLED = 400  # maximum number of sampled vertices of an object
+BEHIND, BEHIND_SHARE = 0.06, 0.02  # m and m per m of depth: minimum distance of a surface behind free space
+LEAST_SEEN = 0.3  # minimum fraction of an object's vertices observed in the other visit
 BESIDE = 0.05  # m, largest distance to a vertex of the other map at the same position
 STAYS = 0.9  # prior probability that an object stays from one visit to the next
 CLUTTER = 0.1  # probability of another surface or object where an object is gone
-GONE = 0.5  # probability from which an object counts as gone
-SAME_THING = 0.3  # fraction of an object's surface under one object of the other visit that makes them the same
+GONE = 0.5  # minimum probability of a vanished object
+SAME_THING = 0.3  # minimum fraction of an object's surface that coincides with the same object of the other visit
 
 
 class Kind(Enum):
@@ -65,7 +65,7 @@ class Visit:
 
     def __post_init__(self) -> None:
         if not len(self.poses):
-            raise DataError("a visit without any pose has seen nothing")
+            raise DataError("visit: expected at least one pose, got none")
 
 
 @dataclass(frozen=True)
@@ -129,9 +129,9 @@ def _observe(visit: Visit, other: Visit) -> list[_Object]:
 
 
 def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
-    """Return two (P,) masks of points (P, 3) m of the world: the visit saw a surface there, or saw through.
+    """Return two (P,) masks of points (P, 3) m of the world: the visit observed a surface, or free space.
 
-    A point that is seen through from any pose is absent, whatever the other poses show.
+    A point in free space from any pose is absent, whatever the other poses show.
     """
     there, through = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
     for k in np.unique(np.linspace(0, len(visit.poses) - 1, LOOKS).round().astype(int)):
@@ -152,7 +152,7 @@ def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
 def probability_gone(confidence: float, there: Bool, through: Bool, matched: bool) -> float:
     """Return the probability, by Bayes' rule, that an object is gone.
 
-    there, through (M,): observations of its surface points; `matched`: whether an object is found at its position. A
+    there, through (M,): observations of its surface points; `matched`: True if an object is found at its position. A
     present object has a surface, and is detected as often as before; a gone one has both only by clutter.
     """
     observed = int(np.count_nonzero(there | through))

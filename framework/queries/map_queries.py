@@ -51,7 +51,7 @@ class Map:
             if class_ not in self.classes:
                 close = get_close_matches(class_, self.classes, n=1)
                 hint = f"; did you mean {close[0]!r}?" if close else ""
-                raise DataError(f"there is no class {class_!r} in this map{hint}")
+                raise DataError(f"class: expected a class of this map, got {class_!r}{hint}")
             return {key: instance for key, instance in found.items() if self.name(instance) == class_}
 
     def name(self, instance: Instance) -> str:
@@ -63,7 +63,7 @@ class Map:
         """Return the object with the surface nearest to a point (3,) m of the world, None without objects."""
         target = np.asarray(point, np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():
-            raise DataError(f"a point is three finite numbers, meters in the world, found {point!r:.60}")
+            raise DataError(f"point: expected 3 finite numbers in m (world), got {point!r:.60}")
         with self.lock:
             found = self.instances(class_)
             vertices = self.scene.mesh().vertices if found else np.zeros((0, 3), np.float32)
@@ -87,14 +87,14 @@ class Map:
     def at_pixel(self, u: int, v: int, camera: Camera, T_world_camera: Float64) -> Instance | None:
         """Return the object at pixel (u, v) of the view from a pose, or None. Raises DataError outside the image."""
         if not (0 <= u < camera.width and 0 <= v < camera.height):
-            raise DataError(f"the pixel ({u}, {v}) is not in the image of {camera.width}x{camera.height}")
+            raise DataError(f"pixel: expected one in the image of {camera.width}x{camera.height} px, got ({u}, {v})")
         with self.lock:
             return self.scene.instances().get(int(self.view(camera, T_world_camera).instance_ids[int(v), int(u)]))
 
     def up(self) -> Float64 | None:
-        """Return the unit vector (3,) against gravity in the world, along which boxes (`obb`) stand; None if unknown.
+        """Return the up direction (3,), a unit vector in the world and the axis of boxes (`obb`); None if unknown.
 
-        It comes from a sensor if frames have `up`, else from floor, walls and the camera's orientation.
+        It is measured by a sensor if frames have `up`, otherwise estimated from floor, walls and camera orientation.
         """
         with self.lock:
             return self.scene.gravity().up
@@ -105,7 +105,7 @@ class Map:
             return self.scene.gravity().source
 
     def floor(self) -> float | None:
-        """Return the floor's height, m along `up`: a point is `point @ up - floor` above it. None if not seen."""
+        """Return the floor height, m along `up`: a point is `point @ up - floor` above it. None if not observed."""
         with self.lock:
             up, mesh = self.scene.gravity().up, self.scene.mesh()
             return None if up is None else floor_height(mesh.vertices, mesh.triangles, up)
@@ -119,7 +119,7 @@ class Map:
             key = instance.id if isinstance(instance, Instance) else instance
             found = self.scene.instances().get(key)
             if found is None:
-                raise DataError(f"there is no instance {key!r} in this map")
+                raise DataError(f"instance: expected an id of this map, got {key!r}")
             return whole.of(found)
 
     def save(self, path: Path | str) -> None:

@@ -19,7 +19,7 @@ from framework.vocabulary.text_queries import object_words
 BY = ("embeddings", "names")
 LEAST_MATCH = 0.1  # smallest similarity by names
 LONGEST_QUERY = 1000  # characters
-NAME_IT = "name it by --model, from Python by model="
+NAME_IT = "set --model (Python: model=)"
 WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instancemap[transformers])"
 
 
@@ -30,7 +30,7 @@ class Match:
     instance: Instance
     name: str  # of its most likely class
     similarity: float  # by embeddings: cosine in [-1, 1]; by names: probability of class and color in [0, 1]
-    color: str  # name of the most frequent color of its surface as observed: "brown"
+    color: str  # name of the most frequent color of its observed surface: "brown"
     centroid: Float64  # (3,) m, of its vertices
 
 
@@ -49,30 +49,29 @@ class TextQuery:
 
     words: str
     by: str | None = None  # of BY; None = embeddings if the map has any or a model is named, else names
-    model: str | None = None  # that embeds the words: folder, file or id; None = that of the run's detector
+    model: str | None = None  # embedding model of the query: folder, file or id; None = that of the run's detector
 
     def __post_init__(self) -> None:
         if not isinstance(self.words, str) or not 0 < len(self.words.strip()) <= LONGEST_QUERY:
-            raise ConfigError(
-                f"the words to look for must be 1 to {LONGEST_QUERY} characters, found {self.words!r:.60}"
-            )
+            raise ConfigError(f"query: expected a text of 1 to {LONGEST_QUERY} characters, got {self.words!r:.60}")
         if self.by not in (None, *BY):
-            raise ConfigError(f"by must be one of {', '.join(BY)}, found {self.by!r:.60}")
+            raise ConfigError(f"by: expected one of {', '.join(BY)}, got {self.by!r:.60}")
         if self.model is not None and self.by == "names":
-            raise ConfigError(f"a model is of embeddings, and by names none is asked: found {self.model!r:.60}")
+            raise ConfigError(f"model: expected no model for by='names', got {self.model!r:.60}")
 
 
 def search(scene: Map, query: TextQuery, run: Path | None = None) -> QueryResult:
     """Return the objects that match a query; `run`: directory of the map's run, if any.
 
-    Raises DataError for unknown words, and if the embeddings are missing or of another model.
+    Raises DataError for unknown words, and for missing embeddings or embeddings of another model.
     """
     space = scene.scene.embedding_space
     by = query.by or ("embeddings" if space or query.model is not None else "names")
     if by == "names":
         return QueryResult(by, space, tuple(by_names(scene, query.words)))
     if not space:
-        raise DataError(f"{run or 'this map'} has no embeddings: run with {WITH_EMBEDDINGS}, or ask by names")
+        where = f"{run or 'this map'}: expected embeddings of its objects, got none"
+        raise DataError(f"{where}; run with {WITH_EMBEDDINGS}, or query by names")
     return QueryResult(by, space, tuple(by_embedding(scene, _embedded(query, space, run))))
 
 
@@ -83,30 +82,32 @@ def _embedded(query: TextQuery, space: str, run: Path | None) -> Float32:
     name, revision = _model_of(run) if query.model is None else (query.model, "main")
     opened = ImageTextModel(name, revision, "cpu", half_precision=False)
     if opened.space != space:
-        found = f"the embeddings of {run or 'this map'} are of {space}, and {name} is {opened.space}"
-        raise DataError(f"{found}: the words need that very model, {NAME_IT}")
+        where = f"{run or 'this map'}: expected the model of its embeddings, {space}"
+        raise DataError(f"{where}, got {opened.space} ({name}); {NAME_IT}")
     return opened.embed_text(query.words)
 
 
 def _model_of(run: Path | None) -> tuple[str, str]:
     """Return model and revision of a run's detector. Raises DataError if its config has none."""
     if run is None:
-        raise DataError(f"a map does not say of which model its embeddings are: {NAME_IT}, or ask by its run")
+        raise DataError(f"model: expected the model of the map's embeddings, got none; {NAME_IT}, or query its run")
     node = read_yaml(run / CONFIG).get("detector") if is_there(run / CONFIG) else None
     if isinstance(node, dict) and isinstance(node.get("model"), str):
         return node["model"], str(node.get("revision", "main"))
-    raise DataError(f"{run / CONFIG} does not say of which model the embeddings are: {NAME_IT}")
+    raise DataError(f"{run / CONFIG}: expected the model of the embeddings in detector.model, got none; {NAME_IT}")
 
 
 def by_embedding(scene: Map, text: Float32) -> list[Match]:
-    """Return the objects with an embedding by its cosine with that of a text (D,), the largest first.
+    """Return the objects with an embedding by its cosine with the embedding of a text (D,), largest first.
 
     Raises DataError if the map's embeddings have another length.
     """
     with scene.lock:
         known = {k: i.embedding for k, i in scene.instances().items() if i.embedding is not None}
         if any(embedding.shape != text.shape for embedding in known.values()):
-            raise DataError(f"the map's embeddings have other than the {len(text)} numbers of the model's texts")
+            raise DataError(
+                f"map: expected embeddings of length {len(text)} as of the model's texts, got another length"
+            )
         return _found(scene, {k: float(embedding @ text) for k, embedding in known.items()})
 
 
@@ -121,8 +122,8 @@ def by_names(scene: Map, query: str) -> list[Match]:
             unknown = ", ".join(map(repr, words.unknown or [query]))
             there = ", ".join(sorted({scene.name(instance) for instance in scene.instances().values()}))
             raise DataError(
-                f"no class of this map and no color is called {unknown}; its objects are {there or 'none'}; colors "
-                f"are {', '.join(COLOR_NAMES)}"
+                f"query: expected classes of this map or colors, got {unknown}; objects: {there or 'none'}; colors: "
+                f"{', '.join(COLOR_NAMES)}"
             )
         columns = [scene.classes.index(name) for name in words.classes]
         mesh, matches = scene.mesh(), {}

@@ -1,4 +1,4 @@
-"""Images of a lit surface: in its own colors, or in those of its instances on a pale background."""
+"""Images of a lit surface: in its own colors, or in instance colors on a pale background."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.rendering.lit_view_kernels import light_up, paint
 from framework.rendering.surface import FrontSides, Surface
 
 SUPERSAMPLING = 2  # rays per pixel in either direction
-NOTHING = (229, 232, 236)  # RGB of empty pixels; not white, as surfaces may be white
+NOTHING = (229, 232, 236)  # RGB of empty pixels; not white, because surfaces may be white
 
 
 class LitView:

@@ -1,4 +1,4 @@
-"""Matching of objects between maps, so that an object has the same color in several pictures."""
+"""Matching of objects between maps, for consistent colors across pictures."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], pos
     if len(mesh.triangles) and len(poses):
         panels = _panels(mesh, ids, {key: instances[key][0] for key in shown}, colors, poses)
     else:
-        panels = _text_panel("nothing was mapped", PANEL_HEIGHT, PANEL_WIDTH, FAINT_INK, "mm")
+        panels = _text_panel("empty map", PANEL_HEIGHT, PANEL_WIDTH, FAINT_INK, "mm")
     legend = _legend([(colors[key], *instances[key]) for key in shown])
     return np.concatenate([_text_panel(title, TITLE_HEIGHT, 24, INK, "lm"), panels, legend])
 

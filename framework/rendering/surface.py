@@ -98,7 +98,7 @@ class Surface:
 
 
 class FrontSides:
-    """The triangles of a surface that face an eye, without the walls and ceilings in between."""
+    """The triangles of a surface that face a viewpoint, without the walls and ceilings in between."""
 
     def __init__(self, surface: Surface, eye_world: Float64) -> None:
         self._eye_world = eye_world  # (3,) m
@@ -109,7 +109,7 @@ class FrontSides:
         self._rasterizer = Rasterizer(self._vertices, self._triangles)
 
     def seen_by(self, camera: Camera, R_world_camera: Float64) -> Hits:
-        """Return the view of a camera at the eye."""
+        """Return the view of a camera at the viewpoint."""
         T_world_camera = np.eye(4)
         T_world_camera[:3, :3], T_world_camera[:3, 3] = R_world_camera, self._eye_world
         return Hits(camera, self._rasterizer.draw(camera, T_world_camera), self._vertices, self._triangles)

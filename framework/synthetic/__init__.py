@@ -1,1 +1,1 @@
-"""Furnished rooms made in memory: furniture, layout, light, camera walk and depth sensor."""
+"""Synthetic furnished rooms: furniture, layout, light, camera trajectory and depth sensor."""

@@ -34,23 +34,23 @@ from framework.synthetic.renderer import cast_ids
 from framework.synthetic.room import Room, furnish_with
 from framework.synthetic.walk import CameraPath, plan_path
 
-SMALLEST = (4.8, 4.2)  # m, width and depth of the smallest room tried
-STREWN = 9  # things put down on the floor against the furniture, as far as there is room
-ATTEMPTS = 6  # scenes drawn, of which the walk that shows most is kept
-JUDGED_VIEWS = 30  # of a walk
-WELL_SEEN, LONG_SEEN = 10, 1 / 6  # px of an object in one of these views; share of the views that show as many
-SMALL_VIEW = Camera(80, 60, 68.0, 68.0, 39.5, 29.5)  # what they are looked at with: a Kinect's field of view
+SMALLEST = (4.8, 4.2)  # m, width and depth of the smallest candidate room
+STREWN = 9  # maximum number of objects on the floor next to furniture
+ATTEMPTS = 6  # candidate scenes; the trajectory with the best visibility is kept
+JUDGED_VIEWS = 30  # views of a trajectory for the visibility score
+WELL_SEEN, LONG_SEEN = 10, 1 / 6  # px of a visible object in a view; minimum fraction of such views
+SMALL_VIEW = Camera(80, 60, 68.0, 68.0, 39.5, 29.5)  # camera of these views, with a Kinect's field of view
 
 MakeGroup = Callable[[Rng], Group]
 
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """What one room is for and what stands in it, beside what all rooms have."""
+    """Purpose and contents of a room, in addition to the contents of all rooms."""
 
-    role: str  # for people
-    groups: tuple[MakeGroup, ...]  # the largest first: they find a place most easily
-    holds: Mapping[str, int]  # COCO class -> how many of it there are at least
+    role: str  # description for messages
+    groups: tuple[MakeGroup, ...]  # largest first, for placement
+    holds: Mapping[str, int]  # COCO class -> minimum number of objects
 
 
 def bag(rng: Rng) -> Group:
@@ -64,7 +64,7 @@ def cupboard(rng: Rng) -> Group:
 
 
 def kitchen(rng: Rng) -> Group:
-    """With things on top of the refrigerator."""
+    """Return a kitchen with objects on top of the refrigerator."""
     group = kitchen_group(rng)
     fridge = next(piece for piece in group.pieces if piece.kind == "refrigerator")
     strew_on(group, fridge, rng, small_things.some(rng, small_things.ON_TOPS, 1))
@@ -133,7 +133,7 @@ SCENES: Mapping[str, SceneSpec] = {
 
 @dataclass(frozen=True)
 class Scene:
-    """A furnished room, the walk through it, and the random numbers that are left for what follows."""
+    """A furnished room, the camera path through it, and the random generator for later steps."""
 
     room: Room
     path: CameraPath
@@ -141,11 +141,11 @@ class Scene:
 
 
 def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: float) -> Scene:
-    """Return the candidate scene of this spec whose walk of `frames` frames shows the most of it.
+    """Return the candidate scene of this spec with the best visibility along `frames` frames.
 
-    `stride` is the walk's, see walk.plan_path.
+    `stride` is the stride of walk.plan_path.
 
-    Raises DataError when in none of them the furniture fits.
+    Raises DataError if the furniture fits in no candidate.
     """
     best: Scene | None = None
     most_shown = (-1.0, -1.0)
@@ -160,12 +160,12 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: floa
         if min(shown) == 1:
             break
     if best is None:
-        raise DataError(f"the {spec.role}: its furniture does not fit; choose another seed")
+        raise DataError(f"{spec.role}: furniture does not fit; set another seed")
     return best
 
 
 def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
-    """Return a scene and the fractions of its classes and same-class objects that its walk shows well."""
+    """Return a scene and the well-visible fractions of its classes and same-class objects."""
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
     caster = RayCaster(surfaces.vertices, surfaces.triangles)

@@ -1,7 +1,7 @@
-"""Where furniture stands: groups against walls, nothing inside anything else, room left to walk.
+"""Furniture layout: groups against walls, without intersections, with free space for the camera path.
 
-Groups are tried at random places along the walls. Of several complete layouts the one with most room to walk is kept;
-where none has enough, the room grows.
+Groups are placed at random positions along the walls. Of several complete layouts, the one with the most free space is
+kept. If none has enough, the room is enlarged.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from framework.synthetic.furniture.solids import axis_rotation
 
 CLEARANCE = 0.06  # m, between groups
 MARGIN = 0.05  # m, between a group and the corner of the room
-LAYOUTS = 16  # complete layouts to choose from
-TRIES = 50  # places tried for each group
-GROWTH = (1.0, 1.06, 1.12, 1.2, 1.3, 1.4, 1.5)  # sides of the rooms tried, relative
-WALK_RADIUS = 1.3  # m, of the free circle that a walk needs
-HEAD_ROOM = 1.9  # m, what hangs higher does not bar the way
-CONTACT = 0.003  # m, between the boxes of things on the floor that touch
-PLACES = 60  # tried for each thing on the floor
-ON_FLOOR = 0.05  # m, what begins lower stands on the floor
-NO_HOSTS = ("door", "window", "rug")  # nothing is put down against these
-CELL = 0.05  # m, of the grid on which free floor is measured
+LAYOUTS = 16  # complete candidate layouts
+TRIES = 50  # candidate positions of each group
+GROWTH = (1.0, 1.06, 1.12, 1.2, 1.3, 1.4, 1.5)  # relative side lengths of candidate rooms
+WALK_RADIUS = 1.3  # m, minimum radius of the free circle for a camera path
+HEAD_ROOM = 1.9  # m, objects above do not block the camera path
+CONTACT = 0.003  # m, between the boxes of touching objects on the floor
+PLACES = 60  # candidate positions of each object on the floor
+ON_FLOOR = 0.05  # m, objects with a lower base stand on the floor
+NO_HOSTS = ("door", "window", "rug")  # no objects are placed against these
+CELL = 0.05  # m, cell size of the grid of free floor
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where all groups of a room stand."""
+    """Placement of all groups of a room."""
 
     width: float  # m, along x
     depth: float  # m, along y
-    pieces: list[Furniture]  # in the room's coordinates: x and y along the walls, z up, origin amid the floor
+    pieces: list[Furniture]  # in room coordinates: x and y along the walls, z up, origin at the center of the floor
     free: Float64  # (rows along y, columns along x) m from each CELL of the floor to furniture or walls
 
 
 def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout:
-    """Return the groups in the smallest room, at least `width` x `depth` m, that leaves space to walk.
+    """Return the groups in the smallest room, at least `width` x `depth` m, with space for a camera path.
 
-    Raises DataError when even a room half as long again is too small.
+    Raises DataError if a room with 1.5 times these sides is too small.
     """
     boxes = [group.boxes for group in groups]
     for factor in GROWTH:
@@ -59,19 +59,19 @@ def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout
             placed = [g.placed(*at) for g, at in zip(groups, complete[best].places, strict=True)]
             pieces = [piece for group in placed for piece in group.pieces]
             return Layout(factor * width, factor * depth, pieces, free[best])
-    raise DataError(f"synthetic room: {len(groups)} groups of furniture do not fit; choose another seed or scene")
+    raise DataError(f"synthetic room: {len(groups)} groups of furniture do not fit; set another seed or scene")
 
 
 @dataclass
 class _Plan:
     places: list[Place] = field(default_factory=list)
-    solid: list[Float64] = field(default_factory=list)  # (N, 2, 3) boxes that others must not enter, for each group
+    solid: list[Float64] = field(default_factory=list)  # (N, 2, 3) solid boxes of each group
 
 
 def _try_layout(
     groups: list[Group], boxes_of_groups: list[Float64], width: float, depth: float, rng: Rng
 ) -> _Plan | None:
-    """One random layout, None when a group finds no place. Works on boxes alone: they turn by quarters exactly."""
+    """Return a random layout, None if a group does not fit. Uses boxes only, whose quarter turns are exact."""
     plan = _Plan()
     taken = np.zeros((0, 2, 3))
     walls: dict[str, tuple[int, float]] = {}
@@ -117,7 +117,7 @@ def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
 
 
 def _turned_boxes(boxes: Float64, quarters: int, place: Place) -> Float64:
-    """Boxes (N, 2, 3) turned by quarters of a circle, then moved."""
+    """Return boxes (N, 2, 3) after quarter turns and a translation."""
     R = np.rint(axis_rotation("z", quarters * np.pi / 2))
     corners = boxes @ R.T + np.array([place[0], place[1], 0.0])
     return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
@@ -135,7 +135,7 @@ def _inside(boxes: Float64, width: float, depth: float) -> bool:
 
 
 def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
-    """For each CELL of the floor (rows along y, columns along x), at most the distance in m to boxes and walls."""
+    """Return a lower bound of the distance (m) to boxes and walls for each CELL (rows along y, columns along x)."""
     rows, columns = int(depth / CELL), int(width / CELL)
     free = np.zeros((rows + 2, columns + 2), np.uint8)
     free[1:-1, 1:-1] = 1
@@ -148,9 +148,9 @@ def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
 
 
 def strew(layout: Layout, things: Sequence[Furniture], rng: Rng) -> Layout:
-    """Return the layout with things next to furniture, without those that do not fit or block the walk.
+    """Return the layout with things next to furniture, omitting those that do not fit or block the camera path.
 
-    The things turn by quarters, so that their boxes stay as tight as they are.
+    The things are rotated by quarter turns, which keeps their boxes tight.
     """
     for thing in things:
         layout = _with_thing(layout, thing, rng)
@@ -180,7 +180,7 @@ def _with_thing(layout: Layout, thing: Furniture, rng: Rng) -> Layout:
 
 
 def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
-    """`thing` beside the box `host` (2, 3), at least half of it along the side that it touches."""
+    """Place `thing` next to the box `host` (2, 3), with at least half of it along the touched side."""
     turned = thing.placed(0, 0, 0, np.pi / 2 * int(rng.integers(4)))
     low, high = turned.bounds()
     axis, sign = int(rng.integers(2)), (-1 if rng.uniform() < 0.5 else 1)
@@ -192,5 +192,5 @@ def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
 
 
 def _meets(box: Float64, others: Float64) -> bool:
-    """Whether the box (2, 3) shares space with one of the others (N, 2, 3)."""
+    """Return True if the box (2, 3) intersects one of the others (N, 2, 3)."""
     return bool((np.minimum(box[1], others[:, 1]) > np.maximum(box[0], others[:, 0])).all(axis=1).any())

@@ -1,7 +1,7 @@
 """Light baked into the vertices: soft shadows of lamps and windows, and three diffuse bounces between surfaces.
 
-The light is static and surfaces are Lambertian, as photometric tracking assumes. All vertices gather light along the
-same directions, so that no noise appears between neighbors.
+Light is static and surfaces are Lambertian, as assumed by photometric tracking. All vertices gather light along the
+same directions, which avoids noise between neighbors.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ class Lamp:
     """Sample points of one light source."""
 
     points: Float64  # (S, 3) m
-    normals: Float64  # (S, 3) unit, 0 = shines in all directions
+    normals: Float64  # (S, 3) unit, 0 = emits in all directions
     power: Color  # linear RGB, for the whole lamp
 
 
 def globe(center: Float64, radius: float, power: Color, samples: int = 16) -> Lamp:
-    """Return a lamp that shines in all directions."""
+    """Return a lamp that emits light in all directions."""
     k = np.arange(samples) + 0.5  # on a Fibonacci sphere
     z, angle = 1 - 2 * k / samples, np.pi * (1 + 5**0.5) * k
     r = np.sqrt(1 - z * z)
@@ -82,7 +82,7 @@ def _direct(origins: Float32, normals: Float32, caster: RayCaster, lamp: Lamp) -
 
 
 def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int32, Float32]:
-    """Return the triangles (V, D) that each vertex sees, -1 = none, and barycentric weights (V, D, 2)."""
+    """Return the triangles (V, D) visible from each vertex, -1 = none, and barycentric weights (V, D, 2)."""
     local = _cosine_directions(GATHER_DIRECTIONS)
     triangle = np.empty((len(origins), len(local)), np.int32)
     uv = np.empty((*triangle.shape, 2), np.float32)

@@ -28,7 +28,7 @@ WALLS: tuple[Color, ...] = (
 )  # fmt: skip
 
 DARKEST = 0.35  # mean sRGB of a surface below which it absorbs a projector's infrared light
-ABSORBED = 0.8  # share of the readings that a black surface absorbs
+ABSORBED = 0.8  # fraction of the readings lost on a black surface
 MATTE_SCREEN = 0.75  # `dark` of a matte screen
 POLISHED, GLAZED = 0.7, 0.5  # `shiny` of metal and of ceramics
 
@@ -62,13 +62,13 @@ class Material:
 
     texture: Texture
     color: Color
-    second: Color  # mixed in by the pattern
+    second: Color  # second color of the pattern
     scale: float = 0.1  # m, size of the pattern
     extent: tuple[float, float] = (1.0, 1.0)  # m, of a picture
     seed: int = 0
     emission: float = 0.0  # relative to a white wall in the room's mean light
-    dark: float = 0.0  # in [0, 1], share of a structured-light camera's readings lost from all directions
-    shiny: float = 0.0  # in [0, 1], share of the others lost at a slant, see shading_kernels.GLANCED_OFF
+    dark: float = 0.0  # in [0, 1], fraction of a structured-light camera's readings lost in all directions
+    shiny: float = 0.0  # in [0, 1], fraction of the others lost at slanted angles, see shading_kernels.GLANCED_OFF
 
 
 def material_table(materials: list[Material]) -> Float32:
@@ -87,7 +87,7 @@ def _to_linear(srgb: Float64) -> Float64:
 
 
 def absorbed(color: Color) -> float:
-    """Return the share of a depth camera's readings that a surface of this color loses."""
+    """Return the fraction of a depth camera's readings lost on a surface of this color."""
     return ABSORBED * max(0.0, 1 - sum(color) / 3 / DARKEST)
 
 
@@ -153,7 +153,7 @@ def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Materi
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
-    """Return a painting or a screen of this size (m); depth cameras do not read the glossy half of the screens."""
+    """Return a painting or a screen of this size (m); the glossy half of the screens has no depth readings."""
     first, second, seed = vivid(rng), vivid(rng), new_seed(rng)
     dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
     return Material(texture, first, second, 0.1, (width, height), seed, emission, dark)

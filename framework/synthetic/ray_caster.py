@@ -1,4 +1,4 @@
-"""Open3D's Embree ray-caster, with this project's pixel convention and repeatable results."""
+"""Open3D's Embree ray caster, with this project's pixel convention and deterministic results."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ Numbers = npt.NDArray[np.floating] | npt.NDArray[np.integer]
 
 @dataclass(frozen=True)
 class RayHits:
-    """Where rays met the surface, with the shape of the rays in front."""
+    """Intersections of rays with the surface; leading dimensions as those of the rays."""
 
-    distance: Float32  # in lengths of the ray's direction, inf = nothing was met
-    triangle: Int32  # NO_TRIANGLE = nothing was met
+    distance: Float32  # in lengths of the ray's direction, inf = no intersection
+    triangle: Int32  # NO_TRIANGLE = no intersection
     uv: Float32  # (..., 2) barycentric weights of the triangle's second and third vertex
 
 
 class RayCaster:
-    """Casts rays at a fixed triangle mesh, by as many threads as numba has. Safe to call from several threads."""
+    """Ray caster of a fixed triangle mesh with numba's number of threads. Thread-safe."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
         import open3d as o3d
 
-        # One thread builds the tree, so that ties between triangles are always decided alike.
+        # one thread builds the tree, so that ties between triangles are deterministic
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(
             _tensor(np.ascontiguousarray(vertices, np.float32)), _tensor(np.ascontiguousarray(triangles, np.uint32))
@@ -41,11 +41,11 @@ class RayCaster:
     def cast(self, rays: Float32) -> RayHits:
         """Return the first hits of rays (..., 6), origin and direction."""
         answer = self._scene.cast_rays(_tensor(np.ascontiguousarray(rays)), get_num_threads())
-        triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's "nothing" is 2^32 - 1, which is -1
+        triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's invalid id 2^32 - 1 becomes -1
         return RayHits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
     def occluded(self, origins: Float32, ends: Float32) -> Bool:
-        """Whether something lies between the points (..., 3) and (..., 3), apart from what touches the ends."""
+        """Return True where a surface lies between the points (..., 3) and (..., 3), except at the ends."""
         rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
         return np.asarray(self._scene.test_occlusions(_tensor(rays), 1e-3, 0.999, get_num_threads()).numpy())
 
@@ -57,9 +57,9 @@ def _tensor(array: Array) -> o3d.core.Tensor:
 
 
 def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:
-    """Rays (A, B, 6) through the image points u, v (px, pixel centers at integers), which broadcast to (A, B).
+    """Return rays (A, B, 6) through the image points u, v (px, pixel centers at integers), broadcast to (A, B).
 
-    The direction has length 1 along the optical axis, so that the distance of a hit is its depth.
+    The direction has length 1 along the optical axis, so that the distance of an intersection is its depth.
     """
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     rays = np.empty((*np.broadcast_shapes(x.shape, y.shape), 6), np.float32)

@@ -28,17 +28,17 @@ EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.12
 
 @dataclass(frozen=True)
 class Rendering:
-    """The picture of an ideal camera."""
+    """Images of an ideal camera."""
 
     color: UInt8  # (H, W, 3) RGB
-    depth: Float32  # (H, W) m along z, 0 = nothing
+    depth: Float32  # (H, W) m along z, 0 = no surface
     instance_ids: Int32  # (H, W)
     incidence: Float32  # (H, W) cosine of the angle between ray and surface normal, in [0, 1]
-    unread: Float32  # (H, W) in [0, 1], share of a depth camera's readings lost to dark and shiny materials
+    unread: Float32  # (H, W) in [0, 1], fraction of a depth camera's readings lost on dark and shiny materials
 
 
 class Renderer:
-    """Renders `surfaces` under `lamps`, whose light is baked once. Safe to call from several threads."""
+    """Renderer of `surfaces` under `lamps`, with light baked once. Thread-safe."""
 
     def __init__(self, surfaces: Surfaces, lamps: list[Lamp]) -> None:
         self.surfaces = surfaces
@@ -58,7 +58,7 @@ class Renderer:
         self._rasterizer = Rasterizer(surfaces.vertices, surfaces.triangles)
 
     def render(self, camera: Camera, T_world_camera: Float64, material_table: Float32 | None = None) -> Rendering:
-        """Return the picture of the room, also with another paints.material_table under the same light."""
+        """Return the images of the room, optionally with another paints.material_table under the same light."""
         surfaces = self._lit if material_table is None else self._lit._replace(table=material_table)
         buffer = self._rasterizer.draw(camera, T_world_camera)
         triangle, depth = buffer.triangle, buffer.depth

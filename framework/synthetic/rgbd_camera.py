@@ -1,4 +1,4 @@
-"""The errors of an RGB-D camera like the Kinect v1.
+"""Error model of an RGB-D camera like the Kinect v1.
 
 - Axial depth noise grows with the square of depth and towards grazing angles: see `framework.sensors.noise_models`.
 - Disparity is quantized to 1/8 px, so depth comes in steps of 2.9e-3 z^2: Khoshelham and Oude Elberink, "Accuracy and
@@ -6,7 +6,7 @@
 - Lateral noise moves readings across edges by about a pixel (Nguyen et al.), applied as by Handa et al., "A Benchmark
   for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
 - Readings are missing in the projector's shadow, at many pixels along depth edges, and at grazing angles.
-- Dark and shiny surfaces lose readings in patches, as the correlation window is wider than a pixel.
+- Dark and shiny surfaces lose readings in patches, because the correlation window is wider than a pixel.
 - Color has noise and motion blur.
 """
 
@@ -38,7 +38,7 @@ COLOR_SIGMA = 1.5  # gray levels of 255
 
 @dataclass(frozen=True)
 class DepthSensor:
-    """Turns exact depth into readings."""
+    """Sensor model from exact depth to readings."""
 
     noise: float  # 0 = exact, 1 = as measured; scales standard deviations and probabilities
     max_range: float  # m
@@ -53,7 +53,7 @@ class DepthSensor:
     ) -> Float32:
         """Return the readings (H, W) m of exact `depth` (H, W) m at the cosines `incidence` (H, W), 0 = no reading.
 
-        `unread` (H, W) is the share of readings that materials lose, in patches; None = no loss.
+        `unread` (H, W) is the fraction of readings lost on materials, in patches; None = no loss.
         """
         if self.noise == 0:
             return np.where(depth <= self.max_range, depth, np.float32(0))
@@ -101,7 +101,7 @@ def blurred(
 
 
 def random_bits(shape: tuple[int, ...], rng: np.random.Generator) -> UInt16:
-    """Return 16 random bits per element: several times faster than draws from a distribution."""
+    """Return 16 random bits per element; several times faster than sampling a distribution."""
     count = math.prod(shape)
     words = rng.integers(0, 2**64, -(-count // 4), np.uint64)
     return words.view(np.uint16)[:count].reshape(shape)

@@ -1,4 +1,4 @@
-"""A furnished room: shell, furniture and lamps. World axes: x and y along the walls, z up, origin amid the floor."""
+"""Furnished room: shell, furniture and lamps. World: x, y along the walls, z up, origin at the center of the floor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear color of lamps and of
 
 
 class RoomKind(StrEnum):
-    """What a room is for. A studio holds all nine classes."""
+    """Kinds of rooms. A studio contains all nine classes."""
 
     STUDIO = "studio"
     LIVING_ROOM = "living_room"
@@ -33,7 +33,7 @@ class RoomKind(StrEnum):
     OFFICE = "office"
 
 
-SMALLEST = {  # m, width and depth of the smallest room tried
+SMALLEST = {  # m, width and depth of the smallest candidate room
     RoomKind.STUDIO: (5.6, 4.8),
     RoomKind.LIVING_ROOM: (4.6, 4.2),
     RoomKind.BEDROOM: (4.2, 3.8),
@@ -44,7 +44,7 @@ SMALLEST = {  # m, width and depth of the smallest room tried
 
 @dataclass(frozen=True)
 class Room:
-    """One room, complete."""
+    """A complete room."""
 
     layout: Layout
     objects: tuple[tuple[int, Furniture], ...]  # (instance id, piece); 0 = shell
@@ -60,7 +60,7 @@ def furnish(kind: RoomKind, rng: Rng) -> Room:
 def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, strewn: Sequence[Furniture] = ()) -> Room:
     """Return a room of at least `width` x `depth` m with these contents, placed largest first.
 
-    As much of what is `strewn` stands on the floor as finds a place against the furniture.
+    `strewn` objects are placed on the floor next to furniture, as far as they fit.
     """
     layout = strew(arrange(contents, width, depth, rng), strewn, rng)
     globe_lamp = clutter.ceiling_lamp(rng).placed(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), HEIGHT)
@@ -70,7 +70,7 @@ def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, st
 
 
 def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
-    """Return the contents of the room, largest first, which is easiest to place."""
+    """Return the contents of the room, largest first, for placement."""
     door, window = single("door", clutter.door(rng)), single("window", clutter.window(rng), z=0.95, hung=True)
     bag = single("backpack", fixtures.backpack(rng))
     extras = [
@@ -100,7 +100,7 @@ def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
 
 
 def _shell(width: float, depth: float, rng: Rng) -> Furniture:
-    """Floor, ceiling and four walls with skirting boards, one of them papered."""
+    """Return floor, ceiling and four walls with baseboards; one wall has wallpaper."""
     shell = Furniture("shell")
     shell.add(panel(width, depth).turned("x", np.pi / 2), _floor(rng), y=depth / 2)
     ceiling = panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
@@ -141,7 +141,7 @@ def _lamps(pieces: list[Furniture]) -> list[Lamp]:
             lamps.append(globe(np.array([*center[:2], HEIGHT - 0.22]), 0.24, _scaled(WARM, 9.0), 24))
         elif piece.kind in ("floor lamp", "table lamp"):
             strength, below = (3.0, 0.10) if piece.kind == "floor lamp" else (0.9, 0.08)
-            # Sample points lie outside the shade, else it would swallow its own light.
+            # sample points are outside of the shade, which would otherwise block its own light
             lamps.append(
                 globe(np.array([*center[:2], high[2] - below]), 0.24 if strength > 1 else 0.16, _scaled(WARM, strength))
             )

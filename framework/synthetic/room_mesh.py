@@ -1,4 +1,4 @@
-"""The labeled mesh that belongs to a video: the exact surfaces in small triangles, as far as the camera saw them."""
+"""Labeled ground-truth mesh of a video: the observed part of the exact surfaces, in small triangles."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.surfaces import Surfaces
 
-ON_SURFACE = 1.001  # of the way to a vertex: its own surface is met within this
+ON_SURFACE = 1.001  # relative distance tolerance for the surface of a vertex
 LONGEST_EDGE = 0.02  # m
 
 
 @dataclass(frozen=True)
 class RoomMesh:
-    """Triangles whose vertices belong to one instance each."""
+    """Triangle mesh with one instance per vertex."""
 
     vertices: Float32  # (V, 3) m, world
     triangles: Int32  # (F, 3), counter-clockwise seen from outside
@@ -40,7 +40,7 @@ def visible_mesh(
 ) -> RoomMesh:
     """Return the surfaces visible from the poses T_world_camera at a depth within `reach` (m, m).
 
-    `caster` has the triangles of `surfaces`. What no depth camera reads is not seen, nor what lies behind it.
+    `caster` has the triangles of `surfaces`. Surfaces without depth readings, and surfaces behind them, are invisible.
     """
     mesh = tessellate(surfaces, longest_edge)
     return mesh.only(seen_from(mesh.vertices, caster, camera, poses, reach, surfaces.unreadable))
@@ -49,7 +49,7 @@ def visible_mesh(
 def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
     """Return the surfaces in triangles whose edges are at most `longest_edge` m long.
 
-    A longer edge is halved until it is short enough, in all triangles that have it, so that no gaps come about.
+    Longer edges are halved repeatedly, in all adjacent triangles, so that the mesh has no gaps.
     """
     instance_ids = np.zeros(len(surfaces.vertices), np.int32)
     instance_ids[surfaces.triangles.ravel()] = np.repeat(surfaces.instance_ids, 3)
@@ -73,9 +73,9 @@ def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
 
 
 def _welded(mesh: RoomMesh) -> RoomMesh:
-    """With vertices of one instance at exactly the same place made one, and without triangles that have no area."""
+    """Merge vertices of one instance at identical positions, and remove triangles without area."""
     rows = np.empty((len(mesh.vertices), 4), np.int32)
-    rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # -0 is at the same place as 0
+    rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # -0 equals 0
     rows[:, 3] = mesh.instance_ids
     order = np.lexsort(rows.T)
     new = np.ones(len(rows), np.bool_)
@@ -98,9 +98,9 @@ def seen_from(
     reach: tuple[float, float],
     unreadable: Bool,
 ) -> Bool:
-    """(V,) Which vertices lie in the picture of one of the poses, at a depth within `reach` and with nothing before.
+    """Return (V,) true for vertices in the view of a pose, at a depth within `reach` and without occlusion.
 
-    Those that lie on one of the `unreadable` triangles (F,) of the caster, or closely behind, have something before.
+    Vertices on one of the `unreadable` triangles (F,) of the caster, or closely behind, count as occluded.
     """
     seen = np.zeros(len(vertices), np.bool_)
     for T_world_camera in poses:

@@ -1,7 +1,7 @@
-"""Processes that write the scenes of a benchmark folder together, and keep what is there already.
+"""Parallel writing of the scenes of a benchmark folder; existing files are kept.
 
-A process stays with one scene for as long as something of it is left to write, because furnishing and lighting a room
-takes seconds; a process that finds no untouched scene helps with another's.
+A process continues with its scene until it is complete, because furnishing and lighting a room takes seconds. A process
+without an unstarted scene helps with another process's scene.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from framework.files.json_file import read_json
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import GENERATION, BenchmarkSettings, SceneNNScene, frame_files, trajectory_file
 
-FRAMES_AT_ONCE = 8  # few, so that all processes end at about the same time
+FRAMES_AT_ONCE = 8  # small, so that all processes end at about the same time
 
-Piece = Callable[[SceneNNScene], int]  # writes some files, returns how many of them are frames
+Piece = Callable[[SceneNNScene], int]  # writes some files, returns the number of frames
 
 
 def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: BenchmarkSettings, jobs: int) -> None:
     """Write the scenes into `root` with `jobs` processes; files of the same scenes are kept.
 
-    Raises ConfigError when `root` holds something else, DataError when a file or a process fails.
+    Raises ConfigError if `root` has other content, DataError if a file or a process fails.
     """
     _begin(root, recording)
     scenes = [_Scene(root / name, spec, recording) for name, spec in specs.items()]
@@ -50,8 +50,8 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Benchmar
     bar = tqdm(total=total, initial=total - missing, desc="rendering", unit=" frames", disable=None)
     with ExitStack() as stack:
         stack.enter_context(bar)
-        # Not forked: threads of numba and OpenCV do not survive that. One pool a process, so that each can be given
-        # the scene that it has in memory.
+        # spawned: threads of numba and OpenCV do not survive a fork; one pool per process, so that each process can
+        # continue with the scene in its memory
         spawn = multiprocessing.get_context("spawn")
         pools = [stack.enter_context(ProcessPoolExecutor(1, spawn, _begin_process)) for _ in range(jobs)]
         running: dict[Future[int], ProcessPoolExecutor] = {}
@@ -73,20 +73,18 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Benchmar
 
 
 def _begin(root: Path, recording: BenchmarkSettings) -> None:
-    """Write the files that all scenes share; refuse a folder with other content."""
+    """Write the files shared by all scenes. Raises ConfigError for a folder with other content."""
     made_by = root / MADE_BY
     wanted = {"generation": GENERATION, **asdict(recording)}
     if made_by.exists():
         try:
             found = read_json(made_by)
         except DataError as error:
-            raise DataError(f"{made_by} is damaged; delete it with its folder, or choose another folder") from error
+            raise DataError(f"{made_by}: damaged; delete its folder, or set another folder") from error
         if found != wanted:
-            raise ConfigError(
-                f"{root} holds rooms of other parameters: found {found}, expected {wanted}; choose another folder"
-            )
+            raise ConfigError(f"{root}: expected rooms with the parameters {wanted}, got {found}; set another folder")
     elif root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise ConfigError(f"{root} must be a new or empty folder, or one that this command began; choose another")
+        raise ConfigError(f"{root}: expected a new or empty folder, or one of this command, got other content")
     (root / "intrinsic").mkdir(parents=True, exist_ok=True)
     with written_whole(made_by) as temporary:
         temporary.write_text(json.dumps(wanted) + "\n")
@@ -96,7 +94,7 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
 
 
 class _Scene:
-    """What is left to write of one scene. The trajectory comes last: where it is, the scene is complete."""
+    """Missing files of one scene. The trajectory is written last: a scene with a trajectory is complete."""
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.spec = folder, spec
@@ -115,7 +113,7 @@ class _Scene:
 
     @property
     def ready(self) -> int:
-        """How many pieces can be written now."""
+        """Number of pieces that can be written now."""
         waiting_for_walk = not self._left and not self.running and not self._complete
         return len(self._left) + waiting_for_walk
 
@@ -129,7 +127,7 @@ class _Scene:
 
 
 def _choose(scenes: list[_Scene], last: _Scene | None) -> _Scene | None:
-    """Return the next scene of a process: its `last` one, else one not started, else the longest."""
+    """Return the next scene of a process: its `last` one, else an unstarted one, else the longest."""
     if last is not None and last.ready:
         return last
     ready = [scene for scene in scenes if scene.ready]
@@ -142,13 +140,13 @@ def _result(future: Future[int], folder: Path) -> int:
         return future.result()
     except BrokenProcessPool as error:
         raise DataError(
-            f"a process that wrote {folder} was ended from outside, perhaps for want of memory; run the same command "
-            "again: it goes on from here"
+            f"{folder}: a writing process was terminated, possibly for lack of memory; run the same command again to "
+            "resume"
         ) from error
 
 
 def _begin_process() -> None:
-    """One thread for each process, Ctrl-C only while it works, and an end when its parent has ended."""
+    """Limit the process to one thread, defer Ctrl-C, and exit with the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     numba.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -163,11 +161,11 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-_in_memory: list[SceneNNScene] = []  # of this process: the scene that it wrote last, if any
+_in_memory: list[SceneNNScene] = []  # of this process: the last written scene, if any
 
 
 def _write(folder: Path, spec: SceneSpec, recording: BenchmarkSettings, piece: Piece) -> int:
-    """Write a part of the scene, in one of the processes."""
+    """Write a part of the scene in one of the processes."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         if not _in_memory or _in_memory[0].folder != folder:

@@ -1,6 +1,6 @@
-"""One room of the synthetic benchmark as a recording in SceneNN's own files.
+"""A room of the synthetic benchmark as a recording in SceneNN's format.
 
-SceneNN's world is y-up and the room is z-up, so everything that is written is turned by a quarter about x.
+SceneNN's world is y-up and the room is z-up, so all output is rotated by a quarter turn about x.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from framework.synthetic.room_mesh import visible_mesh
 from framework.synthetic.walk import FRAME_RATE
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
-GENERATION = 3  # of the rooms that this code makes: raise it when they change, so that none are mixed
+GENERATION = 3  # version of the generated rooms: increment it when they change, so that versions are not mixed
 ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini
-NOISE, MAX_RANGE = 1.0, 6.0  # the sensor's noise, 1 = a Kinect v1; its range, m
-EXPOSURE = 1 / 60  # s, of color, amid which the pose is true: a lamp at home leaves a camera no shorter one
-TRUTH_VIEWS = 60  # frames whose view makes up the labeled mesh; neighbors show nearly the same
-FASTEST = 5.0  # haste: 2.2 m/s, a run
-LARGEST_ID = 934338  # of SceneNN's own labels, which have no order
+NOISE, MAX_RANGE = 1.0, 6.0  # noise of the sensor, 1 = a Kinect v1; its range, m
+EXPOSURE = 1 / 60  # s, of color, centered at the pose: typical for indoor light
+TRUTH_VIEWS = 60  # frames that determine the labeled mesh; neighbors have nearly the same view
+FASTEST = 5.0  # maximum haste: 2.2 m/s
+LARGEST_ID = 934338  # of SceneNN's labels, which are unordered
 PNG = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB),
 )
-"""Noisy pictures hold nothing that a search for repetitions finds, and one filter is as good as a choice among all:
-within 5 % of the size of the slow ways, in 10 ms."""
+"""PNG options for noisy images: no search for repetitions, and a single filter. Files are within 5 % of the size with
+slow options, in 10 ms."""
 
 T_YUP_ZUP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From the room's axes to SceneNN's. It only swaps and negates, so that nothing is rounded."""
+"""Rotation from the room's axes to SceneNN's. It only swaps and negates, which avoids rounding."""
 
 _COCO_TO_SCENENN = {coco: name for name, coco in SCENENN_TO_COCO.items()}
 _NYU_CLASSES = {
@@ -64,29 +64,29 @@ _NYU_CLASSES = {
     "table lamp": "lamp",
     "window": "window",
 }
-"""What NYU calls clutter. The rest has a text and no nyu_class, as much has in SceneNN."""
+"""NYU classes of clutter. Other objects have a text but no nyu_class, as in SceneNN."""
 
 
 @dataclass(frozen=True)
 class BenchmarkSettings:
-    """What all scenes of one benchmark folder have in common."""
+    """Settings shared by all scenes of a benchmark folder."""
 
     seed: int = 0
     frames: int = 120  # of each scene
-    rate: float = 10.0  # Hz, of the frames: few show the same thing
-    width: int = 640  # px, the height is 3/4 of it
-    haste: float = 2.0  # of the walk: 1 = slowly, as a person should record; objects are seen in fewer frames, and blur
+    rate: float = 10.0  # Hz, frame rate; low, to limit redundant frames
+    width: int = 640  # px; the height is 3/4 of the width
+    haste: float = 2.0  # relative camera speed, 1 = as recommended for recording; higher = fewer views and more blur
 
     def __post_init__(self) -> None:
         for name, lowest in (("seed", 0), ("frames", 1), ("width", 16)):
             if getattr(self, name) < lowest:
-                raise ConfigError(f"{name} must be at least {lowest}, found {getattr(self, name)}")
+                raise ConfigError(f"{name}: expected at least {lowest}, got {getattr(self, name)}")
         if not 0 < self.rate <= FRAME_RATE:
-            raise ConfigError(f"rate must be above 0 and at most {FRAME_RATE:.0f} Hz, found {self.rate}")
+            raise ConfigError(f"rate: expected a value in (0, {FRAME_RATE:.0f}] Hz, got {self.rate}")
         if not 0 < self.haste <= FASTEST:
-            raise ConfigError(f"haste must be above 0 and at most {FASTEST}, found {self.haste}")
+            raise ConfigError(f"haste: expected a value in (0, {FASTEST:g}], got {self.haste}")
         if self.width % 4:
-            raise ConfigError(f"width must be a multiple of 4, so that the picture is 4:3; found {self.width}")
+            raise ConfigError(f"width: expected a multiple of 4 px, for images of 4:3, got {self.width}")
 
     @property
     def camera(self) -> Camera:
@@ -94,41 +94,41 @@ class BenchmarkSettings:
 
     @property
     def stride(self) -> float:
-        """How far the walk goes from frame to frame, in frames of a walk without haste at FRAME_RATE."""
+        """Camera motion per frame, in frames of a path with haste 1 at FRAME_RATE."""
         return self.haste * FRAME_RATE / self.rate
 
     @property
     def release(self) -> str:
-        """What tables call the annotation."""
+        """Name of the annotation in tables."""
         return f"synthetic {GENERATION}, seed {self.seed}, {self.frames} frames"
 
 
 class SceneNNScene:
-    """One furnished room and the walk through it, written piece by piece to its folder, in any order."""
+    """A furnished room and its camera path, written in pieces to its folder, in any order."""
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.recording = folder, recording
         for kind in ("image", "depth"):
             (folder / kind).mkdir(parents=True, exist_ok=True)
         self.camera = recording.camera
-        self._stream = [recording.seed, zlib.crc32(folder.name.encode())]  # a scene is a random stream of its own
+        self._stream = [recording.seed, zlib.crc32(folder.name.encode())]  # each scene has its own random stream
         scene = plan_scene(spec, self._stream, recording.frames, recording.stride)
         self.room, self.path = scene.room, scene.path
         self.renderer = Renderer(self.room.surfaces, list(self.room.lamps))
         self._sensor = DepthSensor(NOISE, MAX_RANGE)
         ids = 1 + scene.rng.choice(LARGEST_ID, len(self.room.objects), replace=False)
-        ids[0] = 0  # the shell is no instance
-        self.labels = ids.astype(np.int32)  # (N + 1,) what each instance id of the room is called in the files
+        ids[0] = 0  # the shell is not an instance
+        self.labels = ids.astype(np.int32)  # (N + 1,) label in the files of each instance id of the room
         self.colors = scene.rng.integers(64, 256, (len(ids), 3))  # RGB, of each
 
     def write_frames(self, frames: Sequence[int]) -> int:
-        """Color and depth of some frames; returns their number."""
+        """Write color and depth of some frames; return their number."""
         for index in frames:
             self.write_frame(index)
         return len(frames)
 
     def write_frame(self, index: int) -> None:
-        """Color and depth of frame `index`, counted from 0."""
+        """Write color and depth of frame `index`, counted from 0."""
         T_world_camera = self.path.pose(index)
         picture = self.renderer.render(self.camera, T_world_camera)
         rng = np.random.default_rng([*self._stream, index])
@@ -169,7 +169,7 @@ class SceneNNScene:
                     nyu_class=_NYU_CLASSES.get(piece.kind, "") if class_name is None else _COCO_TO_SCENENN[class_name],
                     color=(int(red), int(green), int(blue)),
                     aabb=np.stack([low, high]),
-                    obb=Box((low + high) / 2, high - low, np.eye(3)),  # furniture stands along the walls
+                    obb=Box((low + high) / 2, high - low, np.eye(3)),  # furniture is aligned with the walls
                 )
             )
         return sorted(annotated, key=lambda one: one.id)
@@ -186,7 +186,7 @@ class SceneNNScene:
 
 
 def frame_files(folder: Path, index: int) -> tuple[Path, Path]:
-    """Color and depth of frame `index`, which counts from 0: the files' names count from 1."""
+    """Return the color and depth files of frame `index` from 0; file names count from 1."""
     return folder / "image" / f"image{index + 1:05d}.png", folder / "depth" / f"depth{index + 1:05d}.png"
 
 

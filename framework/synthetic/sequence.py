@@ -1,4 +1,4 @@
-"""A seeded, furnished room, rendered frame by frame in memory, with everything about it known."""
+"""Synthetic sequence: a seeded, furnished room, rendered frame by frame in memory, with full ground truth."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from framework.synthetic.walk import FRAME_RATE, plan_path
 MOST_FRAMES = 10**6  # nine hours
 MOST_SIDE = 5792  # px; its square is MOST_PIXELS
 FOCAL_LENGTH = 525.0 / 640  # image widths: a Kinect's color camera
-TRUTH_VIEWS = 60  # frames whose exact depth makes up the true surface; neighbors show nearly the same
+TRUTH_VIEWS = 60  # frames that determine the true surface; neighbors have nearly the same view
 
 
 @dataclass
 class Synthetic(RGBDSequence):
-    """A hand-held walk through a furnished room; `room.surfaces` is its exact geometry.
+    """A hand-held camera path through a furnished room; `room.surfaces` is its exact geometry.
 
-    The same parameters give the same frames to the last bit, in whatever order and from whatever thread they are read.
+    Frames are bit-identical for the same parameters, in any order and from any thread.
     """
 
     seed: int = 0  # seed of the room and the camera path, combined with scene
@@ -52,21 +52,19 @@ class Synthetic(RGBDSequence):
         bounds = {"frames": (1, MOST_FRAMES), "width": (16, MOST_SIDE), "height": (16, MOST_SIDE)}
         for name, (lowest, most) in bounds.items():
             if not lowest <= getattr(self, name) <= most:
-                raise ConfigError(
-                    f"dataset.{name} must be at least {lowest} and at most {most}, found {getattr(self, name)}"
-                )
+                raise ConfigError(f"dataset.{name}: expected a value in [{lowest}, {most}], got {getattr(self, name)}")
         if self.seed < 0:
-            raise ConfigError(f"seed must be 0 or positive, found {self.seed}")
+            raise ConfigError(f"seed: expected at least 0, got {self.seed}")
         if not (math.isfinite(self.noise) and self.noise >= 0):
-            raise ConfigError(f"dataset.noise must be 0 (exact) or positive, found {self.noise}")
+            raise ConfigError(f"dataset.noise: expected 0 (exact) or a positive value, got {self.noise}")
         if not self.max_depth > 0:
-            raise ConfigError(f"dataset.max_depth must be positive meters, found {self.max_depth}")
+            raise ConfigError(f"dataset.max_depth: expected a value > 0 m, got {self.max_depth}")
         check_truth_voxel(self.ground_truth_spacing)
         self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride, self.frame_fraction, self.seed)
         self.name = self.scene
         focal = FOCAL_LENGTH * self.width
         self.camera = Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
-        self._stream = zlib.crc32(self.scene.encode())  # a scene is a random stream of its own
+        self._stream = zlib.crc32(self.scene.encode())  # each scene has its own random stream
         rng = np.random.default_rng([self.seed, self._stream])
         self.room = furnish(self.kind, rng)
         self.class_names = dict(self.room.surfaces.class_names)
@@ -102,11 +100,11 @@ class Synthetic(RGBDSequence):
         )
 
     def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Exact depth (H, W) m and instance ids (H, W) from any pose."""
+        """Return exact depth (H, W) m and instance ids (H, W) from any pose."""
         return self._renderer.depth_and_ids(self.camera, T_world_camera)
 
     def scene_truth(self) -> SceneTruth:
-        """Return the labeled surface within the sensor's range in the chosen frames, from their exact depth."""
+        """Return the labeled surface within the sensor's range in the selected frames, from their exact depth."""
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
         chosen = sorted({*self._chosen[::every], self._chosen[-1]})
         return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)

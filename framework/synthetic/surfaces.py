@@ -1,4 +1,4 @@
-"""The triangles of a furnished room, in the arrays that ray-casting and shading read."""
+"""Triangles of a furnished room, as arrays for ray casting and shading."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from framework.synthetic.paints import DARK, Material, material_table
 
 @dataclass(frozen=True)
 class Surfaces:
-    """The exact geometry of a room: what a reconstruction can be measured against."""
+    """Exact geometry of a room, the reference for reconstructions."""
 
     vertices: Float32  # (V, 3) m, world
     normals: Float32  # (V, 3) unit, smoothed over each part
@@ -23,18 +23,18 @@ class Surfaces:
     triangles: Int32  # (F, 3)
     instance_ids: Int32  # (F,), 0 = floor, wall or ceiling
     materials: Int32  # (F,) row of material_table
-    parts: Int32  # (F,) part that the triangle belongs to: pictures have edges between parts
+    parts: Int32  # (F,) part of each triangle: images have edges between parts
     material_table: Float32  # (M, 14), see textures.material_table
     class_names: Mapping[int, str | None]  # instance id -> COCO class; None = clutter
 
     @property
     def unreadable(self) -> Bool:
-        """The triangles (F,) of which no depth camera has any reading: screens and window panes."""
+        """Mask (F,) of triangles without depth readings: screens and window panes."""
         return np.asarray(self.material_table[self.materials, DARK] >= 1)
 
 
 def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:
-    """All parts of the (instance id, object) pairs, which stand where they belong."""
+    """Return all parts of the (instance id, object) pairs in their final poses."""
     vertices: list[Float64] = []
     normals: list[Float64] = []
     texture: list[Float64] = []

@@ -1,4 +1,4 @@
-"""A hand-held walk: an ellipse through the free floor, looking across it at the furniture on the far side."""
+"""Hand-held camera path: an ellipse through the free floor, facing the furniture on the far side."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from framework.synthetic.layout import CELL, Layout
 FRAME_RATE = 30.0  # Hz
 MAX_SPEED = 0.45  # m/s
 MAX_TURN = np.deg2rad(28.0)  # rad/s
-DISTANCE = 0.5  # m, kept from furniture and walls
-RADII = np.arange(0.30, 1.06, 0.15)  # m, of the ellipses tried
-EYE_HEIGHT = (1.38, 1.58)  # m, the range of a walk's mean height
-PITCH = np.deg2rad(14.0)  # how far down the camera looks on average
-PHASES = 48  # places of the ellipse from which the view is judged
+DISTANCE = 0.5  # m, minimum distance to furniture and walls
+RADII = np.arange(0.30, 1.06, 0.15)  # m, radii of candidate ellipses
+EYE_HEIGHT = (1.38, 1.58)  # m, range of the mean height of a path
+PITCH = np.deg2rad(14.0)  # mean downward pitch of the camera
+PHASES = 48  # positions on the ellipse for the visibility score
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A smooth closed walk, gone through at constant phase speed."""
+    """A smooth closed path, traversed at constant phase speed."""
 
     center: Float64  # (2,) m
     radii: Float64  # (2,) m
     height: float  # m, on average
     start: float  # rad, phase of the first frame
     turn: int  # 1 = counter-clockwise seen from above, -1 = clockwise
-    sway: Float64  # (4,) rad, phases of the hand's motion
+    sway: Float64  # (4,) rad, phases of the hand motion
     phase_speed: float = 1.0  # rad/s
 
     def pose(self, frame: float) -> Float64:
-        """T_world_camera (4, 4) of a frame at FRAME_RATE, or between frames."""
+        """Return T_world_camera (4, 4) of a frame at FRAME_RATE, or between frames."""
         return self.pose_at(self.start + self.turn * self.phase_speed * frame / FRAME_RATE)
 
     def pose_at(self, phase: float) -> Float64:
@@ -42,7 +42,7 @@ class CameraPath:
         return look(position[0], float(yaw[0]), float(pitch[0]), float(roll[0]))
 
     def _state(self, phase: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """Position (N, 3) m and yaw, pitch, roll (N,) rad. Whole harmonics, so that the walk closes."""
+        """Return position (N, 3) m and yaw, pitch, roll (N,) rad, from integer harmonics, which close the path."""
         a, b, c, d = self.sway
         position = np.empty((len(phase), 3))
         position[:, 0] = self.center[0] + self.radii[0] * np.cos(phase)
@@ -57,7 +57,7 @@ class CameraPath:
 
 
 class LabelView(Protocol):
-    """Says which instance each pixel of a small picture shows."""
+    """Renderer of instance ids in a small image."""
 
     def __call__(self, T_world_camera: Float64) -> Int32: ...
 
@@ -65,9 +65,9 @@ class LabelView(Protocol):
 def plan_path(
     layout: Layout, frames: int, labels: LabelView, wanted: set[int], rng: np.random.Generator, stride: float = 1.0
 ) -> CameraPath:
-    """Return the walk whose `frames` frames show the most of the `wanted` instances, with every `stride`-th frame.
+    """Return the path with the best visibility of the `wanted` instances in `frames` frames, `stride` apart.
 
-    Raises DataError without room to walk.
+    Raises DataError without enough free floor.
     """
     center, radii = _widest_ellipse(layout)
     turn = 1 if rng.uniform() < 0.5 else -1
@@ -78,7 +78,7 @@ def plan_path(
 
 
 def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
-    """Center and radii of the longest ellipse (of the RADII) that keeps its DISTANCE."""
+    """Return center and radii of the longest ellipse (of RADII) with the minimum DISTANCE."""
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     free, width, depth = layout.free, layout.width, layout.depth
     rows, columns = free.shape
@@ -98,7 +98,7 @@ def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
                 center = np.array([(x[at] + 0.5) * CELL - width / 2, (y[at] + 0.5) * CELL - depth / 2])
                 best = (*score, center, np.array([rx, ry]))
     if best is None:
-        raise DataError("synthetic room: no room to walk between the furniture; choose another seed or scene")
+        raise DataError("synthetic room: no free camera path between the furniture; set another seed or scene")
     return best[2], best[3]
 
 
@@ -114,7 +114,7 @@ def _allowed_phase_speed(path: CameraPath) -> float:
 
 
 def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[int]) -> float:
-    """Return the start phase of a walk over `sweep` rad that shows the most wanted instances, then pixels."""
+    """Return the start phase of a path over `sweep` rad with the most visible wanted instances, then pixels."""
     phases = 2 * np.pi * np.arange(PHASES) / PHASES
     ids = sorted(wanted)
     pixels = np.array(
@@ -129,7 +129,7 @@ def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[i
 
 
 def look(position: Float64, yaw: float, pitch: float, roll: float) -> Float64:
-    """T_world_camera of a camera at `position`; world z is up, yaw 0 looks along +x."""
+    """Return T_world_camera of a camera at `position`; world z is up, yaw 0 faces +x."""
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     down = np.cross(forward, right)

@@ -9,11 +9,11 @@ from framework.data import UInt8
 from framework.training.room_pictures import Example
 
 ZOOM = (0.55, 1.0)  # side lengths of a crop, relative
-ZOOMED = 0.5  # share of the pictures
-LEAST_LEFT = 0.25  # share of an object that must be inside the crop
-SMALLEST = 40  # px, area of an object
+ZOOMED = 0.5  # fraction of the pictures
+LEAST_LEFT = 0.25  # minimum fraction of an object inside the crop
+SMALLEST = 40  # px, minimum area of an object
 GAIN, CHANNEL_GAIN, GAMMA = 0.35, 0.12, 0.35  # logarithms of the largest factors
-BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # shares of the pictures
+BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of the pictures
 
 
 def augmented(example: Example, rng: np.random.Generator) -> Example:

@@ -18,8 +18,8 @@ from framework.detection.mask_rcnn.roi_align import roi_align
 
 BETA = 1.0 / 9.0  # where the smooth L1 loss becomes linear
 ANCHORS = 256  # sampled per image
-ANCHORS_POSITIVE = 0.5  # largest share
-PROPOSALS_POSITIVE = 0.25  # largest share
+ANCHORS_POSITIVE = 0.5  # maximum fraction
+PROPOSALS_POSITIVE = 0.25  # maximum fraction
 BACKGROUND, IGNORED = -1, -2
 
 
@@ -134,7 +134,7 @@ def match(iou: Tensor, foreground: float, background: float, each_object: bool) 
 
 
 def sample(own: Tensor, count: int, positive_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Draw at most `count` boxes; return the indices of those with an object, at most a share, and of background."""
+    """Draw at most `count` boxes; return the indices of boxes with an object (at most a fraction) and of background."""
     positive = _draw(torch.nonzero(own >= 0)[:, 0], int(count * positive_share), generator)
     negative = _draw(torch.nonzero(own == BACKGROUND)[:, 0], count - len(positive), generator)
     return positive, negative

@@ -1,7 +1,7 @@
 """Pictures of many synthetic rooms with instance ids, for training.
 
-Each room has its own random stream and is seen from random poses towards its objects. Domain randomization (Tobin et
-al. 2017) changes the colors of all surfaces in most pictures, so that a network learns shapes.
+Each room has its own random stream and is rendered from random poses towards its objects. Domain randomization (Tobin
+et al. 2017) changes the colors of all surfaces in most pictures, so that a network learns shapes.
 
 A room is a folder, written atomically: 000000.jpg, 000000.png (16-bit instance ids), ... and classes.json.
 """
@@ -39,10 +39,10 @@ FOCAL = (0.7, 1.0)  # image widths
 EYE_HEIGHT = (0.9, 1.75)  # m
 CLEAR = 0.35  # m, between camera and furniture or walls
 TINT = 0.5  # logarithm of the largest factor of a surface's colors
-TINTED = 0.7  # share of the pictures with changed colors
-STUDIOS = 0.5  # share of the rooms with all classes: some classes are in no other kind of room
+TINTED = 0.7  # fraction of the pictures with changed colors
+STUDIOS = 0.5  # fraction of the rooms with all classes: some classes occur in no other kind of room
 QUALITY = 93  # of the JPEG files
-LEAST = 100  # px of objects in a picture
+LEAST = 100  # px, minimum area of objects in a picture
 TRIES = 20  # views tried for each picture
 
 
@@ -155,7 +155,7 @@ class RoomPictures:
         for number in range(first, first + rooms):
             room = room_folder(folder, number)
             if not room.is_dir():
-                raise DataError(f"{room} is missing: render the rooms first")
+                raise DataError(f"{room}: expected a rendered room, got no such folder; render the rooms first")
             self.files += sorted(room.glob("*.jpg"))
             classes = read_json(room / "classes.json")
             self._names[room] = {int(i): str(name) for i, name in classes.items()}

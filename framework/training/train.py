@@ -1,4 +1,4 @@
-"""A training from its config: render rooms, train, evaluate on held-out rooms.
+"""Training run: render rooms, train, evaluate on held-out rooms.
 
 Writes network.safetensors (for `detector=mask_rcnn detector.weights=...`), checkpoint.pt (to resume from), losses.csv,
 losses.png and average_precision.json.
@@ -81,7 +81,7 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
     save_network(trainer.trained(), weights, card, half=True)
     with written_whole(folder / PRECISION) as path:
         path.write_text(json.dumps(_known(asdict(precision)), indent=1))
-    log.info("mask AP50 %.3f, AP %.3f on %d other rooms", precision.ap50, precision.ap, wanted.held_out)
+    log.info("mask AP50 %.3f, AP %.3f on %d held-out rooms", precision.ap50, precision.ap, wanted.held_out)
     return precision
 
 
@@ -91,7 +91,8 @@ def _started(config: DictConfig) -> MaskRCNN:
     if config.start_from:
         start = load_network(Path(config.start_from))
         if start.architecture != network.architecture:
-            raise ConfigError(f"network.start_from: {config.start_from} is not of the architecture of network")
+            expected = "expected weights of the configured architecture"
+            raise ConfigError(f"network.start_from: {expected}, got others in {config.start_from}")
         network.load_state_dict(start.state_dict())
     return network
 

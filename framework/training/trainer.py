@@ -1,4 +1,4 @@
-"""The training loop: batches, steps, checkpoints, the loss curve.
+"""Training loop: batches, steps, checkpoints and the loss curve.
 
 The random draws of a step depend only on the seed and the step, so that a resumed run equals an uninterrupted one.
 """
@@ -61,7 +61,7 @@ class Schedule:
 
 
 class Trainer:
-    """Trains a network on pictures, from the last checkpoint in `folder` if there is one."""
+    """Trainer of a network on pictures; resumes from the last checkpoint in `folder`, if any."""
 
     def __init__(
         self, network: MaskRCNN, pictures: RoomPictures, schedule: Schedule, folder: Path, device: str
@@ -114,7 +114,7 @@ class Trainer:
             terms = losses(self.network, images, objects, self.schedule.budget, generator)
         loss = torch.stack(list(terms.values())).sum()
         if not torch.isfinite(loss):
-            raise DataError(f"training diverged at step {self.step}: the loss is {loss.item()}; lower learning_rate")
+            raise DataError(f"step {self.step}: expected a finite loss, got {loss.item()}; lower learning_rate")
         for group in self._optimizer.param_groups:
             group["lr"] = self.schedule.rate(self.step)
         self._optimizer.zero_grad(set_to_none=True)
@@ -128,7 +128,7 @@ class Trainer:
         index = {name: k for k, name in enumerate(self.network.architecture.classes, start=1)}
         unknown = sorted(set(example.class_names) - set(index))
         if unknown:
-            raise DataError(f"the pictures show classes that the network does not have: {', '.join(unknown)}")
+            raise DataError(f"pictures: expected classes of the network, got {', '.join(unknown)}")
         boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # from pixels to their borders
         return Objects(
             boxes=torch.from_numpy(boxes),
@@ -172,8 +172,8 @@ class Trainer:
             self.step, self.history = state["step"], state["history"]
         except Exception as error:  # torch raises many types for a damaged file
             raise DataError(
-                f"{path} is damaged, or of another network than this one: {in_one_line(error)}; "
-                "remove it, or train in another folder"
+                f"{path}: expected an intact checkpoint of this network: {in_one_line(error)}; remove it, or train in "
+                "another folder"
             ) from error
 
 

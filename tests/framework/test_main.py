@@ -93,7 +93,7 @@ def test_run_escapes_invalid_unicode_file_names(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 3, done.stderr
     for said in (done.stderr, (tmp_path / "instancemap.log").read_text("utf-8")):
-        assert f"frame skipped: {tmp_path}/color/\\udcff_0.png is neither a JPEG nor a PNG file" in said
+        assert f"frame skipped: {tmp_path}/color/\\udcff_0.png: expected a JPEG or PNG file" in said
 
 
 def test_removed_working_folder_exits_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,7 +131,7 @@ def test_run_directory_creation_error_is_one_line(tmp_path: Path) -> None:
     line = command("seed=0")
     done = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
-    assert re.fullmatch(r"error: the directory outputs/.*_fake could not be made: .*\n", done.stderr)
+    assert re.fullmatch(r"error: outputs/.*_fake: directory cannot be created: .*\n", done.stderr)
 
 
 @pytest.mark.parametrize("sweep", [False, True])

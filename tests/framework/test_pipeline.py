@@ -486,7 +486,7 @@ def test_failing_viewer_does_not_affect_run(
     result = pipeline(prefetch, viewer=listener).run_to_any_end(CornerRoom(unreadable=1))
     assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
     told = [record.message for record in caplog.records if "viewer" in record.message]
-    assert told == ["viewer: it failed, and the run goes on without it: no screen any more"]
+    assert told == ["viewer: disabled after an error; the run continues: no screen any more"]
     assert calls == [verb], "it is left alone"
     assert verb == "end" or listener.heard[-1] == "end"
 

@@ -1,4 +1,4 @@
-"""Cameras and numbers in JSON files, with the keys of each format."""
+"""Cameras and numbers in JSON files, with format-specific keys."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
     """Return the JSON object in a file of at most `most` bytes. Raises DataError, with the file."""
     found = read_json(path, most)
     if not isinstance(found, dict):
-        raise DataError(f"{path} must hold a JSON object, found {type(found).__name__}")
+        raise DataError(f"{path}: expected a JSON object, got {type(found).__name__}")
     return found
 
 
@@ -53,35 +53,35 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
     *camera, depth_scale = numbers_of(path, content, *keys)
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
         raise DataError(
-            f"{path}: {keys[-1]} must be in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}], as meters = value / {keys[-1]} "
-            f"(1000 for millimeters), found {depth_scale:g}"
+            f"{path}: {keys[-1]}: expected {COARSEST_DEPTH:g} to {FINEST_DEPTH:g} units per m (1000 for millimeters), "
+            f"got {depth_scale:g}"
         )
     return pinhole(path, *camera), depth_scale
 
 
 def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Camera:
-    """Return the camera with these numbers. Raises DataError, with `where`, if they are not valid."""
+    """Return the camera with these intrinsics. Raises DataError, with `where`, if they are not valid."""
     if width != int(width) or height != int(height):
-        raise DataError(f"{where}: width and height must be whole numbers of pixels, found {width}x{height}")
+        raise DataError(f"{where}: width, height: expected whole numbers of px, got {width:g}x{height:g}")
     with errors_of(where):
         return Camera(int(width), int(height), fx, fy, cx, cy)
 
 
 def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Log the keys that are not `known`. Raises DataError for one that is nearly known: it is misspelled."""
+    """Log unknown keys. Raises DataError for a likely misspelling of a known key."""
     unread = [key for key in content if key not in known]
     for key in unread:
         close = get_close_matches(key.lower(), known, n=1, cutoff=0.8)
         if close:
-            raise DataError(f"{path}: there is no key {key!r}; did you mean {close[0]!r}?")
+            raise DataError(f"{path}: unknown key {key!r}; did you mean {close[0]!r}?")
     if unread:
-        log.warning("%s: not read: %s; its keys are %s", path, ", ".join(unread), ", ".join(known))
+        log.warning("%s: ignored unknown keys: %s; known keys: %s", path, ", ".join(unread), ", ".join(known))
 
 
 def number_list(where: Path | str, values: Any, count: int) -> list[float]:
     """Return `values` as a list of `count` finite numbers. Raises DataError, with `where`."""
     if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
-        raise DataError(f"{where} must be a list of {count} numbers, found {str(values)[:60]}")
+        raise DataError(f"{where}: expected a list of {count} numbers, got {str(values)[:60]}")
     return [float(value) for value in values]
 
 
@@ -89,9 +89,9 @@ def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> lis
     """Return the finite numbers under some keys. Raises DataError, with `where` and the key."""
     for key in keys:
         if key not in content:
-            raise DataError(f"{where}: the key {key!r} is missing")
+            raise DataError(f"{where}: expected a key {key!r}, got none")
         if not _is_number(content[key]):
-            raise DataError(f"{where}: {key} must be a number, found {str(content[key])[:40]}")
+            raise DataError(f"{where}: {key}: expected a number, got {str(content[key])[:40]}")
     return [float(content[key]) for key in keys]
 
 

@@ -1,4 +1,4 @@
-"""Registration of color to a depth camera at the same place, with another size and other intrinsics."""
+"""Registration of color to a depth camera with the same pose but different image size and intrinsics."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from framework.data import MOST_PIXELS, Camera, UInt8
 from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, FrameError
 
-LONGEST_SIDE = 2**15 - 2  # px, that OpenCV can warp
+LONGEST_SIDE = 2**15 - 2  # px, limit of OpenCV's warp
 
 
 @dataclass(frozen=True)
 class ColorRegistration:
-    """Warp from the color to the depth camera. Raises DataError if it would be too large."""
+    """Warp from the color to the depth camera. Raises DataError if its intermediate image is too large."""
 
     color: Camera
     depth: Camera
@@ -26,13 +26,14 @@ class ColorRegistration:
         width, height = self._fine * self.depth.width, self._fine * self.depth.height
         if width * height > MOST_PIXELS or max(width, height, *self.color.shape) > LONGEST_SIDE:
             raise DataError(
-                f"color of {self.color.width}x{self.color.height} px and fx = {self.color.fx:g} px cannot be moved "
-                f"into a depth camera of {self.depth.width}x{self.depth.height} px and fx = {self.depth.fx:g} px"
+                f"expected color and depth cameras of similar resolution, got "
+                f"{self.color.width}x{self.color.height} px and fx = {self.color.fx:g} px for color, "
+                f"{self.depth.width}x{self.depth.height} px and fx = {self.depth.fx:g} px for depth"
             )
 
     @property
     def _fine(self) -> int:
-        """Pixels of the color camera along a pixel of the depth camera, rounded."""
+        """Color pixels per depth pixel along an axis, rounded."""
         return max(1, round(min(self.color.fx / self.depth.fx, LONGEST_SIDE)))
 
     def apply(self, image: UInt8) -> UInt8:
@@ -57,7 +58,7 @@ class ColorRegistration:
 
 
 def registered_images(images: StoredImages, registration: ColorRegistration) -> StoredImages:
-    """Return a frame's images, with color registered to the depth camera when it is read."""
+    """Return a frame's images, with color registered to the depth camera on reading."""
     return replace(images, color=partial(_registered_color, images, registration))
 
 
@@ -66,7 +67,7 @@ def _registered_color(images: StoredImages, registration: ColorRegistration) -> 
     if image.shape[:2] != camera.shape:
         size = f"{image.shape[1]}x{image.shape[0]}"
         expected = f"{camera.width}x{camera.height}"
-        raise FrameError(f"{images.color_name} is {size}, but the color camera's images are {expected}")
+        raise FrameError(f"{images.color_name}: expected {expected} px as in the color camera, got {size} px")
     return registration.apply(image)
 
 

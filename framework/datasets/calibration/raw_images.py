@@ -1,4 +1,4 @@
-"""Conversion of a sensor's raw images: the unit and range of depth, and the lens."""
+"""Conversion of raw sensor images: depth unit, depth range and lens undistortion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.data import Camera, Float32, UInt8, UInt16
 from framework.datasets.calibration.undistortion import Distortion, Undistortion
 from framework.errors import FrameError
 
-NO_READING = 65535  # uint16 that several sensors write instead of 0
+NO_READING = 65535  # uint16, written by several sensors instead of 0
 
 
 def check_max_depth(max_depth: float) -> None:
@@ -31,11 +31,11 @@ class Calibration:
     """A camera and the properties of its images. Raises DataError for an invalid lens."""
 
     camera: Camera
-    source: Path | str  # where it is stored, for messages
+    source: Path | str  # its file or parameter, for messages
     depth_scale: float  # units per meter
     max_depth: float  # m; farther readings become "no reading"; 0 = keep all
     distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
-    lens: Undistortion | None = field(init=False, repr=False)  # undoes the distortion
+    lens: Undistortion | None = field(init=False, repr=False)  # None = a pinhole
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lens", Undistortion(self.camera, self.distortion) if self.distortion else None)
@@ -63,5 +63,5 @@ class Calibration:
     def check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:
         """Raise FrameError, with `name`, unless an image has the size of the camera."""
         if shape[:2] != self.camera.shape:
-            expected = f"{self.source} says {self.camera.width}x{self.camera.height}"
-            raise FrameError(f"{name} is {shape[1]}x{shape[0]}, but {expected}; color, depth and camera must agree")
+            expected = f"expected {self.camera.width}x{self.camera.height} px as in {self.source}"
+            raise FrameError(f"{name}: {expected}, got {shape[1]}x{shape[0]} px")

@@ -1,7 +1,7 @@
 """Lens undistortion.
 
-The model is Brown and Conrady's as in OpenCV: a point at (x, y, 1) m in the camera appears at the pixel
-(fx x' + cx, fy y' + cy) of the recorded image, where with r^2 = x^2 + y^2
+The model is Brown-Conrady as in OpenCV. A point (x, y, 1) m in the camera projects to the pixel
+(fx x' + cx, fy y' + cy) of the recorded image. With r^2 = x^2 + y^2,
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -20,12 +20,12 @@ from framework.data import Camera, Float64, UInt8
 from framework.errors import DataError
 
 Value = TypeVar("Value", bound=np.generic)
-FARTHEST_SHIFT = 0.5  # of the image's width: coefficients that move a pixel farther are of another model or a misprint
+FARTHEST_SHIFT = 0.5  # of the image's width: a larger shift indicates another lens model or a typo
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """The coefficients of a lens; all 0 = a pinhole."""
+    """Distortion coefficients of a lens; all 0 = a pinhole."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -35,7 +35,7 @@ class Distortion:
 
     def __post_init__(self) -> None:
         if not np.isfinite(astuple(self)).all():
-            raise DataError(f"the distortion's coefficients must be finite, found {astuple(self)}")
+            raise DataError(f"distortion (k1, k2, p1, p2, k3): expected finite coefficients, got {astuple(self)}")
 
     def distorted(self, camera: Camera, pixels: Float64) -> Float64:
         """Return the position (N, 2) in the recorded image of the pinhole camera's `pixels` (N, 2)."""
@@ -48,7 +48,7 @@ class Distortion:
 
 
 class Undistortion:
-    """Converts recorded images into those of a pinhole camera with the same intrinsics.
+    """Conversion of recorded images into those of a pinhole camera with the same intrinsics.
 
     Depth stays z along the optical axis. Pixels outside the recorded image become 0. Raises DataError for
     coefficients that do not fit the camera.
@@ -61,8 +61,9 @@ class Undistortion:
         shift = float(np.abs(source - pixels).max())
         if shift > FARTHEST_SHIFT * camera.width:
             raise DataError(
-                f"the distortion {astuple(distortion)} (k1, k2, p1, p2, k3) moves a pixel of the {camera.width}x"
-                f"{camera.height} image by {shift:.0f} px: is it of another lens model?"
+                f"distortion (k1, k2, p1, p2, k3): expected a shift of at most {FARTHEST_SHIFT * camera.width:.0f} px "
+                f"in the {camera.width}x{camera.height} image, got {shift:.0f} px for {astuple(distortion)}; check "
+                "the lens model"
             )
         self._u, self._v = source.T.reshape(2, *camera.shape).astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""Depth cameras that are read through the library of their vendor."""
+"""Depth cameras read through vendor libraries."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from framework.datasets.calibration.undistortion import Distortion
 from framework.errors import DataError, FrameError, in_one_line
 from framework.interfaces import FrameReader, LiveVideo
 
-WAIT_MS = 100  # for a frame, before the reader reports that none has come
-LONGEST_SILENCE = 5.0  # s; a camera that runs and sends nothing for so long is broken, or its cable is
+WAIT_MS = 100  # maximum wait for a frame
+LONGEST_SILENCE = 5.0  # s without a frame before the camera counts as disconnected
 
 Images = TypeVar("Images")
 log = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class DepthCamera(LiveVideo):
-    """Depth registered to color by the library, with the factory's calibration."""
+    """A camera with depth registered to color by the library, with the factory calibration."""
 
     brand: ClassVar[str]
     serial: str = ""  # serial number of the device; "" = the first device found
@@ -40,34 +40,34 @@ class DepthCamera(LiveVideo):
         check_bounds(self, width=(64, 4096), height=(64, 4096), fps=(1, 300))
         check_max_depth(self.max_depth)
         self.name = "_".join(filter(None, (self.brand.lower(), self.serial)))
-        self.errors: tuple[type[Exception], ...] = (RuntimeError,)  # that the library raises
+        self.errors: tuple[type[Exception], ...] = (RuntimeError,)  # errors of the library
 
     @abstractmethod
     def start(self) -> None:
-        """Start to send frames. Raises ConfigError without the library."""
+        """Start streaming. Raises ConfigError without the library."""
 
     @abstractmethod
     def stop(self) -> None:
-        """Stop after a successful start."""
+        """Stop streaming after a successful start."""
 
     @abstractmethod
     def wait(self) -> Any:
-        """Return both images, not registered yet; None = none came within WAIT_MS."""
+        """Return both images, not registered yet; None = nothing received within WAIT_MS."""
 
     @abstractmethod
     def calibrate(self, images: Any) -> Calibration | None:
-        """Return the calibration of the color camera; None = these images do not contain it."""
+        """Return the calibration of the color camera; None = not in these images."""
 
     @abstractmethod
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         """Return copies of color (H, W, 3), RGB, and the depth (H, W) registered to it; None = not sent."""
 
     def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:
-        """Return the lens distortion; None = there is none, or it is of an unsupported model, which is logged."""
+        """Return the lens distortion; None = no distortion, or an unsupported model (logged)."""
         if not any(coefficients):
             return None
         if model != brown_conrady or any(coefficients[5:]):
-            message = "%s: its lens distortion, %s, is of another model than ours and is not undone"
+            message = "%s: expected Brown-Conrady lens distortion, got %s; images are not undistorted"
             log.warning(message, self.name, model)
             return None
         return Distortion(*coefficients[:5])
@@ -76,9 +76,9 @@ class DepthCamera(LiveVideo):
         try:
             self.start()
         except self.errors as error:
-            which = f"the device {self.serial}" if self.serial else "a device"
-            asked = f"{which} with {self.width}x{self.height} at {self.fps} Hz"
-            raise DataError(f"{self.brand}: {asked} could not be started: {in_one_line(error)}") from error
+            which = f"device {self.serial}" if self.serial else "device"
+            mode = f"{self.width}x{self.height} at {self.fps} Hz"
+            raise DataError(f"{self.brand}: {which} with {mode} cannot be started: {in_one_line(error)}") from error
         number = count()
         calibration: Calibration | None = None
         try:
@@ -101,18 +101,20 @@ class DepthCamera(LiveVideo):
         except self.errors as error:
             raise FrameError(f"frame {number}: {in_one_line(error)}") from error
         if color is None or depth is None:
-            raise FrameError(f"frame {number}: the camera has sent no {'color' if color is None else 'depth'}")
+            raise FrameError(
+                f"frame {number}: expected color and depth, got no {'color' if color is None else 'depth'}"
+            )
         color = calibration.color(color, f"frame {number}: color")
         return Frame(number, timestamp, color, calibration.depth(depth, f"frame {number}: depth"), calibration.camera)
 
 
 def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images | None]:
-    """Yield what `wait` returns, None = nothing came for WAIT_MS. Raises DataError after a long silence."""
+    """Yield the results of `wait`. Raises DataError after LONGEST_SILENCE without images."""
     last_time = time.monotonic()
     while True:
         images = wait()
         if images is not None:
             last_time = time.monotonic()
         elif time.monotonic() - last_time > LONGEST_SILENCE:
-            raise DataError(f"{name}: no frame has come for {LONGEST_SILENCE:g} s; is the camera still connected?")
+            raise DataError(f"{name}: no frame received for {LONGEST_SILENCE:g} s; check the camera's connection")
         yield images

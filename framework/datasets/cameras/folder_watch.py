@@ -1,13 +1,13 @@
-"""A folder into which frames are written while they are mapped, with the files of dataset=rgbd_folder.
+"""Live frames from a folder that another program fills during mapping, with the files of dataset=rgbd_folder.
 
-    camera.json         as in an RGB-D folder; waited for
+    camera.json         as in an RGB-D folder; may appear after the start
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
-    end                 an empty file, written last: there will be no more frames
+    end                 an empty file, written after the last frame
 
-A frame is complete with both of its files, in any order. Write each file under a name that begins with a dot, and
-rename it. Numbers must increase. A frame that is incomplete when a later one is complete, or at the end, cannot be
-used. Files of earlier frames may be removed during the run.
+A frame is complete with both of its files, in any order. Write each file under a name that begins with a dot, then
+rename it. Numbers must increase. A frame is skipped if it is incomplete when a later frame is complete, or at the end.
+Files of earlier frames may be removed during the run.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from framework.interfaces import FrameReader, LiveVideo
 COLOR, DEPTH = (".jpg", ".jpeg", ".png"), (".png",)
 LONGEST_WAIT = 86_400.0  # s
 LARGEST_NUMBER = 2**53  # of a frame; smaller ones are exact in every program
-LEAST_REST = 3.0  # times the duration of the last poll, before the next one: folders of many files are slow to list
-CLOCK_TICK = 1e-6  # s, between the times of two frames that were found in one poll
+LEAST_REST = 3.0  # pause between polls, in durations of the last poll: large folders are slow to list
+CLOCK_TICK = 1e-6  # s between the timestamps of two frames of the same poll
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class FolderWatch(LiveVideo):
-    """Frames that another program writes into a folder of images while they are mapped."""
+    """Frames written into a folder by another program during mapping."""
 
     root: Path  # existing folder of frames from another program, relative to the working or project folder
     idle_timeout: float = 0.0  # maximum time without a new frame before the run ends, s, in [0, 86400]; 0 = unlimited
@@ -57,7 +57,7 @@ class FolderWatch(LiveVideo):
         check_max_depth(self.max_depth)
         self.folder = folder_of(Path(self.root))
         if not self.folder.is_dir():
-            raise DataError(f"dataset.root: the folder {self.folder} does not exist")
+            raise DataError(f"dataset.root: expected an existing folder, got {self.folder}")
         self.name = self.folder.resolve().name
 
     def frames(self) -> Generator[FrameReader | None]:
@@ -85,7 +85,7 @@ class FolderWatch(LiveVideo):
                 break
             except DataError as error:
                 if time.monotonic() > deadline:
-                    raise DataError(f"{error}; waited {self.camera_timeout:g} s for it") from error
+                    raise DataError(f"{error}; waited {self.camera_timeout:g} s for this file") from error
             yield None
             time.sleep(self.poll_interval)
         camera, depth_scale, distortion = read_camera(path)
@@ -110,16 +110,16 @@ class Arrivals:
         self._halves: set[int] = set()  # numbers that were skipped with one image
 
     def look(self, to_the_end: bool) -> Iterator[tuple[int, StoredImages | str]]:
-        """Yield the new frames up to the newest complete one, or all that have a file, in ascending order.
+        """Yield new frames in ascending order: up to the newest complete one, or all at the end.
 
-        A frame is its number and images, or why it cannot be used.
+        Each item is a frame's number, and its images or the reason why it cannot be used.
         """
         self._color.look()
         self._depth.look()
         color, depth = self._color.waiting, self._depth.waiting
         both, any_of = sorted(color.keys() & depth.keys()), sorted(color.keys() | depth.keys())
         newest = next((n for n in reversed(both) if _is_whole(color[n]) and _is_whole(depth[n])), -1)
-        newest = max(newest, self._last)  # a frame that comes after its successors is skipped
+        newest = max(newest, self._last)  # a frame that appears after its successors is skipped
         for number in any_of if to_the_end else [number for number in any_of if number <= newest]:
             color_file, depth_file = color.pop(number, None), depth.pop(number, None)
             if number in self._halves:  # the second image of a skipped frame
@@ -128,18 +128,18 @@ class Arrivals:
             if color_file is None or depth_file is None:
                 self._halves.add(number)
             if number <= self._last:
-                yield number, f"{color_file or depth_file} came after frame {self._last}"
+                yield number, f"{color_file or depth_file}: expected frames in order, got it after frame {self._last}"
                 continue
             self._last = number
             if color_file is None or depth_file is None:
-                until = f"when frame {newest} was" if newest > number else "in the end"
-                yield number, f"{color_file or depth_file}: the other image of this frame was not there {until}"
+                until = f"before frame {newest}" if newest > number else "before the end"
+                yield number, f"{color_file or depth_file}: expected the frame's other image {until}, got none"
             else:
                 yield number, StoredImages.of_files(color_file, depth_file)
 
 
 class NewImages:
-    """The images of a folder that are not assigned to frames yet."""
+    """Images of a folder that are not assigned to frames yet."""
 
     def __init__(self, folder: Path, suffixes: Sequence[str]) -> None:
         self.folder, self.suffixes = folder, suffixes
@@ -161,7 +161,7 @@ class NewImages:
                 continue
             number = number_of(path)
             if number is None or number >= LARGEST_NUMBER:
-                log.warning("%s is no frame: its name must end in the frame's number, below 2^53", path)
+                log.warning("%s: expected a name that ends in a frame number below 2^53; file ignored", path)
                 continue
             self._first = self._first or path
             check_one_number([self._first, path])

@@ -65,7 +65,7 @@ class Orbbec(DepthCamera):
 
 
 def _pixels(image: Any, dtype: np.dtype[Any], channels: tuple[int, ...]) -> Any:
-    """Return a copy (H, W, ...) of an image, None = there is none."""
+    """Return a copy (H, W, ...) of an image, None = no image."""
     if image is None:
         return None
     raw = np.frombuffer(image.get_data(), dtype)

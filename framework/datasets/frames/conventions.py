@@ -1,4 +1,4 @@
-"""Conventions of stored poses and depth that may differ from the format: axes, units, delays.
+"""Conventions of stored poses and depth that override those of the format: axes, units, delays.
 
 `instancemap check` detects them.
 """
@@ -35,7 +35,7 @@ class CameraAxes(Enum):
 
     @property
     def R_axes_camera(self) -> Float64:
-        """The rotation (3, 3) from OpenCV's axes to these."""
+        """Rotation (3, 3) from OpenCV's axes to these."""
         return _AXES[self.name]
 
 
@@ -47,7 +47,7 @@ _AXES = {
 
 
 class QuaternionOrder(Enum):
-    """Order of the four numbers that the format defines as x y z w."""
+    """Order of the numbers of a quaternion; the format defines x y z w."""
 
     XYZW = "x y z w"
     WXYZ = "w x y z"

@@ -1,4 +1,4 @@
-"""Folders of images with the number of their frame at the end of their names."""
+"""Folders of images with frame numbers at the end of their names."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from framework.errors import DataError, FrameError
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     """Return the folder's images by the number at the end of their names, in ascending order.
 
-    Raises DataError if there is none, a name has no number, two have the same, or the names differ in other digits
-    as well, such as the decimals of a time.
+    Raises DataError if the folder has no images, a name has no number, two names have the same number, or the names
+    differ in other digits too, such as the decimals of a timestamp.
     """
     if not folder.is_dir():
-        raise DataError(f"the folder {folder} is missing")
+        raise DataError(f"{folder}: expected a folder, got none")
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in suffixes or path.name.startswith("."):
             continue
         number = number_of(path)
         if number is None:
-            raise DataError(f"{path}: the file name must end in the frame's number, like 000000{path.suffix}")
+            raise DataError(f"{path}: expected a name that ends in a frame number, such as 000000{path.suffix}")
         if number in files:
-            raise DataError(f"{path} and {files[number].name} have the same frame number {number}")
+            raise DataError(f"{path}: expected unique frame numbers, got {number} for {files[number].name} too")
         files[number] = path
     check_one_number(list(files.values()))
     if not files:
-        raise DataError(f"{folder} holds no image ({', '.join(suffixes)})")
+        raise DataError(f"{folder}: expected images ({', '.join(suffixes)}), got none")
     return dict(sorted(files.items()))
 
 
@@ -51,7 +51,7 @@ def _missing(files: dict[int, Path], number: int) -> Path:
 
 
 def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[int, int]:
-    """Return (width, height) in px of the first image that can be read. Raises DataError if none can."""
+    """Return (width, height) in px of the first readable image. Raises DataError without one."""
     errors = []
     for path in paths:
         try:
@@ -60,7 +60,7 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[in
             errors.append(str(error))
             continue
         return width, height
-    raise DataError(f"no image can be read: {errors[0]}")
+    raise DataError(f"no image can be read; first error: {errors[0]}")
 
 
 def number_of(path: Path) -> int | None:
@@ -70,13 +70,13 @@ def number_of(path: Path) -> int | None:
 
 
 def check_one_number(files: Sequence[Path]) -> None:
-    """Raise DataError if the names of images differ in more than the number at their end."""
+    """Raise DataError if image names differ in more than the number at their end."""
     for path in files:
         before, of_first = _before_number(path), _before_number(files[0])
         if before != of_first and re.search("[0-9]", before + of_first):
             raise DataError(
-                f"{path.parent}: {files[0].name} and {path.name} differ in more than one number; number the frames in "
-                "their order, 000000.png, 000001.png ..."
+                f"{path.parent}: expected names that differ in one number, got {files[0].name} and {path.name}; number "
+                "the frames in order: 000000.png, 000001.png ..."
             )
 
 

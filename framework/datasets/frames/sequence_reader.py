@@ -1,4 +1,4 @@
-"""Base of the readers of recordings: a subclass lists what is stored, and `Recording` selects and reads frames."""
+"""Base class of recording readers: a subclass lists the stored frames, and `Recording` selects and reads them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from framework.files.image_files import read_color, read_uint16
 from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
 
-FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighboring float32 numbers are 1 mm apart
+FARTHEST = 1e4  # m, maximum distance of a pose from the origin; beyond, float32 has a resolution of 1 mm
 FRAME_RATE = 30.0  # Hz, of recordings without usable timestamps
 
 TO_THE_END = -1  # value of `stop`
@@ -47,9 +47,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StoredImages:
-    """The two images of a frame, registered to each other and not read yet. Reading raises FrameError."""
+    """The two images of a frame, registered to each other, not read yet. Reading may raise FrameError."""
 
-    color_name: Path | str  # the file, and the place in it, for messages
+    color_name: Path | str  # the file, and the position in it, for messages
     depth_name: Path | str
     color: Callable[[], UInt8]  # (H, W, 3) RGB
     depth: Callable[[], UInt16]  # (H, W) in units of the recording; 0 or 65535 = no reading
@@ -67,12 +67,12 @@ class RecordedFrame:
     images: StoredImages
     timestamp: float  # s
     T_world_camera: Float64 | None = None  # (4, 4), None = not known
-    error: str = ""  # reason why the frame cannot be used; "" = it can
+    error: str = ""  # reason why the frame cannot be used; "" = usable
     up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = not known
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
-        """Return the frame with the pose that `pose` returns, or with the DataError that it raises."""
+        """Return the frame with the result of `pose`, or with the message of its DataError."""
         try:
             return cls(images, timestamp, pose())
         except DataError as error:
@@ -81,10 +81,10 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class Contents:
-    """Everything that a recording stores, before frames are selected."""
+    """The full contents of a recording, before frame selection."""
 
     camera: Camera
-    camera_source: Path | str  # where it is stored, for messages
+    camera_source: Path | str  # its file or parameter, for messages
     depth_scale: float  # units per meter
     frames: Sequence[RecordedFrame]
     distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
@@ -92,10 +92,10 @@ class Contents:
 
 @dataclass
 class Recording(RGBDSequence):
-    """An RGB-D video on disk. A subclass lists what is stored (`open`), and knows the recording's own ground truth.
+    """An RGB-D video on disk. A subclass lists the stored frames (`open`) and provides the recording's ground truth.
 
-    The ground truth that the user names replaces the recording's own. It is the whole mesh, whatever frames are
-    selected; the instances in a frame are rendered from it.
+    `ground_truth` replaces the recording's own ground truth. It is the whole mesh, whatever frames are selected; the
+    instances in a frame are rendered from it.
 
     Errors of the whole recording raise DataError when it is opened. Errors of one frame raise FrameError when it is
     read, so that the pipeline counts and skips it.
@@ -119,8 +119,8 @@ class Recording(RGBDSequence):
         self.root = folder_of(Path(self.root))
         self.folder = self.root / self.scene
         if not self.folder.is_dir():
-            project = "" if self.root.is_absolute() else ", neither here nor in a checkout of the project"
-            raise DataError(f"dataset.root: the folder {self.folder} does not exist{project}")
+            project = "" if self.root.is_absolute() else ", missing from the working and the project folder"
+            raise DataError(f"dataset.root: expected an existing folder, got {self.folder}{project}")
         self.name = self.folder.resolve().name
         self.named_truth = None if self.ground_truth is None else read_named_truth(Path(self.ground_truth))
         stored = self.open()
@@ -140,7 +140,7 @@ class Recording(RGBDSequence):
 
     @abstractmethod
     def open(self) -> Contents:
-        """Return what `self.folder` stores. Raises DataError, with the file, if this is no such recording."""
+        """Return the contents of `self.folder`. Raises DataError, with the file, for another format."""
 
     def truth_in(self, index: int) -> FrameTruth | None:
         """Return the recording's own true instances in stored frame `index`, or None if they are not known."""
@@ -158,7 +158,7 @@ class Recording(RGBDSequence):
             return None
         trajectory = self._given_trajectory() if named is None or named.trajectory is None else named.trajectory
         if not len(trajectory.timestamps):
-            log.warning("%s: instances are not evaluated: no given pose shows the world of the ground truth", self.name)
+            log.warning("%s: instances not evaluated: no given pose in the world of the ground truth", self.name)
             return None
         return replace(truth, trajectory=trajectory)
 
@@ -197,7 +197,7 @@ class Recording(RGBDSequence):
         recorded = self.contents.frames[index]
         T_world_camera = self.named_truth.pose(recorded.timestamp, recorded.T_world_camera)
         if T_world_camera is None:
-            return unseen(self.camera, f"frame {index} has no pose from which its true instances can be rendered")
+            return unseen(self.camera, f"frame {index}: expected a pose to render its true instances from, got none")
         return self.named_truth.mesh.seen_by(self.camera, T_world_camera)
 
     def _given_trajectory(self) -> ReferenceTrajectory:
@@ -211,40 +211,41 @@ class Recording(RGBDSequence):
         if any(named.pose(one.timestamp, one.T_world_camera) is not None for one in frames):
             return
         if named.trajectory is None:
-            expected = "expected given poses, whose world the mesh is in, got a recording without poses"
-            raise ConfigError(f"{KEY}: {expected}; add them, or name the directory of a run of it")
+            expected = "expected given poses in the world of the mesh, got a recording without poses"
+            raise ConfigError(f"{KEY}: {expected}; add poses, or set {KEY} to a run directory of this recording")
         expected = "expected a run of this recording, got one without a pose at the time of any selected frame"
-        raise ConfigError(f"{KEY}: {expected}; name another run, or select other frames")
+        raise ConfigError(f"{KEY}: {expected}; set another run, or select other frames")
 
     def _check_first_image(self) -> None:
-        """Raise FrameError for a first image of the wrong size: all others would be skipped one by one."""
+        """Raise FrameError for a first image of the wrong size instead of skipping all frames one by one."""
         images = self.contents.frames[self.chosen[0]].images
         for name, read in ((images.color_name, images.color), (images.depth_name, images.depth)):
             try:
                 shape = read().shape
             except FrameError:
-                continue  # damaged or of a wrong type: counted when the frame is read
+                continue  # a damaged or invalid image is counted when the frame is read
             self.calibration.check_size(name, shape)
 
 
 def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
-    """Give each frame the pose of the frame `delay` later; without one, the frame cannot be used."""
+    """Give each frame the pose of the frame `delay` later, or an error without such a frame."""
     moved = []
     for frame, other in _with_later(frames, delay):
-        error = frame.error or (other.error if other else f"no pose is {delay} frames away")
+        error = frame.error or (other.error if other else f"expected a pose at an offset of {delay} frames, got none")
         moved.append(replace(frame, T_world_camera=other.T_world_camera if other else None, error=error))
     return moved
 
 
 def delay_depth(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
-    """Give each frame the depth image of the frame `delay` later; without one, the frame cannot be used."""
+    """Give each frame the depth image of the frame `delay` later, or an error without such a frame."""
     moved = []
     for frame, other in _with_later(frames, delay):
         if other:
             images = replace(frame.images, depth_name=other.images.depth_name, depth=other.images.depth)
             moved.append(replace(frame, images=images))
         else:
-            moved.append(replace(frame, error=frame.error or f"no depth image is {delay} frames away"))
+            error = frame.error or f"expected a depth image at an offset of {delay} frames, got none"
+            moved.append(replace(frame, error=error))
     return moved
 
 
@@ -254,23 +255,24 @@ def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[R
 
 
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
-    """Return the frame with its pose converted, or with an error if the pose is too far away to be mapped."""
+    """Return the frame with its pose converted, or with an error if the pose is too far from the origin."""
     if recorded.T_world_camera is None:
         return recorded
     T_world_camera = reading.pose(recorded.T_world_camera)
     distance = math.hypot(*T_world_camera[:3, 3])
     if distance <= FARTHEST:
         return replace(recorded, T_world_camera=T_world_camera)
-    error = f"{recorded.images.color_name}: its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
+    expected = f"expected a pose within {FARTHEST:g} m of the origin"
+    error = f"{recorded.images.color_name}: {expected}, got {distance:.6g} m"
     return RecordedFrame(recorded.images, recorded.timestamp, error=error)
 
 
 def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
-    """Return the frames, at 30 Hz if the times of the usable ones do not increase."""
+    """Return the frames, with timestamps at FRAME_RATE if those of the usable ones do not increase."""
     times = [recorded.timestamp for recorded in frames if not recorded.error]
     if all(a < b for a, b in pairwise(times)):
         return frames
-    log.warning("%s: the times do not grow from frame to frame; frames are taken to come at %g Hz", name, FRAME_RATE)
+    log.warning("%s: expected increasing timestamps; timestamps replaced by a rate of %g Hz", name, FRAME_RATE)
     return [replace(recorded, timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
 
 
@@ -292,8 +294,8 @@ def choose_frames(
     """
     check_selection(start, stop, stride, frame_fraction)
     if start >= count:
-        raise ConfigError(f"dataset.start is {start}, but the sequence has only {count} frames (0 to {count - 1})")
-    require(seed >= 0, "seed", seed, "at least 0")
+        raise ConfigError(f"dataset.start: expected a frame from 0 to {count - 1}, got {start}")
+        require(seed >= 0, "seed", seed, "at least 0")
     chosen = range(start, count if stop == TO_THE_END else min(stop, count), stride)
     if frame_fraction == 1:
         return chosen

@@ -1,4 +1,4 @@
-"""Meshes with instance labels at their vertices, as datasets of scanned rooms publish them."""
+"""Meshes with per-vertex instance labels, as published by datasets of scanned rooms."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class LabeledMesh:
 
 
 def unseen(camera: Camera, why: str) -> FrameTruth:
-    """Return the instances of a frame that cannot be rendered: they raise NoPoseError with the reason on access."""
+    """Return instances that raise NoPoseError with the reason on access, for a frame that cannot be rendered."""
 
     def render() -> Int32:
         raise NoPoseError(why)

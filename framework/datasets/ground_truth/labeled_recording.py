@@ -1,4 +1,4 @@
-"""Recordings with a labeled mesh of their own."""
+"""Recordings with their own labeled mesh."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class LabeledRecording(Recording):
-    """A recording of a scene that may have a labeled mesh of its own, which the subclass loads in `open`.
+    """A recording with an optional labeled mesh, loaded by the subclass in `open`.
 
     The ground truth is the whole mesh, whatever frames are selected.
     """
@@ -30,7 +30,7 @@ class LabeledRecording(Recording):
         super().__post_init__()
 
     def load_mesh(self, files: Sequence[Path], read: Callable[..., LabeledMesh]) -> None:
-        """Load the mesh from its files, if all of them exist and the user names no other ground truth.
+        """Load the mesh from its files, if all of them exist and `ground_truth` is not set.
 
         Raises DataError if one is missing and `frame_ground_truth` needs it.
         """
@@ -40,9 +40,9 @@ class LabeledRecording(Recording):
         if not missing:
             self.mesh = read(*files)
         elif self.frame_ground_truth:
-            raise DataError(f"dataset.frame_ground_truth: expected the labeled mesh, found no {missing[0]}")
+            raise DataError(f"dataset.frame_ground_truth: expected a labeled mesh, got no {missing[0]}")
         elif len(missing) < len(files):
-            log.warning("no true instances: %s is missing", missing[0])
+            log.warning("%s: expected for the true instances, got no such file; instances not evaluated", missing[0])
 
     def truth_in(self, index: int) -> FrameTruth | None:
         T_world_camera = self.contents.frames[index].T_world_camera

@@ -1,12 +1,12 @@
-"""The ground truth that the user names: a labeled mesh, or the map of a run.
+"""Ground truth set by `dataset.ground_truth`: a labeled mesh, or the map of a run.
 
     DIR/mesh.ply            a PLY file of any name: vertex x y z [m], integer property `instance`, 0 = none; faces
-    DIR/instances.json      next to it, or in the folder above: {"<id>": {"name", "class"}}, class = a name of COCO, or
-                            null = not known
+    DIR/instances.json      next to it, or in the folder above: {"<id>": {"name", "class"}}, class = a COCO name, or
+                            null = unknown
 
     RUN/                    a run directory: mesh.ply, instances.json (a list) and trajectory.txt
 
-An annotated mesh is in the world of the recording's given poses. The world of a run is known by its trajectory.
+An annotated mesh is in the world of the recording's given poses. The map of a run is in the world of its trajectory.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ MOST_DIGITS = 10  # of an id, with leading zeros
 
 @dataclass(frozen=True)
 class NamedTruth:
-    """A labeled mesh, and the poses of the run that made it."""
+    """A labeled mesh, with the trajectory of its run."""
 
     mesh: LabeledMesh
     name: str  # for tables: the file and its folder
     trajectory: ReferenceTrajectory | None  # None = the mesh is in the world of the recording's given poses
 
     def pose(self, timestamp: float, given: Float64 | None) -> Float64 | None:
-        """Return T_world_camera (4, 4) in the world of the mesh of a frame with this time and given pose.
+        """Return T_world_camera (4, 4) in the world of the mesh for a frame with this timestamp and given pose.
 
         None = not known.
         """
@@ -73,7 +73,7 @@ def read_named_truth(path: Path) -> NamedTruth:
     class_names = read_class_names(names, LARGEST_ID)
     unlisted = set(np.unique(ids).tolist()) - class_names.keys() - {0}
     if unlisted:
-        raise DataError(f"{mesh}: expected an entry of {names} for each instance, got none for {min(unlisted)}; add it")
+        raise DataError(f"{names}: expected an entry for each instance of {mesh.name}, got none for {min(unlisted)}")
     return NamedTruth(_labeled(mesh, ply, ids, class_names), label, None)
 
 
@@ -84,43 +84,43 @@ def truth_files(path: Path) -> list[Path]:
     """
     found = next((place for place in candidates(path) if place.exists()), None)
     if found is None:
-        raise ConfigError(f"{KEY}: expected a labeled mesh (PLY) or a run directory, got {path}, which does not exist")
+        raise ConfigError(f"{KEY}: expected a labeled mesh (PLY) or a run directory, got nonexistent {path}")
     mesh = found / MESH if found.is_dir() else found
     if not is_there(mesh):
-        raise DataError(f"{KEY}: expected {MESH} in the directory {found}, found none; name the labeled mesh")
+        raise DataError(f"{KEY}: expected {MESH} in the directory {found}, got none; set {KEY} to the labeled mesh")
     places = [mesh.with_name(INSTANCES), mesh.absolute().parents[1] / INSTANCES]
     names = next((place for place in places if is_there(place)), None)
     if names is None:
-        raise DataError(f"{KEY}: expected {places[0]} with the class of each instance of {mesh.name}, found none")
+        raise DataError(f"{KEY}: expected {places[0]} with the class of each instance of {mesh.name}, got none")
     trajectory = mesh.with_name(TRAJECTORY)
     return [mesh, names, trajectory] if is_there(trajectory) else [mesh, names]
 
 
 def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
-    """Return the class of each instance of an annotation, None = not known. Raises DataError, with the file."""
+    """Return the class of each instance of an annotation, None = unknown. Raises DataError, with the file."""
     content = read_json(path)
     if not isinstance(content, dict):
-        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
+        raise DataError(f"{path}: expected a JSON object, got {type(content).__name__}")
     class_names: dict[int, str | None] = {}
     for key, entry in content.items():
         if not (key.isascii() and key.isdigit() and len(key) <= MOST_DIGITS and 0 < int(key) <= largest_id):
-            raise DataError(f"{path}: an instance id is a whole number from 1 to {largest_id}, found {key!r:.60}")
+            raise DataError(f"{path}: expected instance ids from 1 to {largest_id}, got {key!r:.60}")
         if int(key) in class_names:
-            raise DataError(f"{path}: instance {int(key)} is there twice, the second time as {key!r}")
+            raise DataError(f"{path}: expected unique instance ids, got {int(key)} twice, the second time as {key!r}")
         class_names[int(key)] = _class_of(f"{path}: instance {key}", entry)
     return class_names
 
 
 def _class_of(where: str, entry: Any) -> str | None:
     if not isinstance(entry, dict) or "class" not in entry:
-        expected = '{"name": ..., "class": name or null}, where null means not known'
-        raise DataError(f"{where} must be {expected}, found {entry!r:.60}")
+        expected = '{"name": ..., "class": name, or null if unknown}'
+        raise DataError(f"{where}: expected {expected}, got {entry!r:.60}")
     name = entry["class"]
     if name is None or (isinstance(name, str) and name in COCO):
         return name
     close = get_close_matches(str(name)[:SHOWN].strip().lower(), COCO, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise DataError(f"{where}: class must be one of COCO's names, or null for not known, found {name!r:.60}{hint}")
+    raise DataError(f"{where}: class: expected a COCO name, or null if unknown, got {name!r:.60}{hint}")
 
 
 def _labels_of(path: Path, ply: PlyMesh) -> Int32:
@@ -130,9 +130,9 @@ def _labels_of(path: Path, ply: PlyMesh) -> Int32:
         found = f"got {', '.join(sorted(ply.properties)) or 'none'}"
         raise DataError(f"{path}: expected a vertex property {LABELS!r} of integers, {found}; label the mesh")
     if not len(ply.triangles):
-        raise DataError(f"{path}: expected faces, from which masks are rendered, got none; name a mesh")
+        raise DataError(f"{path}: expected faces to render masks from, got none; set {KEY} to a mesh with faces")
     if labels.min() < 0 or labels.max() > LARGEST_ID:
-        raise DataError(f"{path}: expected instances from 0 to {LARGEST_ID}, got {labels.min()} to {labels.max()}")
+        raise DataError(f"{path}: {LABELS}: expected 0 to {LARGEST_ID}, got {labels.min()} to {labels.max()}")
     return labels.astype(np.int32)
 
 
@@ -148,7 +148,7 @@ def _classes_of_run(path: Path, entries: Sequence[Any]) -> dict[int, str | None]
     for number, entry in enumerate(entries, start=1):
         key, name = (entry.get("id"), entry.get("class", ...)) if isinstance(entry, dict) else (None, None)
         if type(key) is not int or not 0 < key <= LARGEST_ID or not (name is None or isinstance(name, str)):
-            raise DataError(f"{path}, entry {number}: expected an id and a class, got {entry!r:.60}; run it again")
+            raise DataError(f"{path}, entry {number}: expected an id and a class, got {entry!r:.60}; repeat the run")
         class_names[key] = name
     return class_names
 

@@ -12,7 +12,7 @@ from framework.data import Camera, Float32, Float64, Int32, SceneTruth
 from framework.datasets.ground_truth.scene_truth_kernels import KEY_OFFSET, Slots, move_slots, vote
 from framework.errors import DataError
 
-INITIAL_CAPACITY = 1 << 16  # slots; a power of two, doubled before more than half are taken
+INITIAL_CAPACITY = 1 << 16  # slots; a power of two, doubled before more than half are occupied
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,13 @@ def fuse_scene_truth(
         )
         if taken < 0:
             farthest = KEY_OFFSET * ground_truth_spacing
-            raise DataError(f"ground truth: a point lies more than {farthest:.0f} m from the origin")
+            raise DataError(f"ground truth: expected points within {farthest:.0f} m of the origin, got one beyond")
     points, ids = _elect(slots)
     return SceneTruth(points_world=points, instance_ids=ids, class_names=dict(class_names))
 
 
 def _elect(slots: Slots) -> tuple[Float32, Int32]:
-    """Each voxel's mean point (V, 3) and majority id (V,), in the order of first sight."""
+    """Return each voxel's mean point (V, 3) and majority id (V,), in the order of first observation."""
     keys, ids, votes, sums, first = slots
     taken = np.flatnonzero(votes)
     best_first = taken[np.lexsort((ids[taken], -votes[taken], keys[taken]))]

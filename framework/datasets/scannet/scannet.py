@@ -1,4 +1,4 @@
-"""ScanNet (Dai et al., CVPR 2017): rooms scanned with an iPad and a depth sensor on it, with labeled meshes.
+"""ScanNet (Dai et al., CVPR 2017): rooms scanned with an iPad and an attached depth sensor, with labeled meshes.
 
     scene0000_00/scene0000_00.sens      the video in one file (`sens_file.py`), or as ScanNet's SensReader exports it:
     scene0000_00/color/0.jpg            8-bit color, from 0
@@ -6,12 +6,12 @@
     scene0000_00/pose/0.txt             T_world_camera, four lines of four numbers, m
     scene0000_00/intrinsic/             intrinsic_color.txt, intrinsic_depth.txt and, optional, extrinsic_*.txt: 4x4
     scene0000_00/scene0000_00_vh_clean_2.ply, _vh_clean_2.0.010000.segs.json, .aggregation.json
-                                        optional: the mesh, its segments, and the objects that consist of them
-    scannetv2-labels.combined.tsv       optional, in the folder of the scenes or its parent: the class of each name
-                                        that annotators wrote; without it fewer objects are evaluated
+                                        optional: the mesh, its segments, and the objects made of segments
+    scannetv2-labels.combined.tsv       optional, in the folder of the scenes or its parent: the class of each
+                                        annotated name; without it, fewer objects are evaluated
     scannet-labels.combined.tsv         optional, in the same folders: for annotations of the first release
 
-Color (1296x968) is registered to the depth camera (640x480), which is that of the frames.
+Frames are in the depth camera (640x480); color (1296x968) is registered to it.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from framework.files.image_files import read_color, read_uint16
 from framework.files.number_lines import PrintedMatrix, read_matrix
 from framework.geometry import inverse, rotation_angle
 
-MESH_FILES = ("_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")  # behind the scene's name
+MESH_FILES = ("_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")  # after the scene's name
 DEPTH_SCALE = 1000.0  # units per meter, of exported depth
 MICROSECONDS = 1e6  # per second
-COLOR_SIZE = (1296, 968)  # px; exported color may be smaller, its intrinsics are still those of this size
-NEAR = 2.0  # m, the depth for which the parallax is logged
-LARGEST_SHIFT = 0.5  # px, of the depth camera, by which color may be shifted without a warning
+COLOR_SIZE = (1296, 968)  # px; exported color may be smaller, but its intrinsics are those of this size
+NEAR = 2.0  # m, the depth of the logged parallax
+LARGEST_SHIFT = 0.5  # px of the depth camera: maximum shift of color without a warning
 
 log = logging.getLogger(__name__)
 
@@ -55,8 +55,8 @@ log = logging.getLogger(__name__)
 class ScanNet(LabeledRecording):
     """A scan of ScanNet v2, from its `.sens` file if there is one, otherwise from exported images.
 
-    Extrinsics between the two cameras are not applied: the published ones are identities, as color is registered to
-    depth already. Others are logged with the shift in px that they would cause.
+    Extrinsics between the two cameras are not applied: the published ones are identities, because color is already
+    registered to depth. Other extrinsics are logged with the resulting shift in px.
     """
 
     def open(self) -> Contents:
@@ -65,18 +65,20 @@ class ScanNet(LabeledRecording):
         self._label_tables = [table for table in tables if is_there(table)]
         self.load_mesh([self.folder / f"{self.name}{end}" for end in MESH_FILES], self._read_mesh)
         if self.mesh and not self._label_tables:
-            log.warning("%s is missing: only objects whose own name means a class are evaluated", tables[-1])
+            message = "%s: expected the class of each annotated name, got no such file; fewer objects are evaluated"
+            log.warning(message, tables[-1])
         self.annotation = f"ScanNet v2{'' if self._label_tables else ', no label table'}" if self.mesh else ""
         sens, exported = sorted(self.folder.glob("*.sens")), self.folder / "color"
         if len(sens) > 1:
-            raise DataError(f"{self.folder} holds {len(sens)} .sens files, {sens[0].name} and others; leave one")
+            raise DataError(f"{self.folder}: expected one .sens file, got {len(sens)}: {sens[0].name} and others")
         if sens and exported.is_dir():
-            log.info("%s is read, not the images exported to %s: it has times as well", sens[0], exported.parent)
+            log.info("%s: preferred to the images exported to %s: it contains timestamps", sens[0], exported.parent)
         if sens:
             return _sens_contents(sens[0])
         if exported.is_dir():
             return _exported_contents(self.folder)
-        raise DataError(f"{self.folder} holds neither {self.name}.sens nor color/; dataset.scene is like scene0000_00")
+        expected = f"expected {self.name}.sens or color/, got neither"
+        raise DataError(f"{self.folder}: {expected}; set dataset.scene to a scene such as scene0000_00")
 
     def _read_mesh(self, mesh: Path, segments: Path, objects: Path) -> LabeledMesh:
         nyu40: dict[str, str] = {}
@@ -90,7 +92,9 @@ def _sens_contents(path: Path) -> Contents:
     header = file.header
     for camera, name in ((header.color_camera, "color"), (header.depth_camera, "depth")):
         if not _fits(camera):
-            raise DataError(f"{path}: {name} intrinsics do not belong to images of {camera.width}x{camera.height} px")
+            size = f"{camera.width}x{camera.height}"
+            expected = f"expected {name} intrinsics for images of {size} px"
+            raise DataError(f"{path}: {expected}, got cx, cy = {camera.cx:g}, {camera.cy:g}")
     _warn_of_parallax(path, header.color_extrinsics, header.depth_extrinsics, header.depth_camera)
     with errors_of(path):
         registration = ColorRegistration(header.color_camera, header.depth_camera)
@@ -100,7 +104,7 @@ def _sens_contents(path: Path) -> Contents:
         frames.append(RecordedFrame.posed(images, frame.depth_time / MICROSECONDS, frame.camera_to_world.pose))
     lost = range(len(frames), header.frames)
     if lost:
-        log.warning("%s lacks the last %d of %d frames: %s", path, len(lost), header.frames, file.cut)
+        log.warning("%s: the last %d of %d frames are missing: %s", path, len(lost), header.frames, file.cut)
     frames += [RecordedFrame(frames[-1].images, k / FRAME_RATE, error=f"{path}, {file.cut}") for k in lost]
     return Contents(header.depth_camera, path, header.depth_scale, frames)
 
@@ -131,12 +135,13 @@ def _exported_frame(folder: Path, k: int, images: StoredImages) -> RecordedFrame
 def _camera(path: Path, width: int, height: int) -> Camera:
     camera = read_matrix(path).camera(width, height)
     if not _fits(camera):
-        raise DataError(f"{path} does not belong to images of {width}x{height} px")
+        expected = f"expected intrinsics for images of {width}x{height} px"
+        raise DataError(f"{path}: {expected}, got cx, cy = {camera.cx:g}, {camera.cy:g}")
     return camera
 
 
 def _color_camera(path: Path, width: int, height: int) -> Camera:
-    """Return the camera of exported color, which SensReader may have resized without changing the intrinsics."""
+    """Return the camera of exported color images; SensReader may resize them without changing the intrinsics."""
     matrix = read_matrix(path)
     if _fits(matrix.camera(width, height)) or not _fits(camera := matrix.camera(*COLOR_SIZE)):
         return _camera(path, width, height)
@@ -152,17 +157,17 @@ def _fits(camera: Camera) -> bool:
 
 
 def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, camera: Camera) -> None:
-    """Log by how much color is shifted if the two cameras do not have the same extrinsics."""
+    """Log the shift of color caused by different extrinsics of the two cameras."""
     try:
         T_color_depth = inverse(color.pose()) @ depth.pose()
     except DataError:
-        log.warning("%s: the extrinsics are no rigid motion; the two cameras are taken to be at one place", source)
+        log.warning("%s: expected rigid extrinsics; color and depth cameras are assumed to coincide", source)
         return
     baseline, angle = float(np.linalg.norm(T_color_depth[:3, 3])), rotation_angle(T_color_depth[:3, :3])
     shift = camera.fx * (baseline / NEAR + angle)
     if shift > LARGEST_SHIFT:
         log.warning(
-            "%s: color and depth camera are %.0f mm and %.2f degrees apart, which is not applied: color is shifted by"
-            " up to %.0f px %.0f m away",
+            "%s: extrinsics of %.0f mm and %.2f degrees between color and depth are not applied; color is shifted by "
+            "up to %.0f px at %.0f m",
             *(source, 1000 * baseline, np.degrees(angle), shift, NEAR),
         )

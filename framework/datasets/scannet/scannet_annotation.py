@@ -1,4 +1,4 @@
-"""ScanNet's instances: the segments of a mesh, the objects that consist of them, and the classes of their names."""
+"""ScanNet's instances: the segments of a mesh, the objects made of segments, and the classes of object names."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from framework.datasets.calibration.camera_json import read_json_object
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import DataError
 from framework.files.atomic_write import read_text
+from framework.files.number_lines import SHOWN
 from framework.files.ply import read_ply
 from framework.vocabulary.label_spaces import MEANINGS
 
@@ -23,7 +24,7 @@ LARGEST_FILE = 2**24  # bytes; the largest room's segments take 5 MB, and JSON t
 MOST_OBJECT_ID = np.iinfo(np.int32).max - 2  # one is added, and one more id is used for unlabeled vertices
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
 FIRST_LABEL_TABLE = "scannet-labels.combined.tsv"  # of the first release, 2017, which has other names
-NAME_COLUMNS = ("raw_category", "category")  # what annotators wrote; the first release has no raw_category
+NAME_COLUMNS = ("raw_category", "category")  # annotated names; the first release has no raw_category
 CLASS_COLUMN = "nyu40class"
 UNNAMED = frozenset(  # names without a class: the object may be anything
     {"object", "objects", "unknown", "junk", "furniture", "decoration"}
@@ -35,7 +36,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SegGroup:
-    """An object."""
+    """An annotated object."""
 
     object_id: int  # from 0
     label: str  # as the annotator wrote it
@@ -50,20 +51,22 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     instance, have the class None: detections there are not evaluated, as in ScanNet's own benchmark. `nyu40` is the
     result of `read_label_table`, empty = no table. Names may differ in spaces and signs: trashcan, trash can.
 
-    Raises DataError, with the file, if the files are invalid or do not belong together, or if names are in no table.
+    Raises DataError, with the file, for invalid or inconsistent files, or names that are not in the table.
     """
     ply = read_ply(mesh)
     segments = _whole_numbers(f"{segs}: segIndices", _read_list(segs, "segIndices"))
     if len(segments) != len(ply.vertices):
-        raise DataError(f"{segs} has {len(segments)} segIndices, but {mesh.name} {len(ply.vertices)} vertices")
+        expected = f"expected one for each of {len(ply.vertices)} vertices of {mesh.name}"
+        raise DataError(f"{segs}: segIndices: {expected}, got {len(segments)}")
     present, segment_of_vertex = np.unique(segments, return_inverse=True)
     groups = read_aggregation(aggregation)
     spellings = _spellings(nyu40)
     strange = sorted({group.label for group in groups if _spelled(group.label, spellings) not in spellings})
     if nyu40 and strange:
         raise DataError(
-            f"{aggregation}: {', '.join(f'{label!r:.60}' for label in strange)}: in no label table; add a line to"
-            f" {LABEL_TABLE}, or put {FIRST_LABEL_TABLE} beside it, which has the names of ScanNet's first release"
+            f"{aggregation}: expected names of the label table, got "
+            f"{', '.join(f'{label!r:.60}' for label in strange)}; add a line to {LABEL_TABLE}, or put "
+            f"{FIRST_LABEL_TABLE} next to it for annotations of ScanNet's first release"
         )
     unlabeled = max((group.object_id + 2 for group in groups), default=1)
     instance_of_segment = np.full(len(present), unlabeled, np.int32)
@@ -72,10 +75,11 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     for group in groups:
         absent = group.segments[~np.isin(group.segments, present)]
         if len(absent):
-            raise DataError(f"{aggregation}: object {group.object_id} has segment {absent[0]}, which no vertex is in")
+            expected = f"expected segments of {segs.name}"
+            raise DataError(f"{aggregation}: object {group.object_id}: {expected}, got {absent[0]}")
         instance = group.object_id + 1
         own = _spelled(group.label, spellings)
-        # its own name comes before NYU40's, which has one class for microwaves, keyboards and bottles
+        # the annotated name is preferred: NYU40 has a single class for microwaves, keyboards and bottles
         names = [name for name in (own, nyu40.get(own, "")) if name in MEANINGS and name not in UNNAMED]
         if not names:
             unknown.add(group.label)
@@ -88,7 +92,7 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     if unlabeled in instance_of_segment:
         class_names[unlabeled] = None
     if unknown:
-        log.info("%s: not evaluated, as their class is not known: %s", mesh.parent.name, ", ".join(sorted(unknown)))
+        log.info("%s: not evaluated because of an unknown class: %s", mesh.parent.name, ", ".join(sorted(unknown)))
     return LabeledMesh(ply.vertices, ply.triangles, instance_of_segment[segment_of_vertex], class_names)
 
 
@@ -100,7 +104,8 @@ def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
     for group in found:  # scene0217_00 has all of its objects twice
         before = labels.setdefault(group.object_id, group.label)
         if before != group.label:
-            raise DataError(f"{path}: object {group.object_id} is {before!r:.60} and {group.label!r:.60}")
+            expected = f"object {group.object_id}: expected one label"
+            raise DataError(f"{path}: {expected}, got {before!r:.60} and {group.label!r:.60}")
     return found
 
 
@@ -114,13 +119,13 @@ def read_label_table(path: Path) -> Mapping[str, str]:
     written = next((name for name in NAME_COLUMNS if name in columns), "")
     if not written or CLASS_COLUMN not in columns:
         expected = f"expected columns {' or '.join(NAME_COLUMNS)} and {CLASS_COLUMN}, separated by tabs"
-        raise DataError(f"{path}, line 1: {expected}")
+        raise DataError(f"{path}, line 1: {expected}, got {header[:SHOWN]!r}")
     raw, nyu40 = columns.index(written), columns.index(CLASS_COLUMN)
     table: dict[str, str] = {}
     for n, row in enumerate(rows, start=2):
         words = row.rstrip("\r").split("\t")
         if len(words) <= max(raw, nyu40):
-            raise DataError(f"{path}, line {n}: expected {len(columns)} columns, found {len(words)}")
+            raise DataError(f"{path}, line {n}: expected {len(columns)} columns, got {len(words)}")
         table[words[raw].strip().lower()] = words[nyu40].strip().lower()
     return table
 
@@ -132,7 +137,7 @@ def _spellings(nyu40: Mapping[str, str]) -> dict[str, str]:
 
 
 def _spelled(label: str, spellings: Mapping[str, str]) -> str:
-    """Return the known name that an annotator meant, or what was written."""
+    """Return the known name for an annotated label, or the label if it is unknown."""
     own = label.strip().lower()
     return spellings.get(own) or spellings.get(_letters(own), own)
 
@@ -143,24 +148,25 @@ def _letters(name: str) -> str:
 
 def _group(where: str, group: Any) -> SegGroup:
     if not isinstance(group, dict):
-        raise DataError(f"{where} must be an object, found {type(group).__name__}")
+        raise DataError(f"{where}: expected an object, got {type(group).__name__}")
     object_id, label, segments = (group.get(key) for key in ("objectId", "label", "segments"))
     if type(object_id) is not int or not 0 <= object_id <= MOST_OBJECT_ID:
-        raise DataError(f"{where}: objectId must be a whole number from 0 to {MOST_OBJECT_ID}")
+        raise DataError(f"{where}: objectId: expected an integer from 0 to {MOST_OBJECT_ID}, got {object_id!r:.60}")
     if not isinstance(label, str) or not isinstance(segments, list):
-        raise DataError(f"{where}: expected a label and a list of segments")
+        found = f"{type(label).__name__} and {type(segments).__name__}"
+        raise DataError(f"{where}: expected a label (text) and segments (list), got {found}")
     return SegGroup(object_id, label, _whole_numbers(f"{where}: segments", segments))
 
 
 def _read_list(path: Path, key: str) -> Sequence[Any]:
     found = read_json_object(path, LARGEST_FILE).get(key)
     if not isinstance(found, list):
-        raise DataError(f"{path}: expected a list {key!r}, found {type(found).__name__}")
+        raise DataError(f"{path}: expected a list {key!r}, got {type(found).__name__}")
     return found
 
 
 def _whole_numbers(where: str, values: Sequence[Any]) -> Int64:
     wrong = [value for value in values if type(value) is not int]
     if wrong:
-        raise DataError(f"{where}: expected whole numbers, found {type(wrong[0]).__name__}")
+        raise DataError(f"{where}: expected integers, got {type(wrong[0]).__name__}")
     return np.array(values, np.int64)

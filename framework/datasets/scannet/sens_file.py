@@ -1,4 +1,4 @@
-"""ScanNet's `.sens` files, version 4: a header, then frame after frame with its pose, times and compressed images.
+"""ScanNet's `.sens` files, version 4: a header, then each frame with its pose, timestamps and compressed images.
 
     uint32 version, uint64 n, n bytes: the sensor's name
     float32[64]     four 4x4 matrices: color intrinsics, color extrinsics, depth intrinsics, depth extrinsics
@@ -8,9 +8,9 @@
     uint64          number of frames
     for each frame: float32[16] camera to world, uint64[2] times of color and depth (microseconds),
                     uint64[2] sizes of color and depth (bytes), the two
-    (IMU readings follow, which are not read)
+    (IMU readings at the end are not read)
 
-All little-endian. Opening a file reads only the 96 bytes before each frame's images.
+All values are little-endian. Opening a file reads only the 96 bytes before each frame's images.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class SensHeader:
     color_compression: int  # RAW, PNG or JPEG
     depth_compression: int  # RAW or ZLIB
     depth_scale: float  # units per meter
-    frames: int  # number of frames that the file should hold
+    frames: int  # number of frames according to the header
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class SensFrame:
                 file.seek(byte)
                 data = file.read(length)
         except OSError as error:
-            raise FrameError(f"{name} could not be read: {error.strerror or error}") from error
+            raise FrameError(f"{name}: cannot be read: {error.strerror or error}") from error
         _check_length(name, len(data), length)
         return data
 
@@ -120,8 +120,8 @@ class SensFile:
     """Contents of a file."""
 
     header: SensHeader
-    frames: tuple[SensFrame, ...]  # the complete ones, from the first on
-    cut: str  # why there are fewer than header.frames; "" = all are complete
+    frames: tuple[SensFrame, ...]  # the complete frames before the first incomplete one
+    cut: str  # reason for fewer frames than header.frames; "" = all are complete
 
 
 def open_sens(path: Path) -> SensFile:
@@ -134,9 +134,9 @@ def open_sens(path: Path) -> SensFile:
             header = _read_header(path, file, length)
             frames, cut = _find_frames(path, file, length, header)
     except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
     if not frames:
-        raise DataError(f"{path} holds no frame: {cut or 'its header says 0'}")
+        raise DataError(f"{path}: expected frames, got none: {cut or '0 according to its header'}")
     return SensFile(header, tuple(frames), cut)
 
 
@@ -145,14 +145,14 @@ def _read_header(path: Path, file: BinaryIO, length: int) -> SensHeader:
         data = file.read(count)
         if len(data) < count:
             at = file.tell() - len(data)
-            raise DataError(f"{path}, byte {at}: the file ends at byte {length}, within its header")
+            raise DataError(f"{path}, byte {at}: expected a full header, got the end of the file at byte {length}")
         return data
 
     version, name_bytes = START.unpack(take(START.size))
     if version != VERSION:
-        raise DataError(f"{path}, byte 0: expected version {VERSION} of the .sens format, found {version}")
+        raise DataError(f"{path}, byte 0: expected version {VERSION} of the .sens format, got {version}")
     if name_bytes > LONGEST_NAME:
-        raise DataError(f"{path}, byte 4: the sensor's name has {name_bytes} bytes, more than {LONGEST_NAME}")
+        raise DataError(f"{path}, byte 4: expected a sensor name of at most {LONGEST_NAME} bytes, got {name_bytes}")
     take(name_bytes)
     color_intrinsics, color_extrinsics, depth_intrinsics, depth_extrinsics = (
         _matrix(f"{path}, byte {file.tell()}", take(MATRIX_BYTES)) for _ in range(4)
@@ -161,20 +161,22 @@ def _read_header(path: Path, file: BinaryIO, length: int) -> SensHeader:
     color_code, depth_code, *sizes, depth_scale, frames = IMAGES.unpack(take(IMAGES.size))
     for name, width, height in (("color", *sizes[:2]), ("depth", *sizes[2:])):
         if not 0 < width * height <= MOST_PIXELS:
-            raise DataError(f"{path}, byte {at + 8}: {name} images of {width}x{height} px; at most {MOST_PIXELS} px")
+            expected = f"expected {name} images of 1 to {MOST_PIXELS} px"
+            raise DataError(f"{path}, byte {at + 8}: {expected}, got {width}x{height} px")
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
         expected = f"expected depth units per meter in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}]"
-        raise DataError(f"{path}, byte {at + 24}: {expected}, found {depth_scale:g}")
+        raise DataError(f"{path}, byte {at + 24}: {expected}, got {depth_scale:g}")
     if frames > MOST_FRAMES or frames * FRAME.size > length:
-        raise DataError(f"{path}, byte {at + 28}: {frames} frames cannot be in a file of {length} bytes")
+        most = min(MOST_FRAMES, length // FRAME.size)
+        raise DataError(f"{path}, byte {at + 28}: expected at most {most} frames in {length} bytes, got {frames}")
     if depth_code == OCCIPITAL:
         raise DataError(
-            f"{path}, byte {at + 4}: depth is compressed by Occipital's own method, which only their library reads; "
-            "export the frames with ScanNet's SensReader"
+            f"{path}, byte {at + 4}: expected raw or zlib depth, got Occipital's proprietary compression; export the "
+            "frames with ScanNet's SensReader"
         )
     for byte, name, code, known in ((at, "color", color_code, (0, 1, 2)), (at + 4, "depth", depth_code, (0, 1))):
         if code not in known:
-            raise DataError(f"{path}, byte {byte}: expected a compression of {name} in {known}, found {code}")
+            raise DataError(f"{path}, byte {byte}: expected a compression of {name} in {known}, got {code}")
     color_camera, depth_camera = color_intrinsics.camera(*sizes[:2]), depth_intrinsics.camera(*sizes[2:])
     extrinsics = color_extrinsics, depth_extrinsics
     return SensHeader(color_camera, depth_camera, *extrinsics, color_code, depth_code, depth_scale, frames)
@@ -186,20 +188,21 @@ def _matrix(where: str, data: bytes) -> PrintedMatrix:
 
 
 def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) -> tuple[list[SensFrame], str]:
-    """Yield the complete frames and the reason why there are no more; "" = all frames are complete."""
+    """Return the complete frames and the reason for missing ones; "" = all frames are complete."""
     most_color = 2 * 3 * prod(header.color_camera.shape) + OVERHEAD
     most_depth = 2 * 2 * prod(header.depth_camera.shape) + OVERHEAD
     frames: list[SensFrame] = []
     at = file.tell()
     for number in range(header.frames):
-        ended = f"byte {at}: the file ends at byte {length}, before frame {number} of {header.frames} does"
+        ended = f"byte {at}: the file ends at byte {length}, within frame {number} of {header.frames}"
         images = at + FRAME.size
         if images > length:
             return frames, ended
         file.seek(at)
         pose, color_time, depth_time, color_bytes, depth_bytes = FRAME.unpack(file.read(FRAME.size))
         if color_bytes > most_color or depth_bytes > most_depth:
-            return frames, f"byte {at}: frame {number} claims {color_bytes} bytes of color and {depth_bytes} of depth"
+            expected = f"frame {number}: expected at most {most_color} bytes of color and {most_depth} of depth"
+            return frames, f"byte {at}: {expected}, got {color_bytes} and {depth_bytes}"
         if images + color_bytes + depth_bytes > length:
             return frames, ended
         T_world_camera = _matrix(f"{path}, byte {at}", pose)
@@ -210,19 +213,19 @@ def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) ->
 
 
 def _inflate(name: str, data: bytes, length: int) -> bytes:
-    """Return the unpacked `data`, of at most `length` bytes."""
+    """Decompress `data` to at most `length` bytes."""
     stream = zlib.decompressobj()
     try:
         unpacked = stream.decompress(data, length + 1)
     except zlib.error as error:
-        raise FrameError(f"{name} could not be decoded: {error}") from error
+        raise FrameError(f"{name}: cannot be decompressed: {error}") from error
     if len(unpacked) > length:
-        raise FrameError(f"{name} unpacks to more than the {length} bytes of an image")
+        raise FrameError(f"{name}: expected {length} bytes, got more after decompression")
     if not stream.eof:
-        raise FrameError(f"{name} is truncated: its zlib stream does not end")
+        raise FrameError(f"{name}: expected a complete zlib stream, got a truncated one")
     return unpacked
 
 
 def _check_length(name: str, found: int, expected: int) -> None:
     if found != expected:
-        raise FrameError(f"{name}: expected {expected} bytes, found {found}")
+        raise FrameError(f"{name}: expected {expected} bytes, got {found}")

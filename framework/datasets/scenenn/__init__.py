@@ -1,1 +1,1 @@
-"""SceneNN's files: one module a format, tolerant in reading and strict in writing."""
+"""SceneNN's files: one module per format, with lenient readers and strict writers."""

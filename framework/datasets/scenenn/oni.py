@@ -1,6 +1,6 @@
-"""The frames of an OpenNI recording (.oni): color and depth, paired as by SceneNN's own play-back.
+"""Frames of an OpenNI recording (.oni): color and depth, paired as in SceneNN's playback.
 
-OpenNI 2's C library plays the images. A damaged file can crash it.
+Images are decoded by OpenNI 2's C library, which a damaged file can crash.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from framework.data import UInt8, UInt16
 from framework.datasets.scenenn.oni_records import Images, OniContents, Stream, playable
 from framework.errors import ConfigError, DataError, InstanceMapError, errors_of
 
-LARGEST_TIME_DIFFERENCE = 33_000  # us, of the two images of a frame, as in SceneNN's play-back
-WAITING = 30  # images of one stream that wait for the other, 1 s: the rest of the file may lack it
+LARGEST_TIME_DIFFERENCE = 33_000  # us between the two images of a frame, as in SceneNN's playback
+WAITING = 30  # maximum number of unpaired images of a stream (1 s), in case the other stream ends
 LIBRARIES = ("libOpenNI2.so.0", "libOpenNI2.so", "libOpenNI2.dylib", "OpenNI2.dll")
 LONGEST_PATH = 255  # bytes, of OpenNI 2
-PATIENCE = 10_000  # ms without an image until the player counts as stuck
+PATIENCE = 10_000  # ms without an image before playback counts as stalled
 
 # OniCAPI.h, OniCEnums.h and OniCProperties.h of OpenNI 2.2
 API_VERSION = 2002
@@ -36,7 +36,7 @@ OK, TIME_OUT = 0, 102
 SENSORS = {Stream.DEPTH: 3, Stream.COLOR: 2}
 DEPTH_1_MM, DEPTH_100_UM, RGB888 = 100, 101, 200
 PLAYBACK_SPEED, PLAYBACK_REPEAT = 100, 101
-MANUAL = -1.0  # speed: images come on request, so that none is lost
+MANUAL = -1.0  # speed: images are delivered on request, so that none is lost
 
 
 class _VideoMode(ctypes.Structure):
@@ -66,7 +66,7 @@ class OniImage:
 
 @dataclass(frozen=True)
 class OniFrame:
-    """Color and depth of about the same moment, registered or mirrored if they were recorded so."""
+    """Color and depth of about the same time, registered or mirrored as recorded."""
 
     color: UInt8  # (H, W, 3) RGB
     depth_mm: UInt16  # (H, W) mm, 0 = no reading
@@ -75,10 +75,10 @@ class OniFrame:
 
 
 def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
-    """Yield the frames of a recording; a truncated one is copied into the folder `scratch` meanwhile.
+    """Yield the frames of a recording; a truncated recording is repaired in a copy in the folder `scratch`.
 
-    Raises ConfigError without OpenNI 2, and DataError if OpenNI 2 cannot play the recording to its end or the images
-    cannot form a frame.
+    Raises ConfigError without OpenNI 2, and DataError if OpenNI 2 cannot play the whole recording or color and depth
+    do not match.
     """
     with (
         errors_of(contents.path),
@@ -89,9 +89,9 @@ def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
 
 
 def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
-    """Yield the frames of images in the file's order; of two that are too far apart the earlier one is dropped.
+    """Yield frames from images in the file's order; of two images too far apart, drop the earlier one.
 
-    The published trajectories use the frame numbers of SceneNN's play-back, which does the same. Raises DataError if
+    The published trajectories use the frame numbers of SceneNN's playback, which does the same. Raises DataError if
     color and depth have different sizes.
     """
     waiting = {stream: deque[OniImage](maxlen=WAITING) for stream in Stream}
@@ -105,14 +105,14 @@ def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
                 continue
             if color.pixels.shape[:2] != depth.pixels.shape:
                 sizes = (f"{image.pixels.shape[1]}x{image.pixels.shape[0]}" for image in (color, depth))
-                raise DataError("color is {} and depth {}; they must have the same size".format(*sizes))
+                raise DataError("expected color and depth of the same size, got {} px and {} px".format(*sizes))
             yield OniFrame(color.pixels, depth.pixels, color.time, depth.time)
             colors.popleft()
             depths.popleft()
 
 
 def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Run `play` in its own process, as OpenNI 2 crashes on some damaged recordings."""
+    """Run `play` in its own process, because OpenNI 2 crashes on some damaged recordings."""
     spawn = multiprocessing.get_context("spawn")  # the library's threads and locks do not survive a fork
     receiver, sender = spawn.Pipe(duplex=False)
     player = spawn.Process(target=_deliver, args=(sender, path, streams), daemon=True)
@@ -125,7 +125,7 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
             yield received
     except (EOFError, OSError):
         player.join()
-        raise DataError(f"it is damaged, OpenNI 2 crashed on it with status {player.exitcode}") from None
+        raise DataError(f"damaged recording: OpenNI 2 crashed with status {player.exitcode}") from None
     finally:
         player.terminate()
         player.join()
@@ -133,7 +133,7 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
 
 
 def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -> None:
-    """Send the images and then None, or the error that ended them."""
+    """Send the images and then None, or an error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to both processes; the parent ends this one
     try:
         with closing(play(path, streams)) as images:
@@ -147,29 +147,29 @@ def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -
 
 
 def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Yield the images that OpenNI 2 finds in a file, up to the last of each stream, without damaged ones."""
+    """Yield the intact images of a file, up to the last of each stream, as decoded by OpenNI 2."""
     openni = _library()
     file = os.fsencode(path)
     if len(file) > LONGEST_PATH:
-        raise DataError(f"OpenNI 2 takes paths of at most {LONGEST_PATH} bytes; move it")
+        raise DataError(f"expected a path of at most {LONGEST_PATH} bytes for OpenNI 2, got {len(file)}; move the file")
     with ExitStack() as stack:
-        _check(openni.oniInitialize(API_VERSION), openni, "OpenNI 2 does not start")
+        _check(openni.oniInitialize(API_VERSION), openni, "OpenNI 2 cannot be initialized")
         stack.callback(openni.oniShutdown)
         device = ctypes.c_void_p()
-        _check(openni.oniDeviceOpen(file, ctypes.byref(device)), openni, "OpenNI 2 does not open it")
+        _check(openni.oniDeviceOpen(file, ctypes.byref(device)), openni, "OpenNI 2 cannot open the recording")
         stack.callback(openni.oniDeviceClose, device)
         for name, value in ((PLAYBACK_REPEAT, ctypes.c_int(False)), (PLAYBACK_SPEED, ctypes.c_float(MANUAL))):
             status = openni.oniDeviceSetProperty(device, name, ctypes.byref(value), ctypes.sizeof(value))
-            _check(status, openni, "OpenNI 2 does not take a property of its play-back")
+            _check(status, openni, "OpenNI 2 cannot set a playback property")
         handles = []
         for stream in Stream:
             handle = ctypes.c_void_p()
             status = openni.oniDeviceCreateStream(device, SENSORS[stream], ctypes.byref(handle))
-            _check(status, openni, f"OpenNI 2 finds no {stream.name.lower()} in it")
+            _check(status, openni, f"OpenNI 2 cannot open the {stream.name.lower()} stream")
             stack.callback(openni.oniStreamDestroy, handle)
             handles.append(handle)
         for handle in handles:
-            _check(openni.oniStreamStart(handle), openni, "OpenNI 2 does not play it")
+            _check(openni.oniStreamStart(handle), openni, "OpenNI 2 cannot play the recording")
         yield from _images(openni, handles, streams)
 
 
@@ -182,12 +182,12 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
         status = openni.oniWaitForAnyStream(waited, len(handles), ctypes.byref(which), PATIENCE)
         if status == TIME_OUT:
             reached = ", ".join(f"{stream.name.lower()} {last[stream]} of {streams[stream].last}" for stream in Stream)
-            raise DataError(f"it is damaged, OpenNI 2 plays no further than {reached}")
-        _check(status, openni, "OpenNI 2 does not play it")
+            raise DataError(f"damaged recording: OpenNI 2 stalled at {reached}")
+        _check(status, openni, "OpenNI 2 cannot play the recording")
         stream = list(Stream)[which.value]
         frame = ctypes.POINTER(_Frame)()
         status = openni.oniStreamReadFrame(handles[which.value], ctypes.byref(frame))
-        _check(status, openni, "OpenNI 2 does not play it")
+        _check(status, openni, "OpenNI 2 cannot play the recording")
         try:
             last[stream], time = frame.contents.index, frame.contents.timestamp
             pixels = _pixels(stream, frame.contents)
@@ -198,7 +198,7 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
 
 
 def _pixels(stream: Stream, frame: _Frame) -> npt.NDArray[Any] | None:
-    """Return a copy of the pixels; None if OpenNI delivers fewer than the image has."""
+    """Return a copy of the pixels; None for an incomplete image."""
     pixel_format, shape = frame.mode.pixel_format, (frame.height, frame.width)
     if frame.data_size < frame.stride * frame.height:
         return None
@@ -209,8 +209,8 @@ def _pixels(stream: Stream, frame: _Frame) -> npt.NDArray[Any] | None:
         depth = np.ascontiguousarray(rows[:, : 2 * frame.width]).view(np.uint16)
         return depth if pixel_format == DEPTH_1_MM else ((depth.astype(np.uint32) + 5) // 10).astype(np.uint16)
     raise DataError(
-        f"OpenNI 2 gives {stream.name.lower()} in its pixel format {pixel_format};"
-        f" expected {RGB888} (RGB) for color, {DEPTH_1_MM} (1 mm) or {DEPTH_100_UM} (100 um) for depth"
+        f"{stream.name.lower()}: expected OpenNI pixel format {RGB888} (RGB) for color, {DEPTH_1_MM} (1 mm) or "
+        f"{DEPTH_100_UM} (100 um) for depth, got {pixel_format}"
     )
 
 
@@ -222,7 +222,7 @@ def _library() -> Any:
             continue
         openni.oniGetExtendedError.restype = ctypes.c_char_p
         return openni
-    raise ConfigError("OpenNI 2 is not installed: apt-get install libopenni2-0")
+    raise ConfigError("OpenNI 2 is not installed; run apt-get install libopenni2-0")
 
 
 def _check(status: int, openni: Any, failure: str) -> None:

@@ -1,6 +1,6 @@
-"""The records of an OpenNI recording (.oni): its streams, their numbers of images, and where it is truncated.
+"""Records of an OpenNI recording (.oni): its streams, their numbers of images, and the position of a truncation.
 
-OpenNI 2 plays the images, but can crash on a damaged file, so its records are checked first.
+OpenNI 2 decodes the images but can crash on a damaged file, so its records are checked first.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from framework.files.atomic_write import check_regular
 FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic, version (four numbers), largest time, largest node
 FILE_MAGIC = b"NI10"
 LARGEST_NODE_AT = FILE_HEADER.size - 4
-VERSIONS = (1, 0, 0, 4), (1, 0, 1, 0)  # that OpenNI 2 plays, from and to
-FIRST_WIDE = (1, 0, 1, 0)  # from this version on, positions in the file have 64 bits
+VERSIONS = (1, 0, 0, 4), (1, 0, 1, 0)  # first and last version that OpenNI 2 supports
+FIRST_WIDE = (1, 0, 1, 0)  # first version with 64-bit file positions
 IMAGE_FIELDS = struct.Struct("<QI")  # time, us; number
 RECORD_MAGIC = b"NIR\0"
-LARGEST_NODE = 255  # recorders number them from 1; OpenNI allocates as many as the file claims
-LARGEST_FIELDS = 2**20  # bytes; OpenNI has a buffer of 5.8 MB for them and does not check
+LARGEST_NODE = 255  # recorders number nodes from 1; OpenNI allocates as many as the file declares
+LARGEST_FIELDS = 2**20  # bytes; OpenNI has an unchecked buffer of 5.8 MB for them
 
 
 class OniRecord(IntEnum):
-    """The kinds of records that are read."""
+    """Kinds of records."""
 
     NODE_ADDED_1_0_0_4 = 0x02
     NEW_DATA = 0x0A
@@ -40,7 +40,7 @@ class OniRecord(IntEnum):
 
 
 class Stream(IntEnum):
-    """Type of a node, with the format's number for it."""
+    """Stream types, with the format's node type as value."""
 
     DEPTH = 2
     COLOR = 3
@@ -64,28 +64,28 @@ class OniContents:
     end: int  # bytes of complete records
     cut_off: bool  # True if the recording has no end record
     largest_node: int
-    wide: bool  # positions in the file have 64 bits, else 32
-    table_notes: tuple[int, ...]  # positions of the fields with the positions of the seek tables
+    wide: bool  # 64-bit file positions, else 32-bit
+    table_notes: tuple[int, ...]  # file positions of the fields that point to the seek tables
 
 
 def read_contents(path: Path) -> OniContents:
-    """Return the streams and their images, without their pixels.
+    """Return the streams and their images, without pixels.
 
-    Raises DataError if the file is no recording, or has no image of depth or of color.
+    Raises DataError if the file is not a recording, or has no depth or no color images.
     """
     check_regular(path)
     try:
         with path.open("rb") as file:
             return _read_contents(path, file)
     except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 @contextmanager
 def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
-    """Yield a file that OpenNI 2 plays: the recording, or a repaired copy in `scratch` if it is truncated.
+    """Yield a file for OpenNI 2: the recording, or a repaired copy in `scratch` if it is truncated.
 
-    OpenNI reads the seek tables at the recording's end, and refuses the recording without them.
+    OpenNI reads the seek tables at the recording's end, and rejects a recording without them.
     """
     if not contents.cut_off:
         yield contents.path
@@ -95,11 +95,11 @@ def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
         copy = Path(folder) / "repaired.oni"
         shutil.copyfile(contents.path, copy)
         with copy.open("r+b") as file:
-            file.seek(LARGEST_NODE_AT)  # written only by a recorder that was not killed
+            file.seek(LARGEST_NODE_AT)  # not written if the recorder was killed
             file.write(struct.pack("<I", contents.largest_node))
             for note in contents.table_notes:
                 file.seek(note)
-                file.write(position.pack(0))  # 0 = there is no table
+                file.write(position.pack(0))  # 0 = no table
             file.seek(contents.end)
             file.write(record_header.pack(RECORD_MAGIC, OniRecord.END, 0, record_header.size, 0, 0))
         yield copy
@@ -139,8 +139,8 @@ def _read_contents(path: Path, file: BinaryIO) -> OniContents:
                     images.last = number
     missing = [stream.name.lower() for stream in Stream if stream not in streams or not streams[stream].count]
     if missing:
-        where = f" before byte {end}, where it is cut off or damaged" if cut_off else ""
-        raise DataError(f"{path} has no {' and no '.join(missing)} image{where}; it needs depth and color")
+        where = f" before the truncation or damage at byte {end}" if cut_off else ""
+        raise DataError(f"{path}: expected depth and color images, got no {' and no '.join(missing)}{where}")
     return OniContents(path, streams, end, cut_off, largest_node, wide, tuple(notes))
 
 
@@ -153,19 +153,19 @@ def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
 def _read_version(path: Path, file: BinaryIO) -> tuple[int, ...]:
     header = file.read(FILE_HEADER.size)
     if len(header) < FILE_HEADER.size or not header.startswith(FILE_MAGIC):
-        raise DataError(f"{path} is no OpenNI recording: it begins with {header[:4]!r}, expected {FILE_MAGIC!r}")
+        raise DataError(f"{path}: expected an OpenNI recording beginning with {FILE_MAGIC!r}, got {header[:4]!r}")
     _magic, *numbers, _time, largest_node = FILE_HEADER.unpack(header)
     version = tuple(numbers)
     if largest_node > LARGEST_NODE:
-        raise DataError(f"{path} is damaged: it says to have {largest_node} nodes, expected at most {LARGEST_NODE}")
+        raise DataError(f"{path}: damaged header: expected at most {LARGEST_NODE} nodes, got {largest_node}")
     if not VERSIONS[0] <= version <= VERSIONS[1]:
         first, last, found = (".".join(map(str, one)) for one in (*VERSIONS, version))
-        raise DataError(f"{path} has the format's version {found}; OpenNI 2 plays {first} to {last}")
+        raise DataError(f"{path}: expected format version {first} to {last}, got {found}")
     return version
 
 
 def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
-    """Return the records up to the end record, or up to the first incomplete one."""
+    """Yield the records up to the end record, or up to the first incomplete one."""
     size = file.seek(0, 2)
     position = FILE_HEADER.size
     while position + header.size <= size:
@@ -184,10 +184,10 @@ def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
 
 
 def _added_stream(path: Path, record: _Record) -> Stream | None:
-    """Return the stream of a node; None for a device, infrared or sound."""
+    """Return the stream of a node; None for a device, infrared or audio node."""
     try:
         (name_size,) = struct.unpack_from("<I", record.fields)
         (node_type,) = struct.unpack_from("<I", record.fields, 4 + name_size)
     except struct.error as error:
-        raise DataError(f"{path} is damaged: the record before byte {record.fields_end} is too short") from error
+        raise DataError(f"{path}: damaged: the record before byte {record.fields_end} is too short") from error
     return Stream(node_type) if node_type in list(Stream) else None

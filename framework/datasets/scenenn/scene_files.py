@@ -23,19 +23,19 @@ from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
 from framework.files.number_lines import SHOWN, number, read_lines
 from framework.geometry import nearest_rigid
 
-LARGEST_FRAME = 2**31 - 2  # frame+1 is an int32 as well
+LARGEST_FRAME = 2**31 - 2  # frame+1 is also an int32
 BLOCK = 5  # lines of a frame
 LAST_ROW = "0.000000 0.000000 0.000000 1.000000"  # as in the published files
 MICROSECONDS = 1e6  # per second
 INTRINSICS = ("fx", "fy", "cx", "cy")  # px
-SIZES = {"cx": "depth_width", "cy": "depth_height"}  # px, whose half replaces a missing center
+SIZES = {"cx": "depth_width", "cy": "depth_height"}  # px; half of the size replaces a missing center
 POSITIVE = {"fx", "fy", *SIZES.values()}
-LARGEST_INTRINSICS = 2**20  # bytes; of a file of intrinsics, which has some hundred
+LARGEST_INTRINSICS = 2**20  # bytes; a file of intrinsics has a few hundred
 
 
 @dataclass(frozen=True)
 class TrajectoryLog:
-    """The poses of a file. Frames that it does not contain are in neither mapping."""
+    """The poses of a file. Absent frames are in neither mapping."""
 
     poses: Mapping[int, Float64]  # frame from 0 -> T_world_camera (4, 4), exactly rigid
     unusable: Mapping[int, str]  # frame from 0 -> reason: not rigid (tracking was lost), not finite, cut off, two
@@ -51,7 +51,7 @@ class _Line(NamedTuple):
 
 
 def read_trajectory_log(path: Path) -> TrajectoryLog:
-    """Return the poses of a trajectory.log. A frame that is cut off by the file's end, or has two poses, is unusable.
+    """Return the poses of a trajectory.log. A frame truncated by the file's end, or with two poses, is unusable.
 
     Raises DataError, with the file and the line, for an invalid line elsewhere.
     """
@@ -64,11 +64,11 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
     for first in range(0, len(lines), BLOCK):
         header, *rows = lines[first : first + BLOCK]
         at_end = first + BLOCK >= len(lines)
-        cut = at_end and not rows  # within the header or behind it
+        cut = at_end and not rows  # within the header or after it
         if cut and len(header.words) == 1 and _is_frame(header.words[0]):
-            break  # the frame's number may be cut off itself
+            break  # the frame number itself may be truncated
         if not 3 - cut <= len(header.words) <= 3 or not all(map(_is_frame, header.words)):
-            expected = f"expected the header of a frame, frame frame frame+1, found {header.shown}"
+            expected = f"expected the header of a frame, frame frame frame+1, got {header.shown}"
             raise DataError(f"{path}, line {header.number}: {expected}")
         frame = int(header.words[0])
         matrix = _matrix(path, rows, at_end)
@@ -76,10 +76,10 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
             before, first_matrix = given[frame]
             if matrix is None or not np.array_equal(matrix, first_matrix, equal_nan=True):
                 poses.pop(frame, None)
-                unusable[frame] = f"it has two poses, in lines {before} and {header.number}"
+                unusable[frame] = f"expected one pose, got two, in lines {before} and {header.number}"
             continue
         if matrix is None:
-            unusable[frame] = "the file ends before the pose does"
+            unusable[frame] = "expected a full pose, got the end of the file"
             continue
         given[frame] = header.number, matrix
         try:
@@ -97,7 +97,7 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
     lines = []
     for frame, T_world_camera in sorted(poses.items()):
         if not 0 <= frame <= LARGEST_FRAME:
-            raise DataError(f"{path}: a frame's number is from 0 to {LARGEST_FRAME}, found {frame}")
+            raise DataError(f"{path}: expected frame numbers from 0 to {LARGEST_FRAME}, got {frame}")
         check_rigid(f"{path}: the pose of frame {frame}", T_world_camera)
         lines.append(f"{frame} {frame} {frame + 1}")
         lines.extend(" ".join(repr(float(value)) for value in row) for row in T_world_camera[:3])
@@ -107,7 +107,7 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
 
 
 def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
-    """Return the four rows (4, 4), finite or not; None if the end of the file cuts them off."""
+    """Return the four rows (4, 4), finite or not; None if the file ends before them."""
     matrix = np.empty((4, 4))
     for k, line in enumerate(rows):
         try:
@@ -119,18 +119,18 @@ def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
         elif at_end and k == len(rows) - 1 and len(line.words) <= 4:
             return None
         else:
-            expected = f"expected row {k + 1} of a 4x4 matrix, four numbers, found {line.shown}"
+            expected = f"expected row {k + 1} of a 4x4 matrix, four numbers, got {line.shown}"
             raise DataError(f"{path}, line {line.number}: {expected}")
     return matrix if len(rows) == 4 else None
 
 
 def _is_frame(word: str) -> bool:
-    """Return True for a number that may be in a header."""
+    """Return True for a valid number of a header."""
     return word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1
 
 
 def read_timestamps(path: Path) -> Mapping[int, float]:
-    """Return the time of each image in s by its number: that of its depth.
+    """Return the depth timestamp of each image in s, by its number.
 
     Raises DataError, with the file and the line, if a line is not a number and two times, or repeats a number.
     """
@@ -142,18 +142,18 @@ def read_timestamps(path: Path) -> Mapping[int, float]:
         try:
             image, _color, depth = int(words[0]), *map(float, words[1:])
         except ValueError as error:
-            expected = f"expected `number color_us depth_us`, found {line[:SHOWN]!r}"
+            expected = f"expected `number color_us depth_us`, got {line[:SHOWN]!r}"
             raise DataError(f"{path}, line {n}: {expected}") from error
         if not math.isfinite(depth):
-            raise DataError(f"{path}, line {n}: the time is not finite")
+            raise DataError(f"{path}, line {n}: expected a finite time, got {words[2]}")
         if image in times:
-            raise DataError(f"{path}, line {n}: image {image} is there twice")
+            raise DataError(f"{path}, line {n}: expected unique image numbers, got {image} twice")
         times[image] = depth / MICROSECONDS
     return times
 
 
 def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mapping[int, float] | None = None) -> None:
-    """Write the times of depth and color in s of each image, by its number, atomically; None = those of depth."""
+    """Write the depth and color timestamps (s) of each image, by its number, atomically; None = those of depth."""
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for image, time in times.items():
             color_time = time if color_times is None else color_times[image]
@@ -179,22 +179,22 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
         except ValueError:
             value = math.nan
         if not math.isfinite(value) or (key in POSITIVE and value <= 0):
-            wanted = "a positive number" if key in POSITIVE else "a number"
-            raise DataError(f"{path}, line {n}: {key} must be {wanted} of pixels, found {text[:40]!r}")
+            wanted = "a value > 0 px" if key in POSITIVE else "a finite value in px"
+            raise DataError(f"{path}, line {n}: {key}: expected {wanted}, got {text[:40]!r}")
         if key in values:
-            raise DataError(f"{path}, line {n}: {key} is there a second time")
+            raise DataError(f"{path}, line {n}: {key}: expected one value, got a second one")
         values[key] = value
     for center, size in SIZES.items():
         if size in values:
             values.setdefault(center, values[size] / 2)
     missing = [key for key in INTRINSICS if key not in values]
     if missing:
-        raise DataError(f"{path} has no line with {missing[0]}; it must give {', '.join(INTRINSICS)}")
+        raise DataError(f"{path}: expected lines with {', '.join(INTRINSICS)}, got none with {missing[0]}")
     return values["fx"], values["fy"], values["cx"], values["cy"]
 
 
 def write_intrinsics(path: Path, camera: Camera) -> None:
-    """Write the camera's intrinsics atomically, without loss of digits."""
+    """Write the camera's intrinsics atomically, with all digits."""
     sizes = {"depth_width": camera.width, "depth_height": camera.height}
     values = sizes | {key: getattr(camera, key) for key in INTRINSICS}
     with written_whole(path) as temporary:

@@ -7,9 +7,9 @@
     NNN/NNN.ply, NNN/NNN.xml    optional: the mesh with a label for each vertex, and the classes of the labels
     intrinsic/asus.ini          fx, fy, cx, cy
     release.txt                 optional, one line: the release of the annotation
-    synthesize.json             only of `instancemap synthesize`: its parameters
+    synthesize.json             written only by `instancemap synthesize`: its parameters
 
-The images are those that the official play-back, or `instancemap convert-oni`, extracts from oni/NNN.oni.
+The images are extracted from oni/NNN.oni by the official playback or by `instancemap convert-oni`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ log = logging.getLogger(__name__)
 
 
 class SceneNNSensor(StrEnum):
-    """The camera of a recording, each with its own file of intrinsics."""
+    """Depth sensors of the recordings, each with its own file of intrinsics."""
 
     ASUS = "asus"
     KINECT2 = "kinect2"
@@ -53,7 +53,7 @@ class SceneNNSensor(StrEnum):
 class SceneNN(LabeledRecording):
     """A sequence of SceneNN, or of `instancemap synthesize` in its format.
 
-    A frame without an image, or without a usable pose where there is a trajectory, cannot be used.
+    A frame cannot be used if an image is missing, or if the sequence has a trajectory without a usable pose for it.
     """
 
     scene: str = "011"  # number of the sequence
@@ -81,19 +81,19 @@ def _recorded(images: StoredImages, pose_id: int, poses: TrajectoryLog | None, t
     T_world_camera = poses.poses.get(pose_id) if poses else None
     if poses is None or T_world_camera is not None:
         return RecordedFrame(images, timestamp, T_world_camera)
-    why = poses.unusable.get(pose_id, "trajectory.log has no pose for it")
+    why = poses.unusable.get(pose_id, "expected a pose in trajectory.log, got none")
     return RecordedFrame(images, timestamp, error=f"{images.color_name}: {why}")
 
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:
-    """Return the times of all images or of none: two clocks are not mixed."""
+    """Return the timestamps of all images, or none if some are missing: two clocks are not mixed."""
     if not is_there(path):
         return {}
     times = read_timestamps(path)
     without = [k for k in images if k not in times]
     if not without:
         return times
-    message = "%s has no time for %d of %d images, the first being %d: it is ignored, frames are taken to come at %g Hz"
+    message = "%s: expected times of all images, got none for %d of %d, first %d; timestamps set by a rate of %g Hz"
     log.warning(message, path, len(without), len(images), without[0], FRAME_RATE)
     return {}
 
@@ -108,14 +108,14 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
     ply = read_ply(mesh)
     labels = ply.properties.get("label")
     if labels is None or labels.dtype.kind not in "iu":
-        raise DataError(f"{mesh}: expected a vertex property `label` of whole numbers, found {sorted(ply.properties)}")
+        raise DataError(f"{mesh}: expected a vertex property 'label' of integers, got {sorted(ply.properties)}")
     if len(labels) and (labels.min() < 0 or labels.max() > LARGEST_ID):
-        raise DataError(f"{mesh}: a label must be in [0, {LARGEST_ID}], found {labels.min()} to {labels.max()}")
+        raise DataError(f"{mesh}: label: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
     unlisted = set(present.tolist()) - names.keys() - {0}
     if unlisted:
-        message = "%s: %s does not have %d of its labels, like %d: these are not evaluated"
+        message = "%s: expected all labels in %s, got none for %d, such as %d; these are not evaluated"
         log.warning(message, mesh, annotation.name, len(unlisted), min(unlisted))
     class_names: dict[int, str | None] = {}
     ids = np.zeros(len(present), np.int32)

@@ -1,4 +1,4 @@
-"""SceneNN's annotation, NNN.xml: the objects of the mesh's labels."""
+"""SceneNN's annotation, NNN.xml: the object of each mesh label."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
     """Return the labels of an annotation, in the file's order; unknown elements and attributes are ignored.
 
     Raises DataError, with the line, if the file is not XML, declares a document type (which brings entities and default
-    attributes), has no label, one without an integer id, or two different ones with one id.
+    attributes), has no label, a label without an integer id, or two different labels with the same id.
     """
     content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)
@@ -53,13 +53,13 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
         parser.feed(content)
         parser.close()
     except DefusedXmlException as error:
-        raise labels.error("document types and entities are refused, as they can be an attack; remove it") from error
+        raise labels.error("expected no document type or entity, got one; remove it") from error
     except ParseError as error:
-        raise DataError(f"{path}, line {error.position[0]}: this is not XML: {ErrorString(error.code)}") from error
+        raise DataError(f"{path}, line {error.position[0]}: expected valid XML: {ErrorString(error.code)}") from error
     except (ValueError, LookupError) as error:
-        raise labels.error("its encoding is not known, expected UTF-8") from error
+        raise labels.error("expected UTF-8, got an unknown encoding") from error
     if not labels.found:
-        raise DataError(f"{path} holds no <label>: it is no annotation of SceneNN's")
+        raise DataError(f"{path}: expected <label> elements of a SceneNN annotation, got none")
     return tuple(
         Annotated(
             id_,
@@ -76,48 +76,49 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
 def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
     """Write an annotation atomically; `read_annotation` returns the same, rotations to 1e-15.
 
-    Raises DataError if it would not, or the file cannot be written.
+    Raises DataError for values that XML or the reader cannot represent, or a failed write.
     """
     if not objects:
-        raise DataError(f"{path}: an annotation has at least one label")
+        raise DataError(f"{path}: expected at least one label, got none")
     lines = ['<?xml version="1.0" encoding="utf-8"?>', "<annotation>"]
     ids = set()
     for label in objects:
         attributes = _attributes(label)
         if _id(attributes["id"]) is None or label.id in ids:
-            raise DataError(f"{path}: the id of a label is from 0 to {LARGEST_ID} and its own, found {label.id}")
+            raise DataError(f"{path}: expected unique label ids from 0 to {LARGEST_ID}, got {label.id}")
         ids.add(label.id)
         if _color(attributes["color"]) != label.color:
-            raise DataError(f"{path}: the color of label {label.id} is three values from 0 to 255, found {label.color}")
+            raise DataError(f"{path}: label {label.id}: color: expected 3 values from 0 to 255, got {label.color}")
         if NOT_IN_XML.search(label.text + label.nyu_class):
-            raise DataError(f"{path}: label {label.id} is called {label.text!r}, and XML cannot hold that")
+            expected = "expected a name without characters that are invalid in XML"
+            raise DataError(f"{path}: label {label.id}: {expected}, got {label.text!r}")
         if (label.aabb is not None and _aabb(attributes["aabbox"]) is None) or (
             label.obb is not None and _obb(attributes["obbox"]) is None
         ):
-            raise DataError(f"{path}: a box of label {label.id} has no finite extent")
+            raise DataError(f"{path}: label {label.id}: expected boxes of finite extent, got one without")
         lines.append(f"  <label {' '.join(f'{name}={quoteattr(value)}' for name, value in attributes.items())}/>")
     with written_whole(path) as temporary:
         temporary.write_text("\n".join([*lines, "</annotation>\n"]), encoding="utf-8")
 
 
 class _Labels:
-    """Parser target that collects the labels without a tree, however large or deep the file is."""
+    """Parser target that collects the labels without building a tree."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.expat: Any = None  # its position is the line of an error
+        self.expat: Any = None  # provides the line of an error
         self.found: dict[int, tuple[dict[str, str], int]] = {}  # by id: the label's attributes and its line
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        if tag.rpartition("}")[2] != "label":  # behind its namespace, if it has one
+        if tag.rpartition("}")[2] != "label":  # without a namespace
             return
         id_ = _id(attributes.get("id", ""))
         if id_ is None:
             found = repr(attributes["id"][:40]) if "id" in attributes else "none"
-            raise self.error(f"a label needs an id from 0 to {LARGEST_ID}, found {found}")
+            raise self.error(f"label: expected an id from 0 to {LARGEST_ID}, got {found}")
         before, line = self.found.setdefault(id_, (attributes, self.expat.CurrentLineNumber))
         if attributes != before:
-            raise self.error(f"the label {id_} is there already in line {line}, with other attributes")
+            raise self.error(f"label {id_}: expected the attributes of line {line}, got others")
 
     def error(self, message: str) -> DataError:
         return DataError(f"{self._path}, line {self.expat.CurrentLineNumber}: {message}")
@@ -171,7 +172,7 @@ def _obb(text: str) -> Box | None:
 
 
 def _numbers(text: str, count: int) -> Float64 | None:
-    """Return the `count` finite numbers of a text, None if it is something else."""
+    """Return the `count` finite numbers of a text, None for any other text."""
     try:
         numbers = np.array([float(word) for word in text.split(maxsplit=count)])
     except ValueError:

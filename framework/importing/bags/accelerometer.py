@@ -1,8 +1,8 @@
-"""Up directions from the accelerometer of a ROS bag (sensor_msgs/Imu), if the bag has its pose relative to the camera.
+"""Up directions from the accelerometer of a ROS bag (sensor_msgs/Imu) with known extrinsics to the camera.
 
-At rest an accelerometer measures a vector up, of 9.8 m/s^2 (REP 145), in the axes of the message's frame. An image's
-header names the optical axes of its camera, by the definition of sensor_msgs/Image; /tf_static has the rotation between
-the two. RealSense's recorder stores it with each stream.
+At rest, an accelerometer measures an upward vector of 9.8 m/s^2 (REP 145) in the frame of its message. An image header
+names the optical frame of its camera, by the definition of sensor_msgs/Image. /tf_static contains the rotation between
+the two frames. RealSense's recorder stores it with each stream.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from framework.errors import DataError, FrameError
 from framework.importing.bags.ros_messages import IMU, RosBag
 from framework.importing.bags.ros_transforms import REALSENSE, static_rotation, stream_motion
 
-NEAR = 0.05  # s, before and after a frame, over which is averaged, to remove the trembling of a hand
+NEAR = 0.05  # s, averaging window before and after a frame, against hand tremor
 GRAVITY = 9.81  # m/s^2
-OFF = 0.2  # of gravity, by which the median may differ: a biased sensor, not one with gravity removed
+OFF = 0.2  # maximum deviation of the median from gravity, as a fraction: allows a bias, but not removed gravity
 GYROSCOPE = re.compile("gyro", re.IGNORECASE)  # in names of topics without acceleration
 
 log = logging.getLogger(__name__)
@@ -57,35 +57,35 @@ def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> 
         if isinstance(found, str):
             reasons.append(found)
         elif all(found.up(timestamp) is None for timestamp in timestamps):
-            reasons.append(f"{topic} measured nothing within {NEAR:g} s of a frame")
+            reasons.append(f"{topic}: expected a measurement within {NEAR:g} s of a frame, got none")
         else:
             return found
     if reasons:
-        log.warning("%s: up is not known, as no accelerometer can be used: %s", bag.path, "; ".join(reasons))
+        log.warning("%s: up is unknown because no accelerometer is usable: %s", bag.path, "; ".join(reasons))
     return None
 
 
 def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
-    """Return the accelerometer of a topic, or why it is unusable."""
+    """Return the accelerometer of a topic, or the reason why it is unusable."""
     times, measured, frame_id = _read(bag, topic)
     if not len(times):
-        return f"{topic} has no message that can be read"
+        return f"{topic}: expected readable messages, got none"
     length = float(np.median(np.linalg.norm(measured, axis=1)))
     if abs(length - GRAVITY) > OFF * GRAVITY:
-        return f"{topic} measures {length:.3g} m/s^2, not gravity"
+        return f"{topic}: expected a median of {GRAVITY:g} m/s^2, got {length:.3g} m/s^2"
     try:
         R_camera_imu = _rotation(bag, topic, frame_id, color)
     except DataError as error:
         log.warning("%s", error)
         R_camera_imu = None
     if R_camera_imu is None:
-        return f"how {topic} stands to the camera of {color} is not in the bag"
+        return f"{topic}: expected its rotation to the camera of {color} in the bag, got none"
     order = np.argsort(times, kind="stable")
     return Accelerometer(times[order], measured[order] @ R_camera_imu.T)
 
 
 def _rotation(bag: RosBag, topic: str, frame_id: str, color: str) -> Float64 | None:
-    """R_camera_imu (3, 3), None = not in the bag."""
+    """Return R_camera_imu (3, 3), None = not in the bag."""
     if topic.startswith(REALSENSE):
         T_imu_reference = stream_motion(bag, topic.removesuffix("/imu/data"))
         T_color_reference = stream_motion(bag, color.removesuffix("/image/data"))
@@ -112,7 +112,7 @@ def _read(bag: RosBag, topic: str) -> tuple[Float64, Float64, str]:
                 measured.append(vector)
                 frame_id = frame_id or content.header.frame_id
     except DataError as error:
-        log.warning("%s; what comes before is used", error)
+        log.warning("%s; earlier messages are used", error)
     if damaged:
-        log.warning("%s: %d messages of %s are damaged and left out", bag.path, damaged, topic)
+        log.warning("%s: skipped %d damaged messages of %s", bag.path, damaged, topic)
     return np.array(times), np.array(measured, np.float64).reshape(-1, 3), frame_id

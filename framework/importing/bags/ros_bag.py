@@ -1,13 +1,13 @@
-"""ROS 1 and ROS 2 bags, and the .bag files of RealSense's recorder, which are ROS 1 bags with topics of their own.
+"""ROS 1 and ROS 2 bags, and .bag files of RealSense's recorder: ROS 1 bags with special topics.
 
     sensor_msgs/Image, CompressedImage      color (8 bits) and depth (16UC1 and similar: mm; 32FC1: m)
     sensor_msgs/CameraInfo                  intrinsics of color, and of depth if it is not registered
-    nav_msgs/Odometry, geometry_msgs/PoseStamped    poses of the camera, optional; in its optical axes if the name of
-                                            the frame says so or there is none, else in ROS' (x forward)
+    nav_msgs/Odometry, geometry_msgs/PoseStamped    poses of the camera, optional; in optical axes if the frame name
+                                            contains "optical" or is absent, else in ROS axes (x forward)
     sensor_msgs/Imu, tf2_msgs/TFMessage     up, optional: from the accelerometer and /tf_static
-    /device_0/sensor_1/Color_0/image/data   RealSense's, and Depth_0; their .../tf/0 is T_stream_depth, with the
-                                            rotation as the recorder's own player reads it, and .../option/Depth Units
-                                            the meters of a unit. Depth is registered to color here
+    /device_0/sensor_1/Color_0/image/data   RealSense's color, and Depth_0; their .../tf/0 is T_stream_depth, with the
+                                            rotation as read by the recorder's own player; .../option/Depth Units is
+                                            m per unit. Depth is registered to color on import
 
 Color and depth are associated by time, as in TUM RGB-D; poses are interpolated at the time of color.
 """
@@ -37,12 +37,12 @@ from framework.importing.bags.ros_transforms import REALSENSE, stream_motion
 from framework.importing.depth_resampling import DepthRegistration
 from framework.importing.source import DeviceFrame, Format, Source, StoredFrame
 
-APART = 0.02  # s, at most, of a color image and its depth
-POSE_APART = 0.1  # s, at most, of a color image and the nearest pose
+APART = 0.02  # s, maximum time between a color image and its depth
+POSE_APART = 0.1  # s, maximum time between a color image and the nearest pose
 MILLIMETER = 0.001  # m
-SAME_CAMERA = 0.01  # of the focal length and of the image's width: intrinsics that differ less are of one camera
-MOST_WAITING = 64  # images that wait for their partner
-BROWN = ("plumb_bob", "Brown Conrady", "")  # models of a lens with k1, k2, p1, p2, k3
+SAME_CAMERA = 0.01  # of focal length and image width: intrinsics that differ less belong to the same camera
+MOST_WAITING = 64  # maximum number of unpaired images
+BROWN = ("plumb_bob", "Brown Conrady", "")  # lens models with k1, k2, p1, p2, k3
 DEPTH_STREAM = "/Depth_"  # in RealSense's names
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ def open_source(path: Path, given: Topics) -> Source:
     topics = found_topics(bag, given)
     info = bag.first(topics.camera_info)
     if info is None:
-        raise DataError(f"{path}: {topics.camera_info} has no message")
+        raise DataError(f"{path}: {topics.camera_info}: expected messages, got none")
     camera = _camera(f"{path}: {topics.camera_info}", info)
     pairs = _pairs(bag, topics)
     registration, unit = _registration(bag, topics, camera), _depth_unit(bag, topics)
@@ -71,7 +71,7 @@ def open_source(path: Path, given: Topics) -> Source:
 
 @dataclass(frozen=True)
 class Pair:
-    """A color and a depth image of the same moment, by their indices in their topics."""
+    """A color and a depth image of the same time, by their indices in their topics."""
 
     color: int
     depth: int
@@ -80,12 +80,12 @@ class Pair:
 
 @dataclass(frozen=True)
 class Device:
-    """Everything that the frames of a bag share."""
+    """Properties shared by all frames of a bag."""
 
     bag: RosBag
     topics: Topics
     camera: Camera  # of color
-    registration: DepthRegistration | None  # None: depth is registered to color, perhaps in another size
+    registration: DepthRegistration | None  # None: depth is registered to color, possibly at another resolution
     depth_unit: float  # m
     accelerometer: Accelerometer | None
     trajectory: Trajectory | None
@@ -98,7 +98,8 @@ class Device:
         metric = depth_of(f"{where}: {depth.topic}", self.bag.decoded(depth), self.depth_unit)
         if self.registration is not None:
             if metric.shape != self.registration.depth.shape:
-                raise FrameError(f"{where}: depth has {metric.shape}, its camera {self.registration.depth.shape} px")
+                expected = f"expected depth of shape {self.registration.depth.shape} px as in its camera"
+                raise FrameError(f"{where}: {expected}, got {metric.shape}")
             metric = self.registration.apply(metric)
         return DeviceFrame(
             name=where,
@@ -112,7 +113,7 @@ class Device:
 
 
 def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
-    """Pairs by the times of the headers, or by those of recording if the headers have different clocks."""
+    """Return pairs by header times, or by recording times if the headers have different clocks."""
     sensed: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     stored: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     try:
@@ -120,20 +121,20 @@ def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
             sensed[message.topic].append(bag.sensed_at(message))
             stored[message.topic].append(message.stored_at)
     except DataError as error:
-        log.warning("%s; what comes before is used", error)
+        log.warning("%s; earlier messages are used", error)
     by_header, by_record = (_associated(times[topics.color], times[topics.depth]) for times in (sensed, stored))
     if by_header and 2 * len(by_header) >= len(by_record):
         return by_header
     if by_record:
         return by_record
     raise DataError(
-        f"{bag.path}: none of {len(sensed[topics.color])} images of {topics.color} is within {APART:g} s of one of "
-        f"{len(sensed[topics.depth])} of {topics.depth}"
+        f"{bag.path}: expected color and depth images within {APART:g} s, got none for "
+        f"{len(sensed[topics.color])} images of {topics.color} and {len(sensed[topics.depth])} of {topics.depth}"
     )
 
 
 def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> list[Pair]:
-    """Pairs by times (s), with the first of images with the same time: some recorders leave all headers 0."""
+    """Return pairs by times (s), with the first image of each time: some recorders leave all headers at 0."""
     # sorted, the indices of first occurrences are in the order of recording
     colors, depths = (sorted(np.unique(times, return_index=True)[1].tolist()) for times in (color_times, depth_times))
     pairs = associate([color_times[i] for i in colors], [depth_times[j] for j in depths], APART)
@@ -141,7 +142,7 @@ def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> l
 
 
 def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:
-    """Return the frames in the order of their second image."""
+    """Yield the frames in the order of their second image."""
     topics = device.topics
     partner = {topics.color: {pair.color: pair for pair in pairs}, topics.depth: {pair.depth: pair for pair in pairs}}
     counts = {topics.color: 0, topics.depth: 0}
@@ -168,7 +169,7 @@ def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:
 
 def _alone(device: Device, message: Message) -> DataError:
     place = f"{device.bag.path}, {message.stored_at:.6f} s"
-    return FrameError(f"{place}: the image of {message.topic} has lost its partner, which is far away or damaged")
+    return FrameError(f"{place}: expected a partner for the image of {message.topic}, got none nearby or a damaged one")
 
 
 def _raise(error: DataError) -> DeviceFrame:
@@ -185,7 +186,7 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
         try:
             content = bag.decoded(message)
         except FrameError as error:
-            log.warning("%s: left out", error)
+            log.warning("%s; message skipped", error)
             continue
         if message.kind == ODOMETRY:
             frame_id = content.child_frame_id
@@ -193,15 +194,15 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
         p, q = pose.position, pose.orientation
         lines.append(TumLine(bag.path, number, bag.sensed_at(message), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)))
     if not lines:
-        raise DataError(f"{bag.path}: {topic} has no message")
+        raise DataError(f"{bag.path}: {topic}: expected messages, got none")
     axes = CameraAxes.OPENCV if "optical" in frame_id else CameraAxes.ROS
     if axes is CameraAxes.ROS:
-        log.warning("the poses of %s are of %r: taken as the camera's, with x forward and z up", topic, frame_id)
+        log.warning("%s: poses of frame %r are used as camera poses, with x forward and z up", topic, frame_id)
     return Trajectory.of(bag.path, lines, POSE_APART), PoseReading(camera_axes=axes)
 
 
 def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistration | None:
-    """Return the registration of depth to the color camera. Raises DataError if it is needed and not known."""
+    """Return the registration of depth to the color camera. Raises DataError if it is required but unknown."""
     own = camera_info_of(bag, topics.depth)
     if topics.depth_is_registered or not own or own == topics.camera_info:
         return None
@@ -217,8 +218,8 @@ def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistrati
     if _is_same(depth, color):
         return None
     raise DataError(
-        f"{bag.path}: {topics.depth} is of another camera than {topics.color} ({own}), and how they stand to each "
-        "other is not in the bag; record depth that is registered, such as aligned_depth_to_color"
+        f"{bag.path}: {topics.depth}: expected depth in the camera of {topics.color}, or extrinsics in the bag, got "
+        f"another camera ({own}) without extrinsics; record registered depth, such as aligned_depth_to_color"
     )
 
 
@@ -230,7 +231,7 @@ def _is_same(depth: Camera, color: Camera) -> bool:
 
 
 def _depth_unit(bag: RosBag, topics: Topics) -> float:
-    """Return the unit of whole numbers in depth images, in m."""
+    """Return the unit of integer depth images, in m."""
     if topics.depth.startswith(REALSENSE):
         sensor = topics.depth.partition(DEPTH_STREAM)[0]
         for name in ("Depth Units", "Depth_Units"):
@@ -241,7 +242,7 @@ def _depth_unit(bag: RosBag, topics: Topics) -> float:
 
 
 def _numbers(info: Any, name: str) -> list[float]:
-    """Return a field of a CameraInfo, which is upper case in ROS 1."""
+    """Return a field of a CameraInfo; the name is upper case in ROS 1."""
     return [float(value) for value in getattr(info, name.upper() if hasattr(info, name.upper()) else name)]
 
 
@@ -251,12 +252,13 @@ def _camera(where: str, info: Any) -> Camera:
 
 
 def _distortion(topics: Topics, info: Any) -> Distortion | None:
-    """Return the lens distortion of color; None if there is none, or images are rectified."""
+    """Return the lens distortion of color; None without distortion, or for rectified images."""
     values = _numbers(info, "d")
     if "rect" in topics.color.rpartition("/")[2] or not any(values):
         return None
     if info.distortion_model not in BROWN or len(values) > len(Distortion.__dataclass_fields__):
-        log.warning("%s: a lens of the model %r is not undone", topics.camera_info, info.distortion_model)
+        message = "%s: expected a Brown-Conrady lens model, got %r; images are not undistorted"
+        log.warning(message, topics.camera_info, info.distortion_model)
         return None
     return Distortion(*values)
 

@@ -1,6 +1,7 @@
-"""Messages of ROS bags, and the images in them.
+"""Messages of ROS bags and their images.
 
-Message definitions in a bag are not used, as rosbags would generate code from them. The standard types are known.
+Message definitions in a bag are not used, because rosbags would generate code from them. Only standard types are
+supported.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMU, TRANSFORMS = "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 
-COLOR_CHANNELS = {  # of 8 bits: their number, and the indices of R, G, B
+COLOR_CHANNELS = {  # by encoding: number of 8-bit channels, and the indices of R, G, B
     "rgb8": (3, (0, 1, 2)),
     "bgr8": (3, (2, 1, 0)),
     "8UC3": (3, (2, 1, 0)),
@@ -35,7 +36,7 @@ COLOR_CHANNELS = {  # of 8 bits: their number, and the indices of R, G, B
     "8UC1": (1, (0, 0, 0)),
 }
 MILLIMETERS, METERS = ("16UC1", "mono16", "Z16"), ("32FC1",)
-COMPRESSED_DEPTH = "compressedDepth"  # in the format of such images, behind the encoding
+COMPRESSED_DEPTH = "compressedDepth"  # in the format of such images, after the encoding
 DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: an unused number, quantization A and B
 
 
@@ -44,8 +45,8 @@ class Message:
     """One message, not decoded yet."""
 
     topic: str
-    kind: str  # its type
-    stored_at: float  # s, when it was recorded
+    kind: str  # message type
+    stored_at: float  # s, recording time
     raw: bytes
 
 
@@ -68,14 +69,14 @@ class RosBag:
             self._reader.open()
             self.kinds: dict[str, str] = {found.topic: found.msgtype for found in self._reader.connections}
         except Exception as error:  # of many kinds
-            raise DataError(f"{path} could not be read: {in_one_line(error)[:SHOWN]}") from error
+            raise DataError(f"{path}: cannot be read: {in_one_line(error)[:SHOWN]}") from error
 
     def topics(self, *kinds: str) -> list[str]:
         """Return the topics with messages of these types."""
         return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
 
     def messages(self, topics: Sequence[str]) -> Iterator[Message]:
-        """Yield the messages of some topics in the order of recording. Raises DataError where the bag is damaged."""
+        """Yield the messages of some topics in the order of recording. Raises DataError for a damaged bag."""
         chosen = [found for found in self._reader.connections if found.topic in topics]
         if not chosen:
             return
@@ -83,7 +84,7 @@ class RosBag:
             for connection, stored_at, raw in self._reader.messages(chosen):
                 yield Message(connection.topic, connection.msgtype, stored_at * NANOSECONDS, bytes(raw))
         except Exception as error:  # of many kinds
-            raise DataError(f"{self.path} is damaged: {in_one_line(error)[:SHOWN]}") from error
+            raise DataError(f"{self.path}: damaged bag: {in_one_line(error)[:SHOWN]}") from error
 
     def first(self, topic: str) -> Any:
         """Return the first message of a topic, decoded, or None without one. Raises DataError."""
@@ -97,10 +98,10 @@ class RosBag:
             return decode(message.raw, message.kind)
         except Exception as error:  # of many kinds
             reason = in_one_line(error)[:SHOWN]
-            raise FrameError(f"{self.path}: a message of {message.topic} is damaged: {reason}") from error
+            raise FrameError(f"{self.path}: damaged message of {message.topic}: {reason}") from error
 
     def sensed_at(self, message: Message) -> float:
-        """Return the time of measurement in s from the message's header, which is its first field."""
+        """Return the measurement time in s from the message's header (its first field)."""
         try:
             if self._is_ros1:
                 seconds, nanoseconds = struct.unpack_from("<xxxxII", message.raw)
@@ -108,7 +109,7 @@ class RosBag:
                 order = "<" if message.raw[1] & 1 else ">"
                 seconds, nanoseconds = struct.unpack_from(f"{order}xxxxiI", message.raw)
         except (struct.error, IndexError) as error:
-            raise FrameError(f"{self.path}: a message of {message.topic} has no header") from error
+            raise FrameError(f"{self.path}: expected a header in a message of {message.topic}, got none") from error
         return (int(seconds) * 10**9 + int(nanoseconds)) * NANOSECONDS
 
 
@@ -117,7 +118,8 @@ def color_of(where: str, message: Any) -> UInt8:
     if hasattr(message, "format"):
         return decode_color(where, message.data.tobytes())
     if message.encoding not in COLOR_CHANNELS:
-        raise FrameError(f"{where}: color must be one of {', '.join(COLOR_CHANNELS)}, found {message.encoding[:60]!r}")
+        expected = f"expected color encoding {', '.join(COLOR_CHANNELS)}"
+        raise FrameError(f"{where}: {expected}, got {message.encoding[:60]!r}")
     channels, order = COLOR_CHANNELS[message.encoding]
     return np.ascontiguousarray(_pixels(where, message, np.dtype(np.uint8), channels)[..., order])
 
@@ -125,7 +127,7 @@ def color_of(where: str, message: Any) -> UInt8:
 def depth_of(where: str, message: Any, unit: float) -> Float32:
     """Return the depth (H, W) in m, 0 = no reading, of an Image or a CompressedImage.
 
-    `unit` is that of whole numbers in m. Raises FrameError, with `where`.
+    `unit` is the unit of integer depth in m. Raises FrameError, with `where`.
     """
     if hasattr(message, "format"):
         return _compressed_depth(where, message, unit)
@@ -135,7 +137,7 @@ def depth_of(where: str, message: Any, unit: float) -> Float32:
     if message.encoding in METERS:
         return readings(_pixels(where, message, np.dtype(f"{order}f4"), 1)[..., 0].astype(np.float32))
     known = ", ".join((*MILLIMETERS, *METERS))
-    raise FrameError(f"{where}: depth must be one of {known}, found {message.encoding[:60]!r}")
+    raise FrameError(f"{where}: expected depth encoding {known}, got {message.encoding[:60]!r}")
 
 
 def _whole(stored: Array, unit: float) -> Float32:
@@ -143,15 +145,15 @@ def _whole(stored: Array, unit: float) -> Float32:
 
 
 def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
-    """Return the depth of a PNG; compressedDepth has a header of 12 bytes that quantizes inverse float depth."""
+    """Return the depth of a PNG; compressedDepth has a 12-byte header with the quantization of inverse float depth."""
     encoding, _, codec = message.format.partition(";")
     data = message.data.tobytes()
     if COMPRESSED_DEPTH not in codec:
         return _whole(decode_uint16(where, data), unit)
     if "rvl" in codec.lower():
-        raise FrameError(f"{where}: depth compressed by RVL is not read; record it as png, or uncompressed")
+        raise FrameError(f"{where}: expected PNG or uncompressed depth, got RVL; record depth as PNG or uncompressed")
     if len(data) < DEPTH_HEADER.size:
-        raise FrameError(f"{where} ends after {len(data)} bytes")
+        raise FrameError(f"{where}: expected a header of {DEPTH_HEADER.size} bytes and an image, got {len(data)} bytes")
     _, quantization_a, quantization_b = DEPTH_HEADER.unpack_from(data)
     stored = decode_uint16(where, data[DEPTH_HEADER.size :])
     if encoding.strip() not in METERS:
@@ -166,6 +168,6 @@ def _pixels(where: str, message: Any, dtype: np.dtype[Any], channels: int) -> Ar
     row = width * channels * dtype.itemsize
     if not 0 < row <= step or height < 1 or len(message.data) != height * step:
         size = f"{width}x{height} px of {message.encoding[:60]!r}, {step} bytes a row"
-        raise FrameError(f"{where} is damaged: {size}, do not make {len(message.data)} bytes")
+        raise FrameError(f"{where}: expected data of {size}, got {len(message.data)} bytes")
     rows = np.asarray(message.data, np.uint8).reshape(height, step)[:, :row]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)

@@ -1,4 +1,4 @@
-"""The topics of a ROS bag with color, depth, their cameras and poses: as given, else by type and name."""
+"""Topics of color, depth, their cameras and poses in a ROS bag: as given, else by type and name."""
 
 from __future__ import annotations
 
@@ -22,48 +22,49 @@ KINDS = {"color": IMAGES, "depth": IMAGES, "camera_info": (CAMERA_INFO,), "poses
 
 @dataclass(frozen=True)
 class Topics:
-    """The names of topics; "" = to be found."""
+    """Topic names; "" = selected by type and name."""
 
     color: str = ""
     depth: str = ""
     camera_info: str = ""  # of color
-    poses: str = ""  # once found, "" = there is none: poses are optional
+    poses: str = ""  # optional; "" after the selection = no poses
 
     @property
     def given(self) -> list[str]:
-        """The options of the topics that are named."""
+        """Command-line options of the given topics."""
         return [option for name, option in OPTIONS.items() if getattr(self, name)]
 
     @property
     def depth_is_registered(self) -> bool:
-        """True if the name of the depth says that it is registered."""
+        """True if the name of the depth topic indicates registered depth."""
         return bool(REGISTERED.search(self.depth))
 
 
 def found_topics(bag: RosBag, given: Topics) -> Topics:
-    """Return all topics, found if not given. Raises DataError or ConfigError, with the option, if none fits."""
+    """Return all topics, selected if not given. Raises DataError or ConfigError, with the option, without a match."""
     images = [topic for topic in bag.topics(*IMAGES) if not NEITHER.search(topic)]
     depth = given.depth or _one(bag, "depth", [topic for topic in images if DEPTH.search(topic)], REGISTERED)
     color = given.color or _one(bag, "color", [topic for topic in images if not DEPTH.search(topic)], COLOR)
     info = given.camera_info or camera_info_of(bag, color)
     if not info:
-        raise DataError(f"{bag.path} has no {CAMERA_INFO} beside {color}; name one with --camera-info")
+        expected = f"expected a {CAMERA_INFO} topic next to {color}"
+        raise DataError(f"{bag.path}: {expected}, got none; set --camera-info")
     posed = bag.topics(*POSES)
     if len(posed) > 1 and not given.poses:
-        raise ConfigError(f"{bag.path} has several topics with poses: {', '.join(posed)}; choose one with --poses")
+        raise ConfigError(f"{bag.path}: expected one topic with poses, got {', '.join(posed)}; set --poses")
     topics = replace(given, color=color, depth=depth, camera_info=info, poses=given.poses or "".join(posed))
     for name, kinds in KINDS.items():
         topic = getattr(topics, name)
         if topic and bag.kinds.get(topic) not in kinds:
-            found = bag.kinds.get(topic, "nothing of that name")
+            found = f"{topic} of {bag.kinds[topic]}" if topic in bag.kinds else f"unknown topic {topic}"
             existing = ", ".join(bag.topics(*kinds)) or "none"
-            expected = f"{OPTIONS[name]} must be a topic of {' or '.join(kinds)}"
-            raise ConfigError(f"{expected}; {topic} is {found}. There are: {existing}")
+            expected = f"{OPTIONS[name]}: expected a topic of {' or '.join(kinds)}"
+            raise ConfigError(f"{expected}, got {found}; available topics: {existing}")
     return topics
 
 
 def camera_info_of(bag: RosBag, image: str) -> str:
-    """Return the only CameraInfo, or the nearest to a topic of images in the tree of names; "" = there is none."""
+    """Return the only CameraInfo topic, or the nearest one to an image topic in the tree of names; "" = none."""
     infos = bag.topics(CAMERA_INFO)
     folders = {topic: f"/{topic.strip('/').rpartition('/')[0]}" for topic in (image, *infos)}
     shared = {topic: len(PurePosixPath(commonpath([folders[topic], folders[image]])).parts) for topic in infos}
@@ -74,11 +75,11 @@ def camera_info_of(bag: RosBag, image: str) -> str:
 
 
 def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Pattern[str]) -> str:
-    """Return the one topic that fits, uncompressed if there are both."""
+    """Return the single matching topic; uncompressed topics are preferred."""
     fitting = [topic for topic in candidates if preferred.search(topic)] or list(candidates)
     left = [topic for topic in fitting if bag.kinds[topic] == IMAGE] or fitting
     if len(left) == 1:
         return left[0]
-    problem = f"several topics may be its {name}: {', '.join(left)}" if left else f"no topic can be its {name}"
+    expected = f"expected one {name} topic, got {', '.join(left) or 'none'}"
     existing = ", ".join(bag.topics(*IMAGES)) or "none"
-    raise ConfigError(f"{bag.path}: {problem}; choose one with {OPTIONS[name]}. Its topics of images: {existing}")
+    raise ConfigError(f"{bag.path}: {expected}; set {OPTIONS[name]}; available image topics: {existing}")

@@ -26,7 +26,10 @@ def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
         return None
     R_stream_reference = _rotation(stored.rotation)
     if R_stream_reference is None:
-        raise DataError(f"{bag.path}: the rotation of {stream} is none")
+        found = " ".join(f"{getattr(stored.rotation, name):g}" for name in "xyzw")
+        raise DataError(
+            f"{bag.path}: {stream}: expected a quaternion x y z w of length >= {SMALLEST_QUATERNION:g}, got {found}"
+        )
     T_stream_reference = np.eye(4)
     T_stream_reference[:3, :3] = R_stream_reference
     T_stream_reference[:3, 3] = [getattr(stored.translation, name) for name in "xyz"]
@@ -43,7 +46,7 @@ def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
             if R_parent_child is not None:
                 neighbors[parent][child], neighbors[child][parent] = R_parent_child, R_parent_child.T
     start = to.lstrip("/")
-    R_to: dict[str, Float64] = {start: np.eye(3)}  # of each frame that was reached
+    R_to: dict[str, Float64] = {start: np.eye(3)}  # by reached frame
     waiting = [start]
     while waiting:
         reached = waiting.pop()

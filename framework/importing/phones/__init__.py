@@ -1,1 +1,1 @@
-"""Import of recordings of phone apps."""
+"""Import of phone recordings."""

@@ -1,4 +1,4 @@
-"""Rotation of images by quarter turns, with their camera, pose and lens, as phones store images in sensor orientation.
+"""Rotation of images by quarter turns, with camera, pose and lens: phones store images in sensor orientation.
 
 A quarter clockwise moves the pixel (u, v) of an image of height H to (H - 1 - v, u), and the point (x, y, z) of the
 camera to (-y, x, z).
@@ -18,18 +18,18 @@ from framework.datasets.calibration.undistortion import Distortion
 
 Value = TypeVar("Value", bound=np.generic)
 QUARTER = 90  # degrees
-SIDEWAYS = 0.5  # mean length, in [0, 1], of the world's up in the image: less is a camera that looks up or down
+SIDEWAYS = 0.5  # minimum mean length of up in the image plane, in [0, 1]; less for a camera facing up or down
 
 
 @dataclass(frozen=True)
 class Turn:
-    """A rotation by clockwise quarters."""
+    """A clockwise rotation by quarter turns."""
 
     quarters: int = 0  # 0 to 3
 
     @property
     def R_turned_camera(self) -> Float64:
-        """The rotation (3, 3) from the camera before to the camera after the turn."""
+        """Rotation (3, 3) from the camera before to the camera after the turn."""
         quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         return np.linalg.matrix_power(quarter, self.quarters)
 
@@ -56,9 +56,9 @@ class Turn:
 
 
 def upright(ups_camera: Sequence[Float64 | None]) -> Turn | None:
-    """Return the turn to upright images, or None if it is not known.
+    """Return the turn to upright images, or None if it is unknown.
 
-    `ups_camera` has up (3,) in the camera of each frame, None = not known.
+    `ups_camera` has up (3,) in the camera of each frame, None = unknown.
     """
     known = [up for up in ups_camera if up is not None]
     if not known:

@@ -1,4 +1,4 @@
-"""Polycam's raw data (developer mode; https://github.com/PolyCam/polyform describes it).
+"""Polycam's raw data (developer mode, https://github.com/PolyCam/polyform).
 
     keyframes/images/1442008525605.jpg          8-bit color in sensor orientation; the name is a time in microseconds
     keyframes/cameras/1442008525605.json        fx, fy, cx, cy, width, height and t_00 ... t_23, ARKit's T_world_camera
@@ -8,7 +8,8 @@
     keyframes/confidence/1442008525605.png      uint8: 0 low, 255 high, between them medium (127 in the description, 54
                                                 in exports)
 
-Corrected files are preferred. Up comes from the recorded poses: the world's y axis of optimized poses is undocumented.
+Corrected files are preferred. Up is taken from the recorded poses, because the y axis of optimized poses is
+undocumented.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from framework.files.image_files import read_color, read_uint8, read_uint16
 from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, meters
 
 MICROSECONDS = 1e6  # per second
-LEVELS = (1, 255)  # in the images of confidence, of medium and high
+LEVELS = (1, 255)  # lowest values of medium and high confidence
 ROWS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 
 
@@ -47,7 +48,8 @@ def open_source(path: Path) -> Source:
     stems = [entry.stem for entry in (folder / "cameras").glob("*.json")]
     stems = sorted((stem for stem in stems if re.fullmatch("[0-9]{1,18}", stem)), key=int)
     if not (folder / "depth").is_dir() or not stems:
-        raise DataError(f"{path} has no depth/ or no cameras: Polycam keeps them with a LiDAR and in developer mode")
+        expected = "expected cameras and depth/, got none"
+        raise DataError(f"{path}: {expected}; record with a LiDAR, and export with Polycam's developer mode on")
     frames = [partial(_read, folder, stem) for stem in stems]
     return Source("Polycam", frames, len(frames), posed=True)
 
@@ -76,7 +78,7 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
 
 
 def _pose(path: Path, content: dict[str, Any]) -> Float64:
-    """T_world_camera (4, 4). Raises DataError, with the file."""
+    """Return T_world_camera (4, 4). Raises DataError, with the file."""
     rows = np.reshape(numbers_of(path, content, *ROWS), (3, 4))
     return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
 

@@ -1,4 +1,4 @@
-"""Record3D (https://record3d.app): its "EXR + RGB" export, and the .r3d file that it records.
+"""Record3D (https://record3d.app): its "EXR + RGB" export and its .r3d files.
 
     metadata.json           w, h and dw, dh px of color and depth; K, 3 x 3 in columns, of color; fps; poses, a list
                             [qx, qy, qz, qw, x, y, z] per frame; newer: frameTimestamps, s, and
@@ -36,10 +36,10 @@ from framework.files.tum_trajectory import QUATERNION_TOLERANCE
 from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, readings
 
 CHANNEL = "R"  # of the EXR files
-LZFSE_BLOCK = b"bvx"  # begins each block of compressed data
-BYTES_A_BLOCK = 20_000  # of an image, at least; the compressor ends a block after 40,000 bytes without repetitions
-UNTURNED = 1e-3  # sine of half the angle: a hand-held phone is never so exactly along the axes of the world
-MOST_BLOCKS = 8  # more than these: each may unpack to 27 MB, whatever it claims
+LZFSE_BLOCK = b"bvx"  # first bytes of each block of compressed data
+BYTES_A_BLOCK = 20_000  # minimum of an image; the compressor ends a block after 40,000 bytes without repetitions
+UNTURNED = 1e-3  # sine of half the angle; a hand-held phone is never aligned with the world axes this exactly
+MOST_BLOCKS = 8  # allowed in addition: each block may decompress to 27 MB, whatever its header declares
 
 _load_openexr = partial(import_optional, "OpenEXR", "reads Record3D's depth", "phone")
 _load_lzfse = partial(import_optional, "lzfse", "unpacks Record3D's .r3d files", "phone")
@@ -52,19 +52,19 @@ def open_folder(path: Path) -> Source:
 
 
 def open_file(path: Path) -> Source:
-    """Open a file of the app."""
+    """Open an .r3d file."""
     _load_lzfse()
     files = R3dFile(path)
     where = f"{path}: metadata"
     content = parse_json(where, files.read("metadata", MOST_TEXT))
     if not isinstance(content, dict):
-        raise DataError(f"{where} must be a JSON object, found {type(content).__name__}")
+        raise DataError(f"{where}: expected a JSON object, got {type(content).__name__}")
     return _source(where, content, files)
 
 
 @dataclass(frozen=True)
 class ExrFolder:
-    """The images of an export, by the number of the frame. Reading raises DataError."""
+    """Images of an export, by frame number. Reading may raise DataError."""
 
     folder: Path
 
@@ -87,7 +87,7 @@ class ExrFolder:
 
 
 class R3dFile:
-    """The images of an .r3d file, with the methods of `ExrFolder`."""
+    """Images of an .r3d file, with the methods of `ExrFolder`."""
 
     def __init__(self, path: Path) -> None:
         """Raise DataError, with the file, if it is not a zip archive."""
@@ -95,7 +95,7 @@ class R3dFile:
         try:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
-            raise DataError(f"{path} could not be read: {in_one_line(error)[:SHOWN]}") from error
+            raise DataError(f"{path}: cannot be read: {in_one_line(error)[:SHOWN]}") from error
         self._members = set(self._zip.namelist())
 
     def color(self, number: int) -> UInt8:
@@ -113,39 +113,39 @@ class R3dFile:
         return f"{self.path}: rgbd/{number}.depth"
 
     def read(self, name: str, most: int) -> bytes:
-        """Return the content of a member. Raises DataError if it cannot be read or claims more than `most` bytes."""
+        """Return the content of a member. Raises DataError for unreadable members and sizes above `most` bytes."""
         try:
             info = self._zip.getinfo(name)
             if info.file_size > most:
-                found = f"{self.path}: {name} has {info.file_size} bytes"
-                raise DataError(f"{found}, more than the {most} that it can have")
+                raise DataError(f"{self.path}: {name}: expected at most {most} bytes, got {info.file_size}")
             return self._zip.read(info)
         except KeyError as error:
-            raise FrameError(f"{self.path} has no {name}") from error
+            raise FrameError(f"{self.path}: expected {name}, got no such member") from error
         except (OSError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, ValueError, RuntimeError) as error:
             if isinstance(error, NotImplementedError):
-                raise FrameError(f"{self.path}: {name} is compressed in a way that is not known: {error}") from error
-            raise FrameError(f"{self.path}: {name} is damaged: {in_one_line(error)[:SHOWN]}") from error
+                raise FrameError(f"{self.path}: {name}: unsupported compression: {error}") from error
+            raise FrameError(f"{self.path}: {name}: damaged: {in_one_line(error)[:SHOWN]}") from error
 
     def _unpacked(self, name: str, dtype: str, shape: tuple[int, int]) -> np.typing.NDArray[np.generic]:
         size = math.prod(shape) * np.dtype(dtype).itemsize
         packed = self.read(name, 2 * size + 1000)
         if packed.count(LZFSE_BLOCK) > MOST_BLOCKS + size // BYTES_A_BLOCK:
-            raise FrameError(f"{self.path}: {name} has more blocks than {size} bytes have when they are packed")
+            raise FrameError(f"{self.path}: {name}: expected LZFSE blocks for {size} bytes, got too many blocks")
         lzfse = _load_lzfse()
         try:
             raw = lzfse.decompress(packed)
         except (lzfse.error, MemoryError) as error:
-            raise FrameError(f"{self.path}: {name} could not be unpacked: it is damaged") from error
+            raise FrameError(f"{self.path}: {name}: cannot be decompressed; the file is damaged") from error
         if len(raw) != size:
-            raise FrameError(f"{self.path}: {name} has {len(raw)} bytes, expected {size} for {shape[1]}x{shape[0]} px")
+            expected = f"expected {size} bytes for {shape[1]}x{shape[0]} px"
+            raise FrameError(f"{self.path}: {name}: {expected}, got {len(raw)}")
         return np.frombuffer(raw, dtype).reshape(shape)
 
 
 def _source(where: Path | str, content: Mapping[str, Any], files: ExrFolder | R3dFile) -> Source:
     poses = content.get("poses")
     if not isinstance(poses, list) or not poses:
-        raise DataError(f"{where}: poses must be a list of poses, found {str(poses)[:60]}")
+        raise DataError(f"{where}: poses: expected a list of poses, got {str(poses)[:60]}")
     size = numbers_of(where, content, "w", "h")
     cameras = [pinhole(where, *size, *of_frame) for of_frame in _intrinsics(where, content, len(poses))]
     shape = _depth_shape(where, content, cameras[0])
@@ -172,7 +172,7 @@ def _pose(where: str, values: Any) -> Float64:
     quat_xyzw, position = np.split(np.array(number_list(where, values, 7)), [4])
     length = float(np.linalg.norm(quat_xyzw))
     if abs(length - 1) > QUATERNION_TOLERANCE:
-        raise DataError(f"{where}: the quaternion qx qy qz qw has length {length:.4g}, expected 1")
+        raise DataError(f"{where}: expected a quaternion qx qy qz qw of length 1, got {length:.4g}")
     T_world_arkit = np.eye(4)
     T_world_arkit[:3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
     T_world_arkit[:3, 3] = position
@@ -198,17 +198,17 @@ def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> li
 
 
 def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[float]:
-    """Return the time of each frame in s, by the frame rate in older recordings."""
+    """Return the timestamp of each frame in s, from the frame rate in older recordings."""
     if "frameTimestamps" in content:
         return number_list(f"{where}: frameTimestamps", content.get("frameTimestamps"), count)
     [rate] = numbers_of(where, content, "fps")
     if not rate > 0:
-        raise DataError(f"{where}: fps must be positive, found {rate:g}")
+        raise DataError(f"{where}: fps: expected a value > 0 Hz, got {rate:g}")
     return [k / rate for k in range(count)]
 
 
 def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
-    """Return the size (h, w) of depth in px. Older versions do not store it: depth has color's size there."""
+    """Return the size (h, w) of depth in px; in older versions, without the keys, that of color."""
     if "dw" not in content:
         return camera.shape
     width, height = numbers_of(where, content, "dw", "dh")
@@ -216,7 +216,7 @@ def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) 
 
 
 def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDArray[np.floating]:
-    """Return the one channel (h, w). The header is checked first, as it determines how much memory the rest needs."""
+    """Return the channel (h, w). The header is checked first, because it determines the required memory."""
     OpenEXR = _load_openexr()
     try:
         header = OpenEXR.File(io.BytesIO(data), header_only=True).header()
@@ -224,16 +224,16 @@ def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDAr
         found = tuple(int(n) for n in (high - low + 1)[::-1])
         names = [channel.name for channel in header["channels"]]
     except Exception as error:  # of many kinds
-        raise FrameError(f"{path} is damaged: {in_one_line(error)[:SHOWN]}") from error
+        raise FrameError(f"{path}: damaged: {in_one_line(error)[:SHOWN]}") from error
     if found != shape or names != [CHANNEL] or math.prod(shape) > MOST_PIXELS:
-        expected = f"expected {shape[1]}x{shape[0]} of {CHANNEL}"
-        raise FrameError(f"{path} has {found[1]}x{found[0]} px of {', '.join(names)[:60]}, {expected}")
+        expected = f"expected {shape[1]}x{shape[0]} px of {CHANNEL}"
+        raise FrameError(f"{path}: {expected}, got {found[1]}x{found[0]} px of {', '.join(names)[:60]}")
     try:
         image = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()[CHANNEL].pixels
     except Exception as error:
-        raise FrameError(f"{path} is damaged: {in_one_line(error)[:SHOWN]}") from error
+        raise FrameError(f"{path}: damaged: {in_one_line(error)[:SHOWN]}") from error
     if image.shape != shape or image.dtype not in (np.float16, np.float32):
-        raise FrameError(f"{path} must hold floats, found {image.dtype}")
+        raise FrameError(f"{path}: expected float16 or float32, got {image.dtype}")
     return np.asarray(image, np.float32)
 
 

@@ -1,4 +1,4 @@
-"""3D Scanner App by Laan Labs (https://3dscannerapp.com), its export "All Data" of a low resolution scan.
+"""3D Scanner App by Laan Labs (https://3dscannerapp.com): the export "All Data" of a low-resolution scan.
 
 frame_00000.json        intrinsics, 3 x 3 in rows, of color; cameraPoseARFrame, 4 x 4 in rows, ARKit's
                         T_world_camera; time, s
@@ -35,8 +35,8 @@ def open_source(path: Path) -> Source:
     complete = [n for n in digits if (path / f"frame_{n}.jpg").exists() and (path / f"depth_{n}.png").exists()]
     if not complete:
         raise DataError(
-            f"{path} has no frame with a frame_00000.jpg and a depth_00000.png; in the app, choose a low resolution "
-            'scan, which keeps depth, and export "All Data"'
+            f"{path}: expected frames with frame_00000.jpg and depth_00000.png, got none; in the app, make a low "
+            'resolution scan, which includes depth, and export "All Data"'
         )
     frames = [partial(_read, path, number) for number in complete]
     return Source("3D Scanner App", frames, len(frames), posed=True)

@@ -6,8 +6,8 @@
     camera_matrix.csv       3 x 3 intrinsics of the video
     odometry.csv            timestamp, frame, x, y, z, qx, qy, qz, qw, and of newer versions fx, fy, cx, cy
 
-The app rotates ARKit's camera about its x axis before it writes (q_WA * q_AC in its OdometryEncoder), so that poses are
-T_world_camera in our axes. The accelerometer of a real recording agrees.
+The app rotates ARKit's camera about its x axis before writing (q_WA * q_AC in its OdometryEncoder). Poses are therefore
+T_world_camera in OpenCV's axes, which the accelerometer of a real recording confirms.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from framework.importing.source import DeviceFrame, Format, Source, arkit_up, me
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # the first columns of odometry.csv
 INTRINSICS = ("fx", "fy", "cx", "cy")  # the next ones, of newer versions
-KIND_AT, KIND = 4, b"ftyp"  # of an MP4 or QuickTime file; other kinds may name files that FFmpeg would open
-QUIET = "-8"  # FFmpeg's AV_LOG_QUIET: our own messages report the damage
+KIND_AT, KIND = 4, b"ftyp"  # of an MP4 or QuickTime file; other types may reference files that FFmpeg would open
+QUIET = "-8"  # FFmpeg's AV_LOG_QUIET: damage is reported by DataError
 LAST_FRAME = 10**6 - 1  # six digits
 
 
@@ -76,11 +76,11 @@ def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: b
 
 
 def _read_odometry(path: Path, camera: Camera) -> list[OdometryRow | DataError]:
-    """Each frame's row, or its error; `camera` is that of rows without intrinsics."""
+    """Return each frame's row or error; `camera` is used for rows without intrinsics."""
     lines = read_lines(path)
     header = [word.strip() for word in lines[0].split(",")] if lines else []
     if tuple(header[: len(POSE)]) != POSE:
-        raise DataError(f"{path} must begin with the line {', '.join(POSE)}, found {', '.join(header)[:100]!r}")
+        raise DataError(f"{path}, line 1: expected {', '.join(POSE)}, got {', '.join(header)[:100]!r}")
     has_intrinsics = tuple(header[len(POSE) : len(POSE) + len(INTRINSICS)]) == INTRINSICS
     last = len(POSE) + len(INTRINSICS) if has_intrinsics else len(POSE)
     numbered = [(n, line.split(",")[:last]) for n, line in enumerate(lines[1:], start=2) if line.strip()]
@@ -92,7 +92,7 @@ def _row_or_error(path: Path, number: int, words: list[str], camera: Camera) -> 
     try:
         timestamp, frame, *pose = numbers(where, words[: len(POSE)], len(POSE), ", ".join(POSE))
         if not 0 <= frame <= LAST_FRAME or frame != int(frame):
-            raise DataError(f"{where}: a frame is a whole number, found {words[1].strip()[:SHOWN]!r}")
+            raise DataError(f"{where}: frame: expected 0 to {LAST_FRAME}, got {words[1].strip()[:SHOWN]!r}")
         own = [word for word in words[len(POSE) :] if word.strip()]
         if own:
             values = numbers(where, own, len(INTRINSICS), ", ".join(INTRINSICS))
@@ -105,7 +105,7 @@ def _row_or_error(path: Path, number: int, words: list[str], camera: Camera) -> 
 def _read_camera(path: Path, video: Video) -> Camera:
     lines = [line for line in read_lines(path) if line.strip()]
     if len(lines) != 3:
-        raise DataError(f"{path} must hold 3 lines of 3 numbers, found {len(lines)} lines")
+        raise DataError(f"{path}: expected 3 lines of 3 numbers, got {len(lines)} lines")
     (fx, _, cx), (_, fy, cy), _ = (
         numbers(f"{path}, line {n}", line.split(","), 3) for n, line in enumerate(lines, start=1)
     )
@@ -113,14 +113,14 @@ def _read_camera(path: Path, video: Video) -> Camera:
 
 
 class Video:
-    """Reads frames in sensor orientation, as depth has it, without the rotation that a phone notes."""
+    """Reader of video frames in sensor orientation, as for depth, without the rotation in the metadata."""
 
     def __init__(self, path: Path) -> None:
         """Raise DataError, with the file, if it cannot be decoded."""
         check_regular(path)
         with path.open("rb") as file:
             if not file.read(KIND_AT + len(KIND)).endswith(KIND):
-                raise DataError(f"{path} is no MP4 or QuickTime file")
+                raise DataError(f"{path}: expected an MP4 or QuickTime file, got another format")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", QUIET)
         self.path = path
         before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -132,20 +132,20 @@ class Video:
         self.width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))  # px
         self.height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))  # px
         if not self._capture.isOpened() or not 0 < self.width * self.height <= MOST_PIXELS:
-            raise DataError(f"{path} could not be decoded: it is damaged, or of a kind that OpenCV does not know")
+            raise DataError(f"{path}: cannot be decoded; the file is damaged, or OpenCV does not support its codec")
         self._next = 0
 
     def frame(self, number: int) -> UInt8:
         """Return color (H, W, 3), RGB, of a frame from 0. Frames must be read in order. Raises FrameError."""
         if number < self._next - 1:
-            raise FrameError(f"{self.path}: frame {number} comes after frame {self._next - 1}")
+            raise FrameError(f"{self.path}: expected increasing frames, got {number} after {self._next - 1}")
         while self._next <= number:
             if not self._capture.grab():
-                raise FrameError(f"{self.path} ends, or is damaged, before frame {number}")
+                raise FrameError(f"{self.path}: expected frame {number}, got the end of the video or a damaged part")
             self._next += 1
         decoded, image = self._capture.retrieve()
         if not decoded:
-            raise FrameError(f"{self.path}: frame {number} could not be decoded")
+            raise FrameError(f"{self.path}: frame {number} cannot be decoded")
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 

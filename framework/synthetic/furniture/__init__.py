@@ -1,1 +1,1 @@
-"""Things to put into a room, and what stands together."""
+"""Furniture and furniture groups."""

@@ -1,4 +1,4 @@
-"""Clutter: objects with an instance id and no class, which are never evaluated."""
+"""Clutter: objects with an instance id but no class, excluded from evaluation."""
 
 from __future__ import annotations
 

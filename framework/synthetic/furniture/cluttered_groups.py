@@ -12,18 +12,18 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import SPACING
 from framework.synthetic.paints import Texture
 
-PILLOWS = 0.68  # m, from the wall to where a bed is free to lie on
-BACKREST = 0.50  # m, from the wall to where a couch is free to sit on
-BORDER = 0.06  # m, of a bed or a couch on which nothing lies
-ARM = 0.24  # m, the widest arm of a couch
-SINK = 0.012  # m, how deep things lie in what is soft
-PLACES = 60  # tried for each thing that lies about
-TOUCHING = (0.001, 0.005)  # m, between neighbors of which a sensor cannot tell that they are two
-LADEN_CHAIRS = 0.5  # share of the chairs along a wall on which something lies
+PILLOWS = 0.68  # m, from the wall to the free part of a bed
+BACKREST = 0.50  # m, from the wall to the free part of a couch
+BORDER = 0.06  # m, empty border of a bed or couch
+ARM = 0.24  # m, maximum width of a couch arm
+SINK = 0.012  # m, depth by which objects sink into soft surfaces
+PLACES = 60  # candidate positions of each scattered object
+TOUCHING = (0.001, 0.005)  # m, gap between neighbors, below sensor resolution
+LADEN_CHAIRS = 0.5  # fraction of the chairs along a wall with an object on them
 SEAT = 0.19  # m, from the front of a chair to the middle of its seat
-LEATHER_COUCHES = 0.3  # share of the couches that are of black leather
-RIM = 0.02  # m, of a table, on which nothing lies
-APRON = 0.13  # m, from a table's top down to where the knees of a chair go under it
+LEATHER_COUCHES = 0.3  # fraction of black leather couches
+RIM = 0.02  # m, empty border of a table
+APRON = 0.13  # m, height of the space below a table's top that a chair cannot enter
 
 
 def cluttered_bed_group(rng: Rng) -> Group:
@@ -100,9 +100,9 @@ def _clutter_couch(group: Group, rng: Rng) -> None:
 def _scatter(
     group: Group, lying: list[Furniture], low: Float64, high: Float64, rng: Rng, things: list[Furniture]
 ) -> None:
-    """Lays things on the first piece of `lying`, between the corners `low` and `high` (2,), m.
+    """Place things on the first piece of `lying`, between the corners `low` and `high` (2,), m.
 
-    They lie beside the other pieces and beside each other, but on blankets. What finds no place is left out.
+    They do not overlap other pieces or each other, except blankets. Things without a free position are omitted.
     """
     lying = [*lying]
     in_the_way = [np.stack(piece.bounds()) for piece in lying[1:]]
@@ -120,7 +120,7 @@ def _scatter(
 
 
 def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
-    """`thing` lengthwise or across, somewhere between the corners, or amid them where it is too large for that."""
+    """Place `thing` lengthwise or across, randomly between the corners, or centered if it is too large."""
     turned = thing.placed(0.0, 0.0, 0.0, np.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.3, 0.3))
     turned_low, turned_high = turned.bounds()
     middle = (turned_low + turned_high)[:2] / 2
@@ -130,7 +130,7 @@ def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Fu
 
 
 def _overlap(box: Float64, other: Float64) -> bool:
-    """Whether two boxes (2, 3) share ground, seen from above."""
+    """Return True if two boxes (2, 3) overlap, seen from above."""
     return bool((np.minimum(box[1], other[1])[:2] > np.maximum(box[0], other[0])[:2]).all())
 
 
@@ -142,7 +142,7 @@ def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
 
 
 def chair_row(rng: Rng, count: int) -> Group:
-    """Equal chairs along the wall that touch each other; something lies on some of them."""
+    """Return a row of equal, touching chairs along the wall, some with objects on them."""
     group = Group("chair row")
     chair = seating.chair(rng)
     pitch = size(chair)[0] + _touch(rng)
@@ -166,7 +166,7 @@ def _lay_on_seat(group: Group, chair: Furniture, thing: Furniture) -> None:
 
 
 def desk_row(rng: Rng, count: int) -> Group:
-    """Equal desks that touch, each with the same office chair pushed under it, and other things on each."""
+    """Return equal, touching desks, each with an identical office chair under it and different objects on it."""
     group = Group("desk row")
     desk, chair = tabletops.desk(rng), seating.office_chair(rng)
     pitch = size(desk)[0] + _touch(rng)
@@ -214,7 +214,7 @@ def _between(piece: Furniture, bottom: float, top: float) -> Float64:
 
 
 def strew_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
-    """Things on a flat top, wherever there is room, also touching each other. What finds no place is left out."""
+    """Place things at free positions on a flat top, possibly touching. Things without a free position are omitted."""
     low, high = table.bounds()
     there: list[Float64] = []
     for thing in things:

@@ -1,6 +1,6 @@
-"""Pieces that belong together: a bed with its nightstand, a table with its chairs and what lies on it.
+"""Furniture groups: a bed with its nightstand, a table with chairs and objects on it.
 
-A group is made about the origin, its back at y = 0, facing +y.
+A group is at the origin, with its back at y = 0, facing +y.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 
 Place = tuple[float, float, float]  # x, y (m) and angle (rad, counter-clockwise from above)
 
-WALL_GAP = 0.015  # m, between a wall and what stands against it
+WALL_GAP = 0.015  # m, between a wall and furniture against it
 
 
 @dataclass
@@ -36,12 +36,12 @@ class Group:
 
     @property
     def boxes(self) -> Float64:
-        """The pieces' axis-aligned boxes (N, 2, 3), m."""
+        """Axis-aligned boxes (N, 2, 3) of the pieces, m."""
         return np.array([piece.bounds() for piece in self.pieces])
 
     @property
     def solid(self) -> Bool:
-        """Which pieces (N,) others must not enter: all but rugs."""
+        """Mask (N,) of the solid pieces: all but rugs."""
         return np.array([piece.kind != "rug" for piece in self.pieces])
 
 
@@ -129,12 +129,12 @@ def dining_group(rng: Rng) -> Group:
     table = group.pieces[0]
     low, high = table.bounds()
     make = int(rng.integers(2**31))
-    chairs = [seating.chair(np.random.default_rng(make)) for _ in range(4)]  # a set: all alike
+    chairs = [seating.chair(np.random.default_rng(make)) for _ in range(4)]  # a set of equal chairs
     width = size(chairs[0])[0]
     gap = rng.uniform(0.012, 0.05)
     is_round = table.kind == "round table"
     reach = 0.0 if not is_round else 0.03
-    for side, piece in zip((-1, 1), chairs[:2], strict=True):  # both look at the wall, over the table
+    for side, piece in zip((-1, 1), chairs[:2], strict=True):  # both face the wall across the table
         chair = piece.placed(0, 0, 0, np.pi)
         y = high[1] - chair.bounds()[0][1] + 0.02 + reach
         group.add(chair, side * (width + gap) / 2, y)

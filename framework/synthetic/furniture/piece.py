@@ -1,4 +1,4 @@
-"""Furniture in a local frame: it stands on z = 0 about the origin and faces +y, with its back at negative y."""
+"""Furniture in a local frame: at the origin on z = 0, facing +y."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Rng = np.random.Generator
 class Furniture:
     """One object: its parts, each a solid of one material."""
 
-    kind: str  # for people: "office chair"
+    kind: str  # readable name: "office chair"
     class_name: str | None = None  # COCO's name; None = not evaluated
     parts: list[tuple[Solid, Material]] = field(default_factory=list)
 

@@ -1,4 +1,4 @@
-"""Small objects, and shelves full of them. Only books have a class."""
+"""Small objects, and shelves with small objects. Only books have a class."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def basket(rng: Rng) -> Furniture:
 
 
 def shoes(rng: Rng) -> Furniture:
-    """Return a random shoes."""
+    """Return a random pair of shoes."""
     piece = Furniture("shoes")
     color = paints.vivid(rng)
     upper, sole = paints.cloth(rng, color), paints.paint(rng, (0.85, 0.84, 0.80))
@@ -90,7 +90,7 @@ def carton_stack(rng: Rng) -> Furniture:
 
 
 def book_row(rng: Rng) -> Furniture:
-    """Return books that stand side by side: one instance, like a pile."""
+    """Return a row of upright books: one instance, like a pile."""
     row = Furniture("row of books", "book")
     end = 0.0
     for _ in range(int(rng.integers(5, 9))):
@@ -122,7 +122,7 @@ def shelf(rng: Rng) -> Furniture:
 
 
 def _fill(piece: Furniture, rng: Rng, start: float, end: float, z: float, height: float) -> None:
-    """Put binders, boxes and gaps side by side on one board."""
+    """Place binders, boxes and gaps side by side on one board."""
     x = start
     while True:
         wide = rng.uniform() < 0.2

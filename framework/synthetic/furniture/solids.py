@@ -15,7 +15,7 @@ import numpy as np
 from framework.data import Float64, Int32
 
 SPACING = 0.07  # m, between vertices on flat faces: the resolution of baked shadows
-WELD = 1e-6  # m, vertices closer than this are one point of the surface
+WELD = 1e-6  # m, vertices closer than this are merged
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ def tube(points: Sequence[tuple[float, float, float]] | Float64, radius: float, 
     path = _spline(np.asarray(points, np.float64))
     tangents = np.gradient(path, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    # The coordinate axis that is the least parallel to all tangents: the rod does not twist.
+    # the coordinate axis least parallel to all tangents: the rod does not twist
     aside = np.cross(tangents, np.eye(3)[np.abs(tangents).max(axis=0).argmin()])
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     other = np.cross(tangents, aside)

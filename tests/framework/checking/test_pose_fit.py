@@ -74,7 +74,7 @@ def test_pose_reading_is_identified_from_moving_camera(reading: PoseReading) -> 
     assert judged.best is not None
     assert judged.best.reading == reading
     assert judged.findings[0].verdict is (Verdict.FINE if reading == PoseReading() else Verdict.FAULT)
-    assert "fits as well" not in judged.findings[0].text
+    assert "equally well" not in judged.findings[0].text
 
 
 def test_ambiguous_axes_of_pan_are_reported() -> None:
@@ -85,7 +85,7 @@ def test_ambiguous_axes_of_pan_are_reported() -> None:
     assert fault.setting in ("dataset.pose_kind=T_CAMERA_WORLD", "dataset.camera_axes=OPENGL")
     other = {"dataset.pose_kind=T_CAMERA_WORLD", "dataset.camera_axes=OPENGL"} - {fault.setting}
     assert f"{other.pop()}" in fault.text
-    assert "fits as well, as the camera moves" in fault.text
+    assert "fits this camera motion equally well" in fault.text
 
 
 @pytest.mark.parametrize("factor", [0.2, 5.0, 1000.0])

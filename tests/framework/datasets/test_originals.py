@@ -102,7 +102,7 @@ def test_recording_without_images_raises_one_line(originals: Path, tmp_path: Pat
     path = originals / "oni/no_images.oni"
     with pytest.raises(DataError) as caught:
         convert(path, tmp_path / "out")
-    assert str(caught.value) == f"{path} has no depth and no color image; it needs depth and color"
+    assert str(caught.value) == f"{path}: expected depth and color images, got no depth and no color"
     assert not (tmp_path / "out").exists()
 
 
@@ -126,7 +126,7 @@ def test_openni_1_recording_is_converted_and_mapped(
     originals: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     convert(originals / "oni/test.oni", tmp_path / "011")
-    assert capsys.readouterr().out.startswith(f"{tmp_path / '011'}: 12 frames; left out are 0 images of color and 0")
+    assert capsys.readouterr().out.startswith(f"{tmp_path / '011'}: 12 frames; skipped 0 color and 0 depth")
     (tmp_path / "intrinsic").mkdir()
     write_intrinsics(tmp_path / "intrinsic/asus.ini", KINECT)
     overrides = ("dataset=scenenn", f"dataset.root={tmp_path}", "dataset.stop=3")
@@ -220,7 +220,7 @@ def test_replica_excerpt_skips_frames_with_missing_images(originals: Path, tmp_p
     result = given_poses(GroundTruth(), sequence)
     assert (result.frames, result.frames_skipped) == (4, 2)
     assert [frame.index for frame in result.tracked] == [0, 2]
-    with pytest.raises(FrameError, match=r"frame000001\.jpg could not be read"):
+    with pytest.raises(FrameError, match=r"frame000001\.jpg: cannot be read"):
         sequence[1]
 
 
@@ -245,7 +245,7 @@ def test_tum_excerpt_reads_available_images(originals: Path) -> None:
     assert stored.shape == frame.camera.shape == VGA
     np.testing.assert_allclose(frame.depth, stored / 5000, rtol=1e-6)
     assert readings(frame.depth) == pytest.approx((0.7518, 2.7042, 0.727184), abs=1e-5)
-    with pytest.raises(FrameError, match=r"rgb/1305031229\.528748\.png could not be read"):
+    with pytest.raises(FrameError, match=r"rgb/1305031229\.528748\.png: cannot be read"):
         sequence[0]
 
 

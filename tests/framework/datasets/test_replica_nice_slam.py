@@ -91,7 +91,7 @@ def test_invalid_pose_raises_for_its_frame(root: Path) -> None:
 @pytest.mark.parametrize("name", ["frame000001.jpg", "depth000001.png"])
 def test_missing_image_raises_for_its_frame(root: Path, name: str) -> None:
     (root / "room0/results" / name).unlink()
-    assert f"{name} could not be read" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+    assert f"{name}: cannot be read" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
 
 
 @pytest.mark.parametrize("name", ["results", "traj.txt"])
@@ -102,14 +102,14 @@ def test_missing_results_or_trajectory_raises(root: Path, name: str) -> None:
 
 
 def test_missing_scene_parameter_raises_with_hint(root: Path) -> None:
-    with pytest.raises(DataError, match=r"cam_params\.json is missing: .* dataset\.scene=room0"):
+    with pytest.raises(DataError, match=r"cam_params\.json: expected camera parameters .*, such as room0"):
         ReplicaNiceSlam(root)
 
 
 def test_frames_without_pose_are_counted(root: Path) -> None:
     write_poses(root / "room0", [pose_at(0), pose_at(1)])
     sequence = ReplicaNiceSlam(root, scene="room0")
-    assert "frame000002.jpg: traj.txt has 2 poses and none for it" in fault_of(sequence, 2)
+    assert "frame000002.jpg: expected a pose in traj.txt, got none among its 2 poses" in fault_of(sequence, 2)
     result, _ = mapped(sequence)
     assert (result.frames, result.frames_skipped) == (FRAMES, 1)
 
@@ -132,7 +132,7 @@ def test_scene_symbolic_link_is_read(root: Path, tmp_path: Path) -> None:
 
 def test_invalid_pose_line_error_gives_line_number(root: Path) -> None:
     write_poses(root / "room0", [pose_at(0), pose_at(1)[:3], pose_at(2)])
-    with pytest.raises(DataError, match=r"traj\.txt, line 2: expected 16 numbers, found 12"):
+    with pytest.raises(DataError, match=r"traj\.txt, line 2: expected 16 numbers, got 12"):
         ReplicaNiceSlam(root, scene="room0")
 
 
@@ -154,7 +154,7 @@ def test_invalid_camera_file_raises(root: Path, text: str) -> None:
 
 def test_image_size_mismatch_raises(root: Path) -> None:
     write_depth(root / "room0/results/depth000002.png", 1, (8, 12))
-    assert "is 12x8, but" in fault_of(ReplicaNiceSlam(root, scene="room0"), 2)
+    assert ", got 12x8 px" in fault_of(ReplicaNiceSlam(root, scene="room0"), 2)
     write_camera(root, w=120, h=68)
-    with pytest.raises(DataError, match=r"frame000000\.jpg is 24x16, but .*cam_params\.json says 120x68"):
+    with pytest.raises(DataError, match=r"frame000000\.jpg: expected 120x68 px as in .*cam_params\.json, got 24x16 px"):
         ReplicaNiceSlam(root, scene="room0")

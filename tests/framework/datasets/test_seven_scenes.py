@@ -123,10 +123,10 @@ def test_rounded_rotation_is_made_rigid(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "pose.txt does not exist"),
-        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n", "pose.txt: expected 4 lines of 4 numbers, found 3 lines"),
-        ("1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, found 3"),
-        ("1 0 0 0\n0 one 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, found 'one'"),
+        (None, "pose.txt: expected a text file, got no such file"),
+        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n", "pose.txt: expected 4 lines of 4 numbers, got 3 lines"),
+        ("1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, got 3"),
+        ("1 0 0 0\n0 one 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, got 'one'"),
         ("1 0 0 0\n0 1 0 0\n0 0 nan 0\n0 0 0 1\n", "pose.txt: the pose is not finite"),
         ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "pose.txt: pose: expected a rigid transform, got |R R^T - I| ="),
         ("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt: pose: expected a rigid transform, got |R R^T - I| ="),
@@ -142,17 +142,17 @@ def test_invalid_pose_raises_for_its_frame(folder: Path, text: str | None, messa
 @pytest.mark.parametrize("name", ["color", "depth"])
 def test_missing_image_raises_for_its_frame(folder: Path, name: str) -> None:
     (folder / f"frame-000002.{name}.png").unlink()
-    assert f"frame-000002.{name}.png could not be read" in fault_of(SevenScenes(folder), 2)
+    assert f"frame-000002.{name}.png: cannot be read" in fault_of(SevenScenes(folder), 2)
 
 
 def test_folder_without_frames_error_gives_scene_example(folder: Path) -> None:
-    with pytest.raises(DataError, match=r"holds no frame-000000\.color\.png; dataset\.scene is like chess/seq-01"):
+    with pytest.raises(DataError, match=r"expected frame-000000\.color\.png .*; set dataset\.scene .* chess/seq-01"):
         SevenScenes(folder.parents[1], scene="chess")
 
 
 def test_image_size_mismatch_raises(folder: Path) -> None:
     write_color(folder / "frame-000001.color.png", (1, 2, 3), (240, 320))
-    assert "is 320x240, but the camera of 7-Scenes says 640x480" in fault_of(SevenScenes(folder), 1)
+    assert "expected 640x480 px as in the camera of 7-Scenes, got 320x240 px" in fault_of(SevenScenes(folder), 1)
     write_depth(folder / "frame-000000.depth.png", 1, (240, 320))
-    with pytest.raises(DataError, match=r"frame-000000\.depth\.png is 320x240"):
+    with pytest.raises(DataError, match=r"frame-000000\.depth\.png: expected 640x480 px .*, got 320x240 px"):
         SevenScenes(folder)

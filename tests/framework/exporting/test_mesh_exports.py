@@ -388,7 +388,7 @@ def test_export_mesh_without_triangles_writes_object_vertices(tmp_path: Path) ->
     )
     assert len(read_mesh(tmp_path / "out" / "objects" / "cube_2.ply").vertices) == (mesh.instance_ids == 2).sum()
     assert len(written) == 4
-    with pytest.raises(DataError, match="nothing was mapped"):
+    with pytest.raises(DataError, match="expected a surface to export, got an empty map"):
         export(run, [ExportFormat.GLB], tmp_path / "out")
 
 
@@ -400,22 +400,24 @@ def test_export_partial_run_without_objects_writes_scene(tmp_path: Path) -> None
     [scene] = export(run, [ExportFormat.PLY])
     assert scene == run / "export" / "scene.ply"
     assert len(read_mesh(scene).vertices) == len(read_mesh(run / "mesh.ply").vertices)
-    with pytest.raises(DataError, match="there is no object 'chair' in this run, which has none"):
+    with pytest.raises(
+        DataError, match="object: expected an id or class of this run, got 'chair'; the run has no objects"
+    ):
         export(run, [ExportFormat.PLY], chosen=Chosen(("chair",)))
 
 
 def test_export_invalid_selection_raises(run: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected the directory of a run"):
         export(tmp_path, [ExportFormat.GLB])
-    with pytest.raises(DataError, match="there is no object 'cub' in this run; did you mean 'cube'"):
+    with pytest.raises(DataError, match="object: expected an id or class of this run, got 'cub'; did you mean 'cube'"):
         export(run, [ExportFormat.GLB], tmp_path, Chosen(("cub",)))
-    with pytest.raises(DataError, match=r"no 'cube' has a confidence of 0.9; the highest is 0.80"):
+    with pytest.raises(DataError, match=r"object: expected a confidence >= 0.9 of 'cube', got at most 0.80"):
         export(run, [ExportFormat.GLB], tmp_path, Chosen(("cube",), min_confidence=0.9))
     assert export(run, [ExportFormat.GLB], tmp_path, Chosen(("2",), min_confidence=0.9)) == [
         tmp_path / "objects/cube_2.glb"
     ]
     assert export(run, [ExportFormat.GLB], tmp_path, Chosen(min_confidence=0.9)) == [tmp_path / "scene.glb"]
-    with pytest.raises(DataError, match="triangles must be at least 4, found 0"):
+    with pytest.raises(DataError, match="triangles: expected at least 4, got 0"):
         Chosen(triangles=0)
 
 
@@ -428,5 +430,5 @@ def test_export_up_option_replaces_missing_up_direction(tmp_path: Path, caplog: 
     export(run, [ExportFormat.PLY], tmp_path / "told", up=(0, 2, 0), floor=-1.25)
     assert not caplog.text
     assert read_mesh(tmp_path / "told" / "scene.ply").vertices[:, 2].min() == pytest.approx(0, abs=1e-5)
-    with pytest.raises(DataError, match="up must be three numbers, a direction"):
+    with pytest.raises(DataError, match="up: expected a direction of 3 numbers"):
         read_room(run, up=(0, 0, 0))

@@ -49,7 +49,7 @@ from framework.vocabulary.label_spaces import COCO, read_labels
 def test_oversized_file_raises_before_reading(tmp_path: Path, read: Callable[[Path], object], most: int) -> None:
     with (tmp_path / "large").open("wb") as file:
         file.truncate(most + 1)
-    with pytest.raises(DataError, match=rf"large has {most + 1} bytes, more than the {most} that") as caught:
+    with pytest.raises(DataError, match=rf"large: expected at most {most} bytes, got {most + 1}") as caught:
         read(tmp_path / "large")
     assert isinstance(caught.value, FrameError) == (read in (read_color, read_uint16))
 
@@ -98,7 +98,7 @@ def test_non_regular_file_raises_without_blocking(tmp_path: Path, read: Callable
         path.mkdir()
     else:
         path.symlink_to(kind)
-    with pytest.raises(DataError, match=f"{path} is no file but a") as caught:
+    with pytest.raises(DataError, match=f"{path}: expected a regular file, got a") as caught:
         read(path)
     assert "\n" not in str(caught.value)
 
@@ -119,7 +119,7 @@ def test_writing_to_non_regular_file_raises(tmp_path: Path, kind: str) -> None:
     else:
         path.symlink_to(kind)
     before = path.stat().st_mode
-    with pytest.raises(DataError, match="is no file but a"), written_whole(path) as temporary:
+    with pytest.raises(DataError, match=": expected a regular file, got a"), written_whole(path) as temporary:
         temporary.write_text("{}")
     assert path.stat().st_mode == before
     assert list(tmp_path.iterdir()) == [path]
@@ -146,7 +146,7 @@ def test_failed_write_error_names_requested_file(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(Path, "unlink", refused)
     with (
-        pytest.raises(DataError, match=r"page\.html could not be written: Read-only"),
+        pytest.raises(DataError, match=r"page\.html: cannot be written: Read-only"),
         written_whole(tmp_path / "page.html"),
     ):
         refused()

@@ -36,12 +36,12 @@ def test_gravity_in_m_s2_is_normalized(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("0 0 0", "expected a direction, or nan nan nan where none is known, found '0 0 0'"),
+        ("0 0 0", "expected a direction, or nan nan nan if unknown, got '0 0 0'"),
         ("inf 0 0", "expected a direction"),
         ("nan 0 1", "expected a direction"),
         ("1e300 1e300 0", "expected a direction"),
-        ("1 2", r"expected 3 numbers \(x y z\), found 2"),
-        ("1 2 up", "expected 3 numbers .* found 'up'"),
+        ("1 2", r"expected 3 numbers \(x y z\), got 2"),
+        ("1 2 up", "expected 3 numbers .* got 'up'"),
     ],
 )
 def test_invalid_gravity_line_raises_one_line(tmp_path: Path, line: str, said: str) -> None:

@@ -47,7 +47,7 @@ def test_truncated_jpeg_with_end_marker_raises(share: float) -> None:
     """OpenCV gives a picture that is gray from the cut on."""
     data = JPEG[: int(share * len(JPEG))] + END
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
-    assert message(data).startswith("picture.jpg is damaged: ")
+    assert message(data).startswith("picture.jpg: damaged image: ")
 
 
 def test_jpeg_with_corrupt_block_raises() -> None:
@@ -70,11 +70,11 @@ def test_animated_png_raises() -> None:
     pictures = [Image.new("RGB", (8, 6), color) for color in ("red", "lime", "blue")]
     written = io.BytesIO()
     pictures[0].save(written, "PNG", save_all=True, append_images=pictures[1:], default_image=True)
-    assert "is an animation of 3 pictures; a frame is one" in message(written.getvalue())
+    assert "expected a single image, got an animation of 3" in message(written.getvalue())
 
 
 def test_jpeg_as_depth_raises(tmp_path) -> None:
     path = tmp_path / "depth.png"
     path.write_bytes(JPEG)
-    with pytest.raises(FrameError, match="must be a PNG with one channel of uint16"):
+    with pytest.raises(FrameError, match="expected a PNG with 1 channel of uint16"):
         read_uint16(path)

@@ -34,7 +34,7 @@ def test_one_matrix_per_line_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("1 2 3", "line 1: expected 16 numbers, got 3"), (ROWS.replace("\n", " x "), "line 1: .* found 20")],
+    [("1 2 3", "line 1: expected 16 numbers, got 3"), (ROWS.replace("\n", " x "), "line 1: .* got 20")],
 )
 def test_invalid_matrix_line_error_gives_line_number(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "traj.txt").write_text(text)
@@ -43,7 +43,7 @@ def test_invalid_matrix_line_error_gives_line_number(tmp_path: Path, text: str, 
 
 
 def test_missing_file_raises_and_empty_file_gives_no_matrix(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"missing.txt does not exist"):
+    with pytest.raises(DataError, match=r"missing.txt: expected a text file, got no such file"):
         read_matrix(tmp_path / "missing.txt")
     (tmp_path / "empty.txt").touch()
     assert read_matrix_lines(tmp_path / "empty.txt") == []

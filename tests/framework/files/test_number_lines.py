@@ -31,10 +31,10 @@ def test_nan_lookalike_raises(word: str) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["1", "2"], r"here: expected 3 numbers \(x y z\), found 2"),
-        (["1", "two", "3"], r"here: expected 3 numbers \(x y z\), found 'two'"),
-        (["1", "2", "3x" * 5000], r"here: expected 3 numbers \(x y z\), found '(3x){30}'"),
-        (["1", "2", "\x9b3\u2028"], r"found '\\x9b3\\u2028'"),
+        (["1", "2"], r"here: expected 3 numbers \(x y z\), got 2"),
+        (["1", "two", "3"], r"here: expected 3 numbers \(x y z\), got 'two'"),
+        (["1", "2", "3x" * 5000], r"here: expected 3 numbers \(x y z\), got '(3x){30}'"),
+        (["1", "2", "\x9b3\u2028"], r"got '\\x9b3\\u2028'"),
     ],
 )
 def test_invalid_number_raises_one_line(words: list[str], message: str) -> None:
@@ -45,7 +45,7 @@ def test_invalid_number_raises_one_line(words: list[str], message: str) -> None:
 
 def test_binary_or_missing_file_raises(tmp_path: Path) -> None:
     (tmp_path / "binary.txt").write_bytes(b"\xff\xfe")
-    with pytest.raises(DataError, match=r"binary.txt could not be read as text"):
+    with pytest.raises(DataError, match=r"binary.txt: expected UTF-8 text"):
         read_lines(tmp_path / "binary.txt")
-    with pytest.raises(DataError, match=r"none.txt is missing: make one$"):
-        read_lines(tmp_path / "none.txt", missing="is missing: make one")
+    with pytest.raises(DataError, match=r"none.txt: expected a list, got none; write one$"):
+        read_lines(tmp_path / "none.txt", missing="expected a list, got none; write one")

@@ -169,8 +169,8 @@ def test_written_ply_is_read_by_open3d(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"ply\n", b"plyx\n", r"line 1: .*'ply'.*'plyx\\nformat asci'"),
-        (b"format ascii 1.0\n", b"", "line 9: the header has no line 'format'"),
+        (b"ply\n", b"plyx\n", r"line 1: expected a PLY file, got 'plyx\\nformat asci'"),
+        (b"format ascii 1.0\n", b"", "line 9: expected a header line 'format'"),
         (b"ascii 1.0", b"ascii 2.0", "line 2: .*'format ascii 2.0'"),
         (b"vertex 3", b"vertex -3", "line 3: .*'vertex'.*'-3'"),
         (
@@ -179,31 +179,35 @@ def test_written_ply_is_read_by_open3d(tmp_path):
             "byte [0-9]+: .*1000000000000 'vertex'.* truncated",
         ),
         (b"vertex 3", b"vertex " + b"9" * 5000, "line 3: .*'vertex'.*'9999.*[.][.][.]'"),
-        (b"vertex 3", b"point 3", "line 10: the header has no element 'vertex'"),
-        (b"float x", b"half x", "line 4: unknown type 'half', expected one of char, uchar"),
+        (b"vertex 3", b"point 3", "line 10: expected an element 'vertex' in the header, got none"),
+        (b"float x", b"half x", "line 4: expected a type in char, uchar, .*, got 'half'"),
         (b"float x", b"float", "line 4: .*'property TYPE NAME'.*'property float'"),
         (b"float y", b"float x", "line 5: .*'vertex'.*duplicate.*'x'"),
         (b"element face", b"element vertex", "line 8: duplicate.*'vertex'"),
         (b"list uchar int", b"list float int", "line 9: .*'vertex_indices'.*integer"),
         (b"uchar int vertex", b"uchar float vertex", "vertex_indices: .*integers.*float32"),
         (b"vertex_indices", b"corners", "'face'.*vertex_indices or vertex_index"),
-        (b"end_header", b"end", "line 14: .*200 bytes.*'end_header'"),
-        (b"end_header", b"comment " + b"x" * 70000, "line 10: .*65536 bytes.*'end_header'"),
+        (b"end_header", b"end", "line 14: .*'end_header'.* 200 bytes"),
+        (b"end_header", b"comment " + b"x" * 70000, "line 10: .*'end_header'.* 65536 bytes"),
         (b"1 0 0 2", b"1 0 0", "line 12: 'vertex' 1: .*4 numbers.* 3"),
         (b"1 0 0 2", b"1 0 0 2 5", "line 12: 'vertex' 1: .*4 numbers.* 5"),
         (b"1 0 0 2", b"1 0 0 256", "line 12: label: .*uint8.* 256"),
         (b"1 0 0 2", b"1 0 0 2.5", "line 12: label: .*uint8.* 2.5"),
         (b"1 0 0 2", b"1 0 x 2", "line 12: expected numbers, .*'x'"),
-        (b"1 0 0 2", b"1 nan 0 2", "line 12: vertex 1 is not finite: 1 nan 0"),
-        (b"1 0 0 2", b"\n1 1e39 0 2", "line 13: vertex 1 is not finite: 1 inf 0"),
+        (b"1 0 0 2", b"1 nan 0 2", "line 12: vertex 1: expected finite coordinates, got 1 nan 0"),
+        (b"1 0 0 2", b"\n1 1e39 0 2", "line 13: vertex 1: expected finite coordinates, got 1 inf 0"),
         (b"1 0 0 2", b"1" * 2**20 + b"0 0 0 2", "line 12: .*1048576 bytes"),
-        (b"3 0 1 2", b"3 0 1 3", "line 14: face 0 has vertex 3, but there are 3"),
-        (b"3 0 1 2", b"3 0 -1 2", "line 14: face 0 has vertex -1, but there are 3"),
+        (b"3 0 1 2", b"3 0 1 3", r"line 14: face 0: expected vertex indices in \[0, 3\), got 3"),
+        (b"3 0 1 2", b"3 0 -1 2", r"line 14: face 0: expected vertex indices in \[0, 3\), got -1"),
         (b"3 0 1 2", b"2 0 1", "line 14: face 0: .*3 vertices.* 2"),
         (b"3 0 1 2", b"4 0 1 2", "line 14: 'face' 0: .*5 numbers.* 4"),
-        (b"3 0 1 2\n", b"\n\n", "line 15: the file ends in 'face' 0.* 1 rows"),
-        (b"face 1", b"face 2", "line 14: the file ends in 'face' 1.* 2 rows"),
-        (b"3 0 1 2", b"3 0 1 2\n\n3 0 1 2", "line 16: 4 numbers follow the last row"),
+        (b"3 0 1 2\n", b"\n\n", "line 15: expected 1 rows .* end of the file in 'face' 0"),
+        (b"face 1", b"face 2", "line 14: expected 2 rows .* end of the file in 'face' 1"),
+        (
+            b"3 0 1 2",
+            b"3 0 1 2\n\n3 0 1 2",
+            "line 16: expected the end of the file after the last row, got 4 more numbers",
+        ),
         (
             b"element vertex",
             b"element v\x9a\x00 1\nproperty int a\nelement vertex",
@@ -238,20 +242,28 @@ SECOND = FACES + len(GOOD)
 @pytest.mark.parametrize(
     ("vertices", "faces", "message"),
     [
-        (THREE, GOOD + GOOD[:-1], f"byte {SECOND + 13}: the file ends in 'face' 1, but its header announces 2"),
-        (THREE, GOOD[:5], f"byte {FACES + 5}: the file ends in 'face' 0"),
+        (THREE, GOOD + GOOD[:-1], f"byte {SECOND + 13}: expected 2 rows .* end of the file in 'face' 1"),
+        (THREE, GOOD[:5], f"byte {FACES + 5}: expected 2 rows .* end of the file in 'face' 0"),
         (THREE[:30], b"", f"byte {START}: .*43 bytes.*3 'vertex', 2 'face'.* 30"),
-        (THREE, GOOD * 2 + b"\x05", f"byte {SECOND + 14}: 1 bytes follow the last row"),
-        (THREE, GOOD + face(0, 1, 3), f"byte {SECOND}: face 1 has vertex 3, but there are 3"),
+        (
+            THREE,
+            GOOD * 2 + b"\x05",
+            f"byte {SECOND + 14}: expected the end of the file after the last row, got 1 more bytes",
+        ),
+        (THREE, GOOD + face(0, 1, 3), rf"byte {SECOND}: face 1: expected vertex indices in \[0, 3\), got 3"),
         (THREE, GOOD + face(0, 1), f"byte {SECOND}: face 1: .*3 vertices.* 2"),
         (THREE, face() + GOOD, f"byte {FACES}: face 0: .*3 vertices.* 0"),
-        (THREE, GOOD + face(0, 1, 2, 9), f"byte {SECOND}: face 1 has vertex 9"),
-        (THREE, face(0, 1, 2, length=-1) + GOOD, f"byte {FACES}: 'face' 0 has a list of -1 numbers"),
-        (THREE, face(0, 1, 2, length=32767) + GOOD, f"byte {FACES + 28}: the file ends in 'face' 0"),
+        (THREE, GOOD + face(0, 1, 2, 9), f"byte {SECOND}: face 1: expected vertex indices .*, got 9"),
+        (THREE, face(0, 1, 2, length=-1) + GOOD, f"byte {FACES}: 'face' 0: expected a list length >= 0, got -1"),
+        (
+            THREE,
+            face(0, 1, 2, length=32767) + GOOD,
+            f"byte {FACES + 28}: expected 2 rows .* end of the file in 'face' 0",
+        ),
         (
             THREE[:26] + b"\x7f\xc0\0\0" + THREE[30:],
             GOOD * 2,
-            f"byte {START + 26}: vertex 2 is not finite: nan 1 1e-07",
+            f"byte {START + 26}: vertex 2: expected finite coordinates, got nan 1 1e-07",
         ),
     ],
 )
@@ -265,21 +277,21 @@ def test_line_end_after_last_row_is_accepted(tmp_path):
 
 
 def test_missing_ply_raises(tmp_path):
-    with pytest.raises(DataError, match=r"a.ply could not be read: No such file"):
+    with pytest.raises(DataError, match=r"a.ply: cannot be read: No such file"):
         read_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"vertices": VERTICES.astype(np.float64)}, r"vertices must be \(N, 3\) of float32, found \(5, 3\) of float64"),
-        ({"vertices": VERTICES * np.float32(np.nan)}, "vertices are not all finite"),
-        ({"triangles": np.array([[0, 1, 5]], np.int32)}, r"triangles must be of vertices in \[0, 5\), found 0 to 5"),
-        ({"triangles": np.array([[0, 1, -1]], np.int32)}, "found -1 to 1"),
-        ({"properties": {"x": LABELS}}, "'x' cannot be the name"),
-        ({"properties": {"a b": LABELS}}, "'a b' cannot be the name"),
-        ({"properties": {"label": LABELS[:4]}}, r"label must be \(5,\) of a type that PLY has, found \(4,\) of int32"),
-        ({"properties": {"label": LABELS.astype(np.int64)}}, r"found \(5,\) of int64"),
+        ({"vertices": VERTICES.astype(np.float64)}, r"vertices: expected \(N, 3\) of float32, got \(5, 3\) of float64"),
+        ({"vertices": VERTICES * np.float32(np.nan)}, "vertices: expected finite coordinates"),
+        ({"triangles": np.array([[0, 1, 5]], np.int32)}, r"triangles: expected vertex indices in \[0, 5\), got 0 to 5"),
+        ({"triangles": np.array([[0, 1, -1]], np.int32)}, "got -1 to 1"),
+        ({"properties": {"x": LABELS}}, "expected a property name .*, got 'x'"),
+        ({"properties": {"a b": LABELS}}, "expected a property name .*, got 'a b'"),
+        ({"properties": {"label": LABELS[:4]}}, r"label: expected \(5,\) of a PLY type, got \(4,\) of int32"),
+        ({"properties": {"label": LABELS.astype(np.int64)}}, r"got \(5,\) of int64"),
         ({"comments": ["a\nend_header"]}, "comment"),
     ],
 )

@@ -40,8 +40,8 @@ def source(*frames: DeviceFrame | DataError, posed: bool = True) -> Source:
 def test_unusable_frames_are_counted_and_others_written(tmp_path: Path) -> None:
     stored = source(frame(0), FrameError("one is torn"), frame(2, T_world_camera=None), frame(3))
     written = write_folder(stored, tmp_path / "out", Writing())
-    assert written.errors == ["one is torn", "frame 2 has no pose"]
-    assert str(written) == "2 frames; left out are 2, the first: one is torn"
+    assert written.errors == ["one is torn", "frame 2: expected a pose, got none"]
+    assert str(written) == "2 frames; skipped 2, first error: one is torn"
     assert [seen.timestamp for seen in RgbdFolder(tmp_path / "out")] == pytest.approx([0, 0.1])
 
 
@@ -52,7 +52,7 @@ def test_frames_without_poses_write_no_pose_file(tmp_path: Path) -> None:
 
 
 def test_source_without_usable_frame_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no frame can be used; the first: one is torn"):
+    with pytest.raises(DataError, match="expected usable frames, got none; first error: one is torn"):
         write_folder(source(FrameError("one is torn")), tmp_path / "out", Writing())
     assert not (tmp_path / "out").exists()
 
@@ -62,7 +62,7 @@ def test_nonempty_output_folder_raises(tmp_path: Path) -> None:
     write_folder(source(frame(0)), tmp_path / "empty", Writing())
     before = sorted(tmp_path.rglob("*"))
     for place in (tmp_path / "empty", tmp_path / "empty/camera.json"):
-        with pytest.raises(DataError, match="is there already, and not empty"):
+        with pytest.raises(DataError, match="expected a new or empty folder"):
             write_folder(source(frame(0)), place, Writing())
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -75,17 +75,20 @@ def test_interrupted_import_has_no_camera_json(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         write_folder(Source("a test", frames(), 2, posed=True), tmp_path / "out", Writing())
     assert (tmp_path / "out/color/000000.jpg").exists()
-    with pytest.raises(DataError, match=r"camera\.json is missing"):
+    with pytest.raises(DataError, match=r"camera\.json: expected a camera"):
         RgbdFolder(tmp_path / "out")
 
 
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"timestamp": float("nan")}, "the timestamp is not finite"),
-        ({"color": np.zeros((48, 60, 3), np.uint8)}, "color is 60x48, the camera's is 64x48"),
-        ({"depth": np.zeros((1, 16), np.float32)}, "depth is 16x1 px, too small"),
-        ({"confidence": np.zeros((12, 15), np.uint8)}, r"confidence has the shape \(12, 15\)"),
+        ({"timestamp": float("nan")}, "expected a finite timestamp, got nan"),
+        ({"color": np.zeros((48, 60, 3), np.uint8)}, "expected color of 64x48 px as in the camera, got 60x48 px"),
+        ({"depth": np.zeros((1, 16), np.float32)}, "expected depth of at least 2x2 px, got 16x1 px"),
+        (
+            {"confidence": np.zeros((12, 15), np.uint8)},
+            r"expected confidence of shape \(12, 16\) as depth, got \(12, 15\)",
+        ),
     ],
 )
 def test_inconsistent_frame_data_raises(changed: dict[str, object], said: str) -> None:
@@ -126,9 +129,9 @@ def test_image_of_other_size_is_resampled_to_first_camera(tmp_path: Path) -> Non
 
 
 def test_unknown_format_error_lists_formats(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"is of no format that can be imported\. These are: stray_scanner"):
+    with pytest.raises(DataError, match=r"expected a supported format, got an unknown one; supported: stray_scanner"):
         open_source(tmp_path)
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(DataError, match="expected a recording, got no such file or folder"):
         open_source(tmp_path / "nowhere")
 
 
@@ -136,11 +139,11 @@ def test_nested_export_folder_is_found(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "outer/2026_11_23", room_frames(1))
     assert open_source(tmp_path / "outer").format == "3D Scanner App"
     (tmp_path / "outer/other").mkdir()
-    with pytest.raises(DataError, match="is of no format"):
+    with pytest.raises(DataError, match="expected a supported format"):
         open_source(tmp_path / "outer")
 
 
 def test_zip_file_raises_with_unpack_hint(tmp_path: Path) -> None:
     (tmp_path / "scan.zip").touch()
-    with pytest.raises(DataError, match=r"scan\.zip must be unpacked first; then name the folder"):
+    with pytest.raises(DataError, match=r"scan\.zip: expected a folder or recording, got a zip archive; unpack it"):
         open_source(tmp_path / "scan.zip")

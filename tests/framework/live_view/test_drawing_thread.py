@@ -113,7 +113,7 @@ def test_drawing_thread_draw_error_is_logged_once(room: CornerRoom, caplog: pyte
         time.sleep(0.02)
     background.end()
     told = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
-    assert told == ["viewer: it failed, and the run goes on without it: [Errno 28] No space left on device"]
+    assert told == ["viewer: disabled after an error; the run continues: [Errno 28] No space left on device"]
     assert book.closed
 
 
@@ -139,7 +139,7 @@ def test_drawing_thread_map_error_does_not_end_run(room: CornerRoom, caplog: pyt
     background = DrawingThread(Broken(vertices=[np.zeros((1, 3))]), book, frame_interval=1, map_interval=3600)
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
     background.end()
-    assert "viewer: it failed, and the run goes on without it: Unable to allocate 40 GiB" in caplog.text
+    assert "viewer: disabled after an error; the run continues: Unable to allocate 40 GiB" in caplog.text
     assert not book.maps
 
 

@@ -150,7 +150,7 @@ def test_look_for_separates_surface_from_free_space(before: Visit) -> None:
 
 
 def test_visit_without_poses_raises(before: Visit) -> None:
-    with pytest.raises(DataError, match="without any pose"):
+    with pytest.raises(DataError, match="visit: expected at least one pose"):
         Visit(before.scene, np.zeros((0, 4, 4)))
 
 

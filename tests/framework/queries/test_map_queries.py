@@ -50,7 +50,9 @@ def test_map_instances_are_filtered_by_class(asked: Map) -> None:
         assert all(asked.name(instance) == name for instance in of_class.values())
     absent = next(name for name in asked.classes if name not in names)
     assert asked.instances(absent) == {}
-    with pytest.raises(DataError, match=f"there is no class '{absent}x' in this map; did you mean '{absent}'"):
+    with pytest.raises(
+        DataError, match=f"class: expected a class of this map, got '{absent}x'; did you mean '{absent}'"
+    ):
         asked.instances(f"{absent}x")
 
 
@@ -65,7 +67,7 @@ def test_map_nearest_returns_object_with_nearest_surface(asked: Map) -> None:
         assert of_class is not None
         assert asked.name(of_class) == asked.name(instance)
     for wrong in ((1.0, 2.0), (np.nan, 0.0, 0.0)):
-        with pytest.raises(DataError, match="a point is three finite numbers"):
+        with pytest.raises(DataError, match="point: expected 3 finite numbers"):
             asked.nearest(wrong)
 
 
@@ -85,7 +87,7 @@ def test_map_at_pixel_matches_view(asked: Map) -> None:
         assert found.id == key
     v, u = np.argwhere(view.instance_ids == 0)[0]
     assert asked.at_pixel(int(u), int(v), frame.camera, frame.T_world_camera) is None
-    with pytest.raises(DataError, match=r"the pixel \(-1, 0\) is not in the image of"):
+    with pytest.raises(DataError, match=r"pixel: expected one in the image of .*, got \(-1, 0\)"):
         asked.at_pixel(-1, 0, frame.camera, frame.T_world_camera)
 
 
@@ -117,7 +119,7 @@ def test_map_mesh_of_instance_contains_only_its_vertices(asked: Map) -> None:
         assert len(own.vertices) == len(instance.vertices)
         assert (own.instance_ids == instance.id).all()
         np.testing.assert_array_equal(own.vertices, asked.mesh(instance.id).vertices)
-    with pytest.raises(DataError, match="there is no instance 999"):
+    with pytest.raises(DataError, match="instance: expected an id of this map, got 999"):
         asked.mesh(999)
 
 

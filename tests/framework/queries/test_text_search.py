@@ -63,7 +63,7 @@ def test_by_embedding_ranks_by_similarity(embedded: Map) -> None:
     assert found[0].name == "bed"
     vertices = embedded.mesh(2).vertices
     np.testing.assert_allclose(found[0].centroid, vertices.mean(axis=0), atol=1e-5)
-    with pytest.raises(DataError, match="other than the 3 numbers"):
+    with pytest.raises(DataError, match="expected embeddings of length 3"):
         by_embedding(embedded, np.float32([0, 1, 0]))
 
 
@@ -96,7 +96,7 @@ def test_by_names_accepts_color_without_class(embedded: Map) -> None:
 
 @pytest.mark.parametrize("query", ["a blob", "a wooden chair", "the"])
 def test_by_names_unknown_words_raise(embedded: Map, query: str) -> None:
-    with pytest.raises(DataError, match="its objects are bed, chair; colors are black, gray") as refused:
+    with pytest.raises(DataError, match="objects: bed, chair; colors: black, gray") as refused:
         by_names(embedded, query)
     assert "'chair'" not in str(refused.value)
 
@@ -133,8 +133,8 @@ def test_query_command_prints_method_and_matches(
 @pytest.mark.parametrize(
     ("words", "fault"),
     [
-        (["chair", "--by", "embeddings"], "has no embeddings: run with"),
-        (["flying saucer"], "no class of this map and no color is called 'flying', 'saucer'"),
+        (["chair", "--by", "embeddings"], "expected embeddings of its objects, got none; run with"),
+        (["flying saucer"], "query: expected classes of this map or colors, got 'flying', 'saucer'"),
     ],
 )
 def test_query_command_error_is_one_line(
@@ -152,7 +152,7 @@ def test_query_command_with_embeddings_requires_model(
     """The fixture's are of no model that there is."""
     status, _, err = asked(monkeypatch, capsys, str(run), "a red chair")
     assert (status, len(err.splitlines())) == (1, 1)
-    assert "does not say of which model the embeddings are: name it by --model" in err
+    assert "expected the model of the embeddings in detector.model, got none; set --model" in err
     _, out, _ = asked(monkeypatch, capsys, str(run), "a bed", "--by", "names")
     assert out.splitlines()[0] == "by class names and colors"
     status, _, err = asked(monkeypatch, capsys, "nowhere", "a bed")
@@ -183,7 +183,7 @@ def test_query_with_embeddings_uses_model_of_run(
         assert (answer.by, answer.space) == ("embeddings", model.space)
         assert {one.instance.id: one.similarity for one in answer.objects} == pytest.approx(cosines)
     clip = write_image_text(tmp_path / "clip", "clip")
-    with pytest.raises(DataError, match=f"are of {model.space}, and {clip} is clip@"):
+    with pytest.raises(DataError, match=f"expected the model of its embeddings, {model.space}, got clip@"):
         query(scene, "red chair", model=clip)
 
 
@@ -203,18 +203,21 @@ def test_query_run_without_model_in_config_raises(embedded: Map, tmp_path: Path)
     embedded.save(tmp_path / "map.npz")
     for config in ("detector: null", "detector: 3", "detector: ${hydra:x}", "detector: {model: 4}", "seed: 0"):
         (tmp_path / "config.yaml").write_text(f"{config}\n")
-        with pytest.raises(DataError, match=r"config.yaml does not say of which model the embeddings are: name it by"):
+        with pytest.raises(
+            DataError,
+            match=r"config.yaml: expected the model of the embeddings in detector.model, got none; set --model",
+        ):
             query(tmp_path, "bed")
 
 
 @pytest.mark.parametrize(
     ("question", "fault"),
     [
-        ({"words": " "}, r"the words to look for must be 1 to 1000 characters, found ' '"),
-        ({"words": "chair " * 200}, r"the words to look for must be 1 to 1000 characters, found 'chair chair"),
-        ({"words": 7}, r"must be 1 to 1000 characters, found 7$"),
-        ({"words": "bed", "by": "name"}, r"by must be one of embeddings, names, found 'name'"),
-        ({"words": "bed", "by": "names", "model": "clip"}, r"a model is of embeddings, and by names none is asked"),
+        ({"words": " "}, r"query: expected a text of 1 to 1000 characters, got ' '"),
+        ({"words": "chair " * 200}, r"query: expected a text of 1 to 1000 characters, got 'chair chair"),
+        ({"words": 7}, r"expected a text of 1 to 1000 characters, got 7$"),
+        ({"words": "bed", "by": "name"}, r"by: expected one of embeddings, names, got 'name'"),
+        ({"words": "bed", "by": "names", "model": "clip"}, r"model: expected no model for by='names', got 'clip'"),
     ],
 )
 def test_query_invalid_arguments_raise_before_reading(question: dict[str, Any], fault: str) -> None:
@@ -225,11 +228,13 @@ def test_query_invalid_arguments_raise_before_reading(question: dict[str, Any], 
 def test_query_unanswerable_request_raises(embedded: Map, run_without: Path) -> None:
     with pytest.raises(DataError, match=r"query: expected the directory of a run, got .* without"):
         query("nowhere", "bed")
-    with pytest.raises(DataError, match="has no embeddings: run with detector=with_embeddings"):
+    with pytest.raises(
+        DataError, match="expected embeddings of its objects, got none; run with detector=with_embeddings"
+    ):
         query(run_without, "bed", model="clip")
-    with pytest.raises(DataError, match=r"this map has no embeddings: .* or ask by names"):
+    with pytest.raises(DataError, match=r"this map: expected embeddings .* or query by names"):
         query(instancemap.load_map(run_without / "map.npz"), "bed", by="embeddings")
-    with pytest.raises(DataError, match=r"a map does not say of which model its embeddings are: name it by --model"):
+    with pytest.raises(DataError, match=r"model: expected the model of the map's embeddings, got none; set --model"):
         query(embedded, "bed")
-    with pytest.raises(DataError, match="no class of this map and no color is called 'saucer'"):
+    with pytest.raises(DataError, match="query: expected classes of this map or colors, got 'saucer'"):
         query(embedded, "saucer", by="names")

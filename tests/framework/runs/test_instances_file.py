@@ -80,9 +80,9 @@ def test_class_probabilities_are_written_with_float32_digits(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("", "cannot be read"),
-        ("[", "cannot be read"),
-        ("[" * 100_000, "cannot be read"),
+        ("", "expected valid JSON"),
+        ("[", "expected valid JSON"),
+        ("[" * 100_000, "expected JSON with at most 50 nested lists"),
         ("{}", "expected a list of instances, got dict"),
         ("[7]", "entry 1: expected an object"),
         ([ENTRY, ENTRY | {"id": 0}], r"entry 2: id: expected an integer in \[1, 2147483647\], got 0"),

@@ -89,20 +89,20 @@ def test_write_scenes_writes_common_files(root: Path) -> None:
 )
 def test_write_scenes_other_parameters_raise(root: Path, other: BenchmarkSettings) -> None:
     before = times(root)
-    with pytest.raises(ConfigError, match=r"other parameters.*choose another folder"):
+    with pytest.raises(ConfigError, match=r"expected rooms with the parameters .*; set another folder"):
         write_scenes(root, SPECS, other, jobs=1)
     assert times(root) == before
 
 
 def test_write_scenes_foreign_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "011.ply").write_text("a scan")
-    with pytest.raises(ConfigError, match="new or empty folder"):
+    with pytest.raises(ConfigError, match="expected a new or empty folder"):
         write_scenes(tmp_path, SPECS, RECORDING, jobs=1)
     assert [path.name for path in tmp_path.iterdir()] == ["011.ply"]
-    with pytest.raises(ConfigError, match="new or empty folder"):
+    with pytest.raises(ConfigError, match="expected a new or empty folder"):
         write_scenes(tmp_path / "011.ply", SPECS, RECORDING, jobs=1)
     (tmp_path / "synthesize.json").write_text("{")
-    with pytest.raises(DataError, match=r"synthesize\.json is damaged"):
+    with pytest.raises(DataError, match=r"synthesize\.json: damaged"):
         write_scenes(tmp_path, SPECS, RECORDING, jobs=1)
 
 
@@ -112,7 +112,7 @@ def killed(status: int, rng: object) -> None:
 
 def test_write_scenes_killed_process_raises_one_line_error(tmp_path: Path) -> None:
     deadly = SceneSpec("trap", (partial(killed, 9),), {})
-    with pytest.raises(DataError, match=r"rooms/666 was ended from outside.*run the same command again"):
+    with pytest.raises(DataError, match=r"rooms/666: a writing process was terminated.*run the same command again"):
         write_scenes(tmp_path / "rooms", {"666": deadly}, RECORDING, jobs=1)
 
 

@@ -82,12 +82,12 @@ def test_trainer_resumed_run_equals_uninterrupted_run(
 def test_trainer_invalid_checkpoint_raises(pictures: RoomPictures, tmp_path: Path) -> None:
     Trainer(network(), pictures, Schedule(steps=1, batch=1, budget=SHORT.budget), tmp_path, "cpu").run()
     wider = MaskRCNN(Architecture(**{**vars(TINY), "fpn_channels": 16}))
-    with pytest.raises(DataError, match=r"checkpoint\.pt is damaged, or of another network"):
+    with pytest.raises(DataError, match=r"checkpoint\.pt: expected an intact checkpoint of this network"):
         Trainer(wider, pictures, SHORT, tmp_path, "cpu")
     whole = (tmp_path / CHECKPOINT).read_bytes()
     for content in (b"", whole[: len(whole) // 2]):
         (tmp_path / CHECKPOINT).write_bytes(content)
-        with pytest.raises(DataError, match=r"checkpoint\.pt is damaged"):
+        with pytest.raises(DataError, match=r"checkpoint\.pt: expected an intact checkpoint"):
             Trainer(network(), pictures, SHORT, tmp_path, "cpu")
 
 
@@ -103,12 +103,12 @@ def test_trainer_loss_depends_on_seed(pictures: RoomPictures, tmp_path: Path) ->
 
 def test_trainer_unknown_picture_classes_raise(pictures: RoomPictures, tmp_path: Path) -> None:
     only_chairs = MaskRCNN(Architecture(**{**vars(TINY), "classes": ("chair",)}))
-    with pytest.raises(DataError, match="does not have: bed"):
+    with pytest.raises(DataError, match="pictures: expected classes of the network, got bed"):
         Trainer(only_chairs, pictures, SHORT, tmp_path, "cpu").run()
 
 
 def test_room_pictures_missing_room_raises(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="room_000003 is missing"):
+    with pytest.raises(DataError, match="room_000003: expected a rendered room"):
         RoomPictures(tmp_path, 3, 1)
 
 

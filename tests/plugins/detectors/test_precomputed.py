@@ -220,7 +220,7 @@ def test_invalid_mask_folder_entry_raises(tmp_path: Path, listed: Any, said: str
 
 def test_mask_folder_with_unpaired_file_raises(tmp_path: Path) -> None:
     (write_folder(tmp_path) / "000003.json").rename(tmp_path / "000004.json")
-    with pytest.raises(DataError, match=r"000003\.json could not be read"):
+    with pytest.raises(DataError, match=r"000003\.json: cannot be read"):
         Precomputed(tmp_path)
     (tmp_path / "000003.png").rename(tmp_path / "000005.png")
     (tmp_path / "000005.json").write_text("[]")
@@ -286,7 +286,7 @@ def test_invalid_result_entry_raises_one_line(tmp_path: Path, changes: dict[str,
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("[{]", "is not valid JSON"),
+        ("[{]", "expected valid JSON"),
         ('{"annotations": []}', "expected a list of results in COCO's format, got an object"),
         ("[]", "no detection"),
         ("[3]", "entry 0"),
@@ -296,7 +296,7 @@ def test_invalid_or_missing_result_file_raises(tmp_path: Path, content: str, sai
     (tmp_path / "results.json").write_text(content)
     with pytest.raises(DataError, match=said):
         Precomputed(tmp_path / "results.json")
-    with pytest.raises(DataError, match=r"absent\.json could not be read"):
+    with pytest.raises(DataError, match=r"absent\.json: cannot be read"):
         Precomputed(tmp_path / "absent.json")
 
 

@@ -85,10 +85,10 @@ def test_time_offset_aligns_clocks(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("0 0 0 nan 0 0 0 1\n", "line 1: the pose is not finite"),
+        ("0 0 0 nan 0 0 0 1\n", "line 1: expected a finite pose, got"),
         ("0 0 0 0 0 0 0 2\n", "line 1: the quaternion .* has length 2"),
-        ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "line 2: timestamps must grow, found 0 after 1"),
-        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 2: timestamps must grow, found 1 after 1"),
+        ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "line 2: expected a timestamp > 1 s, got 0 s"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 2: expected a timestamp > 1 s, got 1 s"),
         ("1 0 0 0\n", "line 1: expected 8 numbers"),
         ("# nothing\n", "expected poses in TUM format, got none"),
     ],
@@ -101,7 +101,7 @@ def test_invalid_trajectory_raises_one_line(tmp_path: Path, text: str, message: 
 
 
 def test_missing_file_or_invalid_parameter_raises(tmp_path: Path, path: Path) -> None:
-    with pytest.raises(DataError, match=r"nowhere\.txt does not exist"):
+    with pytest.raises(DataError, match=r"nowhere\.txt: expected a trajectory in TUM format, got no such file"):
         TrajectoryFile(tmp_path / "nowhere.txt")
     with pytest.raises(ConfigError, match=r"TrajectoryFile\.max_time_difference"):
         TrajectoryFile(path, max_time_difference=-1)

@@ -175,9 +175,9 @@ def test_describe_option_formats_parameters_like_yaml() -> None:
 
 
 FAULTY_OPTIONS = {
-    "no_yaml": ("a: [1,\n", "no_yaml.yaml cannot be read: "),
+    "no_yaml": ("a: [1,\n", "no_yaml.yaml: cannot be read: "),
     "list": ("- 1\n", "list.yaml: expected keys and values, got a list"),
-    "no_text": ("\udcff", "no_text.yaml could not be read as text: "),
+    "no_text": ("\udcff", "no_text.yaml: expected UTF-8 text: "),
     "no_class": ("_target_: plugins.detectors.none.NoDetection\n", "has no NoDetection; did you mean 'NoDetections'?"),
     "a_refiner": ("_target_: plugins.refiners.identity.Identity\n", "expected a class that implements Detector"),
     "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "unknown parameter"),

@@ -31,7 +31,7 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
     asked = ("dataset=rgbd_folder", f"dataset.root={inverted}")
     done = checked(tmp_path, *asked)
     assert done.returncode == 1
-    assert "WRONG  poses: they are T_camera_world" in done.stdout
+    assert "WRONG  poses: stored as T_camera_world" in done.stdout
     assert "; set dataset.pose_kind=T_CAMERA_WORLD" in done.stdout
     assert (
         "ERROR   dataset: expected a recording that can be mapped, got errors; try dataset.pose_kind=T_CAMERA_WORLD"
@@ -52,7 +52,7 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
         (("out=2024",), "out: expected a path"),
         (("out=check.jpg",), "out: expected a name that ends in"),
         (("out=nowhere/check.png",), "out: expected a file in an existing folder, got"),
-        (("dataset=rgbd_folder", "dataset.root=nowhere"), "dataset.root: the folder nowhere"),
+        (("dataset=rgbd_folder", "dataset.root=nowhere"), "dataset.root: expected an existing folder, got nowhere"),
         (("dataset=rgbd_folder", "dataset.root=.", "dataset.camera_axes=UNITY"), "camera_axes"),
     ],
 )

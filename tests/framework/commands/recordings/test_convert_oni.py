@@ -143,5 +143,5 @@ def test_convert_oni_invalid_file_leaves_no_output(tmp_path, monkeypatch, capsys
     with pytest.raises(SystemExit, match="1"):
         command(monkeypatch, tmp_path / "a.oni", tmp_path / "011")
     [line] = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"error: {tmp_path / 'a.oni'} is no OpenNI recording")
+    assert line.startswith(f"error: {tmp_path / 'a.oni'}: expected an OpenNI recording")
     assert not (tmp_path / "011").exists()

@@ -25,9 +25,9 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
         (["--scenes", "bedroom,011"], "scenes: expected some of living_chairs, bedroom, got '011'"),
         (["--scenes", ""], "scenes: expected some of"),
         (["--jobs", "0"], "--jobs: expected at least 1"),
-        (["--frames", "0"], "frames must be at least 1"),
-        (["--seed", "-1"], "seed must be at least 0"),
-        (["--width", "30"], "width must be a multiple of 4"),
+        (["--frames", "0"], "frames: expected at least 1"),
+        (["--seed", "-1"], "seed: expected at least 0"),
+        (["--width", "30"], "width: expected a multiple of 4 px"),
     ],
 )
 def test_synthesize_invalid_arguments_are_one_line_errors(

@@ -76,16 +76,16 @@ def test_export_invalid_arguments_exit_with_status_2(
     [
         (
             ("--to", "glb", "--object", "sofa"),
-            "there is no object 'sofa' in this run; it has cube, dining table, picture",
+            "object: expected an id or class of this run, got 'sofa'; classes: cube, dining table, picture",
         ),
-        (("--to", "glb", "--triangles", "1"), "triangles must be at least 4, found 1"),
+        (("--to", "glb", "--triangles", "1"), "triangles: expected at least 4, got 1"),
         (("--to", "floorplan", "--resolution", "0"), "resolution"),
         (("--to", "floorplan", "--robot-height", "nan"), "robot_height"),
         (("--to", "glb", "--min-confidence", "2"), "min_confidence"),
-        (("--to", "glb", "--up", "0", "nan", "1"), "up must be three numbers, a direction"),
-        (("--to", "glb", "--floor", "nan"), "the floor, must be a height within 10000 m, found nan"),
+        (("--to", "glb", "--up", "0", "nan", "1"), "up: expected a direction of 3 numbers"),
+        (("--to", "glb", "--floor", "nan"), "expected a floor height in [-10000, 10000] m, got nan"),
         (("--to", "glb", "--out", "/dev/null"), "/dev/null"),
-        (("--to", "floorplan", "--floor=-1e300"), "the floor, must be a height within 10000 m"),
+        (("--to", "floorplan", "--floor=-1e300"), "expected a floor height in [-10000, 10000] m"),
     ],
 )
 def test_export_impossible_request_is_one_line_error(
@@ -105,12 +105,12 @@ def test_export_python_function_matches_command(run: Path, tmp_path: Path, monke
     assert written == [tmp_path / "a" / "objects" / "cube_2.glb"]
     assert written[0].read_bytes() == (tmp_path / "b" / "objects" / "cube_2.glb").read_bytes()
     for wrong, said in (
-        ({"coloring": "rainbow"}, "coloring must be one of appearance, instance, class, found 'rainbow'"),
-        ({"colours": "class"}, "export has no choice 'colours'"),
+        ({"coloring": "rainbow"}, "coloring: expected one of appearance, instance, class, got 'rainbow'"),
+        ({"colours": "class"}, "export: expected options in .*, got 'colours'"),
     ):
         with pytest.raises(ConfigError, match=said):
             instancemap.export(run, "glb", out=tmp_path, **wrong)
-    with pytest.raises(ConfigError, match="a format must be one of glb, ply"):
+    with pytest.raises(ConfigError, match="a format: expected one of glb, ply"):
         instancemap.export(run, "stl")
 
 

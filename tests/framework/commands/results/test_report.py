@@ -201,7 +201,7 @@ def test_report_invalid_output_path_fails_before_reading(
 ) -> None:
     monkeypatch.setattr(RunReport, "of", pytest.fail)
     assert "expected a file in an existing folder" in command(stored, "--out", stored / "missing" / "page.html")[2]
-    assert "is no file but a folder" in command(stored, "--out", stored)[2]
+    assert ": expected a regular file, got a folder" in command(stored, "--out", stored)[2]
 
 
 def test_report_url_is_percent_encoded(stored: Path, command) -> None:

@@ -295,7 +295,7 @@ def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
         worker.kill()  # idle by now, for some minutes
     first.communicate()
     assert done.returncode == 0, done.stderr
-    assert done.stderr.count("waiting for process") == 2
+    assert done.stderr.count("in use by process") == 2
     assert done.stderr.count("skipped: the completed run in") == 2
     assert "mapping" not in done.stderr
 
@@ -305,7 +305,7 @@ def test_sweep_in_locked_folder_is_refused(tmp_path: Path) -> None:
         done = end(begin(tmp_path))
     assert (done.returncode, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
-    assert f"error: {tmp_path / PLACE} is in use by process {os.getpid()} on " in done.stderr
+    assert f"error: {tmp_path / PLACE}: in use by process {os.getpid()} on " in done.stderr
     assert not (tmp_path / PLACE / "multirun.yaml").exists()
 
 

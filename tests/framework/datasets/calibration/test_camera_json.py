@@ -20,10 +20,10 @@ def test_camera_json_keys_map_to_camera_fields() -> None:
 
 
 def test_missing_or_invalid_json_raises(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"c\.json could not be read: No such file"):
+    with pytest.raises(DataError, match=r"c\.json: cannot be read: No such file"):
         read_json_object(tmp_path / "c.json")
     (tmp_path / "c.json").write_bytes(b"\xff")
-    with pytest.raises(DataError, match="is not valid JSON"):
+    with pytest.raises(DataError, match="expected valid JSON"):
         read_json_object(tmp_path / "c.json")
 
 
@@ -35,10 +35,10 @@ def test_lens_distortion_is_read() -> None:
 
 @pytest.mark.parametrize("value", [0.1, [0.1, 0.2, 0, 0], [0.1] * 8, {"k1": 0.1}, None])
 def test_distortion_without_five_numbers_raises(value: object) -> None:
-    with pytest.raises(DataError, match=r"c\.json: distortion \[k1, k2, .* must be a list of 5 numbers, found"):
+    with pytest.raises(DataError, match=r"c\.json: distortion \[k1, k2, .*: expected a list of 5 numbers, got"):
         distortion_of(Path("c.json"), {"distortion": value})
 
 
 def test_text_distortion_coefficient_raises() -> None:
-    with pytest.raises(DataError, match=r"c\.json: distortion .* 5 numbers, found .*'0\.2'"):
+    with pytest.raises(DataError, match=r"c\.json: distortion .* 5 numbers, got .*'0\.2'"):
         distortion_of(Path("c.json"), {"distortion": [0.1, 0, "0.2", 0, 0]})

@@ -53,5 +53,5 @@ def test_pixel_outside_color_view_repeats_nearest_color() -> None:
 
 @pytest.mark.parametrize("color", [Camera(32, 24, 9e5, 9e5, 16, 12), Camera(40000, 24, 5000, 30, 16, 12)])
 def test_incompatible_cameras_raise_before_allocation(color: Camera) -> None:
-    with pytest.raises(DataError, match="cannot be moved"):
+    with pytest.raises(DataError, match="expected color and depth cameras of similar resolution"):
         ColorRegistration(color, DEPTH)

@@ -119,7 +119,7 @@ def test_overtaken_incomplete_frame_is_reported_once(folder: Path) -> None:
     (folder / color).write_bytes(files[color])
     assert watched.look() == [0]
     write(folder, 2)
-    missing = f"{folder / color}: the other image of this frame was not there when frame 2 was"
+    missing = f"{folder / color}: expected the frame's other image before frame 2, got none"
     assert watched.look() == [missing, 2]
     (folder / depth).write_bytes(files[depth])
     assert watched.look() == []
@@ -128,7 +128,7 @@ def test_overtaken_incomplete_frame_is_reported_once(folder: Path) -> None:
     assert watched.look() == []
     write(folder, 4)
     assert watched.look() == [
-        f"{folder}/depth/000003.png is truncated: it ends after 99 bytes without its end marker",
+        f"{folder}/depth/000003.png: truncated image: no end marker in its 99 bytes",
         4,
     ]
 
@@ -138,7 +138,7 @@ def test_decreasing_frame_number_is_reported(folder: Path) -> None:
     write(folder, 7)
     assert watched.look() == [7]
     write(folder, 3)
-    assert watched.look() == [f"{folder}/color/000003.jpg came after frame 7"]
+    assert watched.look() == [f"{folder}/color/000003.jpg: expected frames in order, got it after frame 7"]
     write(folder, 9)
     assert watched.look() == [9]
 
@@ -155,7 +155,7 @@ def test_removed_files_do_not_stop_watching(folder: Path) -> None:
     first, second = watched.readers()
     assert outcome(first) == 0
     (folder / "color/000001.jpg").unlink()
-    assert "color/000001.jpg could not be read: No such file" in str(outcome(second))
+    assert "color/000001.jpg: cannot be read: No such file" in str(outcome(second))
     for path in (folder / "depth").iterdir():
         path.unlink()
     write(folder, 2)
@@ -167,21 +167,21 @@ def test_unrelated_files_are_ignored_and_ambiguous_names_raise(folder: Path, cap
     for name in (".000000.jpg", "000000.jpg.part", "preview.jpg", f"{2**53}.jpg"):
         (folder / "color" / name).write_bytes(b"?")
     assert watched.look() == watched.look() == []
-    assert sorted(message.partition(" is no frame")[0] for message in caplog.messages) == [
+    assert sorted(message.partition(": expected a name")[0] for message in caplog.messages) == [
         f"{folder}/color/{2**53}.jpg",
         f"{folder}/color/preview.jpg",
     ]
     for k in (4, 3):
         (folder / "color" / f"1305031102.1753{k}.jpg").write_bytes(b"?")
         (folder / "depth" / f"130503110{k}.175304.png").write_bytes(b"?")
-    with pytest.raises(DataError, match="differ in more than one number"):
+    with pytest.raises(DataError, match="expected names that differ in one number"):
         watched.look()
 
 
 def test_image_size_mismatch_is_reported(folder: Path) -> None:
     (folder / "camera.json").write_text(json.dumps(CALIBRATION | {"depth_scale": 1000, "width": 97}))
     write(folder, 0)
-    assert str(*Watched(folder).look()).endswith("says 97x72; color, depth and camera must agree")
+    assert str(*Watched(folder).look()).endswith(f"expected 97x72 px as in {folder}/camera.json, got 96x72 px")
 
 
 @pytest.mark.parametrize("half", [False, True])
@@ -192,7 +192,7 @@ def test_end_file_stops_watching_after_remaining_frames(folder: Path, half: bool
     if half:
         (folder / "depth/000006.png").write_bytes(b"?")
     (folder / "end").touch()
-    left = [f"{folder}/depth/000006.png: the other image of this frame was not there in the end"] if half else []
+    left = [f"{folder}/depth/000006.png: expected the frame's other image before the end, got none"] if half else []
     assert watched.look() == [5, *left]
     assert watched.over
 
@@ -225,7 +225,7 @@ def test_folder_watch_waits_for_camera_file(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [(None, "No such file"), ("{", "not valid JSON"), ("{}", "'width' is missing")]
+    ("text", "said"), [(None, "No such file"), ("{", "expected valid JSON"), ("{}", "expected a key 'width'")]
 )
 def test_missing_or_invalid_camera_file_raises_after_timeout(folder: Path, text: str | None, said: str) -> None:
     (folder / "camera.json").unlink()

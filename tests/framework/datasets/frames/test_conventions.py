@@ -89,7 +89,7 @@ def test_depth_delay_pairs_color_with_matching_depth(delay: int) -> None:
             assert (frame.images.color_name, frame.images.depth_name) == (f"color {k}", f"depth {k + delay}")
             assert frame.timestamp == k / 30
         else:
-            assert f"{delay} frames away" in frame.error
+            assert f"offset of {delay} frames" in frame.error
 
 
 @pytest.mark.parametrize("delay", [-2, 0, 1])
@@ -99,7 +99,7 @@ def test_pose_delay_pairs_images_with_matching_pose(delay: int) -> None:
     for k, frame in enumerate(delay_poses(stored, delay)):
         assert (frame.images.color()[0, 0, 0], frame.timestamp) == (k, k / 30)
         if not 0 <= k + delay < 5:
-            assert frame.error == f"no pose is {delay} frames away"
+            assert frame.error == f"expected a pose at an offset of {delay} frames, got none"
             assert frame.T_world_camera is None
         elif 3 in (k, k + delay):
             assert frame.error == "line 3 is no pose"
@@ -123,5 +123,5 @@ def test_recording_is_read_with_configured_conventions() -> None:
     np.testing.assert_allclose(then.T_world_camera, inverse(first.T_world_camera) @ np.diag([1.0, -1.0, -1.0, 1.0]))
     np.testing.assert_array_equal(then.color, plain[0].color)
     np.testing.assert_allclose(then.depth, plain[1].depth / 2, rtol=1e-6)
-    with pytest.raises(FrameError, match="no pose is 2 frames away"):
+    with pytest.raises(FrameError, match="expected a pose at an offset of 2 frames, got none"):
         meant[len(meant) - 1]

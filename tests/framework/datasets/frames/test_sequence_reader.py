@@ -20,7 +20,7 @@ def test_invalid_selection_error_names_parameter(start, stop, stride, name):
 
 
 def test_start_past_end_error_gives_frame_count():
-    with pytest.raises(ConfigError, match="only 3 frames"):
+    with pytest.raises(ConfigError, match=r"dataset\.start: expected a frame from 0 to 2, got 3"):
         choose_frames(3, 3, -1, 1)
 
 

@@ -152,14 +152,14 @@ def test_frame_without_a_pose_has_no_rendered_truth(folder: Path, tracked_run: P
     times, poses = read_tum(tracked_run / "trajectory.txt")
     write_tum(tracked_run / "trajectory.txt", times[:2], poses[:2])
     frame = RgbdFolder(folder, ground_truth=tracked_run)[2]
-    with pytest.raises(NoPoseError, match="frame 2 has no pose from which"):
+    with pytest.raises(NoPoseError, match="frame 2: expected a pose to render its true instances from"):
         GroundTruthDetector().detect(frame)
     assert frame_hash(frame, ("color", "truth")), "a stored detection is found without rendering"
 
 
 def test_mesh_without_given_poses_raises(folder: Path, mesh: Path) -> None:
     (folder / "poses.txt").unlink()
-    with pytest.raises(ConfigError, match=r"dataset\.ground_truth: expected given poses.*name the directory of a run"):
+    with pytest.raises(ConfigError, match=r"dataset\.ground_truth: expected given poses.*to a run directory"):
         RgbdFolder(folder, ground_truth=mesh)
 
 
@@ -209,16 +209,16 @@ def test_run_with_given_poses_is_not_aligned_to_a_tracked_map(folder: Path, trac
         (
             lambda mesh: mesh.unlink(),
             ConfigError,
-            r"^dataset\.ground_truth: expected a labeled mesh .* does not exist$",
+            r"^dataset\.ground_truth: expected a labeled mesh .*, got nonexistent .*\.ply$",
         ),
         (lambda mesh: write_wall(mesh, label=np.ones(6561, np.int32)), DataError, "'instance' of integers, got label"),
         (lambda mesh: write_wall(mesh, instance=np.ones(6561, np.float32)), DataError, "'instance' of integers"),
         (lambda mesh: write_wall(mesh, instance=np.zeros(6561, np.int32)), DataError, "got only instance 0"),
-        (lambda mesh: write_wall(mesh, instance=np.full(6561, -1, np.int32)), DataError, "expected instances from 0"),
+        (lambda mesh: write_wall(mesh, instance=np.full(6561, -1, np.int32)), DataError, "instance: expected 0 to"),
         (lambda mesh: write_wall(mesh, instance=np.full(6561, 9, np.int32)), DataError, "got none for 9"),
         (lambda mesh: (mesh.parent / "instances.json").unlink(), DataError, "with the class of each instance.*none$"),
-        (lambda mesh: (mesh.parent / "instances.json").write_text('{"7": {}}'), DataError, "instance 7 must be"),
-        (lambda mesh: (mesh.parent / "instances.json").write_text("7"), DataError, "must hold a JSON object"),
+        (lambda mesh: (mesh.parent / "instances.json").write_text('{"7": {}}'), DataError, "instance 7: expected"),
+        (lambda mesh: (mesh.parent / "instances.json").write_text("7"), DataError, "expected a JSON object"),
         (
             lambda mesh: (mesh.parent / "instances.json").write_text('[{"id": "a"}]'),
             DataError,
@@ -228,7 +228,7 @@ def test_run_with_given_poses_is_not_aligned_to_a_tracked_map(folder: Path, trac
         (
             lambda mesh: (mesh.parent / "instances.json").write_text('[{"id": 7, "class": "chair"}]'),
             DataError,
-            r"trajectory\.txt does not exist",
+            r"trajectory\.txt: expected a trajectory in TUM format, got no such file",
         ),
     ],
 )
@@ -242,7 +242,7 @@ def test_unusable_truth_raises_one_line(spoil, kind: type[Exception], message: s
 def test_points_without_faces_are_rejected(folder: Path, mesh: Path) -> None:
     ply = read_ply(mesh)
     write_ply(mesh, ply.vertices, ply.triangles[:0], ply.properties)
-    with pytest.raises(DataError, match="expected faces, from which masks are rendered"):
+    with pytest.raises(DataError, match="expected faces to render masks from"):
         RgbdFolder(folder, ground_truth=mesh)
 
 

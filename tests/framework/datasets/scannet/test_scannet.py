@@ -95,7 +95,7 @@ def test_sens_file_takes_precedence_over_exported_images(tmp_path: Path, caplog:
     write_exported(tmp_path / SCENE, shots(2))
     with caplog.at_level(logging.INFO):
         assert len(ScanNet(tmp_path, SCENE)) == 3
-    assert f"{SCENE}.sens is read, not the images exported" in caplog.text
+    assert f"{SCENE}.sens: preferred to the images exported" in caplog.text
 
 
 def test_timestamps_are_depth_times_if_increasing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -106,7 +106,7 @@ def test_timestamps_are_depth_times_if_increasing(tmp_path: Path, caplog: pytest
     frames[2].times = (0, 0)
     as_sens(tmp_path / SCENE, frames)
     assert [frame.timestamp for frame in ScanNet(tmp_path, SCENE)] == pytest.approx([0, 1 / 30, 2 / 30])
-    assert caplog.text.count("the times do not grow") == 1
+    assert caplog.text.count("expected increasing timestamps") == 1
 
 
 def test_points_are_mapped_at_their_positions(tmp_path: Path, write: Writer) -> None:
@@ -135,9 +135,9 @@ def test_frames_missing_from_truncated_sens_are_counted(tmp_path: Path, caplog: 
     path.write_bytes(content[: len(content) - 1500])
     sequence = ScanNet(tmp_path, SCENE)
     assert len(sequence) == 4
-    assert "lacks the last 1 of 4 frames" in caplog.text
-    assert "before frame 3 of 4 does" in fault_of(sequence, 3)
-    assert "times do not grow" not in caplog.text
+    assert "the last 1 of 4 frames are missing" in caplog.text
+    assert "within frame 3 of 4" in fault_of(sequence, 3)
+    assert "expected increasing timestamps" not in caplog.text
     result, _ = mapped(sequence)
     assert (result.frames, result.frames_skipped) == (4, 1)
 
@@ -172,7 +172,7 @@ def test_color_size_mismatch_raises_for_its_frame(tmp_path: Path, write: Writer)
     frames = shots()
     frames[1].color = frames[1].color[:-1]
     write(tmp_path / SCENE, frames)
-    assert "is 65x48, but the color camera's images are 65x49" in fault_of(ScanNet(tmp_path, SCENE), 1)
+    assert "expected 65x49 px as in the color camera, got 65x48 px" in fault_of(ScanNet(tmp_path, SCENE), 1)
 
 
 def test_downsized_color_scales_published_intrinsics(tmp_path: Path) -> None:
@@ -194,7 +194,7 @@ def test_intrinsics_of_other_image_size_raise(tmp_path: Path, which: str) -> Non
     matrix = np.loadtxt(path)
     matrix[:2] *= 3
     np.savetxt(path, matrix)
-    with pytest.raises(DataError, match=rf"intrinsic_{which}\.txt does not belong to images of"):
+    with pytest.raises(DataError, match=rf"intrinsic_{which}\.txt: expected intrinsics for images of"):
         ScanNet(tmp_path, SCENE)
 
 
@@ -204,8 +204,8 @@ def test_camera_offset_is_logged_with_shift_in_pixels(tmp_path: Path, caplog: py
     path = tmp_path / SCENE / f"{SCENE}.sens"
     write_sens(path, shots(1), color_extrinsics=extrinsics)
     ScanNet(tmp_path, SCENE)
-    assert "100 mm and 0.00 degrees apart" in caplog.text
-    assert "color is shifted by up to 1 px 2 m away" in caplog.text
+    assert "extrinsics of 100 mm and 0.00 degrees between color and depth" in caplog.text
+    assert "color is shifted by up to 1 px at 2 m" in caplog.text
     caplog.clear()
     extrinsics[0, 3] = 0.01
     write_sens(path, shots(1), color_extrinsics=extrinsics)
@@ -213,16 +213,16 @@ def test_camera_offset_is_logged_with_shift_in_pixels(tmp_path: Path, caplog: py
     assert not caplog.text
     write_sens(path, shots(1), color_extrinsics=np.zeros((4, 4)))
     ScanNet(tmp_path, SCENE)
-    assert "the extrinsics are no rigid motion" in caplog.text
+    assert "expected rigid extrinsics" in caplog.text
 
 
 def test_folder_without_scan_error_names_missing_files(tmp_path: Path) -> None:
     (tmp_path / SCENE).mkdir()
-    with pytest.raises(DataError, match=rf"holds neither {SCENE}\.sens nor color/"):
+    with pytest.raises(DataError, match=rf"expected {SCENE}\.sens or color/, got neither"):
         ScanNet(tmp_path, SCENE)
     for name in ("a.sens", "b.sens"):
         write_sens(tmp_path / SCENE / name, shots(1))
-    with pytest.raises(DataError, match=r"holds 2 \.sens files"):
+    with pytest.raises(DataError, match=r"expected one \.sens file, got 2"):
         ScanNet(tmp_path, SCENE)
 
 
@@ -253,7 +253,10 @@ def test_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pyt
     (tmp_path / "scannetv2-labels.combined.tsv").unlink()
     sequence = ScanNet(tmp_path, SCENE)
     assert sequence.annotation == "ScanNet v2, no label table"
-    assert f"{tmp_path / 'scannetv2-labels.combined.tsv'} is missing: only objects" in caplog.text
+    assert (
+        f"{tmp_path / 'scannetv2-labels.combined.tsv'}: expected the class of each annotated name, got no such file"
+        in caplog.text
+    )
     truth = sequence.scene_truth()
     assert truth is not None
     assert set(truth.class_names.values()) == {None}, "nobody else knows what a folding chair is"
@@ -266,7 +269,8 @@ def test_first_release_names_are_resolved_by_its_table(tmp_path: Path) -> None:
     of_both = ScanNet(tmp_path, SCENE).scene_truth()
     table.write_text("id\traw_category\tnyu40class\n1\twall\twall\n")
     with pytest.raises(
-        DataError, match=r"'folding chair'.*: in no label table; .* or put scannet-labels\.combined\.tsv"
+        DataError,
+        match=r"expected names of the label table, got 'folding chair'.* or put scannet-labels\.combined\.tsv",
     ):
         ScanNet(tmp_path, SCENE)
     (tmp_path / "scannet-labels.combined.tsv").write_text(
@@ -285,7 +289,9 @@ def test_incomplete_truth_files_give_no_truth_and_log(tmp_path: Path, caplog: py
     sequence = ScanNet(tmp_path, SCENE)
     assert sequence.scene_truth() is None
     assert sequence.annotation == ""
-    assert f"no true instances: {tmp_path}/{SCENE}/{SCENE}.aggregation.json is missing" in caplog.text
+    assert (
+        f"{tmp_path}/{SCENE}/{SCENE}.aggregation.json: expected for the true instances, got no such file" in caplog.text
+    )
     with pytest.raises(DataError, match=r"dataset\.frame_ground_truth: .*aggregation"):
         ScanNet(tmp_path, SCENE, frame_ground_truth=True)
 

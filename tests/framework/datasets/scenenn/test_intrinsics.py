@@ -41,14 +41,14 @@ def test_intrinsics_syntax_variants_are_read(tmp_path, text):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("fx 544", "fx", r"asus.ini, line 2: fx must be a positive number of pixels, found ''"),
-        ("fx 544", "fx 0", r"asus.ini, line 2: fx must be a positive number of pixels, found '0'"),
-        ("fy 544", "fy -544", "line 3: fy must be a positive number"),
-        ("cx 320", "cx nan", "line 4: cx must be a number of pixels, found 'nan'"),
-        ("cx 320", "cx 320 240", "line 4: cx must be a number of pixels, found '320 240'"),
-        ("cx 320", "depth_width 0", "line 4: depth_width must be a positive number"),
-        ("cx 320", "fx 544", "line 4: fx is there a second time"),
-        ("cy 240\n", "", "asus.ini has no line with cy; it must give fx, fy, cx, cy"),
+        ("fx 544", "fx", r"asus.ini, line 2: fx: expected a value > 0 px, got ''"),
+        ("fx 544", "fx 0", r"asus.ini, line 2: fx: expected a value > 0 px, got '0'"),
+        ("fy 544", "fy -544", "line 3: fy: expected a value > 0 px"),
+        ("cx 320", "cx nan", "line 4: cx: expected a finite value in px, got 'nan'"),
+        ("cx 320", "cx 320 240", "line 4: cx: expected a finite value in px, got '320 240'"),
+        ("cx 320", "depth_width 0", "line 4: depth_width: expected a value > 0 px"),
+        ("cx 320", "fx 544", "line 4: fx: expected one value, got a second one"),
+        ("cy 240\n", "", "asus.ini: expected lines with fx, fy, cx, cy, got none with cy"),
     ],
 )
 def test_invalid_intrinsics_error_gives_file_and_line(tmp_path, old, new, message):
@@ -58,8 +58,8 @@ def test_invalid_intrinsics_error_gives_file_and_line(tmp_path, old, new, messag
 
 
 def test_missing_or_oversized_intrinsics_file_raises(tmp_path):
-    with pytest.raises(DataError, match=r"asus.ini could not be read: No such file"):
+    with pytest.raises(DataError, match=r"asus.ini: cannot be read: No such file"):
         read_intrinsics(tmp_path / "asus.ini")
     (tmp_path / "large.ini").write_bytes(b"fx 1\n" * 2**18)
-    with pytest.raises(DataError, match=r"large.ini has 1310720 bytes, more than the 1048576"):
+    with pytest.raises(DataError, match=r"large.ini: expected at most 1048576 bytes, got 1310720"):
         read_intrinsics(tmp_path / "large.ini")

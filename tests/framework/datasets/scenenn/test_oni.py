@@ -23,7 +23,7 @@ def is_installed():
     return True
 
 
-played = pytest.mark.skipif(not is_installed(), reason="OpenNI 2 is not installed: apt-get install libopenni2-0")
+played = pytest.mark.skipif(not is_installed(), reason="OpenNI 2 is not installed; run apt-get install libopenni2-0")
 
 
 def depths(shape=(6, 8), dtype=np.uint16):
@@ -83,7 +83,7 @@ def test_truncated_recording_plays_complete_frames(tmp_path):
 def test_unsupported_pixel_format_raises(tmp_path):
     nodes = recording()
     nodes[1].pixel_format = YUV422
-    with pytest.raises(DataError, match=r"a\.oni: OpenNI 2 gives color in its pixel format 201; expected 200"):
+    with pytest.raises(DataError, match=r"a\.oni: color: expected OpenNI pixel format 200 .*, got 201"):
         frames_of(OniFile(nodes).write(tmp_path / "a.oni"))
 
 
@@ -92,7 +92,7 @@ def test_stalled_player_raises_after_timeout(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "PATIENCE", 200)
     path = OniFile(recording()).write(tmp_path / "a.oni")
     streams = {stream: Images(node=1, count=9, last=9) for stream in Stream}
-    with pytest.raises(DataError, match="OpenNI 2 plays no further than depth 4 of 9, color 4 of 9"):
+    with pytest.raises(DataError, match="damaged recording: OpenNI 2 stalled at depth 4 of 9, color 4 of 9"):
         list(oni.play(path, streams))
 
 
@@ -101,18 +101,18 @@ def test_player_crash_raises_one_line(tmp_path, monkeypatch):
     path = OniFile(recording()).write(tmp_path / "a.oni")
     with pytest.raises(DataError) as caught:
         frames_of(path)
-    assert str(caught.value) == f"{path}: it is damaged, OpenNI 2 crashed on it with status {-signal.SIGKILL}"
+    assert str(caught.value) == f"{path}: damaged recording: OpenNI 2 crashed with status {-signal.SIGKILL}"
 
 
 def test_missing_openni_error_names_package(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "LIBRARIES", ("libNotThere.so",))
-    with pytest.raises(ConfigError, match="OpenNI 2 is not installed: apt-get install libopenni2-0"):
+    with pytest.raises(ConfigError, match="OpenNI 2 is not installed; run apt-get install libopenni2-0"):
         next(oni.play(tmp_path / "a.oni", {}))
 
 
 @played
 def test_path_over_255_bytes_raises(tmp_path):
-    with pytest.raises(DataError, match="paths of at most 255 bytes"):
+    with pytest.raises(DataError, match="expected a path of at most 255 bytes"):
         next(oni.play(tmp_path / ("a" * 250 + ".oni"), {}))
 
 
@@ -162,5 +162,5 @@ def test_unpaired_stream_buffer_is_bounded():
 
 
 def test_color_and_depth_size_mismatch_raises():
-    with pytest.raises(DataError, match="color is 6x4 and depth 3x2; they must have the same size"):
+    with pytest.raises(DataError, match="expected color and depth of the same size, got 6x4 px and 3x2 px"):
         list(pair([image(Stream.DEPTH, 0), image(Stream.COLOR, 0, (4, 6, 3))]))

@@ -97,16 +97,22 @@ def test_missing_largest_node_is_repaired(tmp_path):
 @pytest.mark.parametrize(
     ("content", "fault"),
     [
-        (b"", "is no OpenNI recording: it begins with b'', expected b'NI10'"),
-        (b"NI10" + bytes(8), "is no OpenNI recording"),
-        (b"RIFF" + bytes(40), "is no OpenNI recording: it begins with b'RIFF'"),
-        (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 2, 0, 0, 2), "version 1.0.2.0; OpenNI 2 plays 1.0.0.4 to 1.0.1.0"),
-        (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2**32 - 1), "is damaged: it says to have 4294967295 nodes"),
+        (b"", ": expected an OpenNI recording beginning with b'NI10', got b''"),
+        (b"NI10" + bytes(8), ": expected an OpenNI recording"),
+        (b"RIFF" + bytes(40), ": expected an OpenNI recording beginning with b'NI10', got b'RIFF'"),
+        (
+            struct.pack("<4sBBHIQI", b"NI10", 1, 0, 2, 0, 0, 2),
+            "expected format version 1.0.0.4 to 1.0.1.0, got 1.0.2.0",
+        ),
+        (
+            struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2**32 - 1),
+            "damaged header: expected at most 255 nodes, got 4294967295",
+        ),
         (
             struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2),
-            "has no depth and no color image before byte 24, where it is",
+            "expected depth and color images, got no depth and no color before the truncation or damage at byte 24",
         ),
-        (None, "could not be read: No such file"),
+        (None, "cannot be read: No such file"),
     ],
 )
 def test_invalid_recording_raises_one_line(tmp_path, content, fault):
@@ -121,12 +127,12 @@ def test_invalid_recording_raises_one_line(tmp_path, content, fault):
 
 def test_named_pipe_raises_without_blocking(tmp_path):
     os.mkfifo(tmp_path / "a.oni")
-    with pytest.raises(DataError, match=r"a\.oni is no file but a device, a pipe"):
+    with pytest.raises(DataError, match=r"a\.oni: expected a regular file, got a device, a pipe"):
         read_contents(tmp_path / "a.oni")
 
 
 @pytest.mark.parametrize(("kept", "missing"), [(0, "color"), (1, "depth")])
 def test_recording_without_color_or_depth_raises(tmp_path, kept, missing):
     path = OniFile([recording().nodes[kept]]).write(tmp_path / "a.oni")
-    with pytest.raises(DataError, match=f"has no {missing} image; it needs depth and color"):
+    with pytest.raises(DataError, match=f"expected depth and color images, got no {missing}$"):
         read_contents(path)

@@ -111,7 +111,7 @@ def test_truncated_trajectory_loses_only_last_frame(path):
         known = length >= second + len("6 6")
         whole = length >= len(PUBLISHED) - len(".000000\n")
         assert list(log.poses) == ([0, 6] if whole else [0])
-        assert log.unusable == ({6: "the file ends before the pose does"} if known and not whole else {})
+        assert log.unusable == ({6: "expected a full pose, got the end of the file"} if known and not whole else {})
 
 
 def test_duplicate_frame_is_usable_only_if_poses_agree(path):
@@ -120,10 +120,10 @@ def test_duplicate_frame_is_usable_only_if_poses_agree(path):
     assert (list(log.poses), log.unusable) == ([0, 6], {})
     path.write_text(PUBLISHED + PUBLISHED.replace("-1.60032", "-1.7"))
     log = read_trajectory_log(path)
-    assert (list(log.poses), log.unusable) == ([0], {6: "it has two poses, in lines 6 and 16"})
+    assert (list(log.poses), log.unusable) == ([0], {6: "expected one pose, got two, in lines 6 and 16"})
     path.write_text(PUBLISHED + PUBLISHED.replace("-1.60032", "-1.7") + PUBLISHED[:-20])
     log = read_trajectory_log(path)
-    assert (list(log.poses), log.unusable) == ([0], {6: "it has two poses, in lines 6 and 26"})
+    assert (list(log.poses), log.unusable) == ([0], {6: "expected one pose, got two, in lines 6 and 26"})
     path.write_text(LOST + LOST.replace("3.15572", "nan") + PUBLISHED)
     assert list(read_trajectory_log(path).unusable) == [1259]
 
@@ -142,10 +142,10 @@ def test_empty_trajectory_has_no_poses(path):
         (1, "-1 -1 0", "line 1: expected the header"),
         (6, "6.5 6 7", "line 6: expected the header"),
         (6, "4294967296 6 7", "line 6: expected the header"),
-        (2, "1 0 0", "line 2: expected row 1 of a 4x4 matrix, four numbers, found '1 0 0'"),
+        (2, "1 0 0", "line 2: expected row 1 of a 4x4 matrix, four numbers, got '1 0 0'"),
         (3, "1", "line 3: expected row 2"),
-        (4, "0 0 one 0", "line 4: expected row 3 .* found '0 0 one 0'"),
-        (4, "", "line 6: expected row 4 .* found '6 6 7'"),
+        (4, "0 0 one 0", "line 4: expected row 3 .* got '0 0 one 0'"),
+        (4, "", "line 6: expected row 4 .* got '6 6 7'"),
         (8, "0 0 0 0 0", "line 8: expected row 2"),
         (10, "0 0 0 1 0", "line 10: expected row 4"),
     ],
@@ -159,12 +159,12 @@ def test_malformed_trajectory_error_gives_file_and_line(path, line, new, message
 
 
 def test_missing_trajectory_raises(path):
-    with pytest.raises(DataError, match=r"trajectory.log could not be read: No such file"):
+    with pytest.raises(DataError, match=r"trajectory.log: cannot be read: No such file"):
         read_trajectory_log(path)
 
 
 @pytest.mark.parametrize(
-    ("poses", "message"), [({0: 2 * np.eye(4)}, "pose of frame 0 is not a rigid"), ({-1: np.eye(4)}, "found -1")]
+    ("poses", "message"), [({0: 2 * np.eye(4)}, "pose of frame 0 is not a rigid"), ({-1: np.eye(4)}, "got -1")]
 )
 def test_writing_invalid_pose_raises_and_leaves_no_file(path, poses, message):
     with pytest.raises(DataError, match=message):

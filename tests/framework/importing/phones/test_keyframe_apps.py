@@ -73,7 +73,9 @@ def test_scanner_app_frames_without_color_are_dropped(tmp_path: Path) -> None:
     assert open_source(tmp_path / "export").count == 3
     for path in (tmp_path / "export").glob("depth_*"):
         path.unlink()
-    with pytest.raises(DataError, match=r"has no frame with a frame_00000\.jpg and a depth_00000\.png; in the app"):
+    with pytest.raises(
+        DataError, match=r"expected frames with frame_00000\.jpg and depth_00000\.png, got none; in the app"
+    ):
         open_source(tmp_path / "export")
 
 
@@ -88,7 +90,7 @@ def test_scan_without_times_is_timed_by_frame_number(tmp_path: Path) -> None:
 def test_polycam_export_without_depth_raises(tmp_path: Path) -> None:
     write_polycam(tmp_path / "export", FRAMES)
     (tmp_path / "export/keyframes/depth").rename(tmp_path / "depth")
-    with pytest.raises(DataError, match="has no depth/ or no cameras: Polycam keeps them with a LiDAR"):
+    with pytest.raises(DataError, match="expected cameras and depth/, got none; record with a LiDAR"):
         open_source(tmp_path / "export")
 
 
@@ -105,19 +107,19 @@ def second(folder: Path, pattern: str) -> Path:
 
 SPOILT_CAMERAS = {
     "3D Scanner App": [
-        (lambda c: c.pop("intrinsics"), "intrinsics must be a list of 9 numbers"),
+        (lambda c: c.pop("intrinsics"), "intrinsics: expected a list of 9 numbers"),
         (lambda c: c.update(cameraPoseARFrame=[0] * 16), "pose: expected the last row 0 0 0 1"),
-        (lambda c: c.update(cameraPoseARFrame=[1, 2]), "cameraPoseARFrame must be a list of 16 numbers"),
+        (lambda c: c.update(cameraPoseARFrame=[1, 2]), "cameraPoseARFrame: expected a list of 16 numbers"),
         (
             lambda c: c.update(intrinsics=[0] * 9),
             "Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy =",
         ),
-        (lambda c: c.update(time="now"), "time must be a number, found now"),
+        (lambda c: c.update(time="now"), "time: expected a number, got now"),
     ],
     "Polycam": [
-        (lambda c: c.pop("fx"), "the key 'fx' is missing"),
+        (lambda c: c.pop("fx"), "expected a key 'fx'"),
         (lambda c: c.update(t_00=3), "pose: expected a rigid transform, got |R R^T - I| ="),
-        (lambda c: c.update(t_23=None), "t_23 must be a number, found None"),
+        (lambda c: c.update(t_23=None), "t_23: expected a number, got None"),
         (lambda c: c.update(fx=-1), "Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy ="),
     ],
 }

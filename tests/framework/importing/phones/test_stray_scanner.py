@@ -65,12 +65,15 @@ def spoil_row(folder: Path, number: int, change) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda words: words[:5], r"odometry.csv, line 3: expected 9 numbers .* found 5"),
-        (lambda words: [*words[:2], " nan", *words[3:]], r"odometry.csv, line 3: the pose is not finite"),
-        (lambda words: [*words[:8], " 7.0", *words[9:]], r"odometry.csv, line 3: the quaternion .* has length 7"),
-        (lambda words: [words[0], " 1.5", *words[2:]], r"odometry.csv, line 3: a frame is a whole number, found '1.5'"),
-        (lambda words: [words[0], " 000077", *words[2:]], r"rgb.mp4 ends, or is damaged, before frame 77"),
-        (lambda words: ["99.0", *words[1:]], r"000001.png is of 99.000000 s, not later than the frame before"),
+        (lambda words: words[:5], r"odometry.csv, line 3: expected 9 numbers .* got 5"),
+        (lambda words: [*words[:2], " nan", *words[3:]], r"odometry.csv, line 3: expected a finite pose"),
+        (
+            lambda words: [*words[:8], " 7.0", *words[9:]],
+            r"odometry.csv, line 3: expected a quaternion .* of length 1, got 7",
+        ),
+        (lambda words: [words[0], " 1.5", *words[2:]], r"odometry.csv, line 3: frame: expected 0 to 999999, got '1.5'"),
+        (lambda words: [words[0], " 000077", *words[2:]], r"rgb.mp4: expected frame 77, got the end of the video"),
+        (lambda words: ["99.0", *words[1:]], r"000001.png: expected a timestamp > .* s, got 99.000000 s"),
         (
             lambda words: [*words[:9], " -5.0", *words[10:]],
             "line 3: Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy =",
@@ -92,7 +95,7 @@ def test_damaged_image_loses_one_frame(folder: Path, tmp_path: Path, name: str) 
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
     assert len(written.timestamps) == 3
     assert name in written.errors[0]
-    assert "left out are 1, the first: " in str(written)
+    assert "skipped 1, first error: " in str(written)
     path.unlink()
     assert len(write_folder(open_source(folder), tmp_path / "again", Writing()).timestamps) == 3
 
@@ -101,20 +104,20 @@ def test_short_video_keeps_decoded_frames(folder: Path, tmp_path: Path) -> None:
     write_video(folder / "rgb.mp4", [frame.color for frame in FRAMES[:2]])
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
     assert (len(written.timestamps), len(written.errors)) == (2, 2)
-    assert "rgb.mp4 ends, or is damaged, before frame 2" in written.errors[0]
+    assert "rgb.mp4: expected frame 2, got the end of the video" in written.errors[0]
 
 
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("rgb.mp4", None, r"rgb\.mp4 could not be read"),
-        ("rgb.mp4", b"#EXTM3U\nhttp://localhost/1.ts\n", r"rgb\.mp4 is no MP4 or QuickTime file"),
-        ("rgb.mp4", b"\0\0\0\x18ftypmp42" + bytes(200), r"rgb\.mp4 could not be decoded"),
-        ("odometry.csv", b"", r"odometry\.csv must begin with the line timestamp, frame"),
-        ("odometry.csv", b"1, 2, 3, 4\n", r"odometry\.csv must begin with the line"),
-        ("odometry.csv", b"timestamp, frame, x, y, z, qx, qy, qz, qw\n", "there is none"),
-        ("camera_matrix.csv", b"1, 0, 2\n0, 1, 2\n", r"camera_matrix\.csv must hold 3 lines"),
-        ("camera_matrix.csv", b"1, 0, 2\n0, x, 2\n0, 0, 1\n", r"camera_matrix\.csv, line 2: .* found ' x'"),
+        ("rgb.mp4", None, r"rgb\.mp4: cannot be read"),
+        ("rgb.mp4", b"#EXTM3U\nhttp://localhost/1.ts\n", r"rgb\.mp4: expected an MP4 or QuickTime file"),
+        ("rgb.mp4", b"\0\0\0\x18ftypmp42" + bytes(200), r"rgb\.mp4: cannot be decoded"),
+        ("odometry.csv", b"", r"odometry\.csv, line 1: expected timestamp, frame"),
+        ("odometry.csv", b"1, 2, 3, 4\n", r"odometry\.csv, line 1: expected"),
+        ("odometry.csv", b"timestamp, frame, x, y, z, qx, qy, qz, qw\n", "the recording has no frames"),
+        ("camera_matrix.csv", b"1, 0, 2\n0, 1, 2\n", r"camera_matrix\.csv: expected 3 lines"),
+        ("camera_matrix.csv", b"1, 0, 2\n0, x, 2\n0, 0, 1\n", r"camera_matrix\.csv, line 2: .* got ' x'"),
     ],
 )
 def test_invalid_export_raises_and_leaves_no_folder(
