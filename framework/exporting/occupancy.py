@@ -74,8 +74,8 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
     origin = (np.floor(low / resolution) - 1) * resolution
     columns, rows = (np.floor((high - origin) / resolution) + 2).astype(np.int64).tolist()
     if rows * columns > MOST_CELLS:
-        found = f"{columns} x {rows} cells of {resolution:g} m"
-        raise DataError(f"plan: expected at most {MOST_CELLS} cells, got {found}; raise the resolution")
+        cells = f"{columns} x {rows} cells of {resolution:g} m"
+        raise DataError(f"plan: expected at most {MOST_CELLS} cells, got {cells}; raise the resolution")
     column, row = np.floor((found.points[:, :2] - origin) / resolution).astype(np.int64).T
     number = row * columns + column  # (P,) cell of each point
     heights = found.points[:, 2]

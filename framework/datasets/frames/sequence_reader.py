@@ -295,7 +295,7 @@ def choose_frames(
     check_selection(start, stop, stride, frame_fraction)
     if start >= count:
         raise ConfigError(f"dataset.start: expected a frame from 0 to {count - 1}, got {start}")
-        require(seed >= 0, "seed", seed, "at least 0")
+    require(seed >= 0, "seed", seed, "at least 0")
     chosen = range(start, count if stop == TO_THE_END else min(stop, count), stride)
     if frame_fraction == 1:
         return chosen
