@@ -142,7 +142,7 @@ def test_mapper_add_none_raises() -> None:
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("detector=nobody", "got nobody"),
         ("fuser.voxel_sise=1", "did you mean fuser.voxel_size?"),
@@ -155,8 +155,8 @@ def test_mapper_add_none_raises() -> None:
         (None, "Mapper: expected overrides such as 'fuser.voxel_size=0.02', got None"),
     ],
 )
-def test_mapper_invalid_override_raises_one_line_error(override: Any, said: str) -> None:
-    with pytest.raises(ConfigError, match=said.replace("?", r"\?")) as refused:
+def test_mapper_invalid_override_raises_one_line_error(override: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message.replace("?", r"\?")) as refused:
         Mapper(*STAGES, override)
     assert "\n" not in str(refused.value)
 

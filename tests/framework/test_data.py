@@ -55,12 +55,12 @@ def test_camera_and_frame_accept_numpy_scalars() -> None:
 
 def test_frame_up_must_be_unit_vector() -> None:
     np.testing.assert_array_equal(frame(up=np.array([0.6, -0.8, 0.0])).up, [0.6, -0.8, 0.0])
-    for wrong, said in (
+    for wrong, message in (
         ([0.0, -9.81, 0.0], "expected a unit vector, got length 9.81"),
         ([0.0, -1.0], r"shape \(3\)"),
         ([0.0, np.nan, 0.0], "expected finite values"),
     ):
-        with pytest.raises(DataError, match=f"frame 7: up .*{said}"):
+        with pytest.raises(DataError, match=f"frame 7: up .*{message}"):
             frame(up=np.array(wrong))
 
 
@@ -135,7 +135,7 @@ def test_valid_data_objects_are_accepted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "changes", "said"),
+    ("make", "changes", "message"),
     [
         (frame, {"color": np.zeros((3, 5, 3), np.uint8)}, r"frame 7: color: expected shape \(3, 4, 3\)"),
         (frame, {"color": np.zeros((3, 4, 3), np.float32)}, "color: expected an array of uint8, got float32"),
@@ -190,9 +190,9 @@ def test_valid_data_objects_are_accepted() -> None:
     ],
 )
 def test_invalid_data_objects_raise_one_line_error(
-    make: Callable[..., object], changes: dict[str, Any], said: str
+    make: Callable[..., object], changes: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(DataError, match=said) as caught:
+    with pytest.raises(DataError, match=message) as caught:
         make(**changes)
     assert "\n" not in str(caught.value)
 
@@ -233,7 +233,7 @@ def test_camera_out_of_range_value_raises(wrong: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         (
             {"fx": 0.82, "fy": 1.09, "cx": 0.5, "cy": 0.5},
@@ -259,9 +259,9 @@ def test_camera_out_of_range_value_raises(wrong: dict[str, float]) -> None:
         ({"width": 10**9, "height": 10**9}, "at most 33554432 px, got 1000000000x1000000000"),
     ],
 )
-def test_camera_implausible_intrinsics_raise(wrong: dict[str, float], said: str) -> None:
+def test_camera_implausible_intrinsics_raise(wrong: dict[str, float], message: str) -> None:
     numbers = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5}
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=message):
         Camera(**(numbers | wrong))  # type: ignore[arg-type]
 
 

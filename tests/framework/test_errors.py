@@ -11,8 +11,8 @@ from framework.errors import ConfigError, DataError, FrameError, InstanceMapErro
 
 
 def test_error_message_of_usual_text_is_unchanged() -> None:
-    said = "/data/scene 1/camera.json: fx must be a number of pixels, found 'näh'"
-    assert str(DataError(said)) == said
+    message = "/data/scene 1/camera.json: fx must be a number of pixels, found 'näh'"
+    assert str(DataError(message)) == message
     assert str(InstanceMapError()) == ""
 
 
@@ -20,20 +20,20 @@ def test_error_message_of_usual_text_is_unchanged() -> None:
     "given", ["x" * 100_000, "x y " * 30_000, "\udcff" * 1000, "\x1b[2J" * 1000, "\n" * 5000, "a\u2028b" * 1000, "\0"]
 )
 def test_error_message_is_shortened_and_escaped(given: str) -> None:
-    said = str(ConfigError(f"detector.label_space: there is no {given}; did you mean 'coco'?"))
-    assert said.isprintable()
-    assert len(said) <= 1000
-    assert said.startswith("detector.label_space: there is no ")
-    assert str(ConfigError(said)) == said, "once is enough"
+    message = str(ConfigError(f"detector.label_space: there is no {given}; did you mean 'coco'?"))
+    assert message.isprintable()
+    assert len(message) <= 1000
+    assert message.startswith("detector.label_space: there is no ")
+    assert str(ConfigError(message)) == message, "once is enough"
     assert one_line(ValueError(given)).isprintable()
-    assert said.encode()
+    assert message.encode()
 
 
 def test_printable_long_word_is_replaced_by_its_length() -> None:
-    said = printable(f"there is no {'x' * 5000}; did you mean 'coco'?")
-    assert "(5001 characters)" in said
-    assert said.endswith("did you mean 'coco'?")
-    assert said.count("x") <= 200
+    message = printable(f"there is no {'x' * 5000}; did you mean 'coco'?")
+    assert "(5001 characters)" in message
+    assert message.endswith("did you mean 'coco'?")
+    assert message.count("x") <= 200
 
 
 def test_frame_error_pickle_round_trip_keeps_message() -> None:

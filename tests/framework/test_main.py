@@ -41,7 +41,7 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("detector=fakke", ["detector: expected one of", "got fakke; did you mean fake?"]),
         (
@@ -66,13 +66,13 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
         ("--experimental-r=config.pickle", ["--experimental-rerun: expected no option that reads a pickle"]),
     ],
 )
-def test_run_invalid_override_exits_with_one_line_error(tmp_path: Path, override: str, said: list[str]) -> None:
+def test_run_invalid_override_exits_with_one_line_error(tmp_path: Path, override: str, message: list[str]) -> None:
     done = start(tmp_path, override)
     assert done.returncode == 1
     assert done.stdout == ""
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert len(done.stderr) < 1200
-    for words in said:
+    for words in message:
         assert words in done.stderr
 
 
@@ -92,8 +92,8 @@ def test_run_escapes_invalid_unicode_file_names(tmp_path: Path) -> None:
     done = start(tmp_path, "dataset=rgbd_folder", f"dataset.root={tmp_path}")
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 3, done.stderr
-    for said in (done.stderr, (tmp_path / "instancemap.log").read_text("utf-8")):
-        assert f"frame skipped: {tmp_path}/color/\\udcff_0.png: expected a JPEG or PNG file" in said
+    for message in (done.stderr, (tmp_path / "instancemap.log").read_text("utf-8")):
+        assert f"frame skipped: {tmp_path}/color/\\udcff_0.png: expected a JPEG or PNG file" in message
 
 
 def test_removed_working_folder_exits_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,8 +156,8 @@ def words(*arguments: str, directory: Path) -> subprocess.CompletedProcess[str]:
 def test_help_lists_all_commands(tmp_path: Path) -> None:
     done = words("--help", directory=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    for name, says in COMMANDS.items():
-        assert re.search(rf"^  {name} +{re.escape(says)}$", done.stdout, re.MULTILINE)
+    for name, states in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(states)}$", done.stdout, re.MULTILINE)
         assert find_spec(module_of(name))
 
 

@@ -154,7 +154,7 @@ def test_pipeline_refines_only_inexact_masks_and_checks_pixels(room: CornerRoom)
 
 
 @pytest.mark.parametrize(
-    ("stage", "verb", "said"),
+    ("stage", "verb", "output"),
     [
         ("detector", "detect", "expected Detections from the detector"),
         ("tracker", "track", "expected a Pose from the tracker"),
@@ -162,11 +162,11 @@ def test_pipeline_refines_only_inexact_masks_and_checks_pixels(room: CornerRoom)
     ],
 )
 def test_pipeline_stage_returning_none_raises(
-    room: CornerRoom, monkeypatch: pytest.MonkeyPatch, stage: str, verb: str, said: str
+    room: CornerRoom, monkeypatch: pytest.MonkeyPatch, stage: str, verb: str, output: str
 ) -> None:
     stages = pipeline(prefetch=0)
     monkeypatch.setattr(getattr(stages, stage), verb, lambda *_: None)
-    with pytest.raises(DataError, match=f"frame 0: {said}, got NoneType"):
+    with pytest.raises(DataError, match=f"frame 0: {output}, got NoneType"):
         stages.run(room)
 
 
@@ -485,8 +485,8 @@ def test_failing_viewer_does_not_affect_run(
     monkeypatch.setattr(listener, verb, fails)
     result = pipeline(prefetch, viewer=listener).run_to_any_end(CornerRoom(unreadable=1))
     assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
-    told = [record.message for record in caplog.records if "viewer" in record.message]
-    assert told == ["viewer: disabled after an error; the run continues: no screen any more"]
+    expected = [record.message for record in caplog.records if "viewer" in record.message]
+    assert expected == ["viewer: disabled after an error; the run continues: no screen any more"]
     assert calls == [verb], "it is left alone"
     assert verb == "end" or listener.heard[-1] == "end"
 

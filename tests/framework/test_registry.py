@@ -153,7 +153,7 @@ def test_build_flattens_parameters_of_parts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("parameters", "said"),
+    ("parameters", "output"),
     [
         ({"threshold": "high"}, ["Probe", "threshold", "'high'", "Float"]),
         ({"limit": 2.5}, ["limit", "2.5", "Integer"]),
@@ -190,9 +190,9 @@ def test_build_flattens_parameters_of_parts() -> None:
     ],
     ids=str,
 )
-def test_build_invalid_parameters_raise_one_line_error(parameters: dict[str, object], said: list[str]) -> None:
+def test_build_invalid_parameters_raise_one_line_error(parameters: dict[str, object], output: list[str]) -> None:
     message = fault(**parameters)
-    for words in said:
+    for words in output:
         assert words in message
 
 
@@ -229,7 +229,7 @@ def talkative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("hydra_runs", [True, False])
 @pytest.mark.parametrize(
-    ("target", "said"),
+    ("target", "output"),
     [
         ("plugins.detectors.none.NoDetection", "did you mean 'plugins.detectors.none.NoDetections'?"),
         (
@@ -243,12 +243,12 @@ def talkative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 @pytest.mark.usefixtures("talkative")
 def test_build_does_not_import_unregistered_target(
-    target: str, said: str, hydra_runs: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    target: str, output: str, hydra_runs: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The options are those of Hydra's search path, also where a stored config is read and no Hydra runs."""
     monkeypatch.setattr(composition, "_added", [])
     with initialize_config_dir(str(CONF), version_base="1.3") if hydra_runs else nullcontext():
-        assert said in fault(_target_=target)
+        assert output in fault(_target_=target)
         assert build(Detector, OmegaConf.create({"_target_": "plugins.detectors.none.NoDetections"})).classes
     assert not {"this", "talkative", "talkative.one"} & set(sys.modules)
     assert capfd.readouterr() == ("", "")
@@ -266,8 +266,8 @@ def test_conflicting_plugins_package_is_reported(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{CHECKOUT}"}
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
-    said = f"plugins: expected InstanceMap's package at {CHECKOUT}/plugins, got another one at {tmp_path}/plugins"
-    assert f"{said}rename it or start in another folder" in done.stderr
+    output = f"plugins: expected InstanceMap's package at {CHECKOUT}/plugins, got another one at {tmp_path}/plugins"
+    assert f"{output}rename it or start in another folder" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert "imported" not in done.stdout
 

@@ -128,8 +128,8 @@ def test_citation_file_has_required_keys() -> None:
         assert all("name" in author or "family-names" in author for author in work["authors"])
     page = PAGES["docs/citing.md"]
     [paper] = citation["references"]
-    for said in (__version__, str(paper["year"]), paper["journal"], str(paper["number"]), paper["url"]):
-        assert said in page
+    for message in (__version__, str(paper["year"]), paper["journal"], str(paper["number"]), paper["url"]):
+        assert message in page
 
 
 def test_dockerfile_matches_project_files() -> None:

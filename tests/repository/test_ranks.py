@@ -184,7 +184,7 @@ def test_provenance_of_runs_is_printed(places: list[Path]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "keys", "said"),
+    ("asked", "keys", "message"),
     [
         (["rooms"], [AP50], "ranks compares two folders or more, found 1"),
         (["rooms", "rooms/../rooms"], [AP50], "different folders, found one twice"),
@@ -200,12 +200,14 @@ def test_provenance_of_runs_is_printed(places: list[Path]) -> None:
         (["rooms", "apart"], [AP50], "apart: there is no run in which all rows have instances.ap50"),
     ],
 )
-def test_incomparable_folders_raise_one_line(places: list[Path], asked: list[str], keys: list[str], said: str) -> None:
+def test_incomparable_folders_raise_one_line(
+    places: list[Path], asked: list[str], keys: list[str], message: str
+) -> None:
     root = places[0].parent
     (root / "empty").mkdir()
     experiment(root / "small", {"a": (0.1,), "b": (0.2,)})
     experiment(root / "apart", {"a": (0.1, None), "b": (None, 0.2), "c": (0.1, 0.2)})
-    with pytest.raises(DataError, match=said) as caught:
+    with pytest.raises(DataError, match=message) as caught:
         write_ranks([root / name for name in asked], keys, None)
     assert "\n" not in str(caught.value)
 

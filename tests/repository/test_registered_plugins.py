@@ -86,12 +86,12 @@ def video(request: pytest.FixtureRequest, ready: Ready, monkeypatch: pytest.Monk
 def come(video: LiveVideo) -> Iterator[Frame]:
     """The frames, which can be read; something is said while none comes."""
     with closing(video.frames()) as readers:
-        said = time.monotonic()
+        message = time.monotonic()
         for reader in readers:
-            assert time.monotonic() - said < 1, "ten times a second, but for a busy machine"
+            assert time.monotonic() - message < 1, "ten times a second, but for a busy machine"
             if reader is not None:
                 yield reader()
-            said = time.monotonic()
+            message = time.monotonic()
 
 
 def test_live_video_yields_current_frames_in_order(video: LiveVideo) -> None:

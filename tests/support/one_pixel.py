@@ -31,14 +31,14 @@ def measured(
     last_id: int,
 ) -> Measurement:
     """Every cluster covers the one pixel that there is."""
-    said = np.flatnonzero(ids).astype(np.int32)
+    message = np.flatnonzero(ids).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True
     relative, named, bits = named_classes(np.log(distributions), logarithmic=True)
     return Measurement(
         np.full((1, 1), COVERED),
-        np.array([0, 0, len(said)], np.int32),
-        said,
+        np.array([0, 0, len(message)], np.int32),
+        message,
         np.array(ids, np.int32),
         np.log(np.array(scores) / FLOOR).astype(np.float32),
         np.float32(np.log(absence)),

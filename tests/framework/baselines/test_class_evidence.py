@@ -54,29 +54,29 @@ def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
 
 def test_class_evidence_few_classes_are_exact() -> None:
     rng = np.random.default_rng(0)
-    said = rng.normal(0, 2, (30, 5))
-    masks, evidence = masks_that_say(said), one_voxel(5)
+    message = rng.normal(0, 2, (30, 5))
+    masks, evidence = masks_that_say(message), one_voxel(5)
     assert sum(observe(evidence, masks, k) for k in range(30)) == 0
-    np.testing.assert_allclose(sums(evidence, 5), said.sum(axis=0), atol=1e-4)
-    assert evidence.class_ids[0, 0, 0] == said.sum(axis=0).argmax()
+    np.testing.assert_allclose(sums(evidence, 5), message.sum(axis=0), atol=1e-4)
+    assert evidence.class_ids[0, 0, 0] == message.sum(axis=0).argmax()
     assert evidence.masked[0, 0] == 30
 
 
 def test_class_evidence_late_class_includes_earlier_masks() -> None:
     """Of 14 classes each mask names 8 and finds the others alike: as a detector's floor does."""
     rng = np.random.default_rng(1)
-    said = np.full((20, 14), -3.0)
-    for row in said:
+    message = np.full((20, 14), -3.0)
+    for row in message:
         row[rng.choice(14, NEW_CLASSES, replace=False)] = rng.normal(0, 1, NEW_CLASSES)
-    masks, evidence = masks_that_say(said), one_voxel(14)
+    masks, evidence = masks_that_say(message), one_voxel(14)
     assert sum(observe(evidence, masks, k) for k in range(20)) == 0
-    np.testing.assert_allclose(sums(evidence, 14), said.sum(axis=0), atol=1e-4)
+    np.testing.assert_allclose(sums(evidence, 14), message.sum(axis=0), atol=1e-4)
 
 
 def test_class_evidence_full_voxel_drops_least_likely_class() -> None:
-    said = np.full((3, 40), -5.0)
-    said[0, :8], said[1, 8:16], said[2, 16:24] = 1.0, 2.0, 9.0
-    masks, evidence = masks_that_say(said), one_voxel(40)
+    message = np.full((3, 40), -5.0)
+    message[0, :8], message[1, 8:16], message[2, 16:24] = 1.0, 2.0, 9.0
+    masks, evidence = masks_that_say(message), one_voxel(40)
     assert evidence.class_ids.shape[2] == CLASS_SLOTS
     assert [observe(evidence, masks, k) for k in range(3)] == [0, 0, 8]
     # classes 0 to 7 have 1 - 5 - 5, 8 to 15 have -5 + 2 - 5, 16 to 23 have -5 - 5 + 9

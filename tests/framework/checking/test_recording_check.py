@@ -208,11 +208,11 @@ def test_unregistered_depth_is_reported(zoom: float, x: float, y: float) -> None
 
 def test_half_frame_motion_between_color_and_depth_is_note() -> None:
     """The desk begins with a turn of 20 px a frame, and a Kinect does not take both at the same moment."""
-    [told] = [
+    [expected] = [
         finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject.startswith("col")
     ]
-    assert told.verdict is Verdict.NOTE
-    assert "with an image motion of" in told.text
+    assert expected.verdict is Verdict.NOTE
+    assert "with an image motion of" in expected.text
 
 
 @dataclass

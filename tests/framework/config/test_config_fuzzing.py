@@ -91,7 +91,7 @@ def test_damaged_option_is_built_or_raises_one_line(content: bytes, option: Path
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         ("_target_: a.B\n\tpath: b\n", "found a tab character"),
         (BOMB, "expected at most 200000 keys and values"),
@@ -104,9 +104,9 @@ def test_damaged_option_is_built_or_raises_one_line(content: bytes, option: Path
     ],
     ids=range(8),
 )
-def test_invalid_option_file_raises_one_line_with_path(content: str, said: str, option: Path) -> None:
+def test_invalid_option_file_raises_one_line_with_path(content: str, message: str, option: Path) -> None:
     line = line_of(option, content.encode(errors="surrogateescape"))
-    assert said in line
+    assert message in line
     assert line.startswith(str(option))
 
 

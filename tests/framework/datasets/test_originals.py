@@ -302,9 +302,9 @@ def test_frames_in_motion_capture_gap_are_skipped(
         assert (result.frames, result.frames_skipped, result.frames_lost) == (len(times), 2, 0)
         assert [tracked.timestamp for tracked in result.tracked] == [time for time in times if time not in GAP]
         results[type(tracker)] = result
-    said = [record.message for record in caplog.records if record.name == "framework.runtime.run_log"]
-    told = f"2 of {len(times)} frames skipped because they have no pose; the first: frame {times.index(GAP[0])}"
-    assert [message.startswith(told) for message in said] == [True, True]
+    output = [record.message for record in caplog.records if record.name == "framework.runtime.run_log"]
+    expected = f"2 of {len(times)} frames skipped because they have no pose; the first: frame {times.index(GAP[0])}"
+    assert [message.startswith(expected) for message in output] == [True, True]
     for ours, theirs in zip(results[GroundTruth].tracked, results[TrajectoryFile].tracked, strict=True):
         # one interpolates, the other takes the nearest, at 0.3 m/s up to 20 ms away
         np.testing.assert_allclose(ours.pose.T_world_camera[:3, 3], theirs.pose.T_world_camera[:3, 3], atol=0.01)

@@ -222,9 +222,9 @@ def test_invalid_camera_value_raises(folder, changes):
 
 @pytest.mark.parametrize("scale", [0, -1000, 0.001, 1e7])
 def test_depth_scale_out_of_range_raises(folder, scale):
-    told = r"depth_scale: expected 1 to 1e\+06 units per m \(1000 for millimeters\), got"
+    reported = r"depth_scale: expected 1 to 1e\+06 units per m \(1000 for millimeters\), got"
     change_camera(folder, depth_scale=scale)
-    with pytest.raises(DataError, match=rf"camera\.json: {told} {scale:g}".replace("+07", r"\+07")):
+    with pytest.raises(DataError, match=rf"camera\.json: {reported} {scale:g}".replace("+07", r"\+07")):
         RgbdFolder(folder)
 
 
@@ -508,13 +508,13 @@ def test_gravity_file_gives_up_direction_of_frames(folder):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "output"),
     [
         ("0 -1 0\n" * 3, r"gravity\.txt: expected one line per frame, got 3 directions for 4 frames in color/"),
         ("0 -1 0\n" * 3 + "0 0 0\n", r"gravity\.txt, line 4: expected a direction"),
     ],
 )
-def test_invalid_gravity_file_raises(folder, content, said):
+def test_invalid_gravity_file_raises(folder, content, output):
     (folder / "gravity.txt").write_text(content)
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=output):
         RgbdFolder(folder)

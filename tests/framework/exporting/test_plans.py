@@ -58,7 +58,7 @@ def at(found: Plan, x: float, y: float) -> tuple[bool, bool]:
     return bool(found.occupied[row, column]), bool(found.free[row, column])
 
 
-def told(found: list, source: int) -> list[tuple[str, int | str]]:
+def expected(found: list, source: int) -> list[tuple[str, int | str]]:
     return [(relation.name, relation.target) for relation in found if relation.source == source]
 
 
@@ -139,24 +139,24 @@ def test_looked_through_excludes_occluded_points(room: UprightRoom) -> None:
 def test_ros_map_matches_map_server_thresholds(run: Path, low: Plan, tmp_path: Path) -> None:
     written = export(run, [ExportFormat.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION, robot_height=0.5))
     assert [path.name for path in written] == ["floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"]
-    said = yaml.safe_load((tmp_path / "map.yaml").read_text())
-    image = Image.open(tmp_path / said["image"])
+    message = yaml.safe_load((tmp_path / "map.yaml").read_text())
+    image = Image.open(tmp_path / message["image"])
     assert (image.format, image.mode, image.size) == ("PPM", "L", (43, 33))
     gray = np.asarray(image)
     np.testing.assert_array_equal(gray, levels(low))
     # map_server: p = (255 - gray) / 255; occupied above one threshold, free below the other
     p = (255 - gray.astype(float)) / 255
-    assert {level: bool(p[gray == level].max() < said["free_thresh"]) for level in (FREE, UNKNOWN, OCCUPIED)} == {
+    assert {level: bool(p[gray == level].max() < message["free_thresh"]) for level in (FREE, UNKNOWN, OCCUPIED)} == {
         FREE: True,
         UNKNOWN: False,
         OCCUPIED: False,
     }
-    assert (p[gray == OCCUPIED] > said["occupied_thresh"]).all()
-    assert (p[gray == UNKNOWN] < said["occupied_thresh"]).all()
+    assert (p[gray == OCCUPIED] > message["occupied_thresh"]).all()
+    assert (p[gray == UNKNOWN] < message["occupied_thresh"]).all()
     # the pixel of a leg, by the origin of the lower left corner
-    x, y, turn = said["origin"]
+    x, y, turn = message["origin"]
     assert turn == 0
-    column, row = int((0.825 + OFF - x) / said["resolution"]), int((1.025 + OFF - y) / said["resolution"])
+    column, row = int((0.825 + OFF - x) / message["resolution"]), int((1.025 + OFF - y) / message["resolution"])
     assert gray[len(gray) - 1 - row, column] == OCCUPIED
 
 
@@ -211,13 +211,13 @@ def test_floor_plan_of_room_without_objects_is_written(tmp_path: Path) -> None:
 
 def test_relations_cube_is_on_table_and_table_on_floor(room: UprightRoom, low: Plan) -> None:
     found = relations(room, low)
-    assert told(found, 2) == [("on", 1)]
-    assert told(found, 1) == [("on", "floor")]
-    assert told(found, 3) == [("attached_to", "walls")]
+    assert expected(found, 2) == [("on", 1)]
+    assert expected(found, 1) == [("on", "floor")]
+    assert expected(found, 3) == [("attached_to", "walls")]
     assert next(one for one in found if one.source == 2).measures["height"] == pytest.approx(0.75, abs=0.02)
     without = relations(room, None)
-    assert told(without, 2) == [("on", 1)]
-    assert told(without, 1) == told(without, 3) == []
+    assert expected(without, 2) == [("on", 1)]
+    assert expected(without, 1) == expected(without, 3) == []
 
 
 def test_relations_stacked_object_is_on_upper_object(tmp_path: Path) -> None:
@@ -225,8 +225,8 @@ def test_relations_stacked_object_is_on_upper_object(tmp_path: Path) -> None:
     lower, upper = (1.2, 1.2, 0.75, 1.4, 1.4, 0.85), (1.2, 1.2, 0.85, 1.4, 1.4, 0.95)
     room = stored(tmp_path, things={"dining table": TABLE, "book": [lower], "other": [upper]})
     found = relations(room, None)
-    assert told(found, 2) == [("on", 1)]
-    assert told(found, 3) == [("on", 2)]
+    assert expected(found, 2) == [("on", 1)]
+    assert expected(found, 3) == [("on", 2)]
 
 
 def test_relations_objects_on_same_table_are_next_to(tmp_path: Path) -> None:
@@ -237,8 +237,8 @@ def test_relations_objects_on_same_table_are_next_to(tmp_path: Path) -> None:
         "far": [(3.2, 0.4, 0.0, 3.6, 0.8, 0.5)],
     }
     found = relations(stored(tmp_path, things=things), None)
-    assert told(found, 2) == [("on", 1), ("next_to", 3)]
-    assert told(found, 3) == [("on", 1)]
+    assert expected(found, 2) == [("on", 1), ("next_to", 3)]
+    assert expected(found, 3) == [("on", 1)]
     gap = next(one.measures["distance"] for one in found if one.name == "next_to")
     assert gap == pytest.approx(0.2, abs=0.03)
     assert not [one for one in found if 4 in (one.source, one.target)]
@@ -268,9 +268,9 @@ def test_relations_objects_inside_container_are_in(tmp_path: Path) -> None:
         "vase": [(1.4, 2.7, 1.0, 1.5, 2.8, 1.2)],
     }
     found = relations(stored(tmp_path, things=things), None)
-    assert told(found, 2) == [("in", 1)]
-    assert told(found, 4) == [("in", 3)]
-    assert told(found, 5) == [("on", 1)]
+    assert expected(found, 2) == [("in", 1)]
+    assert expected(found, 4) == [("in", 3)]
+    assert expected(found, 5) == [("on", 1)]
 
 
 SEAT: list[Block] = [(1.0, 1.0, 0.0, 2.0, 1.8, 0.4), (1.0, 1.7, 0.4, 2.0, 1.8, 0.9)]
@@ -281,13 +281,13 @@ ARMS: list[Block] = [(1.0, 1.0, 0.4, 1.1, 1.7, 0.7), (1.9, 1.0, 0.4, 2.0, 1.7, 0
 def test_relations_pillow_is_on_couch(seat: list[Block], tmp_path: Path) -> None:
     """Whose top is not what it stands on."""
     things = {"couch": seat, "pillow": [(1.3, 1.3, 0.4, 1.7, 1.6, 0.6)]}
-    assert told(relations(stored(tmp_path, things=things), None), 2) == [("on", 1)]
+    assert expected(relations(stored(tmp_path, things=things), None), 2) == [("on", 1)]
 
 
 def test_relations_bag_under_table_is_on_floor(tmp_path: Path) -> None:
     things = {"dining table": TABLE, "bag": [(1.2, 1.2, 0.0, 1.5, 1.5, 0.3)]}
     room = stored(tmp_path, things=things)
-    assert told(relations(room, plan(room, RESOLUTION, 0.5)), 2) == [("on", "floor")]
+    assert expected(relations(room, plan(room, RESOLUTION, 0.5)), 2) == [("on", "floor")]
 
 
 def test_scene_graph_matches_schema(run: Path, tmp_path: Path) -> None:

@@ -38,10 +38,10 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def list_objects(directory: Path, class_name: str, vertices: list[int]) -> None:
     """An instances.json with an object for each number of vertices."""
-    told = {"class": class_name, "confidence": 0.9, "class_probabilities": {class_name: 1.0}, "observations": 5}
+    expected = {"class": class_name, "confidence": 0.9, "class_probabilities": {class_name: 1.0}, "observations": 5}
     box = {"center": [0, 0, 0], "extent": [1, 1, 1], "rotation": np.eye(3).tolist()}
-    told |= {"first_frame": 0, "last_frame": 9, "centroid": [0, 0, 0], "obb": box}
-    entries = [{"id": k, **told, "vertices": number} for k, number in enumerate(vertices, start=1)]
+    expected |= {"first_frame": 0, "last_frame": 9, "centroid": [0, 0, 0], "obb": box}
+    entries = [{"id": k, **expected, "vertices": number} for k, number in enumerate(vertices, start=1)]
     (directory / "instances.json").write_text(json.dumps(entries))
 
 
@@ -109,10 +109,10 @@ def test_write_figure_output_files_are_deterministic(maps: Path, caplog: pytest.
     assert width == pytest.approx(181 / 25.4 * 200, abs=1)  # 181 mm at 200 dpi
     assert height > 400
     assert first[1].startswith(b"%PDF")
-    [said] = [record.getMessage() for record in caplog.records]
-    assert "dataset.scene=206,row=part,seed=0: failed: the map is full" in said
-    assert "in progress without 206" in said
-    assert "\n" not in said
+    [message] = [record.getMessage() for record in caplog.records]
+    assert "dataset.scene=206,row=part,seed=0: failed: the map is full" in message
+    assert "in progress without 206" in message
+    assert "\n" not in message
     write_figure(maps)
     assert [path.read_bytes() for path in paths] == first
 
@@ -125,8 +125,8 @@ def test_map_figure_has_sequences_as_lines_and_rows_as_columns(maps: Path) -> No
     assert found.count("2 instances") == 2
     assert found.count("not complete") == 1
     [note] = [text for text in found if text.startswith("An object")]
-    for said in ("Annotation: made up.", "2 cores of Z80", "code 1234567."):
-        assert said in " ".join(note.split())
+    for message in ("Annotation: made up.", "2 cores of Z80", "code 1234567."):
+        assert message in " ".join(note.split())
 
 
 def test_map_figure_omits_damaged_maps_and_missing_truth(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -134,10 +134,10 @@ def test_map_figure_omits_damaged_maps_and_missing_truth(maps: Path, caplog: pyt
     run(maps, "whole", "gone")
     found = texts(maps)
     assert (found.count("not complete"), found.count("no true instances")) == (3, 1)
-    said = [record.getMessage() for record in caplog.records]
-    assert len(said) == 2
-    assert "mesh.ply" in said[0]
-    assert said[1].endswith("the scene is gone")
+    message = [record.getMessage() for record in caplog.records]
+    assert len(message) == 2
+    assert "mesh.ply" in message[0]
+    assert message[1].endswith("the scene is gone")
 
 
 @pytest.mark.parametrize("vertices", [[1538], [1538, 7]])
@@ -199,7 +199,7 @@ def test_stage_times_figure_averages_sequences(tmp_path: Path, caplog: pytest.Lo
 
 
 @pytest.mark.parametrize(
-    ("figure", "said"),
+    ("figure", "message"),
     [
         ({"kind": "pie"}, r"figure\.kind: expected one of stage_times, maps, got 'pie'"),
         ({"kind": "stage_times", "zoom": True}, r"figure\.zoom: expected figure\.kind=maps with zoom=true"),
@@ -207,8 +207,8 @@ def test_stage_times_figure_averages_sequences(tmp_path: Path, caplog: pytest.Lo
         ("maps", "figure: expected keys and values"),
     ],
 )
-def test_figure_choice_invalid_settings_raise_one_line_error(figure: Any, said: str) -> None:
-    with pytest.raises(ConfigError, match=said) as caught:
+def test_figure_choice_invalid_settings_raise_one_line_error(figure: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
         FigureChoice.of(figure)
     assert "\n" not in str(caught.value)
 
@@ -239,10 +239,10 @@ def test_figures_command_prints_paths_and_errors(
     monkeypatch.setattr(sys, "argv", ["figures", str(maps), str(maps / "nowhere")])
     with pytest.raises(SystemExit) as ended:
         figures.main()
-    said = capsys.readouterr()
+    message = capsys.readouterr()
     assert ended.value.code == 1
-    assert said.out.splitlines() == [str(maps / "figure.png"), str(maps / "figure.pdf")]
-    assert said.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs"
+    assert message.out.splitlines() == [str(maps / "figure.png"), str(maps / "figure.pdf")]
+    assert message.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs"
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError("a worker died"), KeyboardInterrupt()])

@@ -34,7 +34,7 @@ def test_gravity_in_m_s2_is_normalized(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("0 0 0", "expected a direction, or nan nan nan if unknown, got '0 0 0'"),
         ("inf 0 0", "expected a direction"),
@@ -44,9 +44,9 @@ def test_gravity_in_m_s2_is_normalized(tmp_path: Path) -> None:
         ("1 2 up", "expected 3 numbers .* got 'up'"),
     ],
 )
-def test_invalid_gravity_line_raises_one_line(tmp_path: Path, line: str, said: str) -> None:
+def test_invalid_gravity_line_raises_one_line(tmp_path: Path, line: str, message: str) -> None:
     (tmp_path / "gravity.txt").write_text(f"0 -1 0\n{line}\n")
-    with pytest.raises(DataError, match=rf"gravity\.txt, line 2: {said}"):
+    with pytest.raises(DataError, match=rf"gravity\.txt, line 2: {message}"):
         read_gravity(tmp_path / "gravity.txt")
 
 

@@ -22,7 +22,7 @@ def test_byte_order_mark_is_ignored(marked: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (b"", "Expecting value"),
         (b"[1", "delimiter"),
@@ -36,8 +36,8 @@ def test_byte_order_mark_is_ignored(marked: bytes) -> None:
         (b'[{"fx": 1, "fy": 2, "fx": 3}]', "duplicate key 'fx' in an object"),
     ],
 )
-def test_invalid_json_raises_one_line_with_source(content: bytes, said: str) -> None:
-    with pytest.raises(DataError, match=said) as caught:
+def test_invalid_json_raises_one_line_with_source(content: bytes, message: str) -> None:
+    with pytest.raises(DataError, match=message) as caught:
         parse_json("results.json", content)
     assert str(caught.value).startswith(
         ("results.json: expected valid JSON", "results.json: expected JSON with at most")

@@ -80,7 +80,7 @@ def test_interrupted_import_has_no_camera_json(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"timestamp": float("nan")}, "expected a finite timestamp, got nan"),
         ({"color": np.zeros((48, 60, 3), np.uint8)}, "expected color of 64x48 px as in the camera, got 60x48 px"),
@@ -91,8 +91,8 @@ def test_interrupted_import_has_no_camera_json(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_inconsistent_frame_data_raises(changed: dict[str, object], said: str) -> None:
-    with pytest.raises(FrameError, match=f"frame 1: {said}"):
+def test_inconsistent_frame_data_raises(changed: dict[str, object], message: str) -> None:
+    with pytest.raises(FrameError, match=f"frame 1: {message}"):
         frame(1, **changed)
 
 

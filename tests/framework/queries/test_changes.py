@@ -64,7 +64,7 @@ def before() -> Visit:
 CHAIR, TABLE = 5, 6  # of this room, seen well; the ids of its truth
 
 
-def told(found: list, kind: Kind) -> list[str]:
+def expected(found: list, kind: Kind) -> list[str]:
     return sorted(change.name for change in found if change.kind is kind)
 
 
@@ -76,7 +76,7 @@ def test_office_contains_expected_objects() -> None:
 def test_changes_of_unchanged_room_are_empty(before: Visit) -> None:
     found = changes(before, visit(changed_room(1), "detector=ground_truth"))
     assert {change.kind for change in found} <= {Kind.STAYED, Kind.NOT_SEEN}
-    assert len(told(found, Kind.STAYED)) >= 7
+    assert len(expected(found, Kind.STAYED)) >= 7
     assert all(change.before is not None and change.after is not None for change in found if change.kind is Kind.STAYED)
     assert all(0 <= change.probability <= 1 for change in found)
 
@@ -84,13 +84,13 @@ def test_changes_of_unchanged_room_are_empty(before: Visit) -> None:
 def test_changes_removed_objects_vanish_or_appear_reversed(before: Visit) -> None:
     after = visit(changed_room(1, without=(CHAIR, TABLE)), "detector=ground_truth")
     found = changes(before, after)
-    assert told(found, Kind.VANISHED) == ["chair", "dining table"]
-    assert told(found, Kind.APPEARED) == told(found, Kind.MOVED) == []
+    assert expected(found, Kind.VANISHED) == ["chair", "dining table"]
+    assert expected(found, Kind.APPEARED) == expected(found, Kind.MOVED) == []
     assert all(change.probability > 0.5 for change in found if change.kind is Kind.VANISHED)
     assert [change.kind for change in found[:2]] == [Kind.VANISHED] * 2, "changes come first"
     back = changes(after, before)
-    assert told(back, Kind.APPEARED) == ["chair", "dining table"]
-    assert told(back, Kind.VANISHED) == told(back, Kind.MOVED) == []
+    assert expected(back, Kind.APPEARED) == ["chair", "dining table"]
+    assert expected(back, Kind.VANISHED) == expected(back, Kind.MOVED) == []
 
 
 def test_changes_displaced_object_has_moved(before: Visit) -> None:
@@ -99,7 +99,7 @@ def test_changes_displaced_object_has_moved(before: Visit) -> None:
     assert moved.name == "chair"
     assert moved.distance == pytest.approx(np.hypot(0.9, 0.6), abs=0.4), "of its box: each visit saw other sides"
     assert None not in (moved.before, moved.after)
-    assert told(found, Kind.VANISHED) == told(found, Kind.APPEARED) == []
+    assert expected(found, Kind.VANISHED) == expected(found, Kind.APPEARED) == []
 
 
 @pytest.mark.acceptance
@@ -107,7 +107,7 @@ def test_changes_with_noisy_detector_are_empty() -> None:
     one, other = (visit(changed_room(k), "detector=simulated", f"seed={k}") for k in (0, 1))
     found = changes(one, other)
     assert not [change for change in found if change.kind in (Kind.VANISHED, Kind.MOVED) and change.probability > 0.3]
-    assert len(told(found, Kind.STAYED)) >= 5
+    assert len(expected(found, Kind.STAYED)) >= 5
 
 
 def test_changes_between_halves_of_real_recording_are_empty(shared_data: Path) -> None:

@@ -67,7 +67,7 @@ def test_run_contents_frames_without_pose_are_lost(directory: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("dataset", "said"),
+    ("dataset", "message"),
     [
         ({"_target_": "tests.support.scenes.corner_room.LiveRoom"}, "the run mapped a live camera"),
         (
@@ -78,15 +78,15 @@ def test_run_contents_frames_without_pose_are_lost(directory: Path) -> None:
         ({"_target_": "tests.support.scenes.corner_room.CornerRoom", "scene": "${oc.env:HOME}"}, "not resolved"),
     ],
 )
-def test_run_source_other_dataset_is_rejected_with_reason(directory: Path, dataset: dict, said: str) -> None:
+def test_run_source_other_dataset_is_rejected_with_reason(directory: Path, dataset: dict, message: str) -> None:
     change_config(directory, **dataset)
     recording = RunSource.of(RunContents.read(directory))
-    assert said in recording.why_not
+    assert message in recording.why_not
     assert recording.frame(0) is None
     assert recording.camera is None
     truth, why = recording.scene_truth()
     assert truth is None
-    assert said in why
+    assert message in why
 
 
 def test_run_source_changed_truth_is_rejected_with_reason(directory: Path) -> None:

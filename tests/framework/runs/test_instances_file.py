@@ -78,7 +78,7 @@ def test_class_probabilities_are_written_with_float32_digits(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         ("", "expected valid JSON"),
         ("[", "expected valid JSON"),
@@ -128,10 +128,10 @@ def test_class_probabilities_are_written_with_float32_digits(tmp_path: Path) -> 
         ([ENTRY, ENTRY], "expected unique ids, got 1 different ones for 2 instances"),
     ],
 )
-def test_read_instances_invalid_content_raises_one_line_error(tmp_path: Path, content: object, said: str) -> None:
+def test_read_instances_invalid_content_raises_one_line_error(tmp_path: Path, content: object, message: str) -> None:
     path = tmp_path / "instances.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
-    with pytest.raises(DataError, match=said) as caught:
+    with pytest.raises(DataError, match=message) as caught:
         read_instances(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -40,7 +40,7 @@ def test_read_mesh_foreign_ply_raises_one_line_error(tmp_path: Path) -> None:
     mesh = TETRAHEDRON
     shades = dict.fromkeys(("red", "green", "blue"), mesh.colors[:, 0])
     labels = {"instance": mesh.instance_ids, "class": mesh.class_ids}
-    for properties, comments, said in [
+    for properties, comments, message in [
         (shades, ("classes chair",), "expected the vertex property 'instance' of int32"),
         (shades | labels | {"class": mesh.class_ids.astype(np.float32)}, ("classes chair",), "no property 'class'"),
         (labels, ("classes chair",), "expected the vertex property 'red' of uint8, got none"),
@@ -48,7 +48,7 @@ def test_read_mesh_foreign_ply_raises_one_line_error(tmp_path: Path) -> None:
         (shades | labels, ("classes chair", "classes bed"), "found 2"),
     ]:
         write_ply(path, mesh.vertices, mesh.triangles, properties, comments)
-        with pytest.raises(DataError, match=said) as caught:
+        with pytest.raises(DataError, match=message) as caught:
             read_mesh(path)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)

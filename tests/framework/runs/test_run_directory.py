@@ -304,10 +304,10 @@ def test_tracker_pose_source_is_tracked_except_ground_truth(tracker: str, tmp_pa
 def test_headline_contains_key_metrics() -> None:
     metrics = {"sequence": "room0", "frames": 9, "fps": 3.21, "frames_lost": 2, "frames_skipped": 0}
     metrics |= {"instances.count": 4, "trajectory.ate_rmse_m": 0.0123, "instances.ap50": 0.5, "instances.ap25": None}
-    told = headline(metrics | {"pose_source": "tracked"})
-    assert told == "room0 | 9 frames at 3.2/s | 2 lost | ATE 0.012 m | 4 instances | AP50 0.50"
-    told = headline(metrics | {"pose_source": "ground_truth"})
-    assert told == "room0 | 9 frames at 3.2/s | 2 lost | given poses | 4 instances | AP50 0.50"
+    expected = headline(metrics | {"pose_source": "tracked"})
+    assert expected == "room0 | 9 frames at 3.2/s | 2 lost | ATE 0.012 m | 4 instances | AP50 0.50"
+    expected = headline(metrics | {"pose_source": "ground_truth"})
+    assert expected == "room0 | 9 frames at 3.2/s | 2 lost | given poses | 4 instances | AP50 0.50"
 
 
 # Provenance

@@ -55,10 +55,10 @@ def test_row_differences_are_paired() -> None:
 
 
 def test_row_values_skip_undefined_metrics() -> None:
-    told = row("a", seed0=0.4, seed1=None, seed2="many", seed3=True, seed4=math.nan, seed5=1, seed6=10**400)
-    assert told.values(AP) == {("0",): 0.4, ("5",): 1.0}
-    assert told.mean("no.such.key").count == 0
-    assert told.differences(row("b", seed0=None), AP) == {}
+    expected = row("a", seed0=0.4, seed1=None, seed2="many", seed3=True, seed4=math.nan, seed5=1, seed6=10**400)
+    assert expected.values(AP) == {("0",): 0.4, ("5",): 1.0}
+    assert expected.mean("no.such.key").count == 0
+    assert expected.differences(row("b", seed0=None), AP) == {}
 
 
 def test_is_not_zero_matches_paired_t_test() -> None:

@@ -37,8 +37,8 @@ def code(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def write(directory: Path, **metrics: object) -> None:
-    told = {"instances.ap50": 0.5, "git_commit": "abcdef0123", "git_dirty": False}
-    (directory / "metrics.json").write_text(json.dumps(told | metrics))
+    expected = {"instances.ap50": 0.5, "git_commit": "abcdef0123", "git_dirty": False}
+    (directory / "metrics.json").write_text(json.dumps(expected | metrics))
 
 
 def test_read_record_returns_config_and_metrics(directory: Path) -> None:
@@ -49,7 +49,7 @@ def test_read_record_returns_config_and_metrics(directory: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("metrics.json", "", "metrics.json: expected"),
         ("metrics.json", '{"seed": 0', "metrics.json: expected"),
@@ -78,9 +78,9 @@ def test_read_record_returns_config_and_metrics(directory: Path) -> None:
         ),
     ],
 )
-def test_read_record_invalid_file_raises_one_line_error(directory: Path, name: str, content: str, said: str) -> None:
+def test_read_record_invalid_file_raises_one_line_error(directory: Path, name: str, content: str, message: str) -> None:
     (directory / name).write_text(content, encoding="latin-1")
-    with pytest.raises(DataError, match=said) as caught:
+    with pytest.raises(DataError, match=message) as caught:
         read_record(directory)
     assert "\n" not in str(caught.value)
     found, others = find_records(directory.parent)
@@ -160,9 +160,9 @@ def test_is_recorded_other_code_is_true_with_warning(
 ) -> None:
     write(directory, config_hash=config_hash(CONFIG), **theirs)
     assert is_recorded(directory, OmegaConf.create(CONFIG))
-    [told] = caplog.records
-    assert told.levelno == logging.WARNING
-    assert "the current commit is abcdef0" in told.getMessage()
+    [expected] = caplog.records
+    assert expected.levelno == logging.WARNING
+    assert "the current commit is abcdef0" in expected.getMessage()
 
 
 SETTINGS = {"threads": 4, "prefetch": 2, "detection_cache": "off"}

@@ -37,7 +37,7 @@ def test_read_timings_old_stage_gets_current_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         ("", "line 1: expected frame,stage,milliseconds, got ''"),
         ("a,b\n", "line 1: expected frame,stage,milliseconds, got 'a,b'"),
@@ -52,10 +52,10 @@ def test_read_timings_old_stage_gets_current_name(tmp_path: Path) -> None:
         ("frame,stage,milliseconds\n0,\x00,1\n0,fusion\n", "line 3: "),
     ],
 )
-def test_read_timings_invalid_line_raises_with_line_number(tmp_path: Path, content: str, said: str) -> None:
+def test_read_timings_invalid_line_raises_with_line_number(tmp_path: Path, content: str, message: str) -> None:
     path = tmp_path / "timings.csv"
     path.write_text(content)
-    with pytest.raises(DataError, match=said) as caught:
+    with pytest.raises(DataError, match=message) as caught:
         read_timings(path)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)

@@ -145,9 +145,9 @@ def test_settings_out_of_range_raise_with_bounds(name: str, value: object, most:
     config = OmegaConf.create({"seed": 0, "device": "cpu", "threads": 0, "prefetch": 2})
     least = 1 if name == "detection_interval" else 0
     config[name] = value
-    with pytest.raises(ConfigError, match=rf"^{name}: expected an integer in \[{least}, {most}\], got") as told:
+    with pytest.raises(ConfigError, match=rf"^{name}: expected an integer in \[{least}, {most}\], got") as expected:
         Settings.of(config)
-    assert len(str(told.value)) < 400
+    assert len(str(expected.value)) < 400
 
 
 @pytest.mark.parametrize("threads", [-1, 1.0, True])

@@ -36,8 +36,8 @@ def test_first_signal_is_deferred_and_second_raises(number: signal.Signals, capf
         assert second.value.number == number
         with pytest.raises(Interrupted):
             interruption.check()
-    said = "interrupted by Ctrl-C" if number == signal.SIGINT else f"ended by {number.name}"
-    assert capfd.readouterr().err == f"{said}: stopping after this frame; a second signal stops immediately\n"
+    message = "interrupted by Ctrl-C" if number == signal.SIGINT else f"ended by {number.name}"
+    assert capfd.readouterr().err == f"{message}: stopping after this frame; a second signal stops immediately\n"
     assert signal.getsignal(number) is signal.SIG_DFL
 
 

@@ -9,7 +9,7 @@ from framework.tables.comparison import TableChoice
 
 
 @pytest.mark.parametrize(
-    ("node", "said"),
+    ("node", "message"),
     [
         ({"columns": []}, r"table\.columns: expected at least one key, got none"),
         ({"average_over": [], "columns": ["fps"]}, r"table\.average_over: expected at least one key, got none"),
@@ -45,7 +45,7 @@ from framework.tables.comparison import TableChoice
         ("fps", "table: expected keys and values"),
     ],
 )
-def test_table_choice_invalid_settings_raise(node: object, said: str) -> None:
-    with pytest.raises(ConfigError, match=said) as caught:
+def test_table_choice_invalid_settings_raise(node: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
         TableChoice.of(node)
     assert "\n" not in str(caught.value)

@@ -30,12 +30,12 @@ def run(root: Path, row: str, seed: int, ap: float | None, ms: float, scene: str
     directory.mkdir()
     config = {"row": row, "seed": seed, "scene": scene, "refiner": {"kind": row}}
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
-    told = {
+    expected = {
         **{"instances.ap50": ap, "stage_ms.refinement.median": ms, "pose_source": "ground_truth", "choice.fuser": "f"},
         **{"config_hash": config_hash(config), "git_commit": "1234567890", "git_dirty": False},
         **{"environment.cpus": 2, "environment.processor": "Z80"},
     }
-    (directory / "metrics.json").write_text(json.dumps(told | metrics))
+    (directory / "metrics.json").write_text(json.dumps(expected | metrics))
     return directory
 
 
@@ -124,10 +124,10 @@ def test_table_notes_list_requested_runs_without_record(sweep: Path) -> None:
 def test_table_code_note_names_later_evaluation_commit(sweep: Path) -> None:
     """A table of two evaluators must say so."""
     path = sweep / "row=chain,seed=1" / "metrics.json"
-    anew = {"evaluation.git_commit": "fedcba9876", "evaluation.git_dirty": True}
-    path.write_text(json.dumps(json.loads(path.read_text()) | anew))
-    told = "- Code: 1234567 (5 runs), 1234567, evaluated by fedcba9 with changes (1 run)."
-    assert told in write_tables(sweep).splitlines()
+    again = {"evaluation.git_commit": "fedcba9876", "evaluation.git_dirty": True}
+    path.write_text(json.dumps(json.loads(path.read_text()) | again))
+    expected = "- Code: 1234567 (5 runs), 1234567, evaluated by fedcba9 with changes (1 run)."
+    assert expected in write_tables(sweep).splitlines()
 
 
 def test_table_notes_replace_line_breaks(sweep: Path) -> None:
@@ -175,8 +175,8 @@ RUN_TIMES = {
 def of_dataset(sweep: Path, dataset: str, annotation: str | None = None, only: str = "") -> None:
     """What the runs, or those of one row, say that they were measured on."""
     for path in sweep.glob(f"row={only}*/metrics.json"):
-        told = {"choice.dataset": dataset, "annotation_release": annotation}
-        path.write_text(json.dumps(json.loads(path.read_text()) | told))
+        expected = {"choice.dataset": dataset, "annotation_release": annotation}
+        path.write_text(json.dumps(json.loads(path.read_text()) | expected))
 
 
 @pytest.mark.parametrize("annotation", ["not named", None])
@@ -307,15 +307,15 @@ def test_table_notes_count_older_records(sweep: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         ("table: [", "cannot be read"),
         ("table: {columns: [], average_over: [seed]}", r"table\.columns: expected one metric across"),
     ],
 )
-def test_write_tables_invalid_experiment_raises_one_line_error(sweep: Path, content: str, said: str) -> None:
+def test_write_tables_invalid_experiment_raises_one_line_error(sweep: Path, content: str, message: str) -> None:
     (sweep / "multirun.yaml").write_text(content)
-    with pytest.raises(Exception, match=said) as caught:
+    with pytest.raises(Exception, match=message) as caught:
         write_tables(sweep)
     assert "\n" not in str(caught.value)
 

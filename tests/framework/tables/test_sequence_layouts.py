@@ -37,21 +37,21 @@ def experiment(root: Path, table: dict[str, Any]) -> None:
     (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
 
 
-def run(root: Path, row: str, scene: str, seed: int, tracker: str = "ground_truth", **told: Any) -> Path:
+def run(root: Path, row: str, scene: str, seed: int, tracker: str = "ground_truth", **expected: Any) -> Path:
     """Leaves a record; `told` are figures of metrics.json, or `data` and `release`."""
-    directory = root / f"dataset.scene={scene},row={row},seed={seed},tracker={tracker}{len(told.get('data', ''))}"
+    directory = root / f"dataset.scene={scene},row={row},seed={seed},tracker={tracker}{len(expected.get('data', ''))}"
     directory.mkdir()
     config = {
         **{"row": row, "seed": seed, "refiner": {"kind": row}, "tracker": {"kind": tracker}},
-        "dataset": {"root": f"/data{told.pop('data', '')}", "scene": scene, "seed": seed},
+        "dataset": {"root": f"/data{expected.pop('data', '')}", "scene": scene, "seed": seed},
     }
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     metrics = {
         **{"pose_source": "ground_truth" if tracker == "ground_truth" else "tracked", "choice.tracker": tracker},
         **{"choice.refiner": row, "choice.dataset": "scenenn"},
-        "annotation_release": told.pop("release", "made up"),
+        "annotation_release": expected.pop("release", "made up"),
         **{"config_hash": config_hash(config), "git_commit": "1234567890", "git_dirty": False},
-        **{"environment.cpus": 2, "environment.processor": "Z80", **told},
+        **{"environment.cpus": 2, "environment.processor": "Z80", **expected},
     }
     (directory / "metrics.json").write_text(json.dumps(metrics))
     return directory

@@ -54,14 +54,14 @@ def test_train_writes_network_usable_for_further_training(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ("schedule.steps=0", "steps: expected at least 1"),
         (f"network.start_from={ROOMS}", "expected weights of the configured architecture"),
     ],
 )
-def test_train_invalid_config_raises_before_rendering(tmp_path: Path, wrong: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_train_invalid_config_raises_before_rendering(tmp_path: Path, wrong: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         train(config(tmp_path / "rooms", wrong), tmp_path / "run")
     assert not list(tmp_path.iterdir())
 

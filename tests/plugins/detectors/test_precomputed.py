@@ -197,7 +197,7 @@ def test_mask_folder_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("listed", "said"),
+    ("listed", "message"),
     [
         ([{"id": 0, "class": "tv", "score": 0.5}], r"id: expected an integer in \[1, 65535\], got 0"),
         (
@@ -212,8 +212,8 @@ def test_mask_folder_is_read(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_invalid_mask_folder_entry_raises(tmp_path: Path, listed: Any, said: str) -> None:
-    with pytest.raises(DataError, match=said) as raised:
+def test_invalid_mask_folder_entry_raises(tmp_path: Path, listed: Any, message: str) -> None:
+    with pytest.raises(DataError, match=message) as raised:
         Precomputed(write_folder(tmp_path, listed=listed))
     assert "000003.json" in str(raised.value)
 
@@ -246,7 +246,7 @@ def test_mask_image_with_wrong_size_or_type_raises(tmp_path: Path, ids: np.ndarr
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"image_id": "left.png"}, "image_id: expected the number of the frame, or a file name that is one"),
         ({"image_id": -1}, "image_id"),
@@ -275,16 +275,16 @@ def test_mask_image_with_wrong_size_or_type_raises(tmp_path: Path, ids: np.ndarr
         ({"class_probabilities": {"sofa": 1.0}}, "'sofa'"),
     ],
 )
-def test_invalid_result_entry_raises_one_line(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+def test_invalid_result_entry_raises_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(DataError) as raised:
         Precomputed(write(tmp_path, entry(), entry(**changes)))
-    assert said in str(raised.value)
+    assert message in str(raised.value)
     assert f"{tmp_path}/results.json, entry 1: " in str(raised.value)
     assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         ("[{]", "expected valid JSON"),
         ('{"annotations": []}', "expected a list of results in COCO's format, got an object"),
@@ -292,9 +292,9 @@ def test_invalid_result_entry_raises_one_line(tmp_path: Path, changes: dict[str,
         ("[3]", "entry 0"),
     ],
 )
-def test_invalid_or_missing_result_file_raises(tmp_path: Path, content: str, said: str) -> None:
+def test_invalid_or_missing_result_file_raises(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "results.json").write_text(content)
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=message):
         Precomputed(tmp_path / "results.json")
     with pytest.raises(DataError, match=r"absent\.json: cannot be read"):
         Precomputed(tmp_path / "absent.json")

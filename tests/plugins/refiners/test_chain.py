@@ -87,15 +87,15 @@ def test_overrides_set_remove_replace_and_add_links(overrides: list[str], links:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "message"),
     [
         (["refiner.links.gmm_em.std_flor=1"], "Could not override|std_flor"),
         (["refiner.links.gmm_em.std_floor=-1"], "links.gmm_em: refiner plugins.refiners.gmm_em.GmmEm"),
         (["refiner.links=3"], "expected plugins by name, got 3|Could not|merge"),
     ],
 )
-def test_error_names_link(overrides: list[str], said: str) -> None:
-    with pytest.raises(Exception, match=said):
+def test_error_names_link(overrides: list[str], message: str) -> None:
+    with pytest.raises(Exception, match=message):
         registered.built("refiner", "chain", *overrides)
 
 

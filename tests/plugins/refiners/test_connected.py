@@ -103,17 +103,17 @@ def _slowly(refiner: Connected, mask: Bool, depth: Float32, camera: Camera) -> s
                         ahead.append(near)
             pieces.append(piece)
     largest = max(pieces, key=len)
-    stays = sorted(largest, key=lambda p: (p[1], p[0]))
+    unchanged = sorted(largest, key=lambda p: (p[1], p[0]))
     for piece in sorted(pieces, key=len, reverse=True):
         if piece is largest or len(piece) < refiner.min_piece_ratio * len(largest):
             continue
         near = 0
         for u, v in piece:
-            a, b = min(stays, key=lambda p: (p[0] - u) ** 2 + (p[1] - v) ** 2)
+            a, b = min(unchanged, key=lambda p: (p[0] - u) ** 2 + (p[1] - v) ** 2)
             z, other = depth[v, u], depth[b, a]
             aside = np.hypot(a - u, b - v) / camera.fx
             allowed = refiner.max_gap + (refiner.gap_per_depth + refiner.max_depth_slope * aside) * min(z, other)
             near += abs(z - other) <= allowed
         if 2 * near > len(piece):
-            stays += sorted(piece, key=lambda p: (p[1], p[0]))
-    return set(stays)
+            unchanged += sorted(piece, key=lambda p: (p[1], p[0]))
+    return set(unchanged)

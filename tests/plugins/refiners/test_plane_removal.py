@@ -117,8 +117,8 @@ def test_plane_stays_in_cluster_with_largest_fraction():
     np.testing.assert_array_equal(left, half)
 
 
-@pytest.mark.parametrize(("share", "stays"), [(0.4, False), (0.6, True)])
-def test_cluster_fraction_counts_all_parts_of_plane(share, stays):
+@pytest.mark.parametrize(("share", "unchanged"), [(0.4, False), (0.6, True)])
+def test_cluster_fraction_counts_all_parts_of_plane(share, unchanged):
     """A wall seen between posts, in a mask that ends in the middle of it and is longer than what a thread counts."""
     post = np.arange(320) // 32 % 2 == 1
     depth = np.where(post, 1.5, 2.0) * np.ones(CAMERA.shape)
@@ -126,7 +126,7 @@ def test_cluster_fraction_counts_all_parts_of_plane(share, stays):
     mask = np.ones(CAMERA.shape, bool)
     mask[int(share * 240) :] = False
     [left] = masks_of(PlaneRemoval(plane_distance=0.02).refine(lifted(frame, mask), frame))
-    np.testing.assert_array_equal(left, mask & (post | stays))
+    np.testing.assert_array_equal(left, mask & (post | unchanged))
 
 
 def test_screen_near_wall_keeps_front_and_loses_wall():

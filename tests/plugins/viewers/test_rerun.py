@@ -73,7 +73,7 @@ def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
                 yield {name: column[k].as_py() for name, column in columns.items()}
 
 
-def mended(file: Path) -> Path:
+def fixed(file: Path) -> Path:
     """The messages that are whole, which rerun's viewer shows: `RrdReader` refuses a file that ends within one."""
     whole = file.with_name("whole.rrd")
     rrd("merge", file, "-o", str(whole))
@@ -118,9 +118,9 @@ def test_stage_times_cover_only_completed_stages(recorded: Path) -> None:
 
 
 def test_lost_and_skipped_frames_are_logged(recorded: Path) -> None:
-    told = {row["TextLog:text"][0]: row["frame"] for row in rows(recorded, "log")}
-    assert told["lost: too dark"] == 4
-    assert "skipped: frame 2: depth/000002.png is truncated" in told
+    expected = {row["TextLog:text"][0]: row["frame"] for row in rows(recorded, "log")}
+    assert expected["lost: too dark"] == 4
+    assert "skipped: frame 2: depth/000002.png is truncated" in expected
 
 
 def test_camera_path_is_split_at_lost_frames(recorded: Path) -> None:
@@ -222,7 +222,7 @@ def test_killed_run_keeps_recording_up_to_last_second(tmp_path: Path) -> None:
     fused_at = (tmp_path / "note").stat().st_mtime  # later than that nothing can have been drawn, and the rest must be
     file = tmp_path / "run" / "recording.rrd"
     os.truncate(file, file.stat().st_size - 1)  # as if it had been killed while it wrote, which happens now and then
-    frames = list(rows(mended(file), "world/camera/color"))
+    frames = list(rows(fixed(file), "world/camera/color"))
     assert len(frames) > 3
     last = max(row["log_time"] for row in frames) / 1e9
     assert abs(fused_at - last) < 1.5, f"{fused_at - last:.2f} s are missing"
@@ -252,7 +252,7 @@ def test_missing_rerun_package_names_extra(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize(
-    ("parameter", "said"),
+    ("parameter", "message"),
     [
         ("frame_interval=0", r"frame_interval: expected a value in \[1, 1e\+06\], got 0"),
         ("mesh_interval=nan", "mesh_interval: expected a value in"),
@@ -261,8 +261,8 @@ def test_missing_rerun_package_names_extra(monkeypatch: pytest.MonkeyPatch) -> N
         ("port=80", "port must be in"),
     ],
 )
-def test_invalid_parameter_raises(parameter: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_invalid_parameter_raises(parameter: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         build_viewer("rerun", f"viewer.{parameter}")
 
 

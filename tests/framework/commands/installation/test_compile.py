@@ -40,11 +40,11 @@ def test_compile_ctrl_c_ends_in_one_line(tmp_path: Path) -> None:
     time.sleep(3)  # it is at work, or about to be
     process.send_signal(signal.SIGINT)
     asked = time.monotonic()
-    _, said = process.communicate(timeout=10)
+    _, message = process.communicate(timeout=10)
     assert time.monotonic() - asked < 5
     assert process.returncode == 128 + signal.SIGINT
-    assert "Traceback" not in said
-    assert said.splitlines()[-1] == "interrupted"
+    assert "Traceback" not in message
+    assert message.splitlines()[-1] == "interrupted"
 
 
 def test_compile_unknown_kernel_name_raises() -> None:

@@ -52,7 +52,7 @@ def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("gmm_em", "NAME: expected a new name, got the existing option refiner=gmm_em"),
         ("../up", "found '../up'"),
@@ -71,10 +71,10 @@ def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> No
         ("cluster_refiner", "NAME: expected a unique class name, got ClusterRefiner for"),
     ],
 )
-def test_new_plugin_invalid_name_raises(name: str, said: str) -> None:
+def test_new_plugin_invalid_name_raises(name: str, message: str) -> None:
     with pytest.raises(ConfigError) as error:
         check_name("refiner", name)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -110,8 +110,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for stage in GROUPS.keys() - {"refiner"}:
         write_repository(stage, f"my_{stage}", folder)
     line = [sys.executable, "-m", "framework", "new-plugin", "refiner", "my_refiner", "--in", str(folder)]
-    said = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=60).stdout
-    assert len(said.splitlines()) == 3
+    message = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=60).stdout
+    assert len(message.splitlines()) == 3
     for source in (CHECKOUT, *folder.glob("instancemap-my-*")):
         build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder / "wheels")]
         subprocess.run(build, cwd=source, check=True, capture_output=True, timeout=120)
@@ -152,9 +152,9 @@ def test_installed_plugins_pass_their_own_tests(place: Path) -> None:
     (place / "pytest.ini").touch()
     tests = [str(path) for path in place.glob("instancemap-my-*/tests/test_*.py")]
     assert len(tests) == len(GROUPS)
-    said = run(place, "python", "-m", "pytest", "--quiet", "-p", "no:dash", "--import-mode=importlib", *tests)
-    assert " passed" in said
-    assert "skipped" not in said
+    message = run(place, "python", "-m", "pytest", "--quiet", "-p", "no:dash", "--import-mode=importlib", *tests)
+    assert " passed" in message
+    assert "skipped" not in message
 
 
 @pytest.mark.acceptance
@@ -163,18 +163,18 @@ def test_sweep_of_plugin_and_builtin_tabulates_both(place: Path) -> None:
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
     more = ("viewer=my_viewer", "hydra.sweep.dir=outputs/first_sweep")
-    said = run(place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), *more)
+    message = run(place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), *more)
     records = [json.loads(path.read_text()) for path in (place / "outputs" / "first_sweep").glob("*/metrics.json")]
     assert [record["frames"] for record in records] == [3, 3]
     assert all(record["instances.count"] > 0 for record in records)
     for job in ("refiner=gmm_em", "refiner=my_refiner"):
         [log] = (place / "outputs" / "first_sweep").glob(f"*{job}*/frames.jsonl")
         assert [json.loads(line)["frame"] for line in log.read_text().splitlines()] == [0, 1, 2]
-    assert run(place, "instancemap", "tables", "outputs/first_sweep").strip() in said
+    assert run(place, "instancemap", "tables", "outputs/first_sweep").strip() in message
     with (place / "outputs" / "first_sweep" / "table.csv").open() as table:
         rows = list(csv.DictReader(table))
     assert [row["row"] for row in rows] == ["refiner=gmm_em", "refiner=my_refiner"]
-    assert "refiner=my_refiner" in said
+    assert "refiner=my_refiner" in message
     listed = run(place, "instancemap", "plugins", "refiner", "my_refiner")
     assert "my_refiner  [from instancemap-my-refiner]" in listed
 

@@ -197,9 +197,9 @@ def test_plugins_faulty_options_are_listed_with_reason(tmp_path: Path, monkeypat
     (group / "own.yaml").write_text("_target_: plugins.detectors.none.NoDetections\n")
     monkeypatch.setattr(composition, "_added", [tmp_path])
     found = {option.name: option for option in registered("detector")}
-    for name, (_, said) in FAULTY_OPTIONS.items():
+    for name, (_, message) in FAULTY_OPTIONS.items():
         assert found[name].documentation.startswith("unusable:")
-        assert said in found[name].documentation
+        assert message in found[name].documentation
         assert "\n" not in found[name].documentation
     assert found["own"].provider == "command-line"
     assert found["own"].documentation == found["none"].documentation

@@ -41,13 +41,13 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
     picture = cv2.imread(str(tmp_path / "outputs" / "check.png"))
     assert picture is not None
     assert [path.name for path in tmp_path.rglob("*.png")] == ["check.png"]
-    mended = checked(tmp_path, *asked, "dataset.pose_kind=T_CAMERA_WORLD", "out=mended.png")
-    assert (mended.returncode, "WRONG" in mended.stdout) == (0, False), mended.stderr
+    fixed = checked(tmp_path, *asked, "dataset.pose_kind=T_CAMERA_WORLD", "out=mended.png")
+    assert (fixed.returncode, "WRONG" in fixed.stdout) == (0, False), fixed.stderr
     assert (tmp_path / "mended.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("out=2024",), "out: expected a path"),
         (("out=check.jpg",), "out: expected a name that ends in"),
@@ -56,8 +56,8 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
         (("dataset=rgbd_folder", "dataset.root=.", "dataset.camera_axes=UNITY"), "camera_axes"),
     ],
 )
-def test_check_invalid_arguments_are_one_line_errors(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+def test_check_invalid_arguments_are_one_line_errors(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     done = checked(tmp_path, *arguments)
     assert done.returncode == 1
-    assert said in done.stderr
+    assert message in done.stderr
     assert "Traceback" not in done.stderr

@@ -184,7 +184,7 @@ def _truncated_mesh(directory: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("spoil", "message"),
     [
         (_another_config, "expected the config_hash of the config next to it, got another one"),
         (_interrupted, "partial: interrupted by Ctrl-C"),
@@ -202,7 +202,7 @@ def _truncated_mesh(directory: Path) -> None:
     ],
 )
 def test_evaluate_unusable_run_is_refused_and_others_continue(
-    stored: Path, command, spoil: Callable[[Path], None], said: str
+    stored: Path, command, spoil: Callable[[Path], None], message: str
 ) -> None:
     spoilt = Path(shutil.copytree(stored, stored.parent / "a spoilt one"))
     spoil(spoilt)
@@ -213,7 +213,7 @@ def test_evaluate_unusable_run_is_refused_and_others_continue(
     assert len(err.splitlines()) == 1, err
     assert err.startswith("refused: ")
     assert str(spoilt) in err
-    assert said in err
+    assert message in err
     assert {path.name: path.read_bytes() for path in spoilt.iterdir()} == before
 
 

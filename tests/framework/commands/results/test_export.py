@@ -32,12 +32,12 @@ def test_export_prints_written_files(
 ) -> None:
     options = ("--out", tmp_path, "--resolution", 0.1, "--robot-height", 0.5)
     exported(monkeypatch, run, "--to", "glb", "floorplan", "graph", *options)
-    said = [Path(line).relative_to(tmp_path).as_posix() for line in capsys.readouterr().out.splitlines()]
+    message = [Path(line).relative_to(tmp_path).as_posix() for line in capsys.readouterr().out.splitlines()]
     objects = [f"objects/{name}.glb" for name in ("dining_table_1", "cube_2", "picture_3")]
     plans = ["floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"]
-    assert said == ["scene.glb", *objects, *plans, "scene_graph.json"]
+    assert message == ["scene.glb", *objects, *plans, "scene_graph.json"]
     assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()) == sorted(
-        said
+        message
     )
     assert "resolution: 0.1" in (tmp_path / "map.yaml").read_text()
 
@@ -55,7 +55,7 @@ def test_export_default_format_is_glb(run: Path, tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--to", "stl"), "invalid choice: 'stl'"),
         (("--to", "glb", "--triangles", "many"), "invalid int value: 'many'"),
@@ -63,16 +63,16 @@ def test_export_default_format_is_glb(run: Path, tmp_path: Path, monkeypatch: py
     ],
 )
 def test_export_invalid_arguments_exit_with_status_2(
-    words: tuple[str, ...], said: str, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...], message: str, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
         exported(monkeypatch, run, *words)
     assert ended.value.code == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (
             ("--to", "glb", "--object", "sofa"),
@@ -89,14 +89,14 @@ def test_export_invalid_arguments_exit_with_status_2(
     ],
 )
 def test_export_impossible_request_is_one_line_error(
-    words: tuple[str, ...], said: str, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...], message: str, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
         exported(monkeypatch, run, *words)
     assert ended.value.code == 1
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith("error: ")
-    assert said in line
+    assert message in line
 
 
 def test_export_python_function_matches_command(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,11 +104,11 @@ def test_export_python_function_matches_command(run: Path, tmp_path: Path, monke
     exported(monkeypatch, run, "--to", "glb", "--out", tmp_path / "b", "--object", "cube", "--colors", "class")
     assert written == [tmp_path / "a" / "objects" / "cube_2.glb"]
     assert written[0].read_bytes() == (tmp_path / "b" / "objects" / "cube_2.glb").read_bytes()
-    for wrong, said in (
+    for wrong, message in (
         ({"coloring": "rainbow"}, "coloring: expected one of appearance, instance, class, got 'rainbow'"),
         ({"colours": "class"}, "export: expected options in .*, got 'colours'"),
     ):
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=message):
             instancemap.export(run, "glb", out=tmp_path, **wrong)
     with pytest.raises(ConfigError, match="a format: expected one of glb, ply"):
         instancemap.export(run, "stl")

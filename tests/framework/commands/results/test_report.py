@@ -63,13 +63,13 @@ def test_report_of_run_is_one_reproducible_page(stored: Path, command) -> None:
     assert command(stored, "--out", stored.parent / "again.html")[0] == 0
     assert (stored.parent / "again.html").read_bytes() == before
     assert {path.name for path in stored.parent.iterdir()} == {"first", "again.html"}
-    said = texts(before.decode())
+    message = texts(before.decode())
     metrics = json.loads((stored / "metrics.json").read_text())
-    assert "corner_room" in said
-    assert f"AP50 {metrics['instances.ap50']:.2f}" in said
-    assert f"likely, of {metrics['instances.count']}" in said
+    assert "corner_room" in message
+    assert f"AP50 {metrics['instances.ap50']:.2f}" in message
+    assert f"likely, of {metrics['instances.count']}" in message
     for heading in ("Map", "Objects", "Ground truth", "Trajectory", "Mapping progress", "Stage times", "Provenance"):
-        assert heading in said
+        assert heading in message
     assert before.count(b"data:image/webp") > 3, "objects, growth and overview.png"
     assert not re.search(rb'(src|href)="(?!data:|#)', before)
 
@@ -138,9 +138,9 @@ def test_report_unreadable_truth_reason_is_shown(stored: Path, command, monkeypa
 
     monkeypatch.setattr(CornerRoom, "scene_truth", unreadable)
     assert command(stored)[0] == 0
-    said = texts((stored / "report.html").read_text())
-    assert "cannot be compared: instances.json is not valid JSON" in said
-    assert "AP50" in said
+    message = texts((stored / "report.html").read_text())
+    assert "cannot be compared: instances.json is not valid JSON" in message
+    assert "AP50" in message
 
 
 def test_report_of_partial_run_is_marked_partial(stored: Path, command) -> None:
@@ -150,9 +150,9 @@ def test_report_of_partial_run_is_marked_partial(stored: Path, command) -> None:
     for name in ("map.npz", "mesh.ply", "overview.png"):
         (stored / name).unlink()
     assert command(stored)[0] == 0
-    said = texts((stored / "report.html").read_text())
-    assert "This run is partial: interrupted by Ctrl-C." in said
-    assert "The map is empty" in said
+    message = texts((stored / "report.html").read_text())
+    assert "This run is partial: interrupted by Ctrl-C." in message
+    assert "The map is empty" in message
 
 
 def test_report_of_empty_run_is_written(stored: Path, command) -> None:
@@ -161,13 +161,13 @@ def test_report_of_empty_run_is_written(stored: Path, command) -> None:
     (stored / "instances.json").write_text("[]")
     (stored / "timings.csv").write_text("frame,stage,milliseconds\n")
     assert command(stored)[0] == 0
-    said = texts((stored / "report.html").read_text())
-    assert "The map is empty" in said
-    assert "No objects were found" in said
+    message = texts((stored / "report.html").read_text())
+    assert "The map is empty" in message
+    assert "No objects were found" in message
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("instances.json", "{}", "instances.json: expected a list of instances"),
         ("instances.json", '[{"id": 1}]', "entry 1"),
@@ -178,11 +178,11 @@ def test_report_of_empty_run_is_written(stored: Path, command) -> None:
         ("config.yaml", "seed: 9\n", "expected the config_hash of the config next to it, got another one"),
     ],
 )
-def test_report_damaged_record_is_one_line_error(stored: Path, command, name: str, content: str, said: str) -> None:
+def test_report_damaged_record_is_one_line_error(stored: Path, command, name: str, content: str, message: str) -> None:
     (stored / name).write_text(content)
     status, out, err = command(stored)
     assert (status, out, len(err.splitlines())) == (1, "", 1), err
-    assert said in err
+    assert message in err
     assert not (stored / "report.html").exists()
 
 

@@ -36,8 +36,8 @@ def test_detect_output_is_read_by_precomputed(tmp_path: Path) -> None:
     assert "frame skipped: frame 1" in done.stderr
     assert "10 detections in 5 frames of corner_room" in done.stderr
     assert "mask AP50 1.00, AP 1.00: mean of 2 classes, 10 true objects of at least" in done.stderr
-    said = dict(re.findall(r"INFO +(.*?)  +(\S+)$", done.stderr, re.MULTILINE))
-    assert (said["found"], said["mask IoU"], said["class right"], said["false detections an image"]) == (
+    message = dict(re.findall(r"INFO +(.*?)  +(\S+)$", done.stderr, re.MULTILINE))
+    assert (message["found"], message["mask IoU"], message["class right"], message["false detections an image"]) == (
         *("1.00", "1.00", "1.00", "0.00"),
     )
     how = done.stderr.split("use it with: ")[1].split()
@@ -66,7 +66,7 @@ def test_detect_output_is_read_by_pycocotools(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "message"),
     [
         ([], "out: expected a file name, got none; set out=detections.json"),
         (["out=absent/found.json"], "out: expected a file in an existing folder, got"),
@@ -74,10 +74,10 @@ def test_detect_output_is_read_by_pycocotools(tmp_path: Path) -> None:
         (["out=[a,b]"], "out: expected a path (in quotes if it looks like a number), got ['a', 'b']"),
     ],
 )
-def test_detect_errors_are_one_line(tmp_path: Path, overrides: list[str], said: str) -> None:
+def test_detect_errors_are_one_line(tmp_path: Path, overrides: list[str], message: str) -> None:
     done = start(tmp_path, *overrides)
     assert done.returncode == 1
-    assert said in done.stderr
+    assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert not list(tmp_path.iterdir())
 

@@ -254,7 +254,7 @@ def test_experiment_unknown_row_raises() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["row=half,hafl"], "error: row: expected one of"),
         (
@@ -264,10 +264,10 @@ def test_experiment_unknown_row_raises() -> None:
         (["seed=range(0,0)"], "error: seed=range(0,0): expected at least one value, got none"),
     ],
 )
-def test_sweep_errors_are_reported_before_first_run(tmp_path: Path, arguments: list[str], said: str) -> None:
+def test_sweep_errors_are_reported_before_first_run(tmp_path: Path, arguments: list[str], message: str) -> None:
     done = start(tmp_path, *arguments)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith(said)
+    assert done.stderr.startswith(message)
     assert len(done.stderr.splitlines()) == 1
     assert not list(tmp_path.rglob("config.yaml"))
 
@@ -280,7 +280,7 @@ def test_run_without_experiment_is_unchanged() -> None:
 
 
 def test_experiment_settings_do_not_change_config_hash() -> None:
-    told = {
+    expected = {
         "row": "a",
         "rows": {"a": []},
         "sequences": {"all": "b"},
@@ -288,4 +288,4 @@ def test_experiment_settings_do_not_change_config_hash() -> None:
         "table": {"average_over": ["seed"]},
         "figure": {"zoom": True},
     }
-    assert config_hash({"seed": 1}) == config_hash({"seed": 1} | told)
+    assert config_hash({"seed": 1}) == config_hash({"seed": 1} | expected)

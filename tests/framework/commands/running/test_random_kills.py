@@ -70,13 +70,13 @@ def test_run_killed_at_random_moment_leaves_valid_record(tmp_path: Path) -> None
         mapped = (tmp_path / "note").exists()
         process.send_signal(number)
         status, stderr = end(process)
-        told = f"{number.name}, {wait_s:.3f} s after {moment}: status {status}\n{stderr}"
+        expected = f"{number.name}, {wait_s:.3f} s after {moment}: status {status}\n{stderr}"
         there = whole_files(place) if place.exists() else set()
         if mapped and number != signal.SIGKILL:
-            assert there & {"metrics.json", "metrics.partial.json"}, told
-            assert {"trajectory.txt", "timings.csv", "instances.json", "mesh.ply", "map.npz"} <= there, told
-            assert status == 128 + number or "metrics.json" in there, told
-            assert not list(place.glob(".*.partial*")), told
+            assert there & {"metrics.json", "metrics.partial.json"}, expected
+            assert {"trajectory.txt", "timings.csv", "instances.json", "mesh.ply", "map.npz"} <= there, expected
+            assert status == 128 + number or "metrics.json" in there, expected
+            assert not list(place.glob(".*.partial*")), expected
     assert end(begin(tmp_path, *arguments, "skip_completed=true"))[0] == 0
     assert end(begin(tmp_path, *SHORT, f"hydra.run.dir={undisturbed}"))[0] == 0
     assert whole_files(place) == whole_files(undisturbed)

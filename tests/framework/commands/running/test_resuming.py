@@ -112,7 +112,7 @@ def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "message"),
     [
         (("fuser.voxel_size=0.05",), r"fuser.voxel_size: expected 0.04 \(as in the stored map\), got 0.05"),
         (("fuser.max_depth=4",), "fuser.max_depth"),
@@ -126,11 +126,11 @@ def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
     ],
 )
 def test_resume_with_incompatible_config_raises(
-    tmp_path: Path, room: CornerRoom, overrides: tuple[str, ...], said: str
+    tmp_path: Path, room: CornerRoom, overrides: tuple[str, ...], message: str
 ) -> None:
     first, _ = mapped([room[0]], *GIVEN)
     before = put_away(first, tmp_path / "first")
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         Mapper(*GIVEN, *overrides, f"resume_from={before}")
 
 

@@ -83,7 +83,7 @@ def test_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, ba
 
 
 @pytest.mark.parametrize(
-    ("kind", "said"),
+    ("kind", "message"),
     [
         ("OSError", "OSError: weights.bin: Input/output error"),
         ("ValueError", "ValueError: operands could not be broadcast together"),
@@ -91,15 +91,15 @@ def test_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, ba
         ("masks", "masks"),
     ],
 )
-def test_stage_error_leaves_partial_record(tmp_path: Path, kind: str, said: str) -> None:
+def test_stage_error_leaves_partial_record(tmp_path: Path, kind: str, message: str) -> None:
     place = tmp_path / "run"
     status, stderr = end(begin(tmp_path, "detector=faulty", f"detector.kind={kind}", f"hydra.run.dir={place}"))
     assert status == 3
-    assert said in stderr.splitlines()[-1] or said in stderr
+    assert message in stderr.splitlines()[-1] or message in stderr
     assert "ERROR" in stderr
     assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
     left = figures(place)
-    assert said in str(left["partial"])
+    assert message in str(left["partial"])
     assert left["frames"] in (3, 4)  # the detector fails before the frame is taken, masks when they are lifted
     assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
 

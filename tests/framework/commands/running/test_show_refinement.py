@@ -40,7 +40,7 @@ def test_show_refinement_without_detections_draws_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "said"),
+    ("overrides", "message"),
     [
         ([], "out: expected a file name, got none; set out=refinement.png"),
         (["out=absent/refinement.png"], "out: expected a file in an existing folder, got"),
@@ -49,10 +49,10 @@ def test_show_refinement_without_detections_draws_frame(tmp_path: Path) -> None:
         (["out=r.png", "frame=1", "dataset.unreadable=1"], "frame 1: depth/000001.png is truncated"),
     ],
 )
-def test_show_refinement_errors_are_one_line(tmp_path: Path, overrides: list[str], said: str) -> None:
+def test_show_refinement_errors_are_one_line(tmp_path: Path, overrides: list[str], message: str) -> None:
     done = start(tmp_path, *overrides)
     assert done.returncode == 1
-    assert said in done.stderr
+    assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert not list(tmp_path.iterdir())
 

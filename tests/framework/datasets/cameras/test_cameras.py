@@ -99,14 +99,14 @@ def test_lens_is_undistorted_only_for_supported_model(
     device.coeffs = (0.1, -0.05, 0.01, 0.02, 0.001)
     [as_it_is] = sent(brand.video(), 1)
     np.testing.assert_array_equal(as_it_is.color, CornerRoom()[0].color)
-    told = f"{brand.name}: expected Brown-Conrady lens distortion, got inverse; images are not undistorted"
-    assert caplog.messages == [told]
+    expected = f"{brand.name}: expected Brown-Conrady lens distortion, got inverse; images are not undistorted"
+    assert caplog.messages == [expected]
     device.model = "brown"
     [undone] = sent(brand.video(), 1)
     lens = Undistortion(CAMERA, Distortion(*device.coeffs))
     np.testing.assert_array_equal(undone.color, lens.smooth(CornerRoom()[0].color))
     np.testing.assert_allclose(undone.depth, lens.exact(CornerRoom()[0].depth), atol=UNIT)
-    assert caplog.messages == [told]
+    assert caplog.messages == [expected]
 
 
 def test_missing_package_raises_one_line(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,12 +122,13 @@ def test_missing_device_raises_one_line(brand: Brand, device: FakeCamera) -> Non
 
 
 @pytest.mark.parametrize(
-    ("parameters", "said"), [({"serial": "999"}, ": device 999 with 96x72"), ({"width": 640}, ": device with 640x72")]
+    ("parameters", "message"),
+    [({"serial": "999"}, ": device 999 with 96x72"), ({"width": 640}, ": device with 640x72")],
 )
 def test_unsupported_device_request_raises_one_line(
-    brand: Brand, device: FakeCamera, parameters: dict[str, object], said: str
+    brand: Brand, device: FakeCamera, parameters: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(DataError, match=f"{said} at 30 Hz cannot be started: ") as caught:
+    with pytest.raises(DataError, match=f"{message} at 30 Hz cannot be started: ") as caught:
         next(brand.video(**parameters).frames())
     assert "\n" not in str(caught.value)
     assert not device.running
@@ -150,13 +151,13 @@ def test_disconnected_device_raises_and_stops(
 def test_camera_pauses_below_timeout_are_tolerated(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
     monkeypatch.setattr(device_frames, "time", clock)
-    said: list[str | None] = []
+    message: list[str | None] = []
     coming = iter(["first", None, "second", None, "third", None, None])
     with pytest.raises(DataError, match="it: no frame received for 5 s"):  # noqa: PT012
         for images in device_frames.images_of("it", lambda: next(coming)):
-            said.append(images)
+            message.append(images)
             clock.now += 3.0
-    assert said == ["first", None, "second", None, "third", None]
+    assert message == ["first", None, "second", None, "third", None]
 
 
 def test_idle_device_yields_none(brand: Brand, device: FakeCamera) -> None:

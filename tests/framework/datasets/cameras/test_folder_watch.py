@@ -225,14 +225,14 @@ def test_folder_watch_waits_for_camera_file(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [(None, "No such file"), ("{", "expected valid JSON"), ("{}", "expected a key 'width'")]
+    ("text", "output"), [(None, "No such file"), ("{", "expected valid JSON"), ("{}", "expected a key 'width'")]
 )
-def test_missing_or_invalid_camera_file_raises_after_timeout(folder: Path, text: str | None, said: str) -> None:
+def test_missing_or_invalid_camera_file_raises_after_timeout(folder: Path, text: str | None, output: str) -> None:
     (folder / "camera.json").unlink()
     if text is not None:
         (folder / "camera.json").write_text(text)
     watched = Watched(folder, camera_timeout=0)
-    with pytest.raises(DataError, match=said):  # noqa: PT012
+    with pytest.raises(DataError, match=output):  # noqa: PT012
         while True:
             watched.look()
 

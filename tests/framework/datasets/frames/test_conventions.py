@@ -57,15 +57,15 @@ def test_camera_axes_match_system_conventions() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ({"depth_scale": 0.5}, "dataset.depth_scale"),
         ({"depth_scale": -1.0}, "depth_scale"),
         ({"depth_delay": 1001}, "delay"),
     ],
 )
-def test_invalid_reading_parameter_raises(wrong: dict[str, float], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_invalid_reading_parameter_raises(wrong: dict[str, float], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         DepthReading(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="pose_unit"):
         PoseReading(pose_unit=0.0)

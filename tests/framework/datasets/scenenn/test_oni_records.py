@@ -76,10 +76,10 @@ def test_truncated_recording_is_repaired_to_complete_records(tmp_path, wide, end
         assert contents.cut_off
         counts.add(sum(images.count for images in contents.streams.values()))
         with playable(contents, scratch) as played:
-            mended = read_contents(played)
-            assert not mended.cut_off
-            assert mended.streams == contents.streams
-            positions = [struct.unpack_from("<Q", played.read_bytes(), at)[0] for at in mended.table_notes]
+            fixed = read_contents(played)
+            assert not fixed.cut_off
+            assert fixed.streams == contents.streams
+            positions = [struct.unpack_from("<Q", played.read_bytes(), at)[0] for at in fixed.table_notes]
             assert positions == [0, 0] if wide else positions == []
         assert not any(scratch.iterdir())
     assert counts == {2, 3, 4, 5}

@@ -57,7 +57,7 @@ def test_run_length_without_masks_is_empty() -> None:
 
 
 @pytest.mark.parametrize(
-    ("counts", "said"),
+    ("counts", "message"),
     [
         (b"", "packed string"),
         (b"1", "found 1 px"),
@@ -67,8 +67,8 @@ def test_run_length_without_masks_is_empty() -> None:
         (b"O8I", "negative"),
     ],
 )
-def test_run_length_malformed_string_raises(counts: bytes, said: str) -> None:
-    with pytest.raises(DataError, match=said) as raised:
+def test_run_length_malformed_string_raises(counts: bytes, message: str) -> None:
+    with pytest.raises(DataError, match=message) as raised:
         check(counts, (4, 4))
     assert "\n" not in str(raised.value)
 

@@ -394,9 +394,9 @@ def test_cache_folder_is_shared_by_two_processes(tmp_path: Path) -> None:
         for name in ("ready1", "ready2")
     ]
     for process in both:
-        _, said = process.communicate(timeout=120)
-        assert process.returncode == 0, said
-        assert "damaged" not in said
+        _, output = process.communicate(timeout=120)
+        assert process.returncode == 0, output
+        assert "damaged" not in output
     detector = CachedDetector(SphereDetector(), tmp_path / "cache")
     for frame in CornerRoom():
         assert_same(SphereDetector().detect(frame), detector.detect(frame))

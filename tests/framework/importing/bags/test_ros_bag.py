@@ -276,7 +276,7 @@ def two_cameras() -> BagWriter:
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "output"),
     [
         ({}, r"expected one depth topic, got /left/depth/image, /right/depth/image; set --depth"),
         ({"depth": "/left/depth/image"}, r"expected one color topic, got .*; set --color"),
@@ -294,9 +294,9 @@ def two_cameras() -> BagWriter:
         ),
     ],
 )
-def test_ambiguous_or_invalid_topic_error_names_option(tmp_path: Path, given: dict[str, str], said: str) -> None:
+def test_ambiguous_or_invalid_topic_error_names_option(tmp_path: Path, given: dict[str, str], output: str) -> None:
     path = two_cameras().write(tmp_path / "bag")
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=output):
         open_source(path, Topics(**given))
 
 
@@ -319,18 +319,18 @@ def test_registered_depth_and_raw_color_are_preferred(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("left_out", "said"),
+    ("left_out", "output"),
     [
         ("/color/image", "expected one color topic, got none"),
         ("camera_info", "expected a sensor_msgs/msg/CameraInfo topic next to .*, got none"),
     ],
 )
-def test_missing_topic_raises(tmp_path: Path, left_out: str, said: str) -> None:
+def test_missing_topic_raises(tmp_path: Path, left_out: str, output: str) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.messages = [entry for entry in bag.messages if left_out not in entry[1]]
     path = bag.write(tmp_path / "bag")
-    with pytest.raises((ConfigError, DataError), match=said):
+    with pytest.raises((ConfigError, DataError), match=output):
         open_source(path)
 
 
@@ -396,7 +396,7 @@ def test_realsense_accelerometer_gives_up_in_camera_axes(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "output"),
     [
         (
             {"frame_id": "unheard_of"},
@@ -407,7 +407,7 @@ def test_realsense_accelerometer_gives_up_in_camera_axes(tmp_path: Path) -> None
     ],
 )
 def test_unusable_accelerometer_logs_one_line(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, changed: dict[str, Any], said: str
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, changed: dict[str, Any], output: str
 ) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
@@ -416,7 +416,7 @@ def test_unusable_accelerometer_logs_one_line(
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
     assert not (tmp_path / "out/gravity.txt").exists()
     [line] = [record.getMessage() for record in caplog.records if "accelerometer" in record.getMessage()]
-    assert re.search(f"no accelerometer is usable: {said}", line)
+    assert re.search(f"no accelerometer is usable: {output}", line)
     assert "\n" not in line
 
 

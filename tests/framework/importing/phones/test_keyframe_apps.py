@@ -126,13 +126,13 @@ SPOILT_CAMERAS = {
 
 
 @pytest.mark.parametrize(
-    ("app", "how", "said"), [(app, *case) for app, cases in SPOILT_CAMERAS.items() for case in cases]
+    ("app", "how", "message"), [(app, *case) for app, cases in SPOILT_CAMERAS.items() for case in cases]
 )
-def test_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, said: str) -> None:
+def test_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, message: str) -> None:
     WRITERS[app](tmp_path / "export", FRAMES)
     change(second(tmp_path / "export", "frame_*.json" if app == "3D Scanner App" else "cameras/*.json"), how)
     [fault] = write(tmp_path / "export", tmp_path)
-    assert re.search(said, fault), fault
+    assert re.search(message, fault), fault
     assert len(RgbdFolder(tmp_path / "out")) == 3
 
 

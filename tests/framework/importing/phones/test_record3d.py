@@ -87,7 +87,7 @@ def changed(export: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (
             lambda m: m["poses"].__setitem__(1, [0, 0, 0, 2, 0, 0, 0]),
@@ -98,16 +98,16 @@ def changed(export: Path, change: Callable[[dict[str, Any]], Any]) -> None:
         (lambda m: m["frameTimestamps"].__setitem__(1, 0.0), "expected a timestamp > "),
     ],
 )
-def test_damaged_pose_loses_one_frame(export: Path, tmp_path: Path, change, said: str) -> None:
+def test_damaged_pose_loses_one_frame(export: Path, tmp_path: Path, change, message: str) -> None:
     changed(export, change)
     written = write_folder(open_source(export), tmp_path / "out", Writing())
     [fault] = written.errors
-    assert re.search(said, fault)
+    assert re.search(message, fault)
     assert len(RgbdFolder(tmp_path / "out")) == 3
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda m: m.pop("poses"), "poses: expected a list of poses, got None"),
         (lambda m: m.update(poses=[]), "poses: expected a list of poses"),
@@ -120,9 +120,9 @@ def test_damaged_pose_loses_one_frame(export: Path, tmp_path: Path, change, said
         (lambda m: (m.pop("frameTimestamps"), m.update(fps=0)), "fps: expected a value > 0 Hz"),
     ],
 )
-def test_invalid_metadata_raises(export: Path, change, said: str) -> None:
+def test_invalid_metadata_raises(export: Path, change, message: str) -> None:
     changed(export, change)
-    with pytest.raises(DataError, match=rf"metadata\.json: .*{said}|metadata\.json: {said}"):
+    with pytest.raises(DataError, match=rf"metadata\.json: .*{message}|metadata\.json: {message}"):
         open_source(export)
 
 
@@ -153,7 +153,7 @@ def rewritten(r3d: Path, name: str, content: bytes | None) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("rgbd/1.depth", None, r"expected rgbd/1\.depth, got no such member"),
         ("rgbd/1.depth", b"bvx2" + bytes(100), r"rgbd/1\.depth: cannot be decompressed; the file is damaged"),
@@ -164,11 +164,11 @@ def rewritten(r3d: Path, name: str, content: bytes | None) -> Path:
     ],
 )
 def test_damaged_r3d_member_loses_one_frame(
-    r3d: Path, tmp_path: Path, name: str, content: bytes | None, said: str
+    r3d: Path, tmp_path: Path, name: str, content: bytes | None, message: str
 ) -> None:
     written = write_folder(open_source(rewritten(r3d, name, content)), tmp_path / "out", Writing())
     [fault] = written.errors
-    assert re.search(said, fault), fault
+    assert re.search(message, fault), fault
     assert len(RgbdFolder(tmp_path / "out")) == 3
 
 

@@ -63,7 +63,7 @@ def spoil_row(folder: Path, number: int, change) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda words: words[:5], r"odometry.csv, line 3: expected 9 numbers .* got 5"),
         (lambda words: [*words[:2], " nan", *words[3:]], r"odometry.csv, line 3: expected a finite pose"),
@@ -80,11 +80,11 @@ def spoil_row(folder: Path, number: int, change) -> None:
         ),
     ],
 )
-def test_damaged_odometry_row_loses_its_frame(folder: Path, tmp_path: Path, change, said: str) -> None:
+def test_damaged_odometry_row_loses_its_frame(folder: Path, tmp_path: Path, change, message: str) -> None:
     spoil_row(folder, 2, change)
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
-    [fault] = written.errors if "77" not in said else written.errors[:1]
-    assert re.search(said, fault), fault
+    [fault] = written.errors if "77" not in message else written.errors[:1]
+    assert re.search(message, fault), fault
     assert len(RgbdFolder(tmp_path / "out")) == len(written.timestamps)
 
 
@@ -108,7 +108,7 @@ def test_short_video_keeps_decoded_frames(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("rgb.mp4", None, r"rgb\.mp4: cannot be read"),
         ("rgb.mp4", b"#EXTM3U\nhttp://localhost/1.ts\n", r"rgb\.mp4: expected an MP4 or QuickTime file"),
@@ -121,12 +121,12 @@ def test_short_video_keeps_decoded_frames(folder: Path, tmp_path: Path) -> None:
     ],
 )
 def test_invalid_export_raises_and_leaves_no_folder(
-    folder: Path, tmp_path: Path, name: str, content: bytes | None, said: str
+    folder: Path, tmp_path: Path, name: str, content: bytes | None, message: str
 ) -> None:
     (folder / name).unlink()
     if content is not None:
         (folder / name).write_bytes(content)
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=message):
         write_folder(stray_scanner.open_source(folder), tmp_path / "out", Writing())
     assert not (tmp_path / "out").exists()
 

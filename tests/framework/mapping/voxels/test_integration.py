@@ -150,7 +150,7 @@ def test_readings_outside_sensor_range_allocate_no_blocks(depth: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "T", "error", "said"),
+    ("options", "T", "error", "message"),
     [
         (
             {"voxel_size": 1e-4, "truncation_slope": 1.0, "max_depth": 1000.0},
@@ -173,7 +173,7 @@ def test_readings_outside_sensor_range_allocate_no_blocks(depth: float) -> None:
     ],
 )
 def test_frame_exceeding_limits_raises_before_allocation(
-    options: dict[str, float], T: float, error: type[Exception], said: str
+    options: dict[str, float], T: float, error: type[Exception], message: str
 ) -> None:
     volume = assemble(VoxelHashing, max_blocks=1000, **options).new_volume()
     T_world_camera = np.eye(4)
@@ -182,7 +182,7 @@ def test_frame_exceeding_limits_raises_before_allocation(
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth, CAMERA)
     tracemalloc.start()
     try:
-        with pytest.raises(error, match=said):
+        with pytest.raises(error, match=message):
             volume.integrate(frame, T_world_camera, 0.01)
         assert tracemalloc.get_traced_memory()[1] < 3e8
     finally:
