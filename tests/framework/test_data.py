@@ -60,7 +60,7 @@ def test_frame_up_must_be_unit_vector() -> None:
         ([0.0, -1.0], r"shape \(3\)"),
         ([0.0, np.nan, 0.0], "expected finite values"),
     ):
-        with pytest.raises(DataError, match=f"frame 7: up .*{message}"):
+        with pytest.raises(DataError, match=f"frame 7: up.*{message}"):
             frame(up=np.array(wrong))
 
 

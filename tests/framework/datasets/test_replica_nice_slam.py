@@ -82,10 +82,10 @@ def test_invalid_pose_raises_for_its_frame(root: Path) -> None:
         ReplicaNiceSlam(root, scene="room0"), 1
     )
     write_poses(root / "room0", [pose_at(0), np.full((4, 4), np.nan), pose_at(2)])
-    assert "traj.txt, line 2: the pose is not finite" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+    assert "traj.txt, line 2: pose: expected finite values" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
     text = (root / "room0/traj.txt").read_text()
     (root / "room0/traj.txt").write_text(text.replace("nan", "-nan(ind)"))
-    assert "traj.txt, line 2: the pose is not finite" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+    assert "traj.txt, line 2: pose: expected finite values" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
 
 
 @pytest.mark.parametrize("name", ["frame000001.jpg", "depth000001.png"])

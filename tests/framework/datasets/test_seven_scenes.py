@@ -127,7 +127,7 @@ def test_rounded_rotation_is_made_rigid(folder: Path) -> None:
         ("1 0 0 0\n0 1 0 0\n0 0 1 0\n", "pose.txt: expected 4 lines of 4 numbers, got 3 lines"),
         ("1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, got 3"),
         ("1 0 0 0\n0 one 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, got 'one'"),
-        ("1 0 0 0\n0 1 0 0\n0 0 nan 0\n0 0 0 1\n", "pose.txt: the pose is not finite"),
+        ("1 0 0 0\n0 1 0 0\n0 0 nan 0\n0 0 0 1\n", "pose.txt: pose: expected finite values"),
         ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "pose.txt: pose: expected a rigid transform, got |R R^T - I| ="),
         ("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt: pose: expected a rigid transform, got |R R^T - I| ="),
         ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", "pose.txt: pose: expected the last row 0 0 0 1"),

@@ -302,5 +302,5 @@ def test_image_size_mismatch_raises(folder: Path) -> None:
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1.5, float("nan")])
 def test_time_tolerance_out_of_range_raises(folder: Path, value: float) -> None:
-    with pytest.raises(ConfigError, match=r"dataset\.max_time_difference must be in \(0, 1\] s"):
+    with pytest.raises(ConfigError, match=r"dataset\.max_time_difference: expected a value in \(0, 1\] s"):
         TumRgbd(folder, max_time_difference=value)

@@ -162,8 +162,8 @@ MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells()
     [
         (dense(MIXED), {}, r"got ambiguous boxes \(.* could be corners\); set detector\.box_format=CENTER or CORNER"),
         (dense(cells() / 8), {}, r"detector\.weights: expected boxes in px of the input 64x96 or in 0\.\.1"),
-        (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 126\): set detector.objectness=true"),
-        (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 126\): set detector.objectness=false"),
+        (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 126\); set detector.objectness=true"),
+        (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 126\); set detector.objectness=false"),
         (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression .*another detector\.label_space"),
         (detections(as_corners(cells()), 0.9, 3), {}, r"label_space: expected labels 0 to 2 .*, got 3 to 3"),
         (detections(as_corners(cells()), 1.5, 1), {}, r"detector\.layout: expected scores in \[0, 1\], got 0 to 1\.5"),

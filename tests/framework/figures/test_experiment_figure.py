@@ -188,7 +188,7 @@ def test_stage_times_figure_averages_sequences(tmp_path: Path, caplog: pytest.Lo
     (run(root, "whole", "300") / "timings.csv").write_text("frame,stage,milliseconds\n0,integration,x\n")
     paths = write_figure(root)
     assert Image.open(paths[0]).size[0] == pytest.approx(88 / 25.4 * 200, abs=1)
-    assert [record.getMessage() for record in caplog.records][1].endswith("found '0,integration,x'")
+    assert [record.getMessage() for record in caplog.records][1].endswith("got '0,integration,x'")
     found = texts(root)
     assert {"GMM", "map integration", "30 ms", "not complete"} <= set(found)
     assert "tracking" not in found
@@ -216,7 +216,7 @@ def test_figure_choice_invalid_settings_raise_one_line_error(figure: Any, messag
 def test_write_figure_without_data_raises_one_line_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected a folder of runs"):
         write_figure(tmp_path / "nowhere")
-    with pytest.raises(DataError, match=r"expected the folder of an experiment, got none with multirun\.yaml"):
+    with pytest.raises(DataError, match=r"expected the folder of an experiment, got no multirun\.yaml"):
         write_figure(tmp_path)
     root = experiment(tmp_path / "none")
     with pytest.raises(DataError, match="expected a block `figure:`, got none"):
@@ -226,9 +226,7 @@ def test_write_figure_without_data_raises_one_line_error(tmp_path: Path) -> None
         with pytest.raises(DataError, match="expected a completed run, got none"):
             write_figure(root)
         (run(root, "whole", "011") / name).write_text("")
-        with pytest.raises(
-            DataError, match=r"timings\.csv: expected a readable file, got none; the log lists the reasons"
-        ):
+        with pytest.raises(DataError, match=r"expected a readable .*, got none; the log lists the reasons"):
             write_figure(root)
         assert not list(root.glob("figure.*"))
 

@@ -28,7 +28,7 @@ def test_one_matrix_per_line_is_read(tmp_path: Path) -> None:
     first, second = read_matrix_lines(path)
     np.testing.assert_array_equal(first.values, QUARTER_TURN)
     np.testing.assert_array_equal(second.values[:3, 3], [7, 8, 9])
-    with pytest.raises(DataError, match=r"traj\.txt, line 3: the pose is not finite"):
+    with pytest.raises(DataError, match=r"traj\.txt, line 3: pose: expected finite values"):
         second.pose()
 
 

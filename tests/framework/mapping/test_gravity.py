@@ -182,7 +182,7 @@ def test_gravity_round_trips_and_invalid_values_raise() -> None:
         for key in ("camera_up", "sensed_up"):
             with pytest.raises(DataError, match=key):
                 GravityEstimator.of(MapHeader(saved | {key: wrong}))
-    with pytest.raises(DataError, match="sensed_up: expected at most the length 3 of as many unit vectors, got 40"):
+    with pytest.raises(DataError, match=r"sensed_up: expected a length of at most 3 \(a sum of unit vectors\), got 40"):
         GravityEstimator.of(MapHeader(saved | {"sensed_frames": 3}))
     with pytest.raises(DataError, match=r"sensed_frames: expected an integer in \[.*, .*\]"):
         GravityEstimator.of(MapHeader(saved | {"sensed_frames": -1}))

@@ -144,7 +144,7 @@ def test_map_file_of_other_format_raises(other: int, tmp_path: Path) -> None:
     """Before anything else is expected of it: other versions have other arrays."""
     path = tmp_path / "map.npz"
     np.savez(path, header=np.frombuffer(json.dumps({"format": other}).encode(), np.uint8))
-    expected = re.escape(f"{path}: expected map format {FORMAT}; map again, got {other}")
+    expected = re.escape(f"{path}: expected map format {FORMAT}, got {other}; map again")
     with pytest.raises(DataError, match=f"^{expected}$"):
         InstanceMap.load(path)
 

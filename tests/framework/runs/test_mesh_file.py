@@ -42,10 +42,14 @@ def test_read_mesh_foreign_ply_raises_one_line_error(tmp_path: Path) -> None:
     labels = {"instance": mesh.instance_ids, "class": mesh.class_ids}
     for properties, comments, message in [
         (shades, ("classes chair",), "expected the vertex property 'instance' of int32"),
-        (shades | labels | {"class": mesh.class_ids.astype(np.float32)}, ("classes chair",), "no property 'class'"),
+        (
+            shades | labels | {"class": mesh.class_ids.astype(np.float32)},
+            ("classes chair",),
+            "expected the vertex property 'class'",
+        ),
         (labels, ("classes chair",), "expected the vertex property 'red' of uint8, got none"),
         (shades | labels, (), "expected one line 'comment classes ...', got 0"),
-        (shades | labels, ("classes chair", "classes bed"), "found 2"),
+        (shades | labels, ("classes chair", "classes bed"), "got 2"),
     ]:
         write_ply(path, mesh.vertices, mesh.triangles, properties, comments)
         with pytest.raises(DataError, match=message) as caught:

@@ -130,5 +130,5 @@ def test_read_labels_from_text_file_checks_lines(tmp_path):
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="coco, coco_panoptic, nyu40, scenenn, ade20k"):
         read_labels(str(path))
-    with pytest.raises(ConfigError, match="found cocoo"):
+    with pytest.raises(ConfigError, match="got cocoo"):
         read_labels("cocoo")

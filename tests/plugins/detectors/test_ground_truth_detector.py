@@ -32,7 +32,7 @@ def test_ground_truth_masks_of_known_classes_are_exact():
 def test_empty_frame_has_no_detections_and_missing_truth_raises():
     empty = FrameTruth(np.zeros((30, 40), np.int32), {})
     assert len(GroundTruthDetector().detect(frame_with(empty))) == 0
-    with pytest.raises(DataError, match="no instance ground truth"):
+    with pytest.raises(DataError, match="expected instance ground truth"):
         GroundTruthDetector().detect(frame_with(None))
 
 

@@ -219,7 +219,7 @@ def test_damaged_weights_raise(tmp_path):
         (tmp_path / name).write_bytes((WEIGHTS / name).read_bytes())
     damaged = tmp_path / "maskrcnn2go_coco_int8.npz"
     damaged.write_bytes(damaged.read_bytes()[:-1])
-    with pytest.raises(DataError, match=r"maskrcnn2go_coco_int8\.npz is damaged"):
+    with pytest.raises(DataError, match=r"maskrcnn2go_coco_int8\.npz: expected sha256"):
         MaskRCNN2Go(weights=tmp_path, device="cpu")
 
 
@@ -240,5 +240,5 @@ def test_damaged_weights_raise(tmp_path):
 )
 def test_invalid_parameter_raises(parameters):
     (name,) = parameters
-    with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
+    with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         MaskRCNN2Go(**parameters)

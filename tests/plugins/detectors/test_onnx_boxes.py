@@ -175,7 +175,7 @@ def test_unsupported_network_shape_or_label_raises(tmp_path):
 )
 def test_invalid_parameter_raises(parameters, tmp_path):
     (name,) = parameters
-    with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
+    with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         OnnxBoxes(weights=tmp_path / "absent.onnx", **parameters)
 
 

@@ -121,7 +121,7 @@ def test_different_class_names_in_file_are_logged(tmp_path, caplog):
     onnx.save(model, tmp_path / "named.onnx")
     OnnxSegmentation(weights=tmp_path / "named.onnx", label_space=str(tmp_path / "labels.txt"), device="cpu")
     assert "named.onnx: 1 of its 3 classes differ from detector.label_space=" in caplog.text
-    assert "1 is 'fork', not 'cup'" in caplog.text
+    assert "1 is 'fork', expected 'cup'" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_different_class_names_in_file_are_logged(tmp_path, caplog):
             {"output1": np.zeros((1, 40, 40))},
             r"expected two outputs, \(1, 4 \+ classes \+ M, K\) or .*, got output0",
         ),
-        ({"more": np.zeros((1, 2))}, r"found output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
+        ({"more": np.zeros((1, 2))}, r"got output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
     ],
 )
 def test_unsupported_network_shape_raises(tmp_path, changed, message):
@@ -161,7 +161,7 @@ def test_unsupported_network_shape_raises(tmp_path, changed, message):
 )
 def test_invalid_parameter_raises(tmp_path, parameters):
     (name,) = parameters
-    with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
+    with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         OnnxSegmentation(**{"weights": tmp_path / "absent.onnx", **parameters})
 
 

@@ -350,7 +350,7 @@ def test_ellipse_matches_reference(place):
 
 
 def test_missing_truth_raises_and_empty_truth_gives_none():
-    with pytest.raises(DataError, match="no instance ground truth"):
+    with pytest.raises(DataError, match="expected instance ground truth"):
         SimulatedDetector().detect(replace(frame(), truth=None))
     assert len(PERFECT.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {})))) == 0
 
@@ -378,5 +378,5 @@ def test_missing_truth_raises_and_empty_truth_gives_none():
 )
 def test_invalid_parameter_raises(parameters):
     (name,) = parameters
-    with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
+    with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         SimulatedDetector(**parameters)

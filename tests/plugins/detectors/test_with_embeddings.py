@@ -153,16 +153,16 @@ def test_nested_detector_is_built_and_its_errors_name_path(siglip: Path) -> None
         ConfigError, match=r"detector plugins\.detectors\.with_embeddings\.WithEmbeddings: detector: .*min_pixels"
     ):
         registered.built("detector", "with_embeddings", chosen, "detector.detector.min_pixels=0")
-    with pytest.raises(ConfigError, match="detector: expected given"):
+    with pytest.raises(ConfigError, match="expected a value for detector"):
         registered.built("detector", "with_embeddings", "~detector.detector")
 
 
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
-        ("config.json", "its config.json could not be read"),
+        ("config.json", "expected config.json in"),
         ("tokenizer.json", "expected the tokenizer in"),
-        ("model.safetensors", "its weights could not be read"),
+        ("model.safetensors", "expected the weights in"),
         ("preprocessor_config.json", "preprocessor_config.json"),
     ],
 )

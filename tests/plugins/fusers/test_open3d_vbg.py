@@ -336,7 +336,7 @@ def test_damaged_or_foreign_map_file_raises(mapped: Open3DMap, tmp_path: Path) -
         with pytest.raises(DataError, match=r"map\.npz"):
             Open3DMap.load(path)
     BayesianTsdf().scene.save(path)
-    with pytest.raises(DataError, match=f"expected map format open3d_vbg, got {FORMAT}"):
+    with pytest.raises(DataError, match=f"expected map format open3d_vbg 5, got {FORMAT}"):
         Open3DMap.load(path)
     with pytest.raises(DataError, match=r"none\.npz"):
         Open3DMap.load(tmp_path / "none.npz")

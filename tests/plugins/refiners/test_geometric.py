@@ -161,7 +161,7 @@ def test_result_does_not_depend_on_thread_count():
     ("parameters", "message"),
     [
         ({"cell_size": 0}, r"Geometric\.cell_size: expected a value in"),
-        ({"noise_factor": float("nan")}, "noise_factor .* found nan"),
+        ({"noise_factor": float("nan")}, "noise_factor: .* got nan"),
         ({"max_angle": 90.0}, "Geometric.max_angle"),
         ({"min_overlap": 1.0}, "Geometric.min_overlap"),
     ],

@@ -239,7 +239,7 @@ def test_largest_component_matches_reference(reach, density):
     ("make", "parameters", "message"),
     [
         (GmmEm, {"object_components": 0}, r"GmmEm\.object_components: expected a value in"),
-        (GmmEm, {"std_floor": float("nan")}, "std_floor .* found nan"),
+        (GmmEm, {"std_floor": float("nan")}, "std_floor: .* got nan"),
         (GmmEm, {"min_posterior": 1.0}, "min_posterior"),
         (KMeans, {"background_centers": -1}, "KMeans.background_centers"),
         (LargestComponent, {"connection_radius": 0}, "LargestComponent.connection_radius"),

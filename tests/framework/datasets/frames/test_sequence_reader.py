@@ -49,10 +49,10 @@ def test_frame_fraction_one_keeps_all_and_minimum_keeps_one():
 
 @pytest.mark.parametrize("share", [0.0, -0.1, 1.001, float("nan")])
 def test_invalid_frame_fraction_error_names_parameter(share):
-    with pytest.raises(ConfigError, match=r"dataset.frame_fraction must be in \(0, 1\]"):
+    with pytest.raises(ConfigError, match=r"dataset.frame_fraction: expected a value in \(0, 1\]"):
         check_selection(0, -1, 1, share)
 
 
 def test_negative_seed_raises():
-    with pytest.raises(ConfigError, match="seed must be 0 or positive, found -1"):
+    with pytest.raises(ConfigError, match="seed: expected at least 0, got -1"):
         choose_frames(7, 0, -1, 1, frame_fraction=0.5, seed=-1)

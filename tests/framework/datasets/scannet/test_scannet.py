@@ -125,7 +125,7 @@ def test_invalid_pose_raises_for_its_frame(tmp_path: Path, write: Writer) -> Non
     frames = shots()
     frames[1].T_world_camera = NO_POSE
     write(tmp_path / SCENE, frames)
-    assert "the pose is not finite" in fault_of(ScanNet(tmp_path, SCENE), 1)
+    assert "pose: expected finite values" in fault_of(ScanNet(tmp_path, SCENE), 1)
 
 
 def test_frames_missing_from_truncated_sens_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

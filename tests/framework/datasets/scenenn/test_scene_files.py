@@ -82,14 +82,14 @@ def test_lost_frame_is_unusable(path):
 @pytest.mark.parametrize(
     ("old", "new", "why"),
     [
-        ("-1.60032", "nan", "not finite"),
-        ("-1.60032", "-inf", "not finite"),
-        ("-1.60032", "-1.#IND", "not finite"),
-        ("-1.60032", "1.#QNAN0", "not finite"),
-        ("-1.60032", "-nan(ind)", "not finite"),
-        ("0.0228115", "1e300", "not rigid"),
-        ("0.0228115", "0.0428115", "not rigid"),
-        ("-0.999735 -0.0221085 -0.00642794", "0.999735 0.0221085 0.00642794", "det R -1"),  # a reflection
+        ("-1.60032", "nan", "expected finite values"),
+        ("-1.60032", "-inf", "expected finite values"),
+        ("-1.60032", "-1.#IND", "expected finite values"),
+        ("-1.60032", "1.#QNAN0", "expected finite values"),
+        ("-1.60032", "-nan(ind)", "expected finite values"),
+        ("0.0228115", "1e300", "expected a rigid transform"),
+        ("0.0228115", "0.0428115", "expected a rigid transform"),
+        ("-0.999735 -0.0221085 -0.00642794", "0.999735 0.0221085 0.00642794", "det R = -1"),  # a reflection
         ("0.000000 1.000000\n", "0.000000 2.000000\n", "last row"),
     ],
 )
@@ -137,7 +137,7 @@ def test_empty_trajectory_has_no_poses(path):
 @pytest.mark.parametrize(
     ("line", "new", "message"),
     [
-        (1, "0 0", "line 1: expected the header of a frame, frame frame frame.1, got '0 0'"),
+        (1, "0 0", "line 1: expected the header of a frame, frame frame frame.1, found '0 0'"),
         (1, "0 0 1 2", "line 1: expected the header"),
         (1, "-1 -1 0", "line 1: expected the header"),
         (6, "6.5 6 7", "line 6: expected the header"),
@@ -164,7 +164,8 @@ def test_missing_trajectory_raises(path):
 
 
 @pytest.mark.parametrize(
-    ("poses", "message"), [({0: 2 * np.eye(4)}, "pose of frame 0 is not a rigid"), ({-1: np.eye(4)}, "got -1")]
+    ("poses", "message"),
+    [({0: 2 * np.eye(4)}, "pose of frame 0: expected a rigid transform"), ({-1: np.eye(4)}, "got -1")],
 )
 def test_writing_invalid_pose_raises_and_leaves_no_file(path, poses, message):
     with pytest.raises(DataError, match=message):

@@ -66,7 +66,7 @@ def test_network_file_half_precision_keeps_float32_statistics(tmp_path):
 def test_network_file_non_finite_weights_are_not_written(tmp_path):
     network = tiny_network()
     network.rpn.head.cls_logits.bias.data[0] = torch.nan
-    with pytest.raises(DataError, match=r"cls_logits\.bias are not finite"):
+    with pytest.raises(DataError, match=r"cls_logits\.bias: expected finite weights"):
         save_network(network, tmp_path / "network.safetensors", {})
     assert not list(tmp_path.iterdir())
 
@@ -111,7 +111,7 @@ def test_network_file_without_architecture_raises(tmp_path):
             lambda fields: fields | {"backbone": fields["backbone"] | {"name": "vgg"}},
             "expected a known architecture, got 'vgg'",
         ),
-        (lambda fields: fields | {"head_features": 17}, "fc6.bias: expected 17, got 16"),
+        (lambda fields: fields | {"head_features": 17}, "fc6.bias: expected shape 17, got 16"),
     ],
 )
 def test_network_file_invalid_architecture_raises(tmp_path, change, fault):
@@ -134,7 +134,10 @@ def test_network_file_missing_field_uses_default(tmp_path):
 
 def test_network_weights_mismatch_raises():
     tensors = weights(tiny_network())
-    with pytest.raises(DataError, match=r"^here lacks weights backbone\.body\.bn1\.bias and 1 more"):
+    with pytest.raises(
+        DataError,
+        match=r"^here: expected the weights of this network, got missing backbone\.body\.bn1\.bias and 1 more",
+    ):
         filled(
             TINY, {k: v for k, v in tensors.items() if "backbone.body.bn1.b" not in k and "fc7.bias" not in k}, "here"
         )
@@ -142,7 +145,7 @@ def test_network_weights_mismatch_raises():
         filled(TINY, tensors | {"extra": torch.zeros(1)}, "here")
     wrong = tensors | {"rpn.head.cls_logits.weight": torch.zeros(3, 9, 1, 1)}
     with pytest.raises(
-        DataError, match=re.escape(r"here: rpn\.head\.cls_logits\.weight: expected 3 x 8 x 1 x 1, got 3 x 9")
+        DataError, match=re.escape("here: rpn.head.cls_logits.weight: expected shape 3 x 8 x 1 x 1, got 3 x 9")
     ):
         filled(TINY, wrong, "here")
     with pytest.raises(

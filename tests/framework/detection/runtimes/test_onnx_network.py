@@ -144,7 +144,9 @@ def test_onnx_network_non_image_input_raises(tmp_path, shape):
 
 def test_onnx_network_input_type_unsupported_raises(tmp_path):
     path = doubling_network(tmp_path / "n.onnx", (1, 4, 4, 3), TensorProto.BOOL)
-    with pytest.raises(DataError, match=r"one of float32, float16, uint8, found images \(1, 4, 4, 3\) tensor\(bool\)"):
+    with pytest.raises(
+        DataError, match=r"one of float32, float16, uint8 as input, got images \(1, 4, 4, 3\) tensor\(bool\)"
+    ):
         OnnxNetwork(path, "", "cpu", 0)
 
 

@@ -62,10 +62,10 @@ def test_merged_instances_combine_embeddings() -> None:
     [
         (np.eye(2, 3, dtype=np.float32), "", "expected a name in embedding_space, got an empty one"),
         (None, "words@1", "expected embeddings for embedding_space 'words@1', got none"),
-        (np.eye(3, dtype=np.float32), "words@1", r"truth\.instance_ids: expected shape \(2, any\), got \(3, 3\)"),
+        (np.eye(3, dtype=np.float32), "words@1", r": expected shape \(2, any\), got \(3, 3\)"),
         (np.eye(2, 3), "words@1", "expected an array"),
         (np.full((2, 3), 0.4, np.float32), "words@1", r"expected unit vectors or 0 in each row, got length 0\.69"),
-        (np.full((2, 3), np.nan, np.float32), "words@1", "not finite"),
+        (np.full((2, 3), np.nan, np.float32), "words@1", "expected finite values"),
         (np.zeros((2, 0), np.float32), "words@1", "expected 1 to 65536 columns, got 0"),
         (np.eye(2, 3, dtype=np.float32), "w" * 301, "at most 300 characters"),
     ],
