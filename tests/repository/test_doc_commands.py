@@ -55,7 +55,9 @@ def test_all_documented_commands_and_scripts_are_tested() -> None:
     shown_in = (CHECKOUT / "docker" / "Dockerfile").read_text()
     looked_at |= {
         "pip install .",
-        *(line for line in LINES if line.startswith("python docs/results/ranks.py ")),  # test_ranks.py
+        *(
+            line for line in LINES if re.match("python docs/results/(ranks|steps).py ", line)
+        ),  # test_ranks.py, test_steps.py
         *(line for line in LINES if (name := re.match(r"python -m (tests\.[\w.]+)", line)) and find_spec(name[1])),
         *(line for line in LINES if line.startswith("docker ") and f"#   {line}\n" in shown_in),
     }

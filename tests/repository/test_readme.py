@@ -25,8 +25,8 @@ from framework.pipeline import Pipeline
 from framework.refinement.lifting import lift
 from framework.registry import STAGES, build
 from framework.runs.mesh_file import read_mesh
-from tests.support import option_files
 from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
+from tests.support.recordings.phone_exports import room_frames, write_stray_scanner
 from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
 pytestmark = pytest.mark.integration
@@ -135,15 +135,17 @@ def test_documented_command_composes(command: str) -> None:
 
 OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording, and reads what a run made of it
 SMALL = ["dataset.frames=4", "dataset.width=160", "dataset.height=120"]
-OWN = [
-    "dataset=rgbd_folder",
-    "dataset.root=DIR",
-]  # smaller still, and no room has to be furnished
+OWN = ["dataset=rgbd_folder", "dataset.root=DIR"]  # the imported recording
 DEFAULTS = "python -m framework"
 RUNNABLE = {  # what to append, by a command that then takes seconds
     # twice as large: of what is left of a noisy room in a quarter of 160x120, tracking is not to be had
     DEFAULTS: [*SMALL, "dataset=synthetic", "dataset.width=320", "dataset.height=240", "hydra.run.dir=defaults"],
-    "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=outputs/demo"],
+    "python -m framework import SOURCE DIR": [],
+    "python -m framework check dataset=rgbd_folder dataset.root=DIR": [],
+    "python -m framework dataset=rgbd_folder dataset.root=DIR": ["hydra.run.dir=imported"],
+    "python -m framework hydra.run.dir=outputs/demo": ["dataset=synthetic", "detector=simulated", *SMALL],
+    "python -m framework report outputs/demo": [],
+    "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=outputs/synthetic"],
     "python -m framework tracker=ground_truth fuser.voxel_size=0.02": [*OWN, "hydra.run.dir=coarse"],
     "python -m framework -m refiner=identity,kmeans,gmm_em": [*OWN, "hydra.sweep.dir=outputs/table3_map"],
     "python -m framework check dataset=rgbd_folder dataset.root=my_room": [],
@@ -168,11 +170,12 @@ RUNNABLE = {  # what to append, by a command that then takes seconds
     "python -m framework plugins detector": [],
     "python -m framework new-plugin refiner my_refiner": [],
 }
+COPY_POSES = "open('FILE', 'w').write(open('DIR/poses.txt').read())"
 LEFT_BEHIND = [
     "detections.json",
     "refinement.png",
     "instancemap-my-refiner/pyproject.toml",
-    *(f"{run}/metrics.json" for run in ("outputs/demo", "coarse", "own")),
+    *(f"{run}/metrics.json" for run in ("outputs/demo", "imported", "coarse", "own")),
     *(f"outputs/demo/export/{name}" for name in ("scene.glb", "scene.usdc", "map.yaml", "scene_graph.json")),
 ]
 RUN = """
@@ -192,11 +195,10 @@ for line in json.load(open("commands.json")):
 def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which all of these ran, one after the other in one process: to load the libraries takes longest."""
     folder = tmp_path_factory.mktemp("readme")
-    (folder / "DIR").mkdir()
-    option_files.overrides("dataset", "rgbd_folder", folder / "DIR")
-    (folder / "FILE").write_text((folder / "DIR" / "poses.txt").read_text())
+    write_stray_scanner(folder / "SOURCE", room_frames(6))
     recording, result = OWN_DATA
-    lines = [recording, *(shlex.split(command)[3:] + small for command, small in RUNNABLE.items()), result]
+    commands = [shlex.split(command)[3:] + small for command, small in RUNNABLE.items()]
+    lines = [recording, commands[1], COPY_POSES, commands[0], *commands[2:], result]
     (folder / "commands.json").write_text(json.dumps(lines))
     done = subprocess.run(
         [sys.executable, "-c", RUN],
