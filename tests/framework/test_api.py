@@ -148,7 +148,7 @@ def test_mapper_add_none_raises() -> None:
         ("fuser.voxel_sise=1", "did you mean fuser.voxel_size?"),
         ("fuser.voxel_size=-1", "voxel_size: expected a value in"),
         ("detection_cache=bogus", "detection_cache: expected one of"),
-        ("seed=-1", "seed: expected an integer in ["),
+        ("seed=-1", r"seed: expected an integer in \["),
         ("~refiner", "refiner: expected a plugin's config .*; choose refiner=NAME"),
         ("dataset=desk", "got dataset=desk; it is for the command line only"),
         ("hydra.run.dir=x", "got hydra.run.dir=x; it is for the command line only"),

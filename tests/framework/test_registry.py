@@ -267,7 +267,7 @@ def test_conflicting_plugins_package_is_reported(tmp_path: Path) -> None:
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     output = f"plugins: expected InstanceMap's package at {CHECKOUT}/plugins, got another one at {tmp_path}/plugins"
-    assert f"{output}rename it or start in another folder" in done.stderr
+    assert f"{output}; rename it or start in another folder" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert "imported" not in done.stdout
 

@@ -55,12 +55,12 @@ def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> No
     ("name", "message"),
     [
         ("gmm_em", "NAME: expected a new name, got the existing option refiner=gmm_em"),
-        ("../up", "found '../up'"),
-        ("/tmp/x", "found '/tmp/x'"),
-        ("My", "found 'My'"),
-        ("", "found ''"),
-        ("a__b", "found 'a__b'"),
-        ("2d", "found '2d'"),
+        ("../up", "got '../up'"),
+        ("/tmp/x", "got '/tmp/x'"),
+        ("My", "got 'My'"),
+        ("", "got ''"),
+        ("a__b", "got 'a__b'"),
+        ("2d", "got '2d'"),
         ("x" * (LONGEST_NAME + 1), f"at most {LONGEST_NAME} characters"),
         ("class", "NAME: expected a name without a meaning in Python packages"),
         ("conf", "NAME: expected a name without a meaning in Python packages"),
@@ -81,13 +81,13 @@ def test_new_plugin_invalid_name_raises(name: str, message: str) -> None:
 def test_new_plugin_failure_keeps_existing_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = write_repository("refiner", "mine", tmp_path)
     (made / "README.md").write_text("my own")
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="expected a new folder"):
         write_repository("refiner", "mine", tmp_path)
     assert (made / "README.md").read_text() == "my own"
     with pytest.raises(ConfigError, match="--in: expected a folder"):
         write_repository("refiner", "other", tmp_path / "nowhere")
     (tmp_path / "instancemap-linked").symlink_to(tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="expected a new folder"):
         write_repository("refiner", "linked", tmp_path)
 
     def full(path: Path, *_: object, **__: object) -> int:

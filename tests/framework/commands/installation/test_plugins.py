@@ -134,7 +134,7 @@ def test_plugins_lists_options_of_installed_package(environment: dict[str, str],
     ]
     assert "unusable: detector acme.missing.Detector: unknown module acme.missing" in done.stdout
     at = lines.index("  acme_orphan  [from acme-detectors]")
-    assert lines[at + 1].startswith("unusable:")
+    assert lines[at + 1].startswith("      unusable:")
     assert "acme_nobody" in lines[at + 1]
 
 
@@ -178,7 +178,7 @@ FAULTY_OPTIONS = {
     "no_yaml": ("a: [1,\n", "no_yaml.yaml: cannot be read: "),
     "list": ("- 1\n", "list.yaml: expected keys and values, got a list"),
     "no_text": ("\udcff", "no_text.yaml: expected UTF-8 text: "),
-    "no_class": ("_target_: plugins.detectors.none.NoDetection\n", "has no NoDetection; did you mean 'NoDetections'?"),
+    "no_class": ("_target_: plugins.detectors.none.NoDetection\n", "got NoDetection; did you mean 'NoDetections'?"),
     "a_refiner": ("_target_: plugins.refiners.identity.Identity\n", "expected a class that implements Detector"),
     "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "unknown parameter"),
     "no_number": (
