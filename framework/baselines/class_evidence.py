@@ -1,6 +1,6 @@
 """Class evidence of the voxels of a semantic map, background included, and its update by a frame.
 
-After SemanticFusion (McCormac et al. 2017), eq. 2, which is eq. [7] of the paper with one distribution per pixel:
+After SemanticFusion (McCormac et al. 2017), eq. 2, which is eq. [7] with one distribution per pixel:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t),   c = background or a class
 

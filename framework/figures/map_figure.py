@@ -1,4 +1,4 @@
-"""Maps side by side with the ground truth (Figures 4 and 5 of the paper)."""
+"""Maps side by side with the ground truth (after Figures 4 and 5 of the paper)."""
 
 from __future__ import annotations
 

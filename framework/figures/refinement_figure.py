@@ -1,4 +1,4 @@
-"""Clusters of one frame before and after refinement, in the image and from the side (Figure 5 of the paper)."""
+"""Clusters of one frame before and after refinement, in the image and from the side."""
 
 from __future__ import annotations
 

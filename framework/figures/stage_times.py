@@ -24,7 +24,7 @@ COLUMNS = {
     "GMM": ("refinement",),
     "map integration": ("update", "integration"),
 }
-"""The stages whose times add up to a line, by its name in the paper."""
+"""The stages whose times add up to a line, by its name in the paper (the assignment is ours)."""
 COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # for color-blind readers
 RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # ms a frame
 PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights of a diagram, its heading and its axis labels

@@ -22,9 +22,9 @@ LEAST_LIKELIHOOD = 1e-3  # of an instance: no single score decides
 class BayesianTsdf(MapFuser):
     """Two independent Bayesian recursions per voxel, eqs. (7) and (8), as sums of log-likelihoods.
 
-    The likelihood of the matched instance in eq. (8) is the score of the detection. The paper does not state that of
-    other instances: it is `instance_floor`, or with `instance_floor=0` the rest of the score divided equally among all
-    other instances and none.
+    The likelihood of the matched instance in eq. (8) is the score of the detection (our reading). The paper does not
+    state that of other instances: it is `instance_floor`, or with `instance_floor=0` the rest of the score divided
+    equally among all other instances and none.
     """
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)

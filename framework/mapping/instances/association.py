@@ -1,9 +1,10 @@
 """Data association of a frame's clusters with the instances of the map.
 
 The pixels of a cluster vote for the instances of the map at their positions, which are those of the voxels at the
-measured surface, or those of the ray-cast view, as in section 3.3 of the paper. Pairs may match if their overlap is
-large enough, by default over the smaller of the two, so that a part of an object matches the whole. Matching is one to
-one, best IoU first, so that a table does not match the book on it. An unmatched cluster creates a new instance.
+measured surface, or those of the ray-cast view, our reading of section 3.3 of the paper. Pairs may match if their
+overlap is large enough, by default over the smaller of the two, so that a part of an object matches the whole. Matching
+is one to one, best IoU first, so that a table does not match the book on it. An unmatched cluster creates a new
+instance.
 """
 
 from __future__ import annotations

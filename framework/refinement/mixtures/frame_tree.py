@@ -27,8 +27,8 @@ MIN_NODE = 32  # points of a node with children
 class Initialization(Enum):
     """The first responsibilities of the Gaussians of level 1."""
 
-    MASKS = "masks, as in the paper"
-    K_MEANS = "k-means over the frame's points from the masks' means, which the paper argues against"
+    MASKS = "masks, our reading of the paper"
+    K_MEANS = "k-means over the frame's points from the masks' means, the usual method"
 
 
 @dataclass(frozen=True)
