@@ -97,7 +97,7 @@ def test_evaluate_old_metrics_are_replaced_and_others_kept(stored: Path, command
     write_metrics(stored, old)
     status, out, err = command(stored)
     assert (status, err) == (0, "")
-    assert out == f"{stored}: AP50 0.125 -> 1.000, annotation_release first -> not known, 1 other, 5 new\n"
+    assert out == f"{stored}: AP50 0.125 -> 1.000, annotation_release first -> unknown, 1 other, 5 new\n"
     assert metrics_of(stored) == true | CODE | {"fps": 3.0, "trajectory.ate_rmse_m": 0.25}
 
 

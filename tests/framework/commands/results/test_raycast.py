@@ -132,7 +132,7 @@ def test_raycast_error_is_one_line(stored: Path, command: Command, arguments: li
 def test_raycast_without_map_is_one_line(stored: Path, command: Command, tmp_path: Path) -> None:
     (stored / "map.npz").unlink()
     for run in (stored, tmp_path / "nowhere"):
-        message = "error: raycast: expected the directory of a run, got"
+        message = f"error: raycast: expected the directory of a run, got {run} without map.npz\n"
         assert command(run) == (1, "", message)
 
 

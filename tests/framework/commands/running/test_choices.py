@@ -28,9 +28,9 @@ def test_checked_sweep_counts_runs(overrides: list[str], runs: int) -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["row=ours,voxblx_pp"], "row: expected one of ours, vox, got"),
-        (["row="], "row: expected one of ours, got"),
-        (["row=12"], "row: expected one of ours, got"),
+        (["row=ours,voxblx_pp"], "row: expected one of ours, vox"),
+        (["row="], "row: expected one of ours"),
+        (["row=12"], "row: expected one of ours"),
         (["seed=range(0,0)", "row=ours"], "seed=range(0,0): expected at least one value, got none"),
     ],
 )

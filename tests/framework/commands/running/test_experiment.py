@@ -249,7 +249,7 @@ def test_figure_kind_unknown_raises_before_runs() -> None:
 
 
 def test_experiment_unknown_row_raises() -> None:
-    with pytest.raises(ConfigError, match=r"row: expected one of chain, got chian; did you mean chain\?"):
+    with pytest.raises(ConfigError, match=r"row: expected one of .*, got chian; did you mean chain\?"):
         composed(["experiment=ablation_refiner", "row=chian"])
 
 
@@ -259,7 +259,7 @@ def test_experiment_unknown_row_raises() -> None:
         (["row=half,hafl"], "error: row: expected one of"),
         (
             ["row=half,whole", "fuser.capcity=3"],
-            "error: Could not override 'fuser.capcity'. There is no fuser.cap",
+            "error: Could not override 'fuser.capcity'. fuser.capcity: unknown key; did you mean fuser.cap",
         ),
         (["seed=range(0,0)"], "error: seed=range(0,0): expected at least one value, got none"),
     ],
