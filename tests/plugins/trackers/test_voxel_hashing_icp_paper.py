@@ -183,7 +183,7 @@ def test_linear_weights_alone_change_poses_little() -> None:
         (["tracker.residual_weights=HUBER"], "residual_weights"),
         (["tracker.max_intensity_difference=0"], r"max_intensity_difference: expected a value in \[0\.001, 1\]"),
         (["tracker.color_levels=0"], r"color_levels: expected a value in \[1, 3\]"),
-        (["tracker.depth_weight=0"], "color_levels: expected 3 without depth, got 2"),
+        (["tracker.depth_weight=0"], "color_levels: expected 3 if depth_weight is 0, got 2"),
     ],
 )
 def test_invalid_parameter_raises(overrides: list[str], message: str) -> None:

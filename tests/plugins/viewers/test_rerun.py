@@ -247,7 +247,7 @@ def test_missing_rerun_package_names_extra(monkeypatch: pytest.MonkeyPatch) -> N
     find_spec = importlib.util.find_spec
     there = {"rerun": None}
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: there.get(name, find_spec(name, *rest)))
-    with pytest.raises(ConfigError, match=r"viewer: expected the package rerun, got none$"):
+    with pytest.raises(ConfigError, match=r"viewer: expected the package rerun, got none; run pip install"):
         build_viewer("rerun")
 
 
@@ -258,7 +258,7 @@ def test_missing_rerun_package_names_extra(monkeypatch: pytest.MonkeyPatch) -> N
         ("mesh_interval=nan", "mesh_interval: expected a value in"),
         ("memory_limit=lots", "memory_limit: expected a size such as 2GB or 25%, got lots"),
         ("mode=WINDOWS", "mode"),
-        ("port=80", "port must be in"),
+        ("port=80", "port: expected a value in"),
     ],
 )
 def test_invalid_parameter_raises(parameter: str, message: str) -> None:
@@ -273,11 +273,11 @@ def begun(viewer: RerunViewer, directory: Path) -> None:
 def test_unwritable_recording_raises(tmp_path: Path) -> None:
     (tmp_path / "recording.rrd").mkdir()
     with pytest.raises(
-        ConfigError, match=r"viewer\.file: expected a writable file, got .*viewer: .*recording\.rrd: .*Is a directory"
+        ConfigError, match=r"viewer\.file: expected a writable file, got .*recording\.rrd: .*Is a directory"
     ):
         begun(RerunViewer(), tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="cannot be written"):
+    with pytest.raises(ConfigError, match=r"viewer\.file: expected a writable file"):
         begun(RerunViewer(file="file/below.rrd"), tmp_path)
 
 
@@ -294,7 +294,7 @@ def test_occupied_port_raises(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(ConfigError, match=rf"viewer: viewer\.port: expected a free port, got {port}"):
+        with pytest.raises(ConfigError, match=rf"viewer\.port: expected a free port, got {port}"):
             begun(RerunViewer(mode=Mode.BROWSER, port=port), tmp_path)
 
 
