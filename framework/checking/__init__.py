@@ -10,7 +10,7 @@ class Verdict(Enum):
     """Effect of a finding on mapping."""
 
     FINE = "ok"
-    UNKNOWN = "?"  # the recording is not informative
+    UNKNOWN = "?"  # the recording has too little information
     NOTE = "note"  # the recording can be mapped, with worse results
     FAULT = "WRONG"  # the recording cannot be mapped with these settings
 
@@ -22,7 +22,7 @@ class Finding:
     verdict: Verdict
     subject: str
     text: str
-    setting: str = ""  # the fix, KEY=VALUE for the command line; "" = no parameter fixes it
+    setting: str = ""  # fix, as KEY=VALUE for the command line; "" = no parameter fixes the problem
 
     def __str__(self) -> str:
         line = f"{self.verdict.value:<6} {self.subject}: {self.text}"

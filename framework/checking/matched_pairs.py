@@ -1,4 +1,4 @@
-"""Pairs of frames with matched points, for pose estimation."""
+"""Pairs of frames with matched points for pose estimation."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from framework.interfaces import RGBDSequence
 from framework.tracking.absolute_pose import AbsolutePoseEstimator
 from framework.tracking.features import FeatureExtractor, Features, match
 
-MAX_RATIO = 0.8  # maximum ratio of a match's distance to that of the second best (Lowe 2004)
+MAX_RATIO = 0.8  # maximum distance ratio of the best to the second-best match (Lowe 2004)
 FEWEST_POINTS = 30  # minimum number of matches of a pair
-STEPS = (1, 2, 4, 8, 16, 32)  # frames between the first and the second of a pair
-FARTHEST_APART = 0.25  # of the image's width: after a larger motion, larger steps are not tried
+STEPS = (1, 2, 4, 8, 16, 32)  # frame offsets between the two frames of a pair
+FARTHEST_APART = 0.25  # fraction of the image width; after a larger motion, larger steps are not tried
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class MatchedPair:
     points_first: Float32  # (M, 3) m, in the first camera
     pixels_first: Float32  # (M, 2)
     pixels_second: Float32  # (M, 2)
-    T_second_first: Float64  # (4, 4), estimated from the points (PnP)
+    T_second_first: Float64  # (4, 4), estimated from the matched points (PnP)
 
     @property
     def motion(self) -> float:
@@ -48,7 +48,7 @@ class Matcher:
         self._features = lru_cache(maxsize=4 * len(STEPS))(self._extract)
 
     def pairs(self, starts: Sequence[int], steps: Sequence[int] = STEPS) -> Iterator[MatchedPair]:
-        """Yield the pairs from each position in `starts`, until two frames have too little overlap."""
+        """Yield the pairs from each position in `starts`, with increasing steps until the overlap is too small."""
         for k in starts:
             for step in steps:
                 pair = self.pair(k, step)
@@ -59,7 +59,7 @@ class Matcher:
                     break
 
     def pair(self, k: int, step: int) -> MatchedPair | None:
-        """Return the pair of the frames k and k + step of the sequence, or None if too few points match."""
+        """Return the pair of the frames k and k + step, or None if too few points match."""
         if k + step >= len(self.sequence):
             return None
         found_first, found_second = self._features(k), self._features(k + step)

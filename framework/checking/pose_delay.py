@@ -1,6 +1,6 @@
 """Detection of a delay between poses and images.
 
-A delay is only observable if the camera's motion changes: the pairs of frames must differ with other delays.
+A delay is only observable if the camera motion changes: the relative poses of frame pairs must depend on the delay.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from framework.checking.matched_pairs import MatchedPair
 from framework.checking.pose_fit import ALIKE, POOR, SHORTEST_MOTION, PoseFit, error_of, motion_between
 from framework.data import Float64
 
-LONGEST_DELAY = 6  # frames, in both directions; one more is tried: an error that still falls there has no minimum
-CLEARLY = 0.75  # maximum ratio to the mean error without delay; wrong delays of real recordings have 0.88 or more
-TELLS = 1 / 640  # of the image's width: minimum error difference of a counted pair
-MOST = 0.75  # minimum fraction of the counted pairs that improve
+LONGEST_DELAY = 6  # frames, in both directions; one more is tried, to detect an error that is still decreasing
+CLEARLY = 0.75  # maximum ratio to the mean error without delay; real recordings have at least 0.88 for wrong delays
+TELLS = 1 / 640  # fraction of the image width, minimum error difference of a counted pair
+MOST = 0.75  # minimum fraction of improved pairs among the counted pairs
 FEWEST_PAIRS = 5  # minimum number of counted pairs
 
 
@@ -27,13 +27,13 @@ class PoseDelay:
     """A delay of the poses."""
 
     frames: int  # delay; negative = early
-    error: float  # px, mean over the pairs with the poses as stored
-    delayed_error: float  # px, with the poses shifted by the delay
+    error: float  # px, mean over the pairs with the stored poses
+    delayed_error: float  # px, mean over the pairs with the poses shifted by the delay
     pairs: int
     alike: tuple[int, ...]  # other delays that fit equally well
 
     def finding(self, applied: int, step: float) -> Finding:
-        """Return the finding for a recording read with the delay `applied`, with frames `step` seconds apart."""
+        """Return the finding for a recording with the configured delay `applied` and a frame interval of `step` s."""
         count, (when, where) = abs(self.frames), ("late", "later") if self.frames > 0 else ("early", "earlier")
         frames = f"{count} frame{'s' * (count > 1)}"
         text = (
@@ -49,9 +49,10 @@ class PoseDelay:
 def find_delay(
     pairs: Sequence[MatchedPair], poses: Sequence[Float64 | None], fits: Sequence[PoseFit]
 ) -> PoseDelay | None:
-    """Return the delay of the pairs' poses in the best of some readings, or None without a clear delay.
+    """Return the delay of the poses in the best-fitting convention, or None without a significant delay.
 
-    `poses` (F) are the stored poses (4, 4) of all frames by `Frame.index`, None = unknown.
+    `poses` contains the stored poses (4, 4) of all frames by `Frame.index`, None = unknown. `fits` are the candidate
+    conventions.
     """
     known = {k: T for k, T in enumerate(poses) if T is not None}
     delays = range(-LONGEST_DELAY - 1, LONGEST_DELAY + 2)

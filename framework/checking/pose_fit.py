@@ -14,28 +14,28 @@ from framework.data import Float64
 from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseReading, QuaternionOrder
 from framework.geometry import inverse, project, transform
 
-UNSEEN = 1.0  # of the image's width: maximum error, also used for points behind the camera
-SHORTEST_BASELINE = 0.02  # of the median depth: minimum motion for a scale estimate
+UNSEEN = 1.0  # fraction of the image width, maximum error; also used for points behind the camera
+SHORTEST_BASELINE = 0.02  # fraction of the median depth, minimum translation for a scale estimate
 FEWEST_PAIRS = 3  # minimum number of informative pairs
-SHORTEST_MOTION = 0.01  # of the image's width: pairs with less motion fit any poses
-POOR = 0.2  # of the motion: maximum error of valid poses; real recordings have 0.01 to 0.06
-ALIKE, ALIKE_PX = 1.15, 0.2  # ratio and px within which two errors count as equal
-CLEARLY = 0.5  # maximum ratio of another reading's error to the error as stored
-UNCERTAIN = 0.07  # minimum uncertainty of the factor: poses and depth of real recordings are not more accurate
-NOT_WORSE = 1.3  # error ratio: pure rotation hardly constrains the scale
-WRONG_SCALE = 2.5  # minimum ratio of a wrong scale: rotation leaves the scale uncertain by up to 1.6 times
+SHORTEST_MOTION = 0.01  # fraction of the image width; pairs with less motion fit any poses
+POOR = 0.2  # fraction of the motion, maximum error of valid poses; real recordings have 0.01 to 0.06
+ALIKE, ALIKE_PX = 1.15, 0.2  # ratio, and offset in px, up to which two errors count as equal
+CLEARLY = 0.5  # maximum error of another convention, as a ratio to the configured convention
+UNCERTAIN = 0.07  # minimum log uncertainty of the depth factor, due to inaccurate poses and depth in real recordings
+NOT_WORSE = 1.3  # maximum error ratio for a wrong scale; pure rotation hardly constrains the scale
+WRONG_SCALE = 2.5  # minimum ratio of a wrong scale; with rotation, the scale is uncertain by up to 1.6 times
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
-PLAUSIBLE = (0.2, 12.0)  # m, the median depth of a room
+PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
 
 
 @dataclass(frozen=True)
 class PoseFit:
-    """Agreement of the poses with the pairs in one reading."""
+    """Agreement of the poses with the frame pairs in one pose convention."""
 
     reading: PoseReading
-    depth_factor: float  # applied to all depths
-    errors: Float64  # (P,) px, of each pair: the median over its points
-    factor_within: float = 1.0  # uncertainty of the factor, as a factor; 1 if the factor is given
+    depth_factor: float  # factor for all depths
+    errors: Float64  # (P,) px, median error of the points of each pair
+    factor_within: float = 1.0  # uncertainty of depth_factor, as a ratio; 1 if the factor is given
 
     @property
     def error(self) -> float:
@@ -44,13 +44,13 @@ class PoseFit:
 
 
 def readings(pose_unit: float = 1.0) -> Iterator[PoseReading]:
-    """Yield all readings with translations in `pose_unit` meters, the format's own first."""
+    """Yield all pose conventions with translations in `pose_unit` meters, starting with the default convention."""
     for order, kind, axes in product(QuaternionOrder, PoseKind, CameraAxes):
         yield PoseReading(kind, axes, order, pose_unit)
 
 
 def fit(pairs: Sequence[MatchedPair], reading: PoseReading, depth_factor: float | None = None) -> PoseFit:
-    """Return the fit of a reading to pairs with poses; depth_factor=None estimates the factor."""
+    """Return the fit of a pose convention to pairs with poses. `depth_factor=None` estimates the factor."""
     motions = [motion_of(pair, reading) for pair in pairs]
     factor, within = (depth_factor, 1.0) if depth_factor else _depth_factor(pairs, motions)
     errors = np.array([error_of(pair, motion, factor) for pair, motion in zip(pairs, motions, strict=True)])
@@ -71,7 +71,7 @@ def motion_between(T_world_first: Float64, T_world_second: Float64, reading: Pos
 
 
 def _depth_factor(pairs: Sequence[MatchedPair], motions: Sequence[Float64]) -> tuple[float, float]:
-    """Return the ratio of the translations of poses and images, and its uncertainty; 1 and 1 if unknown."""
+    """Return the ratio of the translations of poses and images, and its uncertainty. Both are 1 if unknown."""
     ratios = []
     for pair, T_second_first in zip(pairs, motions, strict=True):
         seen, moved = np.linalg.norm(pair.T_second_first[:3, 3]), np.linalg.norm(T_second_first[:3, 3])
@@ -98,15 +98,15 @@ class PoseJudgment:
     """Findings about a recording's poses and units."""
 
     findings: tuple[Finding, ...]
-    given: PoseFit | None  # with the given reading; None if the pairs are not informative
-    best: PoseFit | None
-    others: tuple[PoseFit, ...] = ()  # all readings, without a depth factor
+    given: PoseFit | None  # fit of the configured convention; None = too few informative pairs
+    best: PoseFit | None  # fit of the best convention; None = too few informative pairs
+    others: tuple[PoseFit, ...] = ()  # fits of all conventions, without a depth factor
 
 
 def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, median_depth: float) -> PoseJudgment:
-    """Check stored poses against the images, and select the best reading.
+    """Check stored poses against the images, and select the best pose convention.
 
-    `given` is the configured reading, `depth_scale` the depth units per meter, `median_depth` the result in m.
+    `given` is the configured convention, `depth_scale` is in units per meter, and `median_depth` is in m.
     """
     informative = [pair for pair in pairs if pair.motion > SHORTEST_MOTION * pair.first.camera.width]
     if len(informative) < FEWEST_PAIRS:
@@ -146,7 +146,7 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
 
 
 def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:
-    """Return the fit with depth as stored, unless another factor is clearly better."""
+    """Return the fit with depth as stored, or with an estimated factor if its error is clearly smaller."""
     as_stored, scaled = fit(pairs, reading, 1.0), fit(pairs, reading)
     far = not 1 / WRONG_SCALE < scaled.depth_factor < WRONG_SCALE
     needed = NOT_WORSE if far else CLEARLY
@@ -157,7 +157,7 @@ def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> 
     low, high = PLAUSIBLE
     factor = chosen.depth_factor
     if low <= median_depth <= high and not low <= median_depth * factor <= high:
-        text = f"translations are {factor:.3g} times those of the images at a median depth of {median_depth:.2f} m"
+        text = f"translations are {factor:.3g} times as long as in the images at a median depth of {median_depth:.2f} m"
         unit = chosen.reading.pose_unit * 10.0 ** round(np.log10(1 / factor))
         return Finding(Verdict.FAULT, "poses", text, f"dataset.pose_unit={unit:g}")
     scale = depth_scale / factor
@@ -177,13 +177,13 @@ def _named(reading: PoseReading) -> str:
 
 
 def _equal_to_best(fits: Sequence[PoseFit]) -> list[PoseFit]:
-    """Return the best fit and those equal to it: for a panning camera, some axes are equivalent."""
+    """Return all fits as good as the best fit. Some axes are equivalent for a panning camera."""
     least = min(one.error for one in fits)
     return [one for one in fits if one.error <= ALIKE * least + ALIKE_PX]
 
 
 def _settings(reading: PoseReading, given: PoseReading) -> tuple[str, ...]:
-    """Return the parameters that differ between the readings."""
+    """Return the parameters with different values in the two conventions."""
     names = ("pose_kind", "camera_axes", "quaternion_order")
     changed = [name for name in names if getattr(reading, name) != getattr(given, name)]
     return tuple(f"dataset.{name}={getattr(reading, name).name}" for name in changed)

@@ -20,33 +20,32 @@ from framework.datasets.frames.sequence_reader import Recording
 from framework.errors import DataError, FrameError
 from framework.interfaces import RGBDSequence, RGBDVideo
 
-CHECKED_FRAMES = 12  # spread over the sequence
-QUICK_STARTS, QUICK_STEPS = (0.1, 0.35, 0.6, 0.85), (1, 4, 16)  # fractions of the sequence; frames from there
-MOST_MISSING = 0.7  # maximum fraction of pixels without a reading, for a good map
-MOST_BEYOND = 0.3  # maximum fraction of readings beyond the mapped range, for a good map
-WIDEST_EDGE = (
-    12 / 640
-)  # of the image's width: maximum width of sharp color edges; real recordings have 4 to 9 px of 640
-EDGE_WINDOW = 15 / 640  # of the image's width, for the contrast of an edge
-FASTEST = 0.2  # of the image's width: maximum motion per frame for the trackers
+CHECKED_FRAMES = 12  # evenly spaced over the sequence
+QUICK_STARTS, QUICK_STEPS = (0.1, 0.35, 0.6, 0.85), (1, 4, 16)  # fractions of the sequence; steps in frames
+MOST_MISSING = 0.7  # maximum fraction of pixels without a depth reading, for a good map
+MOST_BEYOND = 0.3  # maximum fraction of depth readings beyond the mapped range, for a good map
+# maximum width of sharp color edges, as a fraction of the image width; real recordings have 4 to 9 px of 640
+WIDEST_EDGE = 12 / 640
+EDGE_WINDOW = 15 / 640  # fraction of the image width, window for the contrast of an edge
+FASTEST = 0.2  # fraction of the image width, maximum motion per frame for the trackers
 TYPICAL = 0.5, 4.5  # m, median depth of most rooms; real recordings have 1 to 3.5
-SHOWN_MOTION = 0.06  # of the image's width: motion of the pair in the figure, enough to make errors visible
-LONGEST_GAP = 0.5  # s between frames; a gap is also at least five times the usual interval
+SHOWN_MOTION = 0.06  # fraction of the image width, motion of the pair in the figure; makes errors visible
+LONGEST_GAP = 0.5  # s, maximum interval between frames without a gap, or five times the median interval if larger
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class RecordingCheck:
-    """Findings about a recording, and the content of their figure."""
+    """Findings about a recording, and the data of the figure."""
 
     findings: tuple[Finding, ...]
     summary: str
-    frames: tuple[Frame, ...]  # the checked ones
+    frames: tuple[Frame, ...]  # checked frames
     by_delay: tuple[EdgeAlignment, ...]
     poses: PoseJudgment
-    pair: MatchedPair | None  # in the figure, with the stored poses
-    meant: MatchedPair | None  # the pair without the delay of the poses
+    pair: MatchedPair | None  # pair in the figure, with the stored poses
+    meant: MatchedPair | None  # pair in the figure, with the pose delay corrected
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -54,14 +53,14 @@ class RecordingCheck:
 
 
 def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
-    """Check some frames of a sequence and their neighbors for mapping up to `farthest` meters.
+    """Check some frames of a sequence, and their neighbors, for mapping up to `farthest` meters.
 
     Raises DataError if no frame is readable.
     """
     given, depth_delay = PoseReading(), 0
     if isinstance(sequence, Recording):
         given, depth_delay = sequence.pose_reading, sequence.depth_reading.depth_delay
-        # as stored: with far readings, and poses that are not converted
+        # use all depth readings, and poses before conversion
         sequence = replace(sequence, pose_reading=PoseReading(pose_delay=given.pose_delay), max_depth=0.0)
     count = len(sequence)
     chosen = [int(k) for k in np.unique(np.linspace(0, count - 1, CHECKED_FRAMES).round())]
@@ -72,7 +71,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
         findings.append(Finding(Verdict.NOTE, "frames", text))
     depth_finding, median_depth = _check_depth(frames, farthest, _scale_of(sequence))
     longest = registration.LONGEST_DELAY
-    room = min(longest, (count - 1) // 4)  # for frames before and after
+    room = min(longest, (count - 1) // 4)  # number of frames before and after each checked frame
     edges = EdgeComparison(sequence, sorted({min(max(k, room), count - 1 - room) for k in chosen}))
     by_delay = edges.alignments((delay, 1.0) for delay in range(-longest, longest + 1))
     best = max(by_delay, key=lambda alignment: alignment.strength).delay if by_delay else 0
@@ -92,7 +91,8 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     else:
         no_poses = Finding(Verdict.FINE, "poses", "none in the recording; the camera is tracked")
         judgment, pose_delay = PoseJudgment((no_poses,), None, None), 0
-    if not any(finding.subject == "depth" for finding in judgment.findings):  # poses measure it more exactly
+    # poses determine the depth scale more accurately
+    if not any(finding.subject == "depth" for finding in judgment.findings):
         findings.append(depth_finding)
     motion_finding = _check_motion(steps, len(neighbors), sequence.camera.width)
     findings += [*judgment.findings, registration_finding, motion_finding, _check_sharpness(frames)]
@@ -110,7 +110,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
 def _judge_poses(
     sequence: RGBDSequence, pairs: Sequence[MatchedPair], asked: PoseReading, median_depth: float
 ) -> tuple[PoseJudgment, int]:
-    """Return the findings about the poses, and their delay in frames."""
+    """Return the findings about the poses and the pose delay in frames."""
     given, scale = replace(asked, pose_delay=0), _scale_of(sequence)
     judgment = pose_fit.judge(pairs, given, scale, median_depth)
     if judgment.given is None or judgment.best is None:
@@ -130,7 +130,7 @@ def _judge_poses(
 
 
 def _stored_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
-    """Return the poses of all frames of a recording, selected or not."""
+    """Return the poses of all frames in a recording, independent of the frame selection."""
     return [recorded.T_world_camera for recorded in sequence.contents.frames] if isinstance(sequence, Recording) else []
 
 
@@ -150,7 +150,7 @@ def warn_of_poses(sequence: RGBDVideo) -> None:
 
 @dataclass
 class DelayedDepth(RGBDSequence):
-    """A sequence with the depth of some frames later."""
+    """A sequence with the depth images of later frames."""
 
     sequence: RGBDSequence
     delay: int  # frames
@@ -173,7 +173,7 @@ def _is_posed(pair: MatchedPair) -> bool:
 
 
 def _scale_of(sequence: RGBDSequence) -> float:
-    """Return the units per meter of stored depth."""
+    """Return the depth units per meter."""
     return sequence.contents.depth_scale if isinstance(sequence, Recording) else 1.0
 
 
@@ -190,7 +190,7 @@ def _read(sequence: RGBDSequence, chosen: Sequence[int]) -> tuple[list[Frame], l
 
 
 def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tuple[Finding, float]:
-    """Return the finding, and the median depth in m."""
+    """Return the finding about depth and the median depth in m."""
     readings = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
     if not len(readings):
         return Finding(Verdict.FAULT, "depth", "no readings in any checked frame"), 0.0
@@ -212,7 +212,7 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
 
 
 def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
-    """Return the finding about the motion from frame to frame, `steps` in fractions of the width."""
+    """Return the finding about the motion between neighboring frames. `steps` are fractions of the width."""
     if not neighbors:
         return Finding(Verdict.UNKNOWN, "motion", "unknown with a single frame")
     lost = neighbors - len(steps)
@@ -227,7 +227,7 @@ def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
 
 
 def _check_sharpness(frames: Sequence[Frame]) -> Finding:
-    """Return the finding about the width of color edges: contrast by gradient, at the strongest ones."""
+    """Return the finding about sharpness, measured by the width of color edges."""
     widths = [_edge_width(frame) for frame in frames]
     text = f"median edge width of {np.median(widths):.1f} px, maximum of {max(widths):.1f} px in {len(frames)} frames"
     blurred = sum(width > WIDEST_EDGE * frames[0].camera.width for width in widths)
@@ -237,17 +237,17 @@ def _check_sharpness(frames: Sequence[Frame]) -> Finding:
 
 
 def _edge_width(frame: Frame) -> float:
-    """Return the median width of color edges in px."""
+    """Return the median width in px of the strongest color edges: contrast divided by gradient."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     window = np.ones((max(3, round(EDGE_WINDOW * frame.camera.width)),) * 2, np.uint8)
     contrast = cv2.subtract(cv2.dilate(gray, window), cv2.erode(gray, window)).astype(np.float32)
-    slope = color_gradient(frame) / 8  # Sobel's weights sum up to 8
+    slope = color_gradient(frame) / 8  # the weights of the Sobel filter add up to 8
     strong = slope >= max(float(np.quantile(slope, 0.95)), 1e-3)
     return float(np.median(contrast[strong] / slope[strong])) if strong.any() else float(len(window))
 
 
 def _check_times(sequence: RGBDSequence) -> list[Finding]:
-    """Return the finding about the timestamps of a recording."""
+    """Return the finding about the timestamps of a recording, if any."""
     if not isinstance(sequence, Recording) or len(sequence) < 3:
         return []
     times: Float64 = np.array([sequence.contents.frames[k].timestamp for k in sequence.chosen])

@@ -1,6 +1,7 @@
-"""Check of the registration of color and depth in space and time: depth edges must coincide with color edges.
+"""Check of the registration of color and depth in space and time.
 
-Depth edges are compared with color gradients: shifted, scaled, and from nearby frames.
+Depth edges must coincide with color edges. Shifted and scaled depth edges, and depth edges of nearby frames, are
+compared with color gradients.
 """
 
 from __future__ import annotations
@@ -17,36 +18,36 @@ from framework.data import Bool, Float32, Frame
 from framework.errors import FrameError
 from framework.interfaces import RGBDSequence
 
-WIDTH = 320  # px, of the compared images
-LONGEST_SHIFT = 16  # px of WIDTH, in both directions
+WIDTH = 320  # px, width of the compared images
+LONGEST_SHIFT = 16  # px at WIDTH, in both directions
 LONGEST_DELAY = 6  # frames, in both directions
-ZOOMS = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.11, 1.18, 1.25)  # of the depth image about its center
-DEPTH_STEP = 0.05  # of the depth: a larger step is an edge
-STRONG = 200.0  # Sobel units: stronger gradients are clipped, so that a lamp does not dominate
+ZOOMS = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.11, 1.18, 1.25)  # scale of the depth image about its center
+DEPTH_STEP = 0.05  # fraction of the depth; a larger step is an edge
+STRONG = 200.0  # Sobel units; stronger gradients are clipped, so that lamps do not dominate
 FEWEST_FRAMES = 3
-FEWEST_EDGES = 20.0  # px of WIDTH: frames with fewer are not counted
-CLEARLY = 1.2  # minimum ratio of another alignment's strength to the strength as stored
-LARGEST_SHIFT = 0.007  # of the image's width, due to lenses and rolling shutters; real recordings have 0.003
-WEAKEST = 0.25  # standard deviations: minimum strength above chance
+FEWEST_EDGES = 20.0  # px at WIDTH; frames with fewer edge pixels are ignored
+CLEARLY = 1.2  # minimum strength of another alignment, as a ratio to the stored alignment
+LARGEST_SHIFT = 0.007  # fraction of the image width, due to lenses and rolling shutters; real recordings have 0.003
+WEAKEST = 0.25  # standard deviations, minimum strength of a match that is not random
 
 
 @dataclass(frozen=True)
 class EdgeAlignment:
-    """Agreement of color edges with the depth edges of the frame `delay` later, zoomed."""
+    """Agreement of color edges with the scaled depth edges of the frame `delay` later."""
 
     delay: int  # frames
     zoom: float
-    strength: float  # standard deviations of the gradient above its mean, at the best shift
-    shift: tuple[float, float]  # (x, y), the best one, in fractions of the image's width
+    strength: float  # mean gradient at the depth edges for the best shift, in standard deviations
+    shift: tuple[float, float]  # best shift (x, y), as fractions of the image width
 
     @property
     def moved(self) -> bool:
-        """True if the edges fit best with a shift."""
+        """True if the best shift is significant."""
         return max(map(abs, self.shift)) > LARGEST_SHIFT
 
 
 class EdgeComparison:
-    """Comparison of color and depth edges in selected frames of a sequence; unreadable frames are skipped."""
+    """Comparison of color and depth edges in selected frames of a sequence. Unreadable frames are skipped."""
 
     def __init__(self, sequence: RGBDSequence, chosen: Sequence[int]) -> None:
         self.sequence = sequence
@@ -54,7 +55,7 @@ class EdgeComparison:
         self._edges = lru_cache(maxsize=None)(self._find_edges)
 
     def alignments(self, candidates: Iterable[tuple[int, float]]) -> list[EdgeAlignment]:
-        """Return the alignment of each delay and zoom with enough edges."""
+        """Return the alignments of the candidates (delay, zoom) with enough edges."""
         found = []
         for delay, zoom in candidates:
             pairs = [(k, k + delay) for k in self.chosen if 0 <= k + delay < len(self.sequence)]
@@ -69,7 +70,7 @@ class EdgeComparison:
         return found
 
     def _correlation(self, of_color: int, of_depth: int, zoom: float) -> Float32 | None:
-        """Return the mean gradient (2 L + 1, 2 L + 1) at the depth edges, for each shift of up to L px."""
+        """Return the mean gradient (2 L + 1, 2 L + 1) at the depth edges for each shift of up to L px."""
         color, depth = self._edges(of_color), self._edges(of_depth)
         if color is None or depth is None:
             return None
@@ -85,7 +86,7 @@ class EdgeComparison:
         return np.asarray(cv2.matchTemplate(padded, edges, cv2.TM_CCORR) / edges.sum(), np.float32)
 
     def _find_edges(self, k: int) -> tuple[Float32, Float32] | None:
-        """Return the gradient of color, with mean 0 and deviation 1, and the depth edges, both (h, WIDTH)."""
+        """Return the normalized color gradient and the depth edges, both (h, WIDTH), or None."""
         try:
             frame = self.sequence[k]
         except FrameError:
@@ -100,13 +101,13 @@ class EdgeComparison:
 
 
 def color_gradient(frame: Frame) -> Float32:
-    """Return the length (H, W) of the gray values' gradient in Sobel units."""
+    """Return the gradient magnitude (H, W) of the gray values in Sobel units."""
     gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
     return np.asarray(np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)), np.float32)
 
 
 def depth_edges(depth: Float32) -> Bool:
-    """Return the nearer side (H, W) of each step between two readings."""
+    """Return the depth edges (H, W): pixels on the nearer side of a depth step."""
     edges = np.zeros(depth.shape, np.bool_)
     for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         a, b = depth[one], depth[other]
@@ -118,10 +119,10 @@ def depth_edges(depth: Float32) -> Bool:
 def judge(
     by_delay: Sequence[EdgeAlignment], by_zoom: Sequence[EdgeAlignment], applied_delay: int, step: float
 ) -> tuple[Finding, int]:
-    """Return the finding, and the delay of the depth images in frames.
+    """Return the finding and the delay of the depth images in frames.
 
-    `by_zoom` is for the best delay, and `applied_delay` is the configured delay. `step` is the image motion per frame
-    in fractions of the width: a shift of less than half of it may be caused by a time offset.
+    `by_zoom` has the best delay, and `applied_delay` is the configured delay. `step` is the image motion per frame as a
+    fraction of the width. A shift of less than half of this motion may be due to a time offset.
     """
     subject = "color and depth"
     here = next((alignment for alignment in by_delay if alignment.delay == 0), None)

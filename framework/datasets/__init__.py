@@ -1,1 +1,1 @@
-"""Sequences that feed the pipeline: one file per format."""
+"""Sequence readers, one module per format."""

@@ -1,11 +1,11 @@
-"""Replica as NICE-SLAM distributes it (Straub et al., 2019; Zhu et al., CVPR 2022): renders of eight scanned rooms.
+"""Replica in NICE-SLAM's version (Straub et al., 2019; Zhu et al., CVPR 2022): rendered views of eight scanned rooms.
 
-    cam_params.json                     of all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
+    cam_params.json                     for all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
     room0/results/frame000000.jpg       8-bit color, from 0
     room0/results/depth000000.png       uint16 along z, `scale` units per meter
     room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers row by row, m
 
-The camera's axes are x right, y down, z forward: NICE-SLAM converts them for its own use.
+The camera axes are x right, y down, z forward. NICE-SLAM converts them on reading.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 
 @dataclass
 class ReplicaNiceSlam(Recording):
-    """A scene of Replica in NICE-SLAM's layout: exact depth and poses, and no instances."""
+    """A Replica scene in NICE-SLAM's layout, with exact depth and poses but without instances."""
 
     def open(self) -> Contents:
         path = self.folder.absolute().parent / "cam_params.json"  # not resolved: a scene may be a link

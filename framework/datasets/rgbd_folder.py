@@ -1,17 +1,17 @@
 """Folder of color and depth images: the format for your own data.
 
     camera.json         {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}; meters = value / depth_scale;
-                        "distortion": [k1, k2, p1, p2, k3], optional, of the lens of all images: undistorted when read
+                        optional "distortion": [k1, k2, p1, p2, k3] of all images, which are undistorted on reading
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw
-    gravity.txt         optional; x y z, one line per frame: up in its camera, from a sensor; nan nan nan = unknown
-    instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class is a
+    gravity.txt         optional; x y z, one line per frame: up in the camera, from a sensor; nan nan nan = unknown
+    instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class = a
                                             COCO name, or null = unknown
 
-Files of a frame have the same number in their names. The numbers may start anywhere and have gaps. Names with
-timestamps, such as 1305031102.175304.png, are invalid. Line k of poses.txt and gravity.txt, not counting comments and
-empty lines, belongs to the k-th frame in ascending order.
+The files of a frame have the same number in their names. Numbers may start at any value and have gaps. Names with
+timestamps, such as 1305031102.175304.png, are invalid. Line k of poses.txt and gravity.txt belongs to the k-th frame in
+ascending order. Comments and empty lines are not counted.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from framework.files.image_files import read_uint16
 from framework.files.number_lines import read_gravity
 from framework.files.tum_trajectory import TumLine, read_tum_lines
 
-LARGEST_ID = 2**16 - 1  # of an instance: instance images are uint16
+LARGEST_ID = 2**16 - 1  # of an instance, because instance images are uint16
 
 Entry = TypeVar("Entry")
 log = logging.getLogger(__name__)
@@ -82,9 +82,9 @@ class RgbdFolder(Recording):
         return FrameTruth(ids, self._class_names)
 
     def own_scene_truth(self) -> SceneTruth | None:
-        """Return the fused depth and instance ids of the selected frames, None without instances or poses.
+        """Return the fused depth and instance ids of the selected frames, or None without instances or poses.
 
-        Frames that cannot be read are skipped. The points are as exact as the depth images.
+        Unreadable frames are skipped. The points are as accurate as the depth images.
         """
         if not self._instances or not self._has_poses:
             return None
@@ -104,7 +104,7 @@ class RgbdFolder(Recording):
                 yield LabeledDepth(depth, truth.instance_ids, self.camera, recorded.T_world_camera)
 
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
-        """Return the class of each instance, and each frame's image of instances; empty without labels."""
+        """Return the class of each instance and the instance image of each frame, both empty without labels."""
         folder, names = self.folder / "instance", self.folder / "instances.json"
         if self.named_truth is not None or (not is_there(folder) and not is_there(names)):
             return {}, []
@@ -123,7 +123,7 @@ def _recorded(images: StoredImages, index: int, line: TumLine | None, up: Float6
 
 
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
-    """Raise DataError, with the first unmatched frame, unless both have the same frame numbers."""
+    """Raise DataError that names the first unmatched frame if the frame numbers differ."""
     unmatched = sorted(color.keys() ^ other.keys())
     if not unmatched:
         return
@@ -137,7 +137,7 @@ def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
 
 
 def _read_optional(path: Path, read: Callable[[Path], list[Entry]], name: str, frames: int) -> list[Entry] | None:
-    """Return the entry of each frame, None without the file."""
+    """Return the entry of each frame, or None if the file does not exist."""
     if not is_there(path):
         return None
     entries = read(path)

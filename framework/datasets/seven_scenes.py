@@ -4,8 +4,8 @@
     chess/seq-01/frame-000000.depth.png     uint16, mm along z; 0 or 65535 = no reading
     chess/seq-01/frame-000000.pose.txt      T_world_depthcamera, four lines of four numbers, m
 
-Color and depth are published unregistered, with the intrinsics of the depth camera only. Without registration, masks
-are offset by 30 px or more.
+Color and depth are published unregistered, and only with the intrinsics of the depth camera. Without registration,
+masks are offset by 30 px or more.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from framework.files.number_lines import read_matrix
 
 DEPTH_SCALE = 1000.0  # units per meter
 DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)  # as published
-# Not published: fitted to 50 frames of redkitchen, depth edges against color edges. The cameras are taken as parallel
-# and 25 mm apart as in a Kinect; a free fit of the offset is not better.
+# Not published: fitted by aligning depth edges to color edges in 50 frames of redkitchen. The cameras are assumed to be
+# parallel and 25 mm apart, as in a Kinect. Fitting the offset, too, does not improve the alignment.
 COLOR_CAMERA = Camera(640, 480, 529.0, 529.0, 320.0, 239.0)
-BASELINE = 0.025  # m from the depth to the color camera along the depth camera's x axis
+BASELINE = 0.025  # m, from the depth camera to the color camera along the x axis of the depth camera
 _IMAGE_NAME = re.compile(r"frame-([0-9]{6})\.(color|depth)\.png")
 
 
@@ -35,7 +35,7 @@ _IMAGE_NAME = re.compile(r"frame-([0-9]{6})\.(color|depth)\.png")
 class SevenScenes(Recording):
     """A sequence of 7-Scenes, with depth and poses registered to the color camera.
 
-    Lens distortion and the time between color and depth are ignored.
+    Lens distortion and the time offset between color and depth are ignored.
     """
 
     def open(self) -> Contents:
@@ -57,17 +57,17 @@ def _recorded(folder: Path, number: int) -> RecordedFrame:
 
 
 def _color_pose(path: Path) -> Float64:
-    """Return T_world_camera (4, 4) of the color camera. Raises DataError, with the file, if it is not valid."""
+    """Return T_world_camera (4, 4) of the color camera. Raises DataError that names the file of an invalid pose."""
     T_depthcamera_camera = np.eye(4)
     T_depthcamera_camera[0, 3] = BASELINE
     return read_matrix(path).pose() @ T_depthcamera_camera
 
 
 def register(raw: UInt16) -> UInt16:
-    """Return depth (H, W) of the color camera in mm, the nearest reading in each pixel.
+    """Return the depth (H, W) of the color camera in mm, with the nearest depth reading in each pixel.
 
     An image of another size is returned unchanged, so that the reader rejects its size. The color camera has a wider
-    field of view: the border has no reading, and the image shrinks without holes.
+    field of view. The border therefore has no readings, and the image shrinks without holes.
     """
     if raw.shape != DEPTH_CAMERA.shape:
         return raw

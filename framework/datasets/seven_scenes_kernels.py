@@ -10,7 +10,10 @@ from framework.datasets.calibration.raw_images import NO_READING
 
 @njit(cache=True, nogil=True)
 def register_depth(raw: UInt16, ratio: float, u_0: float, v_0: float, disparity_1: float, registered: UInt16) -> None:
-    """Move pixel (u, v) with reading z to (ratio u + u_0 - disparity_1 / z, ratio v + v_0); z stays the same."""
+    """Move each pixel (u, v) with depth z to (ratio u + u_0 - disparity_1 / z, ratio v + v_0) in `registered`.
+
+    The depth stays the same. The nearest depth reading of a target pixel is kept.
+    """
     height, width = registered.shape
     for v in range(raw.shape[0]):
         v_color = round(ratio * v + v_0)

@@ -1,14 +1,14 @@
 """TUM RGB-D (Sturm et al., IROS 2012): Kinect videos with motion-capture poses.
 
-    rgb.txt, depth.txt      one line per image, `timestamp filename`, s; `#` begins a comment
-    rgb/, depth/            8-bit color and uint16 depth along z, registered to color, 5000 units per meter; 0 = none
-    groundtruth.txt         optional; TUM format, T_world_camera of the color camera, about 100 poses a second
+    rgb.txt, depth.txt      one line per image: `timestamp filename`, timestamp in s; `#` begins a comment
+    rgb/, depth/            8-bit color; uint16 depth along z, registered to color, 5000 units per m; 0 = no reading
+    groundtruth.txt         optional; TUM format, T_world_camera of the color camera, about 100 poses per second
     camera.json             for other recordings in this layout: intrinsics, depth scale and distortion, with the
                             same keys as in an RGB-D folder; read if the folder's name does not contain freiburg
 
 The published depth correction factors are already applied. Color and depth of freiburg1 and freiburg2 have the lens
-distortion of the color camera, 5 px or more in half of the pixels; both are undistorted when read. freiburg3 was
-published undistorted.
+distortion of the color camera: 5 px or more in half of the pixels. The reader undistorts both. freiburg3 was published
+undistorted.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from framework.files.tum_trajectory import TumLine, read_tum_lines
 from framework.geometry import interpolate
 
 DEPTH_SCALE = 5000.0  # units per meter
-LONGEST_NAME = 255  # characters of an image's
+LONGEST_NAME = 255  # characters of a file name
 
 log = logging.getLogger(__name__)
 
@@ -65,14 +65,14 @@ PUBLISHED: Mapping[Intrinsics, StoredCamera] = {
 
 @dataclass
 class TumRgbd(Recording):
-    """A sequence of TUM RGB-D, or another recording in its layout.
+    """A sequence of TUM RGB-D, or another recording in the same layout.
 
-    Color and depth are associated by time: the closest pairs first, each image once. The true pose is interpolated at
-    the time of the color image. It is unknown if no pose is within `max_time_difference`.
+    Color and depth images are associated by time: the closest pairs first, each image once. The ground-truth pose is
+    interpolated at the time of the color image. It is unknown if no pose is within `max_time_difference`.
     """
 
     intrinsics: Intrinsics = Intrinsics.AUTO  # intrinsics of the color camera
-    max_time_difference: float = 0.02  # maximum difference from color to depth and to the true pose, s, in (0, 1]
+    max_time_difference: float = 0.02  # maximum time difference between color and depth or pose, s, in (0, 1]
     undistort: bool = True  # correction of the lens distortion; False = images as stored
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ class TumRgbd(Recording):
         return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None)
 
     def _stored_camera(self) -> tuple[StoredCamera, Path | str]:
-        """Return the camera, and its source: a file or a parameter."""
+        """Return the camera and its source (file or parameter)."""
         intrinsics, own = self.intrinsics, self.folder / "camera.json"
         if intrinsics is Intrinsics.AUTO:
             named = re.search(r"freiburg[123]", self.name)
@@ -130,20 +130,20 @@ Timed = TypeVar("Timed", ListedImage, TumLine)
 
 @dataclass(frozen=True)
 class Trajectory:
-    """True poses, interpolated at any time."""
+    """Ground-truth poses, interpolated in time."""
 
-    lines: Sequence[TumLine]  # in order of time; some may be invalid poses
+    lines: Sequence[TumLine]  # in order of time; poses may be invalid
     timestamps: Float64  # (L,) s, of the lines
     max_time_difference: float  # s
 
     @classmethod
     def of(cls, path: Path, lines: Sequence[TumLine], max_difference: float) -> Trajectory:
-        """Return the trajectory from the lines of a file; of lines with the same timestamp, the first is used."""
+        """Return the trajectory from the lines of a file. Only the first line of each timestamp is used."""
         ordered = sorted(_first_of_each(path, lines, "poses"), key=lambda line: line.timestamp)
         return cls(ordered, np.array([line.timestamp for line in ordered]), max_difference)
 
     def at(self, timestamp: float) -> Float64 | None:
-        """Return T_world_camera (4, 4), None = unknown. Raises DataError if a required line is not a valid pose."""
+        """Return T_world_camera (4, 4) at a time in s, None = unknown. Raises DataError for an invalid stored pose."""
         after = int(np.searchsorted(self.timestamps, timestamp, side="right"))
         around = range(max(after - 1, 0), min(after + 1, len(self.lines)))
         if not any(abs(self.timestamps[k] - timestamp) <= self.max_time_difference for k in around):
@@ -155,7 +155,7 @@ class Trajectory:
 
 
 def associate(first: Sequence[float], second: Sequence[float], max_difference: float) -> list[tuple[int, int]]:
-    """Return index pairs of matching times (s), in the order of `first`'s times.
+    """Return index pairs of matching times (s), in the order of the times in `first`.
 
     The closest pairs are matched first, as in the benchmark's own associate.py.
     """
@@ -178,20 +178,18 @@ def associate(first: Sequence[float], second: Sequence[float], max_difference: f
 
 
 def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]:
-    """Return the first item of each timestamp: association is quadratic in the number of duplicates."""
+    """Return the first item of each timestamp, because association is quadratic in the number of duplicates."""
     at: dict[float, Timed] = {}
     for item in items:
         at.setdefault(item.timestamp, item)
     if len(at) < len(items):
         repeated = len(items) - len(at)
-        log.warning(
-            "%s: expected unique timestamps; skipped %d %s with an earlier one's timestamp", path, repeated, name
-        )
+        log.warning("%s: expected unique timestamps; skipped %d %s with a repeated timestamp", path, repeated, name)
     return list(at.values())
 
 
 def _read_list(path: Path) -> list[ListedImage]:
-    """Return the images of a list. Raises DataError for a line that is not `timestamp filename`."""
+    """Read a list of images. Raises DataError for a line that is not `timestamp filename`."""
     lines = read_lines(path, missing="expected lines of `timestamp filename`, got no such file")
     numbered = [(n, line.strip()) for n, line in enumerate(lines, start=1)]
     images = [_listed(path, n, line) for n, line in numbered if line and not line.startswith("#")]

@@ -12,21 +12,21 @@ from pathlib import Path
 
 from framework.errors import DataError
 
-MOST_TEXT = 2**28  # bytes of text and JSON; an hour of poses takes 10 MB
+MOST_TEXT = 2**28  # bytes of text or JSON; one hour of poses takes 10 MB
 _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # names of `written_whole`
 
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Yield a temporary path next to `path`, which replaces `path` on success and is deleted on failure.
+    """Yield a temporary path next to `path`. The file replaces `path` on success and is deleted on failure.
 
-    The temporary name keeps the suffix, by which image and mesh writers choose their format. Links are followed.
-    Raises DataError if writing fails, or if `path` is not a regular file.
+    The temporary name has the same suffix, because image and mesh writers derive the format from the suffix. Links are
+    followed. Raises DataError if writing fails or `path` is not a regular file.
     """
     path = Path(os.path.realpath(path))
     if path.exists():
         check_regular(path)
-    # containers that share a folder may have the same process ids
+    # processes in containers with a shared folder may have the same id
     temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         yield temporary
@@ -34,7 +34,7 @@ def written_whole(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        reason = error.strerror or f"{error}; the disk may be full"  # NumPy only reports the number of items
+        reason = error.strerror or f"{error}; the disk may be full"  # NumPy reports only the number of items
         raise DataError(f"{path}: cannot be written: {reason}") from error
     finally:
         with suppress(OSError):  # the disk may be read-only
@@ -42,19 +42,19 @@ def written_whole(path: Path) -> Iterator[Path]:
 
 
 def is_there(path: Path) -> bool:
-    """Return True if an optional file exists, including broken links and folders, which its reader reports."""
+    """Return True if an optional file exists. Broken links and folders also count, so that the reader reports them."""
     return os.path.lexists(path)
 
 
 def remove_left_over(directory: Path) -> None:
-    """Remove temporary files of killed processes; no other process may write to `directory`."""
+    """Remove the temporary files of killed processes. No other process may write to `directory`."""
     for path in directory.glob(".*.partial*"):
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)
 
 
 def check_regular(path: Path) -> os.stat_result:
-    """Return the status of a regular file. Raises DataError for others, such as a pipe, which may never end."""
+    """Return the status of a regular file. Raises DataError for others, because reading a pipe may never end."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:
@@ -77,7 +77,7 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:
-    """Read UTF-8 text without its byte order mark. Raises DataError."""
+    """Read UTF-8 text and remove the byte order mark. Raises DataError."""
     try:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -1,4 +1,4 @@
-"""Locks on directories, and new directories."""
+"""Locks on directories, and creation of new directories."""
 
 from __future__ import annotations
 
@@ -14,19 +14,23 @@ from filelock import FileLock, Timeout
 from framework.errors import DataError
 from framework.files.atomic_write import read_text, written_whole
 
-LOCK, HOLDER = ".lock", ".lock_holder"  # the locked file, and its owner: on Windows, locked files cannot be read
+# the owner has its own file, because locked files cannot be read on Windows
+LOCK, HOLDER = ".lock", ".lock_holder"
 
 log = logging.getLogger(__name__)
 
 
 def new_directory(wanted: str) -> str:
-    """Create a directory with the first unused name of `wanted`, `wanted`_2, ... Raises DataError."""
+    """Create a directory with the first unused name of `wanted`, `wanted`_2, ... and return the path.
+
+    Raises DataError if the directory cannot be created.
+    """
     path, number = Path(wanted), 1
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         while True:
             try:
-                path.mkdir()  # atomic: succeeds in one process
+                path.mkdir()  # atomic: succeeds in only one process
                 return str(path)
             except FileExistsError:
                 number += 1
@@ -39,7 +43,8 @@ def new_directory(wanted: str) -> str:
 def locked(directory: Path, wait: bool = False) -> Iterator[None]:
     """Lock `directory` while the body runs. The lock ends with the process, even after `kill -9`.
 
-    If another process has the lock, waits or raises DataError. Warns on a file system without locks.
+    If another process holds the lock, `wait` waits for it to exit; otherwise, DataError is raised. A warning is logged
+    on file systems without locks.
     """
     directory.mkdir(parents=True, exist_ok=True)
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
@@ -63,7 +68,7 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
 
 
 def is_locked(directory: Path) -> bool:
-    """Return True if a process has locked `directory`."""
+    """Return True if a process holds the lock of `directory`."""
     if not (directory / LOCK).exists():
         return False
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
@@ -86,5 +91,5 @@ def holder(directory: Path) -> str:
 
 
 def holder_name(process: int | None) -> str:
-    """Return the name of a process as in `holder`."""
+    """Return the name of a process in the format of `holder`."""
     return f"process {process} on {socket.gethostname()}"

@@ -1,4 +1,4 @@
-"""SHA-256 of arrays, files and folders."""
+"""SHA-256 hashes of arrays, files and folders."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ def add_array(digest: hashlib._Hash, array: Array) -> None:
 
 
 def path_hash(path: Path) -> str:
-    """Return the SHA-256 (hex) of a file, or of the names and contents of all files in a folder. Raises DataError."""
+    """Return the SHA-256 (hex) of a file, or of the names and contents of all files in a folder.
+
+    Raises DataError if a file cannot be read.
+    """
     if path.is_dir():
         digest = hashlib.sha256()
         for below in sorted(below for below in path.rglob("*") if below.is_file()):

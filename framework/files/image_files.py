@@ -1,7 +1,7 @@
-"""Strict image readers: a damaged file is an error.
+"""Strict image readers that reject damaged files.
 
-Pillow checks headers and the checksums of PNG, but accepts truncated files, so the end marker is checked here. libjpeg
-fills in what it cannot decode with a warning that OpenCV does not report; simplejpeg raises an error.
+Pillow checks headers and PNG checksums, but accepts truncated files. The end marker is therefore checked here. libjpeg
+fills in undecodable regions with only a warning, which OpenCV does not report. simplejpeg raises an error.
 """
 
 from __future__ import annotations
@@ -22,17 +22,20 @@ from framework.files.atomic_write import read_bytes
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-JPEG_PADDING = b"\0\r\n"  # some cameras append zeros, and some programs a line end
-LARGEST_FILE = 2**28  # bytes; MOST_PIXELS of four 16-bit channels
+JPEG_PADDING = b"\0\r\n"  # some cameras append zeros; some programs append a line break
+LARGEST_FILE = 2**28  # bytes, size of MOST_PIXELS with four 16-bit channels
 
 
 def read_color(path: Path) -> UInt8:
-    """Return (H, W, 3) uint8 RGB of a JPEG or PNG file. Raises FrameError if it is damaged or not 8-bit."""
+    """Return the colors (H, W, 3), uint8 RGB, of a JPEG or PNG file.
+
+    Raises FrameError if the file is damaged or not 8-bit.
+    """
     return decode_color(path, _read(path))
 
 
 def decode_color(name: Path | str, data: bytes) -> UInt8:
-    """Decode the content of such a file; `name` is for errors."""
+    """Decode the content of a color image as in `read_color`. `name` is for error messages."""
     check_image(name, data)
     if data.startswith(JPEG_START):
         try:
@@ -46,17 +49,17 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
 
 
 def read_uint16(path: Path) -> UInt16:
-    """Return the (H, W) uint16 values of a PNG file. Raises FrameError if it is damaged or of another type."""
+    """Return the uint16 values (H, W) of a PNG file. Raises FrameError if it is damaged or of another type."""
     return decode_uint16(path, _read(path))
 
 
 def decode_uint16(name: Path | str, data: bytes) -> UInt16:
-    """Decode the content of such a file; `name` is for errors."""
+    """Decode the content of a PNG file as in `read_uint16`. `name` is for error messages."""
     return np.asarray(_decode_channel(name, data, np.uint16), np.uint16)
 
 
 def read_uint8(path: Path) -> UInt8:
-    """Return the (H, W) uint8 values of a PNG file. Raises FrameError if it is damaged or of another type."""
+    """Return the uint8 values (H, W) of a PNG file. Raises FrameError if it is damaged or of another type."""
     return np.asarray(_decode_channel(path, _read(path), np.uint8), np.uint8)
 
 
@@ -87,9 +90,9 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
 
 
 def check_image(name: Path | str, data: bytes) -> None:
-    """Raise FrameError unless `data` is a complete PNG or JPEG file with an image of at most MOST_PIXELS.
+    """Raise FrameError if `data` is not a complete PNG or JPEG file with an image of at most MOST_PIXELS.
 
-    Decoders allocate what the header declares, which may be 10^10 px in a damaged file.
+    Decoders allocate the size in the header, which may be 10^10 px in a damaged file.
     """
     if not data:
         raise FrameError(f"{name}: expected an image, got an empty file")
@@ -99,17 +102,17 @@ def check_image(name: Path | str, data: bytes) -> None:
     elif data.startswith(JPEG_START):
         kind, ended = JpegImageFile, data.rstrip(JPEG_PADDING).endswith(JPEG_END)
     else:
-        raise FrameError(f"{name}: expected a JPEG or PNG file, got another format")
+        raise FrameError(f"{name}: expected a JPEG or PNG file, got a file that begins with {data[:8]!r}")
     if not ended:
         raise FrameError(f"{name}: truncated image: no end marker in its {len(data)} bytes")
     try:
-        image = kind(io.BytesIO(data))  # Image.open warns of large images and has its own limit
+        image = kind(io.BytesIO(data))  # Image.open warns about large images and has its own limit
         width, height = image.size
         pictures = getattr(image, "n_frames", 1)
         image.verify()
-    except Exception as error:  # Pillow has no base exception
+    except Exception as error:  # Pillow has no common base exception
         raise FrameError(f"{name}: damaged image: {in_one_line(error)}") from error
     if pictures > 1:
-        raise FrameError(f"{name}: expected a single image, got an animation of {pictures}")
+        raise FrameError(f"{name}: expected a single image, got an animation of {pictures} images")
     if not 0 < width * height <= MOST_PIXELS:
         raise FrameError(f"{name}: expected an image of 1 to {MOST_PIXELS} px, got {width}x{height} px")

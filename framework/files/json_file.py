@@ -12,12 +12,12 @@ from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
 
 DEEPEST = 50  # nested objects and lists
-TOO_DEEP = f"expected JSON with at most {DEEPEST} nested lists and objects, got more"
-MOST_BITS = 63  # of an integer: times in ns have 61, and libraries support no more
+TOO_DEEP = f"expected JSON with at most {DEEPEST} nested lists and objects, got deeper nesting"
+MOST_BITS = 63  # of an integer, limit of libraries; timestamps in ns have 61
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write `content` atomically, with all digits of floats."""
+    """Write `content` atomically, with floats in full precision."""
     with written_whole(path) as temporary:
         temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
@@ -28,7 +28,7 @@ def read_json(path: Path, most: int = MOST_TEXT) -> Any:
 
 
 def parse_json(where: object, content: bytes | str) -> Any:
-    """Parse JSON with or without a byte order mark. Raises DataError, which begins with `where`."""
+    """Parse JSON with or without a byte order mark. Raises DataError that names `where`."""
     try:
         found = json.loads(content, parse_int=_whole, object_pairs_hook=_once)
     except RecursionError as error:
@@ -47,7 +47,7 @@ def _whole(digits: str) -> int:
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Reject duplicate keys, which JSON permits without defining their meaning."""
+    """Return an object. Raises ValueError for duplicate keys, because JSON does not define their meaning."""
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for k, (key, _) in enumerate(pairs) if key in {before for before, _ in pairs[:k]})
@@ -56,7 +56,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _is_shallow(content: Any) -> bool:
-    """Return True if content is at most DEEPEST deep, without recursion."""
+    """Return True if the nesting depth is at most DEEPEST. Does not use recursion."""
     level = [content] if isinstance(content, list | dict) else []
     for _ in range(DEEPEST):
         nodes = [node.values() if isinstance(node, dict) else node for node in level]
@@ -67,7 +67,10 @@ def _is_shallow(content: Any) -> bool:
 
 
 def _finite(content: Any) -> Any:
-    """Replace NaN, which is not JSON, by null: an undefined metric, such as the AP of an absent class."""
+    """Replace NaN with null.
+
+    JSON does not support NaN, the value of undefined metrics such as the AP of an absent class.
+    """
     if isinstance(content, Mapping):
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list):

@@ -1,6 +1,6 @@
-"""Text files with numbers on each line: gravity directions, 4x4 matrices, and helpers for other formats.
+"""Text files of numbers: gravity directions, 4x4 matrices, and helpers for other formats.
 
-np.loadtxt does not read the NaN of Microsoft's C library, and does not report line numbers.
+np.loadtxt does not parse the NaN of Microsoft's C library and does not report line numbers.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from framework.errors import DataError, errors_of
 from framework.files.atomic_write import read_text, written_whole
 from framework.geometry import nearest_rigid
 
-SHOWN = 60  # characters of a file that an error repeats
-COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is NaN of Microsoft's C library
+SHOWN = 60  # maximum number of characters of a file in an error message
+COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is NaN in Microsoft's C library
 GRAVITY_COLUMNS = "x y z"
-SHORTEST, LONGEST = 1e-6, 1e6  # of a direction, in any unit
+SHORTEST, LONGEST = 1e-6, 1e6  # limits of the length of a direction, in any unit
 
 _NO_NUMBER = re.compile(r"[+-]?(1\.#\w+|nan\(\w+\))", re.ASCII | re.IGNORECASE)
 
@@ -34,12 +34,12 @@ def read_lines(path: Path, missing: str = "expected a text file, got no such fil
 
 
 def number(word: str) -> float:
-    """Parse a number; NaN for -1.#IND, 1.#INF and the like of Microsoft's C library. Raises ValueError."""
+    """Parse a number. Special values of Microsoft's C library (-1.#IND, 1.#INF) become NaN. Raises ValueError."""
     return math.nan if _NO_NUMBER.fullmatch(word) else float(word)
 
 
 def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> list[float]:
-    """Parse the words of a line as `count` numbers, which may be NaN. Raises DataError with `where` and `names`."""
+    """Parse the words of a line as `count` numbers. NaN is valid. Raises DataError that names `where`."""
     expected = f"{where}: expected {count} numbers{f' ({names})' if names else ''}"
     if len(words) != count:
         raise DataError(f"{expected}, got {len(words)}")
@@ -53,9 +53,9 @@ def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> li
 
 
 def read_gravity(path: Path) -> list[Float64 | None]:
-    """Read the up direction in the camera frame of each frame: `x y z` per line, `nan nan nan` = unknown.
+    """Read the up direction of each frame, in the camera: `x y z` per line, `nan nan nan` = unknown.
 
-    Returns unit vectors (3,); None = unknown. Skips empty lines and comments after `#`. Raises DataError.
+    Returns unit vectors (3,), None = unknown. Empty lines, and comments after `#`, are skipped. Raises DataError.
     """
     words = [COMMENT.sub("", line).split() for line in read_lines(path)]
     return [_direction(f"{path}, line {n}", found) for n, found in enumerate(words, start=1) if found]
@@ -80,18 +80,18 @@ def _direction(where: str, words: Sequence[str]) -> Float64 | None:
 
 @dataclass(frozen=True)
 class PrintedMatrix:
-    """A matrix from a file, validated when it is used as a pose or camera."""
+    """A matrix from a file, validated on conversion to a pose or camera."""
 
-    where: str  # file, and line if it contains several
+    where: str  # file, and line in a file with several matrices
     values: Float64  # (4, 4), may be NaN
 
     def pose(self) -> Float64:
-        """Return the rigid (4, 4) transform. Raises DataError if it is not rigid."""
+        """Return the transform (4, 4), exactly rigid. Raises DataError if the matrix is not rigid."""
         with errors_of(self.where):
             return nearest_rigid(self.values)
 
     def camera(self, width: int, height: int) -> Camera:
-        """Return the pinhole camera with this intrinsic matrix for images of this size. Raises DataError."""
+        """Return the pinhole camera with this intrinsic matrix and image size in px. Raises DataError."""
         (fx, _, cx, _), (_, fy, cy, _) = self.values[:2].tolist()
         if not np.allclose(self.values, [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]]):
             found = " / ".join(" ".join(f"{value:g}" for value in row) for row in self.values)
@@ -102,7 +102,7 @@ class PrintedMatrix:
 
 
 def read_matrix(path: Path) -> PrintedMatrix:
-    """Read a file with one matrix: four lines of four numbers. Raises DataError."""
+    """Read a matrix from a file of four lines with four numbers. Raises DataError."""
     lines = _numbered_lines(path)
     if len(lines) != 4:
         raise DataError(f"{path}: expected 4 lines of 4 numbers, got {len(lines)} lines")
@@ -110,11 +110,11 @@ def read_matrix(path: Path) -> PrintedMatrix:
 
 
 def read_matrix_lines(path: Path) -> list[PrintedMatrix]:
-    """Read a file with a matrix of 16 numbers on each line. Raises DataError."""
+    """Read a file with one matrix, 16 numbers, per line. Raises DataError."""
     lines = _numbered_lines(path)
     return [PrintedMatrix(where, np.array(numbers(where, words, 16)).reshape(4, 4)) for where, words in lines]
 
 
 def _numbered_lines(path: Path) -> list[tuple[str, list[str]]]:
-    """Return the place and words of each line that is not empty."""
+    """Return the position, for messages, and the words of each nonempty line."""
     return [(f"{path}, line {n}", line.split()) for n, line in enumerate(read_lines(path), start=1) if line.strip()]

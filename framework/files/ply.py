@@ -1,6 +1,6 @@
-"""Triangle meshes as PLY files: reads all three encodings, writes little-endian binary.
+"""Triangle meshes as PLY files. Reads all three encodings and writes little-endian binary.
 
-Open3D crashes the process on some malformed files, and plyfile is GPL.
+The format is implemented here because Open3D crashes on some malformed files and plyfile has a GPL license.
 """
 
 from __future__ import annotations
@@ -18,26 +18,27 @@ from framework.errors import DataError
 from framework.files.atomic_write import read_bytes, written_whole
 from framework.files.ply_elements import TYPES, Element, read_elements
 
-LARGEST_FILE = 2**32  # bytes; the mesh of a room has some 2^26
+LARGEST_FILE = 2**32  # bytes; the mesh of a room has about 2^26
 AXES = ("x", "y", "z")
-INDICES = ("vertex_indices", "vertex_index")  # names of a face's list
-TYPE_NAMES = {code: name for name, code in reversed(TYPES.items())}  # the classic names: float, not float32
+INDICES = ("vertex_indices", "vertex_index")  # names of the list property of faces
+TYPE_NAMES = {code: name for name, code in reversed(TYPES.items())}  # traditional names: float instead of float32
 
 
 @dataclass(frozen=True)
 class PlyMesh:
-    """The mesh in a PLY file."""
+    """Mesh in a PLY file."""
 
     vertices: Float32  # (V, 3) m
     triangles: Int32  # (F, 3)
-    properties: Mapping[str, Array]  # per vertex, (V,), other scalar properties by name, in the file's type
-    comments: tuple[str, ...]  # of the header, in order
+    properties: Mapping[str, Array]  # by name: other scalar properties (V,) of the vertices, in the type of the file
+    comments: tuple[str, ...]  # comments of the header, in file order
 
 
 def read_ply(path: Path) -> PlyMesh:
-    """Read a mesh; polygons become triangle fans, other elements and lists of a vertex are ignored.
+    """Read a mesh. Polygons become triangle fans.
 
-    Raises DataError with line or byte for a damaged file, vertices that are not finite, or invalid vertex indices.
+    Other elements, and list properties of vertices, are ignored. Raises DataError that names the line or byte for a
+    damaged file, vertices that are not finite, or invalid vertex indices.
     """
     header, elements = read_elements(path, read_bytes(path, LARGEST_FILE))
     if "vertex" not in elements:
@@ -51,14 +52,15 @@ def read_ply(path: Path) -> PlyMesh:
 def write_ply(
     path: Path, vertices: Float32, triangles: Int32, properties: Mapping[str, Array], comments: Sequence[str] = ()
 ) -> None:
-    """Write vertices (V, 3) m, triangles (F, 3) and properties (V,) of the vertices.
+    """Write vertices (V, 3) in m, triangles (F, 3) and vertex properties (V,).
 
-    Raises DataError for a mesh that `read_ply` rejects, or a failed write.
+    Raises DataError for a mesh that `read_ply` would reject, or for a failed write.
     """
     _check_mesh(path, vertices, triangles)
     row = _vertex_dtype(path, len(vertices), properties)
-    if any("\n" in comment or "\r" in comment for comment in comments):
-        raise DataError(f"{path}: expected comments of one line, got one with a line break")
+    broken = next((comment for comment in comments if "\n" in comment or "\r" in comment), None)
+    if broken is not None:
+        raise DataError(f"{path}: expected comments without line breaks, got {broken!r:.60}")
     rows = np.empty(len(vertices), row)
     for axis, name in enumerate(AXES):
         rows[name] = vertices[:, axis]
@@ -87,7 +89,7 @@ def _vertices(path: Path, rows: Element) -> Float32:
     missing = [axis for axis in AXES if axis not in rows.scalars]
     if missing:
         raise DataError(f"{path}: element 'vertex': expected a scalar property {missing[0]!r}, got none")
-    with np.errstate(over="ignore"):  # a value too large for float32 is not finite
+    with np.errstate(over="ignore"):  # values too large for float32 become infinite and are rejected
         vertices = np.stack([rows.scalars[axis].astype(np.float32) for axis in AXES], axis=1)
     if not np.isfinite(vertices).all():
         k = int(np.argmin(np.isfinite(vertices).all(axis=1)))
@@ -116,10 +118,10 @@ def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
 
 
 def _fans(corners: Int32, lengths: Int64) -> Int32:
-    """Split polygons with `lengths` corners into triangles (F, 3): corners 0 1 2, 0 2 3, ..."""
+    """Split polygons with `lengths` corners into triangles (F, 3) of the corners 0 1 2, 0 2 3, ..."""
     if (lengths == 3).all():
         return corners.reshape(-1, 3)
-    triangles = lengths - 2  # of each polygon
+    triangles = lengths - 2  # number of triangles of each polygon
     corner_0 = np.repeat(_starts(lengths), triangles)
     corner_1 = corner_0 + 1 + np.arange(len(corner_0)) - np.repeat(_starts(triangles), triangles)
     return corners[np.stack([corner_0, corner_1, corner_1 + 1], axis=1)]

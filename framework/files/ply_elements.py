@@ -1,4 +1,4 @@
-"""Elements of a PLY file: the tables declared in its header, in any of the three encodings."""
+"""Elements of a PLY file: the tables declared in the header, in any of the three encodings."""
 
 from __future__ import annotations
 
@@ -15,52 +15,52 @@ from framework.data import Array, Float64, Int64
 from framework.errors import DataError
 
 LARGEST_HEADER = 2**16  # bytes; a header has tens of lines
-LONGEST_LINE = 2**20  # bytes of a text file; splitting a longer line takes tens of times its memory
+LONGEST_LINE = 2**20  # bytes of a text file; splitting a line takes tens of times its size in memory
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 TYPES = {
     **dict(zip(("char", "uchar", "short", "ushort", "int", "uint", "float", "double"), "bBhHiIfd", strict=True)),
     **{str(np.dtype(code)): code for code in "bBhHiIfd"},  # int8, uint8, ...
 }
-MOST_DIGITS = 18  # of a row count
+MOST_DIGITS = 18  # of a number of rows
 
 
 @dataclass(frozen=True)
 class Property:
-    """A column of an element: one number per row, or a list of numbers per row."""
+    """A column of an element, with one number or a list of numbers per row."""
 
     name: str
-    dtype: np.dtype[Any]  # of the numbers, in the machine's byte order
-    count: np.dtype[Any] | None = None  # of the list's length; None = one number
+    dtype: np.dtype[Any]  # type of the numbers, in native byte order
+    count: np.dtype[Any] | None = None  # type of the list length; None = one number
 
 
 @dataclass(frozen=True)
 class Element:
-    """A table of the file with N rows. The arrays are empty until the rows are read."""
+    """A table with N rows. The arrays are empty until the rows are read."""
 
     name: str
     rows: int
     properties: tuple[Property, ...] = ()
     scalars: dict[str, Array] = field(default_factory=dict)  # (N,) each
     lists: dict[str, tuple[Array, Int64]] = field(default_factory=dict)  # values (sum of lengths,), lengths (N,)
-    place: Callable[[int], str] = str  # where a row is in the file: "line 12" or "byte 340"
+    place: Callable[[int], str] = str  # position of a row in the file: "line 12" or "byte 340"
 
 
 @dataclass(frozen=True)
 class Header:
-    """The content of a file's header."""
+    """Content of a PLY header."""
 
     format: str  # one of FORMATS
-    elements: tuple[Element, ...]  # in the file's order
-    comments: tuple[str, ...]  # without the word `comment`
+    elements: tuple[Element, ...]  # in file order
+    comments: tuple[str, ...]  # without the keyword `comment`
     lines: int
     size: int  # bytes, including the line end_header
 
 
 def read_elements(path: Path, data: bytes) -> tuple[Header, dict[str, Element]]:
-    """Return the header of a file with this content, and its elements by name with their rows.
+    """Return the header of a PLY file, and the elements by name with their rows.
 
-    Raises:
-        DataError: The file is damaged or does not match its header; names the line or byte.
+    `data` is the content of the file. Raises DataError that names the line or byte if the file is damaged or does not
+    match its header.
     """
     header = _parse_header(path, data)
     body = _Body(path, data, header)
@@ -107,7 +107,7 @@ def _parse_header(path: Path, data: bytes) -> Header:
 
 
 def _header_lines(path: Path, data: bytes) -> list[bytes]:
-    """Return the lines up to `end_header`, with their line ends."""
+    """Return the lines up to `end_header`, including line breaks."""
     if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
         raise DataError(f"{path}, line 1: expected a PLY file, got {shown(data[:16].decode('latin-1'))}")
     lines = data[:LARGEST_HEADER].splitlines(keepends=True)
@@ -144,7 +144,7 @@ def _dtype(name: str) -> np.dtype[Any]:
 
 
 def _check_size(path: Path, header: Header, body: int) -> None:
-    """Raise DataError if the rows do not fit into a body of `body` bytes, which limits arrays to the file's size."""
+    """Raise DataError if the rows do not fit into `body` bytes. This limits the size of arrays to the file size."""
     least = 0
     for element in header.elements:
         if element.rows and not element.properties:
@@ -155,7 +155,7 @@ def _check_size(path: Path, header: Header, body: int) -> None:
         else:
             row = sum((column.count or column.dtype).itemsize for column in element.properties)
         least += element.rows * row
-    if least > body + (header.format == "ascii"):  # the last line needs no end
+    if least > body + (header.format == "ascii"):  # the last line needs no line break
         announced = ", ".join(f"{element.rows} {shown(element.name)}" for element in header.elements[:4])
         raise DataError(
             f"{path}, byte {header.size}: expected at least {least} bytes for {announced}, got {body}; "
@@ -164,9 +164,10 @@ def _check_size(path: Path, header: Header, body: int) -> None:
 
 
 class _Body:
-    """The numbers after the header: bytes of a binary file, or the words of a text file, each as a float64.
+    """The numbers after the header: the bytes of a binary file, or the words of a text file as float64.
 
-    Positions and sizes count bytes in a binary file and words in a text file. float64 holds all PLY types exactly.
+    Positions and sizes are in bytes for binary files, and in words for text files. float64 represents all PLY types
+    exactly.
     """
 
     def __init__(self, path: Path, data: bytes, header: Header) -> None:
@@ -176,14 +177,14 @@ class _Body:
         if header.format == "binary_big_endian":
             self._order = "big"
         self._position = 0
-        self._offset = header.size  # bytes before position 0
+        self._offset = header.size  # number of bytes before position 0
         self._data: memoryview | Float64 = memoryview(data)[header.size :]
         self._end = len(self._data)
         if self._text:
             self._split_lines(data[header.size :].splitlines(), header.lines)
 
     def read(self, element: Element) -> Element:
-        """Return the element with its rows, which begin at the current position."""
+        """Return the element with its rows, starting at the current position."""
         sizes = [0] * len(element.properties)
         if element.rows:
             sizes = self._row(element, 0, self._position)
@@ -192,7 +193,7 @@ class _Body:
         return self._ragged(element)
 
     def check_end(self) -> None:
-        """Raise DataError if numbers follow the last row declared in the header."""
+        """Raise DataError if numbers follow the last declared row."""
         if self._position < self._end and (self._text or bytes(self._data[self._position :]).strip()):
             count = self._end - self._position
             raise DataError(
@@ -218,7 +219,7 @@ class _Body:
                         f"{self._path}, line {number}: expected numbers, got {shown(str(error))}"
                     ) from error
         self._data, self._end = np.array(words), len(words)
-        self._line_starts = np.array([*starts, len(words)], np.int64)  # of each line with numbers
+        self._line_starts = np.array([*starts, len(words)], np.int64)  # position of each line with numbers
         self._line_numbers = np.array([*numbers, before + len(lines)], np.int64)
 
     def _place(self, position: int) -> str:
@@ -230,7 +231,7 @@ class _Body:
         return 1 if self._text else dtype.itemsize
 
     def _row(self, element: Element, row: int, start: int) -> list[int]:
-        """Return how many numbers each column has in the row that begins at `start`."""
+        """Return the number of values of each column in the row at position `start`."""
         position, lengths = start, []
         where = f"{shown(element.name)} {row}"
         for column in element.properties:
@@ -259,7 +260,7 @@ class _Body:
         return lengths
 
     def _view(self, dtype: np.dtype[Any], start: int, rows: int, length: int, stride: int) -> npt.NDArray[Any]:
-        """Return (rows, length) numbers: the first at `start`, each row `stride` after the last; empty past the end."""
+        """Return numbers (rows, length) from position `start`, with `stride` between rows, or none beyond the end."""
         if start + (rows - 1) * stride + length * self._size(dtype) > self._end:
             return np.empty((0, 0))
         stored = np.dtype(np.float64) if self._text else dtype.newbyteorder(self._order)
@@ -267,7 +268,7 @@ class _Body:
         return np.ndarray((rows, length), stored, self._data, start * unit, (stride * unit, stored.itemsize))
 
     def _rows_are_alike(self, element: Element, lengths: list[int]) -> bool:
-        """Return True if the lists of all rows are as long as those of the first one."""
+        """Return True if the lists of all rows have the same lengths as in the first row."""
         stride = self._stride(element, lengths)
         end = self._position + element.rows * stride
         if not element.rows or end > self._end:
@@ -290,7 +291,7 @@ class _Body:
         return counts + sum(n * self._size(c.dtype) for c, n in zip(element.properties, lengths, strict=True))
 
     def _uniform(self, element: Element, lengths: list[int]) -> Element:
-        """Read rows that all have the same length, as strided views."""
+        """Read rows of equal length as strided views."""
         stride, start, position = self._stride(element, lengths), self._position, self._position
         scalars: dict[str, Array] = {}
         lists: dict[str, tuple[Array, Int64]] = {}
@@ -310,7 +311,7 @@ class _Body:
         return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(start + row * stride))
 
     def _ragged(self, element: Element) -> Element:
-        """Read rows whose lists have different lengths: each begins where the previous one ends."""
+        """Read rows of different lengths, one after the other."""
         lengths = np.empty((len(element.properties), element.rows), np.int64)
         starts = np.empty(element.rows, np.int64)
         for row in range(element.rows):
@@ -339,9 +340,9 @@ class _Body:
         return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(int(starts[row])))
 
     def _native(self, column: Property, stored: npt.NDArray[Any], positions: Int64 | None) -> Array:
-        """Return the numbers, flattened, in the column's type; scalars own their memory.
+        """Return the flattened numbers in the type of the column. Scalars own their memory.
 
-        Raises DataError if a number of a text file is out of the type's range.
+        Raises DataError if a number of a text file is out of range for the type.
         """
         if self._text and positions is not None and column.dtype.kind != "f":
             limits = np.iinfo(column.dtype)
@@ -349,11 +350,11 @@ class _Body:
             if wrong.any():
                 place, value = self._place(int(positions[wrong][0])), stored[wrong][0]
                 raise DataError(f"{self._path}, {place}: {column.name}: expected a {column.dtype}, got {value:g}")
-        with np.errstate(over="ignore"):  # finite numbers are checked where they are needed
+        with np.errstate(over="ignore"):  # overflow is detected by later checks for finite values
             values = np.ascontiguousarray(stored.reshape(-1), column.dtype)
         return values if column.count is not None or values.flags.owndata else values.copy()
 
 
 def shown(text: str) -> str:
-    """Return a word of the file, quoted and shortened for a one-line error."""
+    """Return text from the file, quoted and shortened for a one-line error message."""
     return repr(text if len(text) <= 40 else text[:37] + "...")

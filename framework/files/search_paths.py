@@ -1,31 +1,42 @@
-"""Search paths of files in parameters, and the config folder."""
+"""Search paths for files in parameters, and the config folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-PROJECT_ROOT = _PACKAGE.parent  # in a checkout, the parent of conf/
+PROJECT_ROOT = _PACKAGE.parent  # parent of conf/ in a checkout
 CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else PROJECT_ROOT / "conf"
-"""The config folder: in the package if installed from a wheel, next to it in a checkout."""
+"""Config folder: inside the package if installed from a wheel, next to the package in a checkout."""
 
 
 def candidates(path: Path) -> tuple[Path, ...]:
-    """Return the path with `~` expanded; a relative one in the working folder, then in the project folder."""
+    """Return the candidates for a path: relative paths in the working folder, then in the project folder.
+
+    `~` is expanded.
+    """
     path = expanded(path)
     if path.is_absolute():
         return (path,)
-    packaged = [_PACKAGE.joinpath(*path.parts[1:])] if path.parts[:1] == ("data",) else []  # a wheel's framework/desk
+    # in a wheel, data/desk is framework/desk
+    packaged = [_PACKAGE.joinpath(*path.parts[1:])] if path.parts[:1] == ("data",) else []
     return tuple(dict.fromkeys((Path.cwd() / path, PROJECT_ROOT / path, *packaged)))
 
 
 def folder_of(path: Path) -> Path:
-    """Return the first candidate that is a folder, else the path itself."""
+    """Return the folder at a path, found in the working folder or the project folder.
+
+    Args:
+        path: Path of a folder, absolute or relative; `~` is expanded.
+
+    Returns:
+        The first existing folder, or the expanded path if none exists.
+    """
     return next((place for place in candidates(path) if place.is_dir()), expanded(path))
 
 
 def expanded(path: Path) -> Path:
-    """Return the path with `~` expanded; unchanged for an unknown user."""
+    """Return the path with `~` expanded, or the path itself for an unknown user."""
     try:
         return path.expanduser()
     except RuntimeError:

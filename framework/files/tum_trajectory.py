@@ -1,6 +1,6 @@
-"""Trajectories in the TUM format: a line per pose, `timestamp tx ty tz qx qy qz qw`, T_world_camera, meters, seconds.
+"""Trajectories in the TUM format: one pose T_world_camera per line, `timestamp tx ty tz qx qy qz qw`, in s and m.
 
-evo, which also reads them, is GPL.
+The format is implemented here because evo has a GPL license.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from framework.files.atomic_write import written_whole
 from framework.files.number_lines import COMMENT, SHOWN, numbers, read_lines
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
-QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | due to rounding
+QUATERNION_TOLERANCE = 1e-2  # maximum | |q| - 1 | due to rounding
 
 
 @dataclass(frozen=True)
 class TumLine:
-    """One line of a TUM file, validated when it is used as a pose."""
+    """One line of a TUM file, validated on conversion to a pose."""
 
     path: Path
-    number: int  # of the line in the file, from 1
+    number: int  # line number in the file, from 1
     timestamp: float  # s
     position: tuple[float, ...]  # (3,) m, may be NaN
     quat_xyzw: tuple[float, ...]  # (4,), may be NaN
 
     def pose(self) -> Float64:
-        """Return T_world_camera (4, 4), rigid. Raises DataError for an invalid pose."""
+        """Return the rigid T_world_camera (4, 4). Raises DataError for an invalid pose."""
         return rigid_pose(self._place, self.position, self.quat_xyzw)
 
     def fault(self, message: str) -> DataError:
@@ -46,7 +46,7 @@ class TumLine:
 
 
 def rigid_pose(place: str, position: Sequence[float], quat_xyzw: Sequence[float]) -> Float64:
-    """Return T_world_camera (4, 4) of a position (3,) m and a quaternion. Raises DataError that begins with `place`."""
+    """Return T_world_camera (4, 4) from a position (3,) in m and a quaternion. Raises DataError that names `place`."""
     norm = math.hypot(*quat_xyzw)
     if not all(map(math.isfinite, (*position, norm))):
         found = " ".join(f"{value:g}" for value in (*position, *quat_xyzw))
@@ -60,9 +60,10 @@ def rigid_pose(place: str, position: Sequence[float], quat_xyzw: Sequence[float]
 
 
 def read_tum(path: Path) -> tuple[Float64, Float64]:
-    """Return timestamps (F,) s and poses T_world_camera (F, 4, 4) of a TUM file.
+    """Return the timestamps (F,) in s and the poses T_world_camera (F, 4, 4) of a TUM file.
 
-    Raises DataError for a line without eight finite numbers and a unit quaternion, or timestamps that do not increase.
+    Raises DataError for a line without eight finite numbers and a unit quaternion, or for timestamps that do not
+    increase.
     """
     lines = read_tum_lines(path)
     for before, line in pairwise(lines):
@@ -73,16 +74,17 @@ def read_tum(path: Path) -> tuple[Float64, Float64]:
 
 
 def read_tum_lines(path: Path) -> list[TumLine]:
-    """Return the lines of a TUM file without comments. Raises DataError for a line without eight numbers."""
+    """Return the lines of a TUM file, except comments. Raises DataError for a line without eight numbers."""
     lines = read_lines(path, missing="expected a trajectory in TUM format, got no such file")
     words = [COMMENT.sub("", line).split() for line in lines]
     return [_line(path, number, found) for number, found in enumerate(words, start=1) if found]
 
 
 def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence[Float64] | Float64) -> None:
-    """Write timestamps and poses T_world_camera (4, 4), which `read_tum` reads with an error of at most 1e-9.
+    """Write timestamps in s and poses T_world_camera (4, 4).
 
-    Raises DataError for different lengths, a pose that is not rigid, or a failed write.
+    `read_tum` reads them with an error of at most 1e-9. Raises DataError for different lengths, a pose that is not
+    rigid, or a failed write.
     """
     if len(timestamps) != len(poses):
         raise DataError(f"{path}: expected a timestamp for each pose, got {len(timestamps)} for {len(poses)} poses")

@@ -1,4 +1,4 @@
-"""YAML files, validated before loading: a few lines of aliases can expand to gigabytes."""
+"""YAML files, validated before loading, because a few lines of aliases can expand to gigabytes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import read_text
 
-LARGEST_FILE = 2**22  # bytes; the config of a run has 3 KB, that of a sweep 20
+LARGEST_FILE = 2**22  # bytes; the config of a run has 3 KB, the config of a sweep 20 KB
 DEEPEST = 50  # nested mappings and lists
-TOO_DEEP = f"expected at most {DEEPEST} nested mappings and lists, got more"
+TOO_DEEP = f"expected at most {DEEPEST} nested mappings and lists, got deeper nesting"
 MOST_VALUES = 200_000  # keys and values after the expansion of aliases
 
-_EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled one is ten times as fast
+_EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loader is ten times as fast
 
 
 def load_yaml(path: Path) -> Any:
@@ -32,7 +32,7 @@ def load_yaml(path: Path) -> Any:
 
 @contextmanager
 def yaml_faults(path: Path) -> Iterator[None]:
-    """Convert errors of loading a file to a DataError that names it."""
+    """Convert errors of loading a file to a DataError that names the file."""
     try:
         yield
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, OverflowError) as error:
@@ -40,7 +40,7 @@ def yaml_faults(path: Path) -> Iterator[None]:
 
 
 def _events(where: object, text: str) -> Iterator[Any]:
-    """Yield events. Raises DataError at the nesting limit of PyYAML 6.0.4 and later."""
+    """Yield the parser events. Raises DataError at the nesting limit of PyYAML 6.0.4 and later."""
     try:
         yield from yaml.parse(text, _EventLoader)
     except yaml.YAMLError as error:
@@ -50,7 +50,7 @@ def _events(where: object, text: str) -> Iterator[Any]:
 
 
 def check_yaml(where: object, text: str) -> None:
-    """Raise DataError for YAML that is too deep or too large, and YAMLError for invalid YAML."""
+    """Raise DataError if YAML is nested too deeply or too large, and YAMLError if it is invalid."""
     counts = [0]  # number of values of each open mapping and list, outermost first
     open_anchors: list[Hashable] = []
     anchors: dict[Hashable, int] = {}
@@ -73,4 +73,6 @@ def check_yaml(where: object, text: str) -> None:
         if len(counts) > DEEPEST:
             raise DataError(f"{where}: {TOO_DEEP}")
         if counts[-1] > MOST_VALUES:
-            raise DataError(f"{where}: expected at most {MOST_VALUES} keys and values with aliases expanded, got more")
+            raise DataError(
+                f"{where}: expected at most {MOST_VALUES} keys and values with aliases expanded, got {counts[-1]}"
+            )

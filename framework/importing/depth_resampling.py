@@ -1,4 +1,4 @@
-"""Resampling of depth to a color image, from another camera or a lower resolution."""
+"""Resampling of depth to a color image from another camera or a lower resolution."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, UInt8
 from framework.importing.depth_resampling_kernels import move_readings, upsample
 
-FINEST = 0.9  # of the depth camera's focal length in px: at 1.0, rounding would leave lines without readings
+FINEST = 0.9  # maximum focal length, as a ratio to the depth camera's; at 1.0, rounding would leave lines empty
 
 
 @dataclass(frozen=True)
 class DepthRegistration:
-    """Registration of depth to a color camera with another pose: the nearest reading in each pixel."""
+    """Registration of depth to a color camera with another pose. Each pixel gets the nearest depth reading."""
 
     depth: Camera
     color: Camera
@@ -27,19 +27,19 @@ class DepthRegistration:
         return self.color.scaled(min(1.0, FINEST * min(self.depth.fx / self.color.fx, self.depth.fy / self.color.fy)))
 
     def apply(self, depth: Float32) -> Float32:
-        """Return depth (H, W) in m of `target` from depth (h, w) in m of the depth camera, 0 = no reading."""
+        """Return the depth (H, W) of `target` in m from the depth (h, w) of the depth camera in m, 0 = no reading."""
         registered = np.zeros(self.target.shape, np.float32)
         move_readings(depth, self.depth.K, self.target.K, self.T_color_depth, registered)
         return registered
 
 
 def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, target_color: UInt8) -> Float32:
-    """Return depth (H, W) in m of the camera `target` from depth (h, w) in m of the whole image of `camera`.
+    """Return the depth (H, W) of the camera `target` in m from the depth (h, w) of the whole image of `camera` in m.
 
-    `color` and `target_color` are the images (., ., 3) of the two cameras, which have the same pose. If the four
+    `color` and `target_color` are the images (., ., 3) of the two cameras, which have the same pose. If the four depth
     readings around a pixel belong to one surface, their inverses are interpolated, which is exact for a plane.
-    Otherwise the pixel gets the reading with the nearest and most similar color (weights of joint bilateral
-    upsampling, Kopf et al., SIGGRAPH 2007), so that no reading lies between two surfaces. Holes are kept.
+    Otherwise, the pixel gets the depth reading with the nearest and most similar color, so that no reading lies between
+    two surfaces. The weights are those of joint bilateral upsampling (Kopf et al., SIGGRAPH 2007). Holes are kept.
     """
     height, width = depth.shape
     guide = np.asarray(cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
@@ -51,6 +51,6 @@ def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, targ
 
 
 def _coordinates(size: int, f_target: float, c_target: float, f: float, c: float, scale: float) -> Float64:
-    """Return the positions (size,) in the depth image of the pixels of a target's row or column."""
+    """Return the positions (size,) in the depth image for the pixels of a row or column of the target."""
     in_color = (np.arange(size) - c_target) * (f / f_target) + c
     return np.asarray((in_color + 0.5) * scale - 0.5, np.float64)

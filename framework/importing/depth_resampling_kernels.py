@@ -7,13 +7,13 @@ from numba import njit
 
 from framework.data import Float32, Float64, UInt8
 
-ONE_SURFACE = 0.05  # of the nearest of four readings, by which the farthest may be farther
-COLOR_SIGMA = 15.0  # of 255, root of the summed squares of R, G, B: noise and shading of one object
+ONE_SURFACE = 0.05  # maximum range of four depth readings of one surface, as a fraction of the nearest
+COLOR_SIGMA = 15.0  # of 255, RGB distance due to noise and shading of one object
 
 
 @njit(cache=True, nogil=True)
 def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, registered: Float32) -> None:
-    """Fill `registered` with depth moved to the target camera; the nearest reading wins."""
+    """Fill `registered` with depth moved to the target camera. The nearest depth reading has precedence."""
     height, width = registered.shape
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -37,7 +37,7 @@ def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, reg
 
 @njit(cache=True, nogil=True)
 def upsample(depth: Float32, guide: UInt8, u: Float64, v: Float64, color: UInt8, found: Float32) -> None:
-    """Fill `found` (H, W) at the coordinates u (W,), v (H,) of depth (h, w), whose colors are guide (h, w, 3)."""
+    """Fill `found` (H, W) from the coordinates u (W,), v (H,) in depth (h, w) with the colors guide (h, w, 3)."""
     height, width = depth.shape
     for row in range(len(v)):
         if not -0.5 <= v[row] <= height - 0.5:

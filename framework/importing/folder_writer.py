@@ -25,7 +25,7 @@ from framework.importing.phones.image_rotation import QUARTER, Turn
 from framework.importing.source import SURE, UNSURE, DeviceFrame, Source
 
 DEPTH_SCALE = 1000.0  # units per meter
-LONGER_SIDE = 640  # px, default for written images; trackers and detectors are tuned for it
+LONGER_SIDE = 640  # px, default for written images; trackers and detectors are tuned for this size
 JPEG_QUALITY = 95  # percent
 
 
@@ -33,10 +33,10 @@ JPEG_QUALITY = 95  # percent
 class Writing:
     """Options of the RGB-D folder writer."""
 
-    width: int = 0  # px, of the images before rotation, at most as stored; 0 = LONGER_SIDE for the longer side
-    stride: int = 1  # use every stride-th frame
-    confidence: int = 1  # 0, 1 or 2: minimum confidence of depth, if the recording has confidence
-    turn: int = 0  # degrees clockwise, 0, 90, 180 or 270, of the written images
+    width: int = 0  # px, before rotation, at most the stored width; 0 = LONGER_SIDE for the longer side
+    stride: int = 1  # step between frames; 1 = every frame
+    confidence: int = 1  # minimum depth confidence, 0, 1 or 2, if the recording has confidence
+    turn: int = 0  # rotation of the written images, degrees clockwise, 0, 90, 180 or 270
 
     def __post_init__(self) -> None:
         require(0 <= self.width <= MOST_PIXELS, "--width", self.width, f"a value in [0, {MOST_PIXELS}] px")
@@ -60,9 +60,9 @@ class Written:
     """Result of writing a source."""
 
     timestamps: list[float] = field(default_factory=list)  # s, of the written frames
-    poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of them, none without poses
-    errors: list[str] = field(default_factory=list)  # of each skipped frame
-    ups: list[Float64 | None] = field(default_factory=list)  # (3,) up in the camera of each before rotation
+    poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of these frames; empty without poses
+    errors: list[str] = field(default_factory=list)  # message of each skipped frame
+    ups: list[Float64 | None] = field(default_factory=list)  # (3,) up in the camera before rotation; None = unknown
 
     def __str__(self) -> str:
         count = f"{len(self.timestamps)} frames"
@@ -70,15 +70,15 @@ class Written:
 
 
 def check_new(directory: Path) -> None:
-    """Raise DataError unless the directory is missing or empty."""
+    """Raise DataError if the directory exists and is not empty."""
     if directory.is_dir() and not any(directory.iterdir()):
         return
     if directory.exists() or directory.is_symlink():
-        raise DataError(f"{directory}: expected a new or empty folder, got an existing one; set another or remove it")
+        raise DataError(f"{directory}: expected a new or empty folder, got an existing path; set another or remove it")
 
 
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
-    """Write the frames, then their poses and up directions, and camera.json last.
+    """Write the frames, their poses and up directions, and finally camera.json.
 
     Unusable frames are skipped. Raises DataError if `directory` is not empty, no frame is usable, or a file cannot be
     written.
@@ -86,7 +86,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     check_new(directory)
     written = Written()
     turn = writing.turned
-    camera = None  # the focal length of phones varies: all frames are resampled to the first camera
+    camera = None  # the focal length of phones varies, so all frames are resampled to the camera of the first frame
     for number, frame in _frames(source, writing.stride, written):
         if camera is None:
             camera = writing.camera(frame.camera)
@@ -119,7 +119,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
 
 
 def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int, DeviceFrame]]:
-    """Yield the number and content of each usable frame; collect the errors of the others in `written`."""
+    """Yield the number and content of each usable frame. Errors of unusable frames are added to `written`."""
     chosen = islice(enumerate(source.frames), 0, None, stride)
     for number, stored in tqdm(chosen, total=-(-source.count // stride), unit=" frames", disable=None):
         try:

@@ -23,14 +23,15 @@ FORMATS = (
 def open_source(path: Path, topics: Topics | None = None) -> Source:
     """Open the recording at `path`. Raises DataError for an unknown format or an unreadable recording.
 
-    `topics` are topics of a ROS bag that types and names do not identify.
+    `topics` are the topics of a ROS bag that types and names do not identify.
     """
     if not path.exists():
         raise DataError(f"{path}: expected a recording, got no such file or folder")
     if path.suffix.lower() == ".zip":
         raise DataError(f"{path}: expected a folder or recording, got a zip archive; unpack it")
     folders = [entry for entry in path.iterdir() if entry.is_dir()] if path.is_dir() else []
-    for place in (path, *(folders if len(folders) == 1 else [])):  # a zipped folder often has another around it
+    # unpacked archives often have an outer folder
+    for place in (path, *(folders if len(folders) == 1 else [])):
         for kind in FORMATS:
             if not kind.recognized(place):
                 continue
@@ -40,4 +41,4 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
                 raise ConfigError(f"{', '.join(topics.given)}: expected a ROS bag for topics, got {path}")
             return kind.open(place)
     known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
-    raise DataError(f"{path}: expected a supported format, got an unknown one; supported: {known}")
+    raise DataError(f"{path}: expected a supported format, got an unknown format; supported: {known}")

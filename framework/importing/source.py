@@ -1,4 +1,4 @@
-"""Device recordings for import: frames as stored, with depth often coarser than color."""
+"""Recordings of devices for import. Depth often has a lower resolution than color."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from framework.datasets.frames.conventions import CameraAxes, PoseReading
 from framework.errors import FrameError, errors_of
 from framework.geometry import nearest_rigid
 
-SMALLEST_SIDE = 2  # px, minimum of a depth image for resampling
+SMALLEST_SIDE = 2  # px, minimum side of a depth image for resampling
 UNSURE, FAIRLY_SURE, SURE = 0, 1, 2  # ARKit's low, medium and high confidence
 
 _ARKIT = PoseReading(camera_axes=CameraAxes.OPENGL)
@@ -23,16 +23,16 @@ _ARKIT = PoseReading(camera_axes=CameraAxes.OPENGL)
 
 @dataclass(frozen=True)
 class DeviceFrame:
-    """One frame as stored. Raises FrameError for inconsistent parts."""
+    """One stored frame. Raises FrameError for inconsistent images."""
 
-    name: Path | str  # its file, for messages
+    name: Path | str  # file of the frame, for messages
     timestamp: float  # s
     camera: Camera  # of the color image
     color: UInt8  # (H, W, 3) RGB
-    depth: Float32  # (h, w) m along z, 0 = no reading; with the field of view of color
-    confidence: UInt8 | None = None  # (h, w), UNSURE to SURE, of the depth; None = not known
-    T_world_camera: Float64 | None = None  # (4, 4), None = not known
-    up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = not known
+    depth: Float32  # (h, w) m along z, 0 = no reading; has the field of view of color
+    confidence: UInt8 | None = None  # (h, w), of the depth, from UNSURE to SURE; None = unknown
+    T_world_camera: Float64 | None = None  # (4, 4), None = unknown
+    up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = unknown
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.timestamp):
@@ -44,20 +44,20 @@ class DeviceFrame:
             expected = f"expected depth of at least {SMALLEST_SIDE}x{SMALLEST_SIDE} px"
             raise FrameError(f"{self.name}: {expected}, got {self.depth.shape[1]}x{self.depth.shape[0]} px")
         if self.confidence is not None and self.confidence.shape != self.depth.shape:
-            expected = f"expected confidence of shape {self.depth.shape} as depth"
+            expected = f"expected confidence of shape {self.depth.shape}, as for depth"
             raise FrameError(f"{self.name}: {expected}, got {self.confidence.shape}")
 
 
-StoredFrame = Callable[[], DeviceFrame]  # reads a frame; raises DataError if it cannot be used
+StoredFrame = Callable[[], DeviceFrame]  # reads a frame; raises DataError if the frame is unusable
 
 
 @dataclass(frozen=True)
 class Source:
-    """A recording for import. Read its frames in order; frames may be skipped."""
+    """A recording for import. Frames must be read in order, but may be skipped."""
 
     format: str  # name for messages
     frames: Iterable[StoredFrame]  # in order of time
-    count: int  # of the frames
+    count: int  # number of frames
     posed: bool  # True if the recording has poses; frames without a pose are then skipped
     distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
 
@@ -69,29 +69,29 @@ class Format:
     name: str  # for the command line
     needs: str  # characteristic files, for messages
     recognized: Callable[[Path], bool]  # True for a recording in this format
-    open: Callable[..., Source]  # takes the path, and the topics for formats with topics; raises DataError
+    open: Callable[..., Source]  # parameters: path, and topics if has_topics; raises DataError
     has_topics: bool = False
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
-    """Return T_world_camera (4, 4) of a pose with ARKit's camera axes. Raises DataError, with `where`."""
+    """Return T_world_camera (4, 4) of a pose with ARKit's camera axes. Raises DataError that names `where`."""
     with errors_of(where):
         return _ARKIT.pose(nearest_rigid(T_world_arkit))
 
 
 def arkit_up(T_world_camera: Float64) -> Float64:
-    """Return up (3,) in the camera of a pose in ARKit's world, whose y axis is against gravity.
+    """Return the up direction (3,) in the camera of a pose in ARKit's world frame.
 
-    This is ARConfiguration.WorldAlignment.gravity, the default.
+    The y axis of this world frame points against gravity, as in ARConfiguration.WorldAlignment.gravity, the default.
     """
     return np.array(T_world_camera[1, :3])
 
 
 def meters(raw: NDArray[np.uint16]) -> Float32:
-    """Convert stored millimeters to depth (h, w) in m; 65535, no reading of several sensors, becomes 0."""
+    """Convert stored millimeters to depth (h, w) in m. The value 65535, no reading in some sensors, becomes 0."""
     return np.where(raw == np.iinfo(np.uint16).max, 0, raw).astype(np.float32) / np.float32(1000)
 
 
 def readings(depth: NDArray[np.floating]) -> Float32:
-    """Convert stored meters (h, w) to float32; values that are not positive and finite become 0."""
+    """Convert stored meters (h, w) to float32. Values that are not positive and finite become 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

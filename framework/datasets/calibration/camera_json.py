@@ -17,13 +17,13 @@ from framework.files.atomic_write import MOST_TEXT
 from framework.files.json_file import read_json
 
 CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")  # of camera.json
-DISTORTION = "distortion"  # the key of the lens distortion
+DISTORTION = "distortion"  # key of the lens distortion
 
 log = logging.getLogger(__name__)
 
 
 class StoredCamera(NamedTuple):
-    """The camera of a recording."""
+    """Calibration of a recording."""
 
     camera: Camera
     depth_scale: float  # units per meter
@@ -31,7 +31,7 @@ class StoredCamera(NamedTuple):
 
 
 def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
-    """Return the JSON object in a file of at most `most` bytes. Raises DataError, with the file."""
+    """Return the JSON object in a file of at most `most` bytes. Raises DataError that names the file."""
     found = read_json(path, most)
     if not isinstance(found, dict):
         raise DataError(f"{path}: expected a JSON object, got {type(found).__name__}")
@@ -39,7 +39,7 @@ def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
 
 
 def read_camera(path: Path) -> StoredCamera:
-    """Return the camera in a camera.json. Raises DataError, with the file and the key."""
+    """Return the calibration in a camera.json. Raises DataError that names the file and the key."""
     content = read_json_object(path)
     check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
     return StoredCamera(*camera_of(path, content, CAMERA_KEYS), distortion_of(path, content))
@@ -48,7 +48,7 @@ def read_camera(path: Path) -> StoredCamera:
 def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:
     """Return the camera and the depth scale (units per meter) under `keys`, in the order of CAMERA_KEYS.
 
-    Raises DataError, with the file and the key.
+    Raises DataError that names the file and the key.
     """
     *camera, depth_scale = numbers_of(path, content, *keys)
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
@@ -60,7 +60,7 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
 
 
 def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Camera:
-    """Return the camera with these intrinsics. Raises DataError, with `where`, if they are not valid."""
+    """Return the camera with these intrinsics. Raises DataError that names `where` if they are invalid."""
     if width != int(width) or height != int(height):
         raise DataError(f"{where}: width, height: expected whole numbers of px, got {width:g}x{height:g}")
     with errors_of(where):
@@ -68,7 +68,7 @@ def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float
 
 
 def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Log unknown keys. Raises DataError for a likely misspelling of a known key."""
+    """Log unknown keys. Raises DataError for a probable misspelling of a known key."""
     unread = [key for key in content if key not in known]
     for key in unread:
         close = get_close_matches(key.lower(), known, n=1, cutoff=0.8)
@@ -79,14 +79,14 @@ def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> 
 
 
 def number_list(where: Path | str, values: Any, count: int) -> list[float]:
-    """Return `values` as a list of `count` finite numbers. Raises DataError, with `where`."""
+    """Return `values` as a list of `count` finite numbers. Raises DataError that names `where`."""
     if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
         raise DataError(f"{where}: expected a list of {count} numbers, got {str(values)[:60]}")
     return [float(value) for value in values]
 
 
 def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> list[float]:
-    """Return the finite numbers under some keys. Raises DataError, with `where` and the key."""
+    """Return the finite numbers under `keys`. Raises DataError that names `where` and the key."""
     for key in keys:
         if key not in content:
             raise DataError(f"{where}: expected a key {key!r}, got none")
@@ -96,7 +96,7 @@ def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> lis
 
 
 def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
-    """Return the lens distortion in the content of a file, or None without one. Raises DataError."""
+    """Return the lens distortion in the content of a file, or None without distortion. Raises DataError."""
     if DISTORTION not in content:
         return None
     return Distortion(*number_list(f"{path}: distortion [k1, k2, p1, p2, k3]", content[DISTORTION], 5))

@@ -17,7 +17,7 @@ LONGEST_SIDE = 2**15 - 2  # px, limit of OpenCV's warp
 
 @dataclass(frozen=True)
 class ColorRegistration:
-    """Warp from the color to the depth camera. Raises DataError if its intermediate image is too large."""
+    """Warp from the color camera to the depth camera. Raises DataError if the intermediate image is too large."""
 
     color: Camera
     depth: Camera
@@ -37,10 +37,10 @@ class ColorRegistration:
         return max(1, round(min(self.color.fx / self.depth.fx, LONGEST_SIDE)))
 
     def apply(self, image: UInt8) -> UInt8:
-        """Return the depth camera's colors (H, W, 3) from an image of the color camera.
+        """Return the colors (H, W, 3) of the depth camera from an image of the color camera.
 
-        A pixel is the mean of its area: the image is resampled (bilinear) at `fine` times the depth camera's
-        resolution, then averaged over fine x fine. Outside the color image, the nearest color is repeated.
+        Each pixel is the mean color of its area. The image is resampled (bilinear) at `fine` times the resolution of
+        the depth camera, then averaged over fine x fine pixels. Outside the color image, the nearest color is repeated.
         """
         fine = self._fine
         # pixel i of the fine image has its center at (i + 1/2) / fine - 1/2 in the depth image
@@ -58,7 +58,7 @@ class ColorRegistration:
 
 
 def registered_images(images: StoredImages, registration: ColorRegistration) -> StoredImages:
-    """Return a frame's images, with color registered to the depth camera on reading."""
+    """Return the images of a frame with color registered to the depth camera on reading."""
     return replace(images, color=partial(_registered_color, images, registration))
 
 
@@ -72,6 +72,6 @@ def _registered_color(images: StoredImages, registration: ColorRegistration) -> 
 
 
 def _line(f_color: float, c_color: float, f_depth: float, c_depth: float, fine: int) -> tuple[float, float]:
-    """Return (a, b): the coordinate i of the fine image is a i + b in the color image."""
+    """Return the numbers a and b: the coordinate i of the fine image is a i + b in the color image."""
     slope = f_color / f_depth
     return slope / fine, slope * (0.5 / fine - 0.5 - c_depth) + c_color

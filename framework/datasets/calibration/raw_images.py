@@ -13,11 +13,11 @@ from framework.data import Camera, Float32, UInt8, UInt16
 from framework.datasets.calibration.undistortion import Distortion, Undistortion
 from framework.errors import FrameError
 
-NO_READING = 65535  # uint16, written by several sensors instead of 0
+NO_READING = 65535  # uint16, written by some sensors instead of 0
 
 
 def check_max_depth(max_depth: float) -> None:
-    """Raise ConfigError for an invalid range."""
+    """Raise ConfigError for an invalid maximum depth."""
     require(
         math.isfinite(max_depth) and max_depth >= 0,
         "dataset.max_depth",
@@ -31,9 +31,9 @@ class Calibration:
     """A camera and the properties of its images. Raises DataError for an invalid lens."""
 
     camera: Camera
-    source: Path | str  # its file or parameter, for messages
+    source: Path | str  # file or parameter of the camera, for messages
     depth_scale: float  # units per meter
-    max_depth: float  # m; farther readings become "no reading"; 0 = keep all
+    max_depth: float  # m; farther depth readings are dropped; 0 = keep all
     distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
     lens: Undistortion | None = field(init=False, repr=False)  # None = a pinhole
 
@@ -41,12 +41,12 @@ class Calibration:
         object.__setattr__(self, "lens", Undistortion(self.camera, self.distortion) if self.distortion else None)
 
     def color(self, raw: UInt8, name: Path | str) -> UInt8:
-        """Return color (H, W, 3) of the pinhole camera. Raises FrameError, with `name`, for another size."""
+        """Return the color (H, W, 3) of the pinhole camera. Raises FrameError that names the image for a wrong size."""
         self.check_size(name, raw.shape)
         return self.lens.smooth(raw) if self.lens else raw
 
     def depth(self, raw: UInt16, name: Path | str) -> Float32:
-        """Return depth (H, W) in m, 0 = no reading. Raises FrameError, with `name`, for another size."""
+        """Return the depth (H, W) in m, 0 = no reading. Raises FrameError that names the image for a wrong size."""
         self.check_size(name, raw.shape)
         depth = raw.astype(np.float32)
         depth /= np.float32(self.depth_scale)
@@ -56,12 +56,12 @@ class Calibration:
         return self.lens.exact(depth) if self.lens else depth
 
     def labels(self, raw: UInt16, name: Path | str) -> UInt16:
-        """Return labels (H, W), not interpolated. Raises FrameError, with `name`, for another size."""
+        """Return the labels (H, W), not interpolated. Raises FrameError that names the image for a wrong size."""
         self.check_size(name, raw.shape)
         return self.lens.exact(raw) if self.lens else raw
 
     def check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:
-        """Raise FrameError, with `name`, unless an image has the size of the camera."""
+        """Raise FrameError that names the image if its size differs from the camera."""
         if shape[:2] != self.camera.shape:
             expected = f"expected {self.camera.width}x{self.camera.height} px as in {self.source}"
             raise FrameError(f"{name}: {expected}, got {shape[1]}x{shape[0]} px")

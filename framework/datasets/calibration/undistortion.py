@@ -1,7 +1,7 @@
 """Lens undistortion.
 
-The model is Brown-Conrady as in OpenCV. A point (x, y, 1) m in the camera projects to the pixel
-(fx x' + cx, fy y' + cy) of the recorded image. With r^2 = x^2 + y^2,
+The lens model is Brown-Conrady, as in OpenCV. A point (x, y, 1) m in the camera projects to the pixel
+(fx x' + cx, fy y' + cy) of the recorded image. With r^2 = x^2 + y^2:
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -20,7 +20,7 @@ from framework.data import Camera, Float64, UInt8
 from framework.errors import DataError
 
 Value = TypeVar("Value", bound=np.generic)
-FARTHEST_SHIFT = 0.5  # of the image's width: a larger shift indicates another lens model or a typo
+FARTHEST_SHIFT = 0.5  # fraction of the image width; a larger shift indicates another lens model or a typo
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Distortion:
             raise DataError(f"distortion (k1, k2, p1, p2, k3): expected finite coefficients, got {astuple(self)}")
 
     def distorted(self, camera: Camera, pixels: Float64) -> Float64:
-        """Return the position (N, 2) in the recorded image of the pinhole camera's `pixels` (N, 2)."""
+        """Return the positions (N, 2) in the recorded image for `pixels` (N, 2) of the pinhole camera."""
         x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -48,9 +48,9 @@ class Distortion:
 
 
 class Undistortion:
-    """Conversion of recorded images into those of a pinhole camera with the same intrinsics.
+    """Conversion of recorded images to a pinhole camera with the same intrinsics.
 
-    Depth stays z along the optical axis. Pixels outside the recorded image become 0. Raises DataError for
+    Depth is still measured along the optical axis. Pixels outside the recorded image become 0. Raises DataError for
     coefficients that do not fit the camera.
     """
 
@@ -68,9 +68,9 @@ class Undistortion:
         self._u, self._v = source.T.reshape(2, *camera.shape).astype(np.float32)
 
     def smooth(self, image: UInt8) -> UInt8:
-        """Return undistorted colors (H, W, 3), interpolated."""
+        """Return the undistorted colors (H, W, 3), with linear interpolation."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR), np.uint8)
 
     def exact(self, image: NDArray[Value]) -> NDArray[Value]:
-        """Return undistorted depth or labels (H, W), float32 or uint16, of the nearest pixel."""
+        """Return the undistorted depth or labels (H, W), float32 or uint16, from the nearest pixels."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_NEAREST), image.dtype)

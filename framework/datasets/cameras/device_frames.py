@@ -1,4 +1,4 @@
-"""Depth cameras read through vendor libraries."""
+"""Depth cameras, read with the libraries of their vendors."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from framework.datasets.calibration.undistortion import Distortion
 from framework.errors import DataError, FrameError, in_one_line
 from framework.interfaces import FrameReader, LiveVideo
 
-WAIT_MS = 100  # maximum wait for a frame
-LONGEST_SILENCE = 5.0  # s without a frame before the camera counts as disconnected
+WAIT_MS = 100  # ms, maximum wait for a frame
+LONGEST_SILENCE = 5.0  # s, maximum time without a frame; the camera then counts as disconnected
 
 Images = TypeVar("Images")
 log = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class DepthCamera(LiveVideo):
-    """A camera with depth registered to color by the library, with the factory calibration."""
+    """A camera with factory calibration. The library registers depth to color."""
 
     brand: ClassVar[str]
     serial: str = ""  # serial number of the device; "" = the first device found
@@ -44,7 +44,7 @@ class DepthCamera(LiveVideo):
 
     @abstractmethod
     def start(self) -> None:
-        """Start streaming. Raises ConfigError without the library."""
+        """Start streaming. Raises ConfigError if the library is not installed."""
 
     @abstractmethod
     def stop(self) -> None:
@@ -52,18 +52,18 @@ class DepthCamera(LiveVideo):
 
     @abstractmethod
     def wait(self) -> Any:
-        """Return both images, not registered yet; None = nothing received within WAIT_MS."""
+        """Return both images, not yet registered, or None if nothing is received within WAIT_MS."""
 
     @abstractmethod
     def calibrate(self, images: Any) -> Calibration | None:
-        """Return the calibration of the color camera; None = not in these images."""
+        """Return the calibration of the color camera, or None if these images do not contain it."""
 
     @abstractmethod
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
-        """Return copies of color (H, W, 3), RGB, and the depth (H, W) registered to it; None = not sent."""
+        """Return copies of color (H, W, 3), RGB, and the registered depth (H, W); None = missing."""
 
     def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:
-        """Return the lens distortion; None = no distortion, or an unsupported model (logged)."""
+        """Return the lens distortion, or None without distortion. Unsupported models are logged and ignored."""
         if not any(coefficients):
             return None
         if model != brown_conrady or any(coefficients[5:]):
@@ -95,7 +95,7 @@ class DepthCamera(LiveVideo):
             self.stop()
 
     def _frame(self, images: Any, number: int, timestamp: float, calibration: Calibration) -> Frame:
-        """Raise FrameError if one of the two images is missing or they cannot be registered."""
+        """Return the registered frame. Raises FrameError if an image is missing or registration fails."""
         try:
             color, depth = self.read(images)
         except self.errors as error:

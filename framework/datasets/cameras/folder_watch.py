@@ -1,13 +1,13 @@
-"""Live frames from a folder that another program fills during mapping, with the files of dataset=rgbd_folder.
+"""Live frames written into a folder by another program during mapping, with the layout of dataset=rgbd_folder.
 
     camera.json         as in an RGB-D folder; may appear after the start
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     end                 an empty file, written after the last frame
 
-A frame is complete with both of its files, in any order. Write each file under a name that begins with a dot, then
-rename it. Numbers must increase. A frame is skipped if it is incomplete when a later frame is complete, or at the end.
-Files of earlier frames may be removed during the run.
+A frame is complete when both of its files exist; their order does not matter. Write each file under a name that begins
+with a dot, then rename it. Numbers must increase. A frame is skipped if it is still incomplete when a later frame is
+complete or the sequence ends. You can remove the files of earlier frames during the run.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from framework.interfaces import FrameReader, LiveVideo
 
 COLOR, DEPTH = (".jpg", ".jpeg", ".png"), (".png",)
 LONGEST_WAIT = 86_400.0  # s
-LARGEST_NUMBER = 2**53  # of a frame; smaller ones are exact in every program
-LEAST_REST = 3.0  # pause between polls, in durations of the last poll: large folders are slow to list
-CLOCK_TICK = 1e-6  # s between the timestamps of two frames of the same poll
+LARGEST_NUMBER = 2**53  # of a frame; smaller numbers are exact in double precision
+LEAST_REST = 3.0  # minimum pause between polls, as a multiple of the last poll's duration; listing a folder can be slow
+CLOCK_TICK = 1e-6  # s, minimum difference between the timestamps of two frames of the same poll
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class FolderWatch(LiveVideo):
         last_time, last_arrival = 0.0, time.monotonic()
         while True:
             began = time.monotonic()
-            # checked first: files that were written before `end` count
+            # checked before the images, so that all files written before `end` are read
             over = (self.folder / "end").exists() or 0 < self.idle_timeout < began - last_arrival
             for number, images in arrivals.look(to_the_end=over):
                 last_time, last_arrival = max(time.time(), last_time + CLOCK_TICK), began
@@ -77,7 +77,7 @@ class FolderWatch(LiveVideo):
             time.sleep(min(max(self.poll_interval, LEAST_REST * (time.monotonic() - began)), 0.1))
 
     def _calibration(self) -> Generator[None, None, Calibration]:
-        """Return the content of camera.json, once it is complete."""
+        """Wait for a complete camera.json and return the calibration."""
         path, deadline = self.folder / "camera.json", time.monotonic() + self.camera_timeout
         while True:
             try:
@@ -93,7 +93,7 @@ class FolderWatch(LiveVideo):
 
 
 def _read(number: int, images: StoredImages | str, timestamp: float, calibration: Calibration) -> Frame:
-    """Return the frame. Raises FrameError if it cannot be used."""
+    """Read a frame. Raises FrameError if it is unusable."""
     if isinstance(images, str):
         raise FrameError(images)
     color = calibration.color(images.color(), images.color_name)
@@ -102,24 +102,24 @@ def _read(number: int, images: StoredImages | str, timestamp: float, calibration
 
 
 class Arrivals:
-    """New frames in a folder, by number."""
+    """Detector of new frames in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._color, self._depth = NewImages(folder / "color", COLOR), NewImages(folder / "depth", DEPTH)
         self._last = -1  # number of the last complete or skipped frame
-        self._halves: set[int] = set()  # numbers that were skipped with one image
+        self._halves: set[int] = set()  # numbers of skipped frames with one image
 
     def look(self, to_the_end: bool) -> Iterator[tuple[int, StoredImages | str]]:
-        """Yield new frames in ascending order: up to the newest complete one, or all at the end.
+        """Yield new frames in ascending order, up to the newest complete frame, or all frames at the end.
 
-        Each item is a frame's number, and its images or the reason why it cannot be used.
+        Each item is the frame number, and either the images or the reason for skipping the frame.
         """
         self._color.look()
         self._depth.look()
         color, depth = self._color.waiting, self._depth.waiting
         both, any_of = sorted(color.keys() & depth.keys()), sorted(color.keys() | depth.keys())
         newest = next((n for n in reversed(both) if _is_whole(color[n]) and _is_whole(depth[n])), -1)
-        newest = max(newest, self._last)  # a frame that appears after its successors is skipped
+        newest = max(newest, self._last)  # a frame that arrives after a later frame is skipped
         for number in any_of if to_the_end else [number for number in any_of if number <= newest]:
             color_file, depth_file = color.pop(number, None), depth.pop(number, None)
             if number in self._halves:  # the second image of a skipped frame
@@ -128,7 +128,7 @@ class Arrivals:
             if color_file is None or depth_file is None:
                 self._halves.add(number)
             if number <= self._last:
-                yield number, f"{color_file or depth_file}: expected frames in order, got it after frame {self._last}"
+                yield number, f"{color_file or depth_file}: expected ascending frames, got {number} after {self._last}"
                 continue
             self._last = number
             if color_file is None or depth_file is None:
@@ -139,7 +139,7 @@ class Arrivals:
 
 
 class NewImages:
-    """Images of a folder that are not assigned to frames yet."""
+    """Images of a folder that are not yet assigned to frames."""
 
     def __init__(self, folder: Path, suffixes: Sequence[str]) -> None:
         self.folder, self.suffixes = folder, suffixes
@@ -148,11 +148,11 @@ class NewImages:
         self._first: Path | None = None
 
     def look(self) -> None:
-        """Add the new images. Raises DataError for names without an order."""
+        """Add the new images. Raises DataError if their names have no unique order."""
         try:
             with os.scandir(self.folder) as entries:
                 names = {entry.name for entry in entries}
-        except OSError:  # it does not exist yet
+        except OSError:  # the folder does not exist yet
             return
         new, self._names = names - self._names, names
         for name in sorted(new):

@@ -1,4 +1,4 @@
-"""An Orbbec camera, by pyorbbecsdk2 (2.x): https://github.com/orbbec/pyorbbecsdk (Apache-2.0)."""
+"""Orbbec cameras, read with pyorbbecsdk2 (2.x): https://github.com/orbbec/pyorbbecsdk (Apache-2.0)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from framework.datasets.calibration.raw_images import Calibration
 from framework.datasets.cameras.device_frames import WAIT_MS, DepthCamera
 from framework.errors import import_optional
 
-MILLIMETERS = 1000.0  # per meter: the unit of the library's depth scale
+MILLIMETERS = 1000.0  # per meter; the library's depth scale is in millimeters
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Orbbec(DepthCamera):
 
     def calibrate(self, images: Any) -> Calibration | None:
         depth = images.get_depth_frame()
-        if depth is None:  # only depth frames contain their unit
+        if depth is None:  # the depth unit is only available from a depth frame
             return None
         found, lens = self._color.get_intrinsic(), self._color.get_distortion()
         camera = Camera(found.width, found.height, found.fx, found.fy, found.cx, found.cy)
@@ -65,7 +65,7 @@ class Orbbec(DepthCamera):
 
 
 def _pixels(image: Any, dtype: np.dtype[Any], channels: tuple[int, ...]) -> Any:
-    """Return a copy (H, W, ...) of an image, None = no image."""
+    """Return a copy (H, W, ...) of an image, or None without an image."""
     if image is None:
         return None
     raw = np.frombuffer(image.get_data(), dtype)

@@ -1,4 +1,4 @@
-"""An Intel RealSense camera, by pyrealsense2 (2.5x): https://github.com/realsenseai/librealsense (Apache-2.0)."""
+"""Intel RealSense cameras, read with pyrealsense2 (2.5x): https://github.com/realsenseai/librealsense (Apache-2.0)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from framework.errors import import_optional
 
 @dataclass
 class RealSense(DepthCamera):
-    """A RealSense camera."""
+    """An Intel RealSense camera."""
 
     brand = "RealSense"
 

@@ -1,6 +1,6 @@
-"""Conventions of stored poses and depth that override those of the format: axes, units, delays.
+"""Conventions of stored poses and depth that override the defaults of the format: axes, units, delays.
 
-`instancemap check` detects them.
+`instancemap check` detects the conventions of a recording.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from framework.config.validation import require
 from framework.data import Float64
 from framework.geometry import inverse
 
-COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # units per meter of stored depth; most sensors have 1000
+COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # depth units per meter; most sensors have 1000
 LONGEST_DELAY = 1000  # frames
 
 
@@ -27,7 +27,7 @@ class PoseKind(Enum):
 
 
 class CameraAxes(Enum):
-    """Axes of the camera in stored poses."""
+    """Camera axes of stored poses."""
 
     OPENCV = "x right, y down, z forward"
     OPENGL = "x right, y up, z backward"
@@ -35,7 +35,7 @@ class CameraAxes(Enum):
 
     @property
     def R_axes_camera(self) -> Float64:
-        """Rotation (3, 3) from OpenCV's axes to these."""
+        """Rotation (3, 3) from OpenCV's axes to these axes."""
         return _AXES[self.name]
 
 
@@ -47,7 +47,7 @@ _AXES = {
 
 
 class QuaternionOrder(Enum):
-    """Order of the numbers of a quaternion; the format defines x y z w."""
+    """Order of the components of a quaternion. The default of the formats is x y z w."""
 
     XYZW = "x y z w"
     WXYZ = "w x y z"
@@ -70,7 +70,7 @@ class PoseReading:
         )
 
     def pose(self, stored: Float64) -> Float64:
-        """Return T_world_camera (4, 4) of a stored rigid transform (4, 4)."""
+        """Convert a stored rigid transform (4, 4) to T_world_camera (4, 4)."""
         if self == PoseReading():
             return stored
         T = stored.copy()

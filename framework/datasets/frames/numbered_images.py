@@ -12,10 +12,10 @@ from framework.errors import DataError, FrameError
 
 
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """Return the folder's images by the number at the end of their names, in ascending order.
+    """Return the images of a folder by the number at the end of their names, in ascending order.
 
-    Raises DataError if the folder has no images, a name has no number, two names have the same number, or the names
-    differ in other digits too, such as the decimals of a timestamp.
+    Raises DataError for a folder without images, a name without a number, or two names with the same number. Names
+    that differ in other digits, such as the decimals of a timestamp, also raise DataError.
     """
     if not folder.is_dir():
         raise DataError(f"{folder}: expected a folder, got none")
@@ -36,7 +36,7 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
 
 
 def paired_images(colors: dict[int, Path], depths: dict[int, Path]) -> dict[int, StoredImages]:
-    """Return the images of each frame by its number. Reading a missing one raises FrameError."""
+    """Return the images of each frame by frame number. Reading a missing image raises FrameError."""
     numbers = sorted(colors.keys() | depths.keys())
     return {
         k: StoredImages.of_files(*(files.get(k) or _missing(files, k) for files in (colors, depths))) for k in numbers
@@ -44,14 +44,14 @@ def paired_images(colors: dict[int, Path], depths: dict[int, Path]) -> dict[int,
 
 
 def _missing(files: dict[int, Path], number: int) -> Path:
-    """Return the path of a missing image, named like the others."""
+    """Return the expected path of a missing image."""
     first = next(iter(files.values()))
     before = _before_number(first)
     return first.with_stem(before + str(number).zfill(len(first.stem) - len(before)))
 
 
 def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[int, int]:
-    """Return (width, height) in px of the first readable image. Raises DataError without one."""
+    """Return the width and height in px of the first readable image. Raises DataError if no image is readable."""
     errors = []
     for path in paths:
         try:
@@ -64,13 +64,13 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[in
 
 
 def number_of(path: Path) -> int | None:
-    """Return the number at the end of an image's name, or None without one."""
+    """Return the number at the end of an image's name, or None if it has no number."""
     digits = path.stem[len(_before_number(path)) :]
     return int(digits) if digits else None
 
 
 def check_one_number(files: Sequence[Path]) -> None:
-    """Raise DataError if image names differ in more than the number at their end."""
+    """Raise DataError if image names differ in digits other than their last number."""
     for path in files:
         before, of_first = _before_number(path), _before_number(files[0])
         if before != of_first and re.search("[0-9]", before + of_first):

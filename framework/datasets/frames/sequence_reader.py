@@ -1,4 +1,4 @@
-"""Base class of recording readers: a subclass lists the stored frames, and `Recording` selects and reads them."""
+"""Base class of recording readers. A subclass lists the stored frames; `Recording` selects and reads them."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from framework.files.image_files import read_color, read_uint16
 from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
 
-FARTHEST = 1e4  # m, maximum distance of a pose from the origin; beyond, float32 has a resolution of 1 mm
-FRAME_RATE = 30.0  # Hz, of recordings without usable timestamps
+FARTHEST = 1e4  # m, maximum distance of a pose from the origin; at this distance, float32 resolves 1 mm
+FRAME_RATE = 30.0  # Hz, for recordings without valid timestamps
 
 TO_THE_END = -1  # value of `stop`
 _STREAM = zlib.crc32(b"share")  # separates this random stream from others with the same seed
@@ -47,32 +47,32 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StoredImages:
-    """The two images of a frame, registered to each other, not read yet. Reading may raise FrameError."""
+    """The two images of a frame, registered to each other and read on demand. Reading may raise FrameError."""
 
-    color_name: Path | str  # the file, and the position in it, for messages
+    color_name: Path | str  # file, and position in the file, for messages
     depth_name: Path | str
     color: Callable[[], UInt8]  # (H, W, 3) RGB
-    depth: Callable[[], UInt16]  # (H, W) in units of the recording; 0 or 65535 = no reading
+    depth: Callable[[], UInt16]  # (H, W) in depth units of the recording; 0 or 65535 = no reading
 
     @classmethod
     def of_files(cls, color: Path, depth: Path) -> StoredImages:
-        """Return the images of two JPEG or PNG files."""
+        """Return the images in two JPEG or PNG files."""
         return cls(color, depth, partial(read_color, color), partial(read_uint16, depth))
 
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """One frame of a recording, images not read yet."""
+    """One frame of a recording, with images read on demand."""
 
     images: StoredImages
     timestamp: float  # s
-    T_world_camera: Float64 | None = None  # (4, 4), None = not known
-    error: str = ""  # reason why the frame cannot be used; "" = usable
-    up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = not known
+    T_world_camera: Float64 | None = None  # (4, 4), None = unknown
+    error: str = ""  # reason of an unusable frame; "" = usable
+    up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = unknown
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
-        """Return the frame with the result of `pose`, or with the message of its DataError."""
+        """Return the frame with the result of `pose`, or with the error message if `pose` raises DataError."""
         try:
             return cls(images, timestamp, pose())
         except DataError as error:
@@ -81,10 +81,10 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class Contents:
-    """The full contents of a recording, before frame selection."""
+    """Contents of a recording before the frame selection."""
 
     camera: Camera
-    camera_source: Path | str  # its file or parameter, for messages
+    camera_source: Path | str  # file or parameter of the camera, for messages
     depth_scale: float  # units per meter
     frames: Sequence[RecordedFrame]
     distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
@@ -94,11 +94,11 @@ class Contents:
 class Recording(RGBDSequence):
     """An RGB-D video on disk. A subclass lists the stored frames (`open`) and provides the recording's ground truth.
 
-    `ground_truth` replaces the recording's own ground truth. It is the whole mesh, whatever frames are selected; the
-    instances in a frame are rendered from it.
+    `ground_truth` replaces the recording's own ground truth. It is the whole mesh, independent of the frame selection.
+    The instances in a frame are rendered from this mesh.
 
-    Errors of the whole recording raise DataError when it is opened. Errors of one frame raise FrameError when it is
-    read, so that the pipeline counts and skips it.
+    Errors of the whole recording raise DataError when the recording is opened. Errors of one frame raise FrameError
+    when the frame is read. The pipeline counts and skips such frames.
     """
 
     root: Path  # folder of the recording or of the scenes, relative to the working or project folder
@@ -140,25 +140,31 @@ class Recording(RGBDSequence):
 
     @abstractmethod
     def open(self) -> Contents:
-        """Return the contents of `self.folder`. Raises DataError, with the file, for another format."""
+        """Return the contents of `self.folder`. Raises DataError that names the file if the format is invalid."""
 
     def truth_in(self, index: int) -> FrameTruth | None:
-        """Return the recording's own true instances in stored frame `index`, or None if they are not known."""
+        """Return the recording's own ground-truth instances in stored frame `index`, or None if they are unknown."""
         return None
 
     def own_scene_truth(self) -> SceneTruth | None:
-        """Return the recording's own true instances, in the world of its poses, or None without annotation."""
+        """Return the recording's own ground-truth instances in the world frame of its poses.
+
+        None = no annotation.
+        """
         return None
 
     def scene_truth(self) -> SceneTruth | None:
-        """Return the true instances, with the poses that show their world; None without annotation or poses."""
+        """Return the ground-truth instances with a trajectory in their world frame.
+
+        None = no annotation or no poses.
+        """
         named = self.named_truth
         truth = self.own_scene_truth() if named is None else named.mesh.scene_truth()
         if truth is None:
             return None
         trajectory = self._given_trajectory() if named is None or named.trajectory is None else named.trajectory
         if not len(trajectory.timestamps):
-            log.warning("%s: instances not evaluated: no given pose in the world of the ground truth", self.name)
+            log.warning("%s: instances not evaluated: no given pose in the world frame of the ground truth", self.name)
             return None
         return replace(truth, trajectory=trajectory)
 
@@ -187,7 +193,7 @@ class Recording(RGBDSequence):
         )
 
     def metric_depth(self, index: int) -> Float32:
-        """Return depth (H, W) in m, 0 = no reading. Raises FrameError."""
+        """Return the depth (H, W) of stored frame `index` in m, 0 = no reading. Raises FrameError."""
         images = self.contents.frames[index].images
         return self.calibration.depth(images.depth(), images.depth_name)
 
@@ -197,7 +203,7 @@ class Recording(RGBDSequence):
         recorded = self.contents.frames[index]
         T_world_camera = self.named_truth.pose(recorded.timestamp, recorded.T_world_camera)
         if T_world_camera is None:
-            return unseen(self.camera, f"frame {index}: expected a pose to render its true instances from, got none")
+            return unseen(self.camera, f"frame {index}: expected a pose to render ground-truth instances, got none")
         return self.named_truth.mesh.seen_by(self.camera, T_world_camera)
 
     def _given_trajectory(self) -> ReferenceTrajectory:
@@ -206,18 +212,18 @@ class Recording(RGBDSequence):
         return ReferenceTrajectory(times, np.array([one.T_world_camera for one in posed]).reshape(-1, 4, 4), given=True)
 
     def _check_truth_poses(self, named: NamedTruth) -> None:
-        """Raise ConfigError if no selected frame has a pose in the world of the named ground truth."""
+        """Raise ConfigError if no selected frame has a pose in the world frame of the named ground truth."""
         frames = [self.contents.frames[index] for index in self.chosen]
         if any(named.pose(one.timestamp, one.T_world_camera) is not None for one in frames):
             return
         if named.trajectory is None:
-            expected = "expected given poses in the world of the mesh, got a recording without poses"
+            expected = "expected given poses in the world frame of the mesh, got a recording without poses"
             raise ConfigError(f"{KEY}: {expected}; add poses, or set {KEY} to a run directory of this recording")
-        expected = "expected a run of this recording, got one without a pose at the time of any selected frame"
+        expected = "expected a run of this recording, got a run without a pose at the time of any selected frame"
         raise ConfigError(f"{KEY}: {expected}; set another run, or select other frames")
 
     def _check_first_image(self) -> None:
-        """Raise FrameError for a first image of the wrong size instead of skipping all frames one by one."""
+        """Raise FrameError if the first images have the wrong size, instead of skipping every frame."""
         images = self.contents.frames[self.chosen[0]].images
         for name, read in ((images.color_name, images.color), (images.depth_name, images.depth)):
             try:
@@ -228,7 +234,7 @@ class Recording(RGBDSequence):
 
 
 def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
-    """Give each frame the pose of the frame `delay` later, or an error without such a frame."""
+    """Return the frames with the pose of the frame `delay` later, or with an error if there is no such frame."""
     moved = []
     for frame, other in _with_later(frames, delay):
         error = frame.error or (other.error if other else f"expected a pose at an offset of {delay} frames, got none")
@@ -237,7 +243,7 @@ def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[Recorde
 
 
 def delay_depth(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
-    """Give each frame the depth image of the frame `delay` later, or an error without such a frame."""
+    """Return the frames with the depth image of the frame `delay` later, or with an error if there is no such frame."""
     moved = []
     for frame, other in _with_later(frames, delay):
         if other:
@@ -255,7 +261,7 @@ def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[R
 
 
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
-    """Return the frame with its pose converted, or with an error if the pose is too far from the origin."""
+    """Return the frame with its pose in the default convention, or with an error if it is too far from the origin."""
     if recorded.T_world_camera is None:
         return recorded
     T_world_camera = reading.pose(recorded.T_world_camera)
@@ -268,16 +274,16 @@ def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
 
 
 def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
-    """Return the frames, with timestamps at FRAME_RATE if those of the usable ones do not increase."""
+    """Return the frames, with timestamps at FRAME_RATE if the timestamps of usable frames do not increase."""
     times = [recorded.timestamp for recorded in frames if not recorded.error]
     if all(a < b for a, b in pairwise(times)):
         return frames
-    log.warning("%s: expected increasing timestamps; timestamps replaced by a rate of %g Hz", name, FRAME_RATE)
+    log.warning("%s: expected increasing timestamps; using a frame rate of %g Hz", name, FRAME_RATE)
     return [replace(recorded, timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
 
 
 def check_selection(start: int, stop: int, stride: int, frame_fraction: float = 1.0) -> None:
-    """Raise ConfigError unless the parameters can select frames."""
+    """Raise ConfigError if the parameters are invalid."""
     require(start >= 0, "dataset.start", start, "at least 0")
     above = f"above dataset.start ({start}), or {TO_THE_END} for the end"
     require(stop == TO_THE_END or stop > start, "dataset.stop", stop, above)
@@ -288,9 +294,23 @@ def check_selection(start: int, stop: int, stride: int, frame_fraction: float = 
 def choose_frames(
     count: int, start: int, stop: int, stride: int, frame_fraction: float = 1.0, seed: int = 0
 ) -> Sequence[int]:
-    """Return the selected frames of `count`, ascending: a slice, and a random fraction of it.
+    """Return the indices of the selected frames in ascending order.
 
-    The same `seed` selects the same frames, at least one. Raises ConfigError if no frame is left.
+    The same `seed` always selects the same frames. At least one frame is selected.
+
+    Args:
+        count: Number of frames in the recording.
+        start: Index of the first frame.
+        stop: Index after the last frame; TO_THE_END = to the end.
+        stride: Step between frames; 1 = every frame.
+        frame_fraction: Fraction of these frames, selected at random, in (0, 1].
+        seed: Seed of the random selection.
+
+    Returns:
+        Frame indices from 0.
+
+    Raises:
+        ConfigError: A parameter is invalid, or `start` is beyond the last frame.
     """
     check_selection(start, stop, stride, frame_fraction)
     if start >= count:

@@ -1,4 +1,4 @@
-"""Meshes with per-vertex instance labels, as published by datasets of scanned rooms."""
+"""Meshes with vertex instance labels, as published by datasets of scanned rooms."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from framework.rendering.rasterizer import Rasterizer
 
 @dataclass(frozen=True)
 class LabeledMesh:
-    """The true surface of a scene with its instances."""
+    """The ground-truth surface of a scene with its instances."""
 
     vertices: Float32  # (V, 3) m, world
     triangles: Int32  # (F, 3)
@@ -26,11 +26,11 @@ class LabeledMesh:
     classes: tuple[str, ...] | None = None  # as in SceneTruth
 
     def scene_truth(self) -> SceneTruth:
-        """Return all vertices as points, whatever frames of the video are selected."""
+        """Return all vertices as points, independent of the frame selection."""
         return SceneTruth(self.vertices, self.instance_ids, dict(self.class_names), self.classes)
 
     def seen_by(self, camera: Camera, T_world_camera: Float64) -> FrameTruth:
-        """Return the instances of the vertices nearest to each pixel's surface point, rendered on demand."""
+        """Return the instance of the vertex nearest to each pixel's surface point, rendered on demand."""
         return DeferredTruth(
             render=lambda: self._rasterizer.draw(camera, T_world_camera).nearest(self.triangles, self.instance_ids),
             shape=camera.shape,
@@ -54,7 +54,7 @@ class LabeledMesh:
 
 
 def unseen(camera: Camera, why: str) -> FrameTruth:
-    """Return instances that raise NoPoseError with the reason on access, for a frame that cannot be rendered."""
+    """Return the ground truth of a frame that cannot be rendered: access raises NoPoseError with the reason."""
 
     def render() -> Int32:
         raise NoPoseError(why)

@@ -1,4 +1,4 @@
-"""Recordings with their own labeled mesh."""
+"""Recordings with a labeled mesh."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class LabeledRecording(Recording):
-    """A recording with an optional labeled mesh, loaded by the subclass in `open`.
+    """A recording with an optional labeled mesh.
 
-    The ground truth is the whole mesh, whatever frames are selected.
+    The subclass loads the mesh in `open`. The ground truth is the whole mesh, independent of the frame selection.
     """
 
-    frame_ground_truth: bool = False  # true instances per frame, rendered from the mesh for simulated detectors
+    frame_ground_truth: bool = False  # ground truth per frame for simulated detectors, rendered from the mesh
 
     def __post_init__(self) -> None:
         self.mesh: LabeledMesh | None = None
         super().__post_init__()
 
     def load_mesh(self, files: Sequence[Path], read: Callable[..., LabeledMesh]) -> None:
-        """Load the mesh from its files, if all of them exist and `ground_truth` is not set.
+        """Load the mesh with `read` if all of its files exist and `ground_truth` is not set.
 
-        Raises DataError if one is missing and `frame_ground_truth` needs it.
+        Raises DataError if a file is missing and `frame_ground_truth` requires the mesh.
         """
         if self.named_truth is not None:
             return
@@ -42,7 +42,7 @@ class LabeledRecording(Recording):
         elif self.frame_ground_truth:
             raise DataError(f"dataset.frame_ground_truth: expected a labeled mesh, got no {missing[0]}")
         elif len(missing) < len(files):
-            log.warning("%s: expected for the true instances, got no such file; instances not evaluated", missing[0])
+            log.warning("%s: expected a file of ground-truth instances, got none; instances not evaluated", missing[0])
 
     def truth_in(self, index: int) -> FrameTruth | None:
         T_world_camera = self.contents.frames[index].T_world_camera

@@ -1,12 +1,13 @@
-"""Ground truth set by `dataset.ground_truth`: a labeled mesh, or the map of a run.
+"""Ground truth set by `dataset.ground_truth`: a labeled mesh or the map of a run.
 
     DIR/mesh.ply            a PLY file of any name: vertex x y z [m], integer property `instance`, 0 = none; faces
-    DIR/instances.json      next to it, or in the folder above: {"<id>": {"name", "class"}}, class = a COCO name, or
+    DIR/instances.json      next to it or in the parent folder: {"<id>": {"name", "class"}}; class = a COCO name, or
                             null = unknown
 
     RUN/                    a run directory: mesh.ply, instances.json (a list) and trajectory.txt
 
-An annotated mesh is in the world of the recording's given poses. The map of a run is in the world of its trajectory.
+A labeled mesh is in the world frame of the recording's given poses. The map of a run is in the world frame of its
+trajectory.
 """
 
 from __future__ import annotations
@@ -32,23 +33,23 @@ from framework.vocabulary.label_spaces import COCO
 
 KEY = "dataset.ground_truth"
 MESH, INSTANCES, TRAJECTORY, METRICS = "mesh.ply", "instances.json", "trajectory.txt", "metrics.json"  # of a run
-LABELS = "instance"  # the property of a vertex
+LABELS = "instance"  # the vertex property
 LARGEST_ID = np.iinfo(np.int32).max
-MOST_DIGITS = 10  # of an id, with leading zeros
+MOST_DIGITS = 10  # of an id, including leading zeros
 
 
 @dataclass(frozen=True)
 class NamedTruth:
-    """A labeled mesh, with the trajectory of its run."""
+    """A labeled mesh and the trajectory of its run."""
 
     mesh: LabeledMesh
     name: str  # for tables: the file and its folder
-    trajectory: ReferenceTrajectory | None  # None = the mesh is in the world of the recording's given poses
+    trajectory: ReferenceTrajectory | None  # None = the mesh is in the world frame of the given poses
 
     def pose(self, timestamp: float, given: Float64 | None) -> Float64 | None:
-        """Return T_world_camera (4, 4) in the world of the mesh for a frame with this timestamp and given pose.
+        """Return T_world_camera (4, 4) of a frame in the world frame of the mesh, or None if it is unknown.
 
-        None = not known.
+        The frame has this timestamp (s) and given pose (4, 4).
         """
         if self.trajectory is None:
             return given
@@ -57,9 +58,9 @@ class NamedTruth:
 
 
 def read_named_truth(path: Path) -> NamedTruth:
-    """Return the ground truth at a path, a run directory or a labeled mesh.
+    """Return the ground truth in a run directory or a labeled mesh.
 
-    Raises ConfigError for a path that does not exist, and DataError, with the file, for an invalid one.
+    Raises ConfigError if the path does not exist. Raises DataError that names the file if it is invalid.
     """
     files = truth_files(path)
     mesh, names = files[0], files[1]
@@ -78,9 +79,9 @@ def read_named_truth(path: Path) -> NamedTruth:
 
 
 def truth_files(path: Path) -> list[Path]:
-    """Return the mesh at a path, its instances.json and, for a run, its trajectory.
+    """Return the files at a path: the mesh, its instances.json and, for a run, its trajectory.
 
-    Raises ConfigError or DataError, naming the file, if one is missing.
+    Raises ConfigError or DataError that names a missing file.
     """
     found = next((place for place in candidates(path) if place.exists()), None)
     if found is None:
@@ -97,7 +98,7 @@ def truth_files(path: Path) -> list[Path]:
 
 
 def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
-    """Return the class of each instance of an annotation, None = unknown. Raises DataError, with the file."""
+    """Return the class of each annotated instance, None = unknown. Raises DataError that names the file."""
     content = read_json(path)
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected a JSON object, got {type(content).__name__}")
@@ -124,7 +125,7 @@ def _class_of(where: str, entry: Any) -> str | None:
 
 
 def _labels_of(path: Path, ply: PlyMesh) -> Int32:
-    """Return the instance (V,) of each vertex of a mesh with triangles."""
+    """Return the instance ids (V,) of the vertices of a mesh with triangles."""
     labels = ply.properties.get(LABELS)
     if labels is None or labels.dtype.kind not in "iu":
         found = f"got {', '.join(sorted(ply.properties)) or 'none'}"
@@ -143,7 +144,7 @@ def _labeled(path: Path, ply: PlyMesh, ids: Int32, class_names: Mapping[int, str
 
 
 def _classes_of_run(path: Path, entries: Sequence[Any]) -> dict[int, str | None]:
-    """Return the class of each instance of a run, None in a map without classes."""
+    """Return the class of each instance of a run; None = the map has no classes."""
     class_names: dict[int, str | None] = {}
     for number, entry in enumerate(entries, start=1):
         key, name = (entry.get("id"), entry.get("class", ...)) if isinstance(entry, dict) else (None, None)

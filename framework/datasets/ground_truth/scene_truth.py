@@ -1,4 +1,4 @@
-"""Fusion of exact depth, instance images and true poses into the ground-truth surface."""
+"""Fusion of exact depth, instance images and ground-truth poses into the ground-truth surface."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from framework.data import Camera, Float32, Float64, Int32, SceneTruth
 from framework.datasets.ground_truth.scene_truth_kernels import KEY_OFFSET, Slots, move_slots, vote
 from framework.errors import DataError
 
-INITIAL_CAPACITY = 1 << 16  # slots; a power of two, doubled before more than half are occupied
+INITIAL_CAPACITY = 1 << 16  # slots; a power of two, doubled before more than half of the slots are occupied
 
 
 @dataclass(frozen=True)
 class LabeledDepth:
-    """One view of the ground truth."""
+    """Ground truth of one view."""
 
     depth: Float32  # (H, W) m along z, 0 = no reading
     instance_ids: Int32  # (H, W), 0 = no instance
@@ -26,18 +26,18 @@ class LabeledDepth:
 
 
 def check_truth_voxel(size: float) -> None:
-    """Raise ConfigError for an implausible spacing of true points."""
+    """Raise ConfigError for an implausible spacing of ground-truth points."""
     require(1e-3 <= size <= 1, "dataset.ground_truth_spacing", size, "a value in [0.001, 1] m")
 
 
 def fuse_scene_truth(
     views: Iterable[LabeledDepth], class_names: Mapping[int, str | None], ground_truth_spacing: float = 0.02
 ) -> SceneTruth:
-    """Return one labeled point for each voxel of `ground_truth_spacing` meters that contains a view's pixels.
+    """Return one labeled point for each occupied voxel of `ground_truth_spacing` meters.
 
-    Every pixel with depth votes for (its voxel, its instance id). A voxel gets the id with most votes, the smaller of
-    two equal ones, and the mean of the points that voted for it. Points are in the order in which their voxels were
-    first seen. Memory depends on the surface, not on the number of views.
+    Every pixel with depth votes for its instance id in its voxel. A voxel gets the id with the most votes; ties go to
+    the smaller id. Its point is the mean of the points that voted for this id. Points are in the order of first
+    observation. Memory depends on the surface, not on the number of views.
     """
     slots, taken = Slots.empty(INITIAL_CAPACITY), 0
     for view in views:
@@ -57,13 +57,13 @@ def fuse_scene_truth(
         )
         if taken < 0:
             farthest = KEY_OFFSET * ground_truth_spacing
-            raise DataError(f"ground truth: expected points within {farthest:.0f} m of the origin, got one beyond")
+            raise DataError(f"ground truth: expected points within {farthest:.0f} m of the origin, got a point beyond")
     points, ids = _elect(slots)
     return SceneTruth(points_world=points, instance_ids=ids, class_names=dict(class_names))
 
 
 def _elect(slots: Slots) -> tuple[Float32, Int32]:
-    """Return each voxel's mean point (V, 3) and majority id (V,), in the order of first observation."""
+    """Return the mean point (V, 3) and the majority id (V,) of each voxel, in the order of first observation."""
     keys, ids, votes, sums, first = slots
     taken = np.flatnonzero(votes)
     best_first = taken[np.lexsort((ids[taken], -votes[taken], keys[taken]))]

@@ -9,18 +9,18 @@ from numba import njit
 
 from framework.data import Float32, Float64, Int32, Int64
 
-KEY_BITS = 21  # of a voxel coordinate in a packed key: 2^20 voxels of 2 cm to each side are 20 km
+KEY_BITS = 21  # per voxel coordinate in a packed key: 2^20 voxels of 2 cm in each direction are 20 km
 KEY_OFFSET = 1 << (KEY_BITS - 1)
 
 
 class Slots(NamedTuple):
-    """A hash table with linear probing, (S,) each. A slot without votes is empty."""
+    """A hash table with linear probing, as arrays (S,). A slot without votes is empty."""
 
     keys: Int64  # packed voxel
     ids: Int32
     votes: Int64
     sums: Float64  # (S, 3) of the points' coordinates, m
-    first: Int64  # order of first sight
+    first: Int64  # order of first observation
 
     @classmethod
     def empty(cls, capacity: int) -> Slots:
@@ -30,7 +30,7 @@ class Slots(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
-    """Return the slot that holds (key, instance), or the empty one where it belongs."""
+    """Return the slot of (key, instance), or the empty slot for its insertion."""
     keys, ids, votes, _, _ = slots
     mask = len(keys) - 1
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(instance) * np.uint64(0xC2B2AE3D27D4EB4F)
@@ -46,7 +46,7 @@ def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
 def vote(
     depth: Float32, instance_ids: Int32, intrinsics: Float64, T: Float64, scale: float, slots: Slots, taken: int
 ) -> int:
-    """Add the pixels of a view; return the number of occupied slots, or -1 if a point is too far away."""
+    """Add the pixels of a view and return the number of occupied slots, or -1 if a point is too far away."""
     keys, ids, votes, sums, first = slots
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     height, width = depth.shape
@@ -81,7 +81,7 @@ def vote(
 
 @njit(cache=True, nogil=True)
 def move_slots(slots: Slots, to: Slots) -> None:
-    """Move all entries into a larger table."""
+    """Copy all entries into a larger table."""
     for s in range(len(slots.keys)):
         if slots.votes[s] > 0:
             slot = _slot(to, slots.keys[s], slots.ids[s])

@@ -1,1 +1,1 @@
-"""ScanNet's files."""
+"""ScanNet file formats."""

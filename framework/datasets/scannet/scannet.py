@@ -1,14 +1,14 @@
 """ScanNet (Dai et al., CVPR 2017): rooms scanned with an iPad and an attached depth sensor, with labeled meshes.
 
-    scene0000_00/scene0000_00.sens      the video in one file (`sens_file.py`), or as ScanNet's SensReader exports it:
+    scene0000_00/scene0000_00.sens      the video in one file (`sens_file.py`), or the export of ScanNet's SensReader:
     scene0000_00/color/0.jpg            8-bit color, from 0
     scene0000_00/depth/0.png            uint16, mm along z
     scene0000_00/pose/0.txt             T_world_camera, four lines of four numbers, m
     scene0000_00/intrinsic/             intrinsic_color.txt, intrinsic_depth.txt and, optional, extrinsic_*.txt: 4x4
     scene0000_00/scene0000_00_vh_clean_2.ply, _vh_clean_2.0.010000.segs.json, .aggregation.json
-                                        optional: the mesh, its segments, and the objects made of segments
+                                        optional: mesh, segments, and objects as sets of segments
     scannetv2-labels.combined.tsv       optional, in the folder of the scenes or its parent: the class of each
-                                        annotated name; without it, fewer objects are evaluated
+                                        annotated name; without this file, fewer objects are evaluated
     scannet-labels.combined.tsv         optional, in the same folders: for annotations of the first release
 
 Frames are in the depth camera (640x480); color (1296x968) is registered to it.
@@ -44,19 +44,19 @@ from framework.geometry import inverse, rotation_angle
 MESH_FILES = ("_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")  # after the scene's name
 DEPTH_SCALE = 1000.0  # units per meter, of exported depth
 MICROSECONDS = 1e6  # per second
-COLOR_SIZE = (1296, 968)  # px; exported color may be smaller, but its intrinsics are those of this size
-NEAR = 2.0  # m, the depth of the logged parallax
-LARGEST_SHIFT = 0.5  # px of the depth camera: maximum shift of color without a warning
+COLOR_SIZE = (1296, 968)  # px, for the exported intrinsics; exported color images may be smaller
+NEAR = 2.0  # m, depth for the logged parallax
+LARGEST_SHIFT = 0.5  # px of the depth camera, maximum shift of color without a warning
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class ScanNet(LabeledRecording):
-    """A scan of ScanNet v2, from its `.sens` file if there is one, otherwise from exported images.
+    """A scan of ScanNet v2, read from its `.sens` file if it exists, otherwise from exported images.
 
-    Extrinsics between the two cameras are not applied: the published ones are identities, because color is already
-    registered to depth. Other extrinsics are logged with the resulting shift in px.
+    Extrinsics between the two cameras are not applied. The published extrinsics are identities, because color is
+    already registered to depth. Other extrinsics are logged with the resulting shift in px.
     """
 
     def open(self) -> Contents:
@@ -65,14 +65,14 @@ class ScanNet(LabeledRecording):
         self._label_tables = [table for table in tables if is_there(table)]
         self.load_mesh([self.folder / f"{self.name}{end}" for end in MESH_FILES], self._read_mesh)
         if self.mesh and not self._label_tables:
-            message = "%s: expected the class of each annotated name, got no such file; fewer objects are evaluated"
+            message = "%s: expected a label table with the class of each name, got none; fewer objects are evaluated"
             log.warning(message, tables[-1])
         self.annotation = f"ScanNet v2{'' if self._label_tables else ', no label table'}" if self.mesh else ""
         sens, exported = sorted(self.folder.glob("*.sens")), self.folder / "color"
         if len(sens) > 1:
             raise DataError(f"{self.folder}: expected one .sens file, got {len(sens)}: {sens[0].name} and others")
         if sens and exported.is_dir():
-            log.info("%s: preferred to the images exported to %s: it contains timestamps", sens[0], exported.parent)
+            log.info("%s: preferred to the images exported to %s, because of its timestamps", sens[0], exported.parent)
         if sens:
             return _sens_contents(sens[0])
         if exported.is_dir():
@@ -82,7 +82,7 @@ class ScanNet(LabeledRecording):
 
     def _read_mesh(self, mesh: Path, segments: Path, objects: Path) -> LabeledMesh:
         nyu40: dict[str, str] = {}
-        for table in self._label_tables:  # the second release, and the nearer of two tables, take precedence
+        for table in self._label_tables:  # the second release and the nearer folder take precedence
             nyu40 |= read_label_table(table)
         return read_labeled_mesh(mesh, segments, objects, nyu40)
 
@@ -141,7 +141,7 @@ def _camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _color_camera(path: Path, width: int, height: int) -> Camera:
-    """Return the camera of exported color images; SensReader may resize them without changing the intrinsics."""
+    """Return the camera of exported color images. SensReader may resize images without changing the intrinsics."""
     matrix = read_matrix(path)
     if _fits(matrix.camera(width, height)) or not _fits(camera := matrix.camera(*COLOR_SIZE)):
         return _camera(path, width, height)
@@ -157,7 +157,7 @@ def _fits(camera: Camera) -> bool:
 
 
 def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, camera: Camera) -> None:
-    """Log the shift of color caused by different extrinsics of the two cameras."""
+    """Log the shift of color due to different extrinsics of the two cameras."""
     try:
         T_color_depth = inverse(color.pose()) @ depth.pose()
     except DataError:

@@ -1,4 +1,4 @@
-"""ScanNet's instances: the segments of a mesh, the objects made of segments, and the classes of object names."""
+"""ScanNet's instances: segments of a mesh, objects as sets of segments, and classes of object names."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from framework.files.number_lines import SHOWN
 from framework.files.ply import read_ply
 from framework.vocabulary.label_spaces import MEANINGS
 
-LARGEST_FILE = 2**24  # bytes; the largest room's segments take 5 MB, and JSON takes up to 30 times as much memory
-MOST_OBJECT_ID = np.iinfo(np.int32).max - 2  # one is added, and one more id is used for unlabeled vertices
+LARGEST_FILE = 2**24  # bytes; segments of the largest room take 5 MB; parsed JSON takes up to 30 times the memory
+MOST_OBJECT_ID = np.iinfo(np.int32).max - 2  # instance id = object id + 1; one more id is used for unlabeled vertices
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
-FIRST_LABEL_TABLE = "scannet-labels.combined.tsv"  # of the first release, 2017, which has other names
+FIRST_LABEL_TABLE = "scannet-labels.combined.tsv"  # of the first release (2017), with other names
 NAME_COLUMNS = ("raw_category", "category")  # annotated names; the first release has no raw_category
 CLASS_COLUMN = "nyu40class"
-UNNAMED = frozenset(  # names without a class: the object may be anything
+UNNAMED = frozenset(  # names without a class: the class of the object is unknown
     {"object", "objects", "unknown", "junk", "furniture", "decoration"}
     | {"otherprop", "otherfurniture", "otherstructure"}
 )
@@ -39,19 +39,20 @@ class SegGroup:
     """An annotated object."""
 
     object_id: int  # from 0
-    label: str  # as the annotator wrote it
-    segments: Int64  # (S,) of the mesh
+    label: str  # name as written by the annotator
+    segments: Int64  # (S,) ids of mesh segments
 
 
 def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[str, str]) -> LabeledMesh:
-    """Return the mesh with object k as instance k + 1; where objects overlap, the later wins.
+    """Return the mesh with object k as instance k + 1. If objects overlap, the later object has precedence.
 
-    Objects of a class of COCO have its name. Objects of other known classes (wall, cabinet, ...) are instance 0: a
-    detection of a COCO class there is wrong. Objects without a known class, and all unlabeled vertices as one more
-    instance, have the class None: detections there are not evaluated, as in ScanNet's own benchmark. `nyu40` is the
-    result of `read_label_table`, empty = no table. Names may differ in spaces and signs: trashcan, trash can.
+    Objects of a COCO class have its name. Objects of other known classes (wall, cabinet, ...) become instance 0:
+    detections of a COCO class there are false positives. Objects of unknown classes have the class None. All unlabeled
+    vertices form another instance of class None. Detections there are not evaluated, as in ScanNet's own benchmark.
 
-    Raises DataError, with the file, for invalid or inconsistent files, or names that are not in the table.
+    `nyu40` is the result of `read_label_table`; empty = no table. Names may differ in spaces and punctuation, such as
+    trashcan and trash can. Raises DataError that names the file for invalid or inconsistent files, or for names that
+    are not in the table.
     """
     ply = read_ply(mesh)
     segments = _whole_numbers(f"{segs}: segIndices", _read_list(segs, "segIndices"))
@@ -97,11 +98,11 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
 
 
 def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
-    """Return the objects of a scene, in the file's order. Raises DataError, with the file and the object."""
+    """Return the objects of a scene in file order. Raises DataError that names the file and the object."""
     groups = _read_list(path, "segGroups")
     found = tuple(_group(f"{path}: segGroups[{k}]", group) for k, group in enumerate(groups))
     labels: dict[int, str] = {}
-    for group in found:  # scene0217_00 has all of its objects twice
+    for group in found:  # scene0217_00 contains every object twice
         before = labels.setdefault(group.object_id, group.label)
         if before != group.label:
             expected = f"object {group.object_id}: expected one label"
@@ -110,9 +111,9 @@ def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
 
 
 def read_label_table(path: Path) -> Mapping[str, str]:
-    """Return the NYU40 class of each name in a label table of either release, "" = none.
+    """Return the NYU40 class of each name in a label table of either release; "" = no class.
 
-    Raises DataError, with the file and the line.
+    Raises DataError that names the file and the line.
     """
     header, *rows = read_text(path, LARGEST_FILE).rstrip("\r\n").split("\n")
     columns = header.rstrip("\r").split("\t")
@@ -131,13 +132,13 @@ def read_label_table(path: Path) -> Mapping[str, str]:
 
 
 def _spellings(nyu40: Mapping[str, str]) -> dict[str, str]:
-    """Return the known name for each known name and for its letters and digits alone."""
+    """Return the known name for each spelling: the name itself, and its letters and digits only."""
     names = {**nyu40, **MEANINGS, **dict.fromkeys(UNNAMED)}
     return {_letters(name): name for name in names} | {name: name for name in names}
 
 
 def _spelled(label: str, spellings: Mapping[str, str]) -> str:
-    """Return the known name for an annotated label, or the label if it is unknown."""
+    """Return the known name of an annotated label, or the label itself if it is unknown."""
     own = label.strip().lower()
     return spellings.get(own) or spellings.get(_letters(own), own)
 

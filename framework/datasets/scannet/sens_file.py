@@ -1,16 +1,16 @@
-"""ScanNet's `.sens` files, version 4: a header, then each frame with its pose, timestamps and compressed images.
+"""ScanNet's `.sens` files, version 4: a header, and frames with pose, timestamps and compressed images.
 
-    uint32 version, uint64 n, n bytes: the sensor's name
+    uint32 version, uint64 n, n bytes: sensor name
     float32[64]     four 4x4 matrices: color intrinsics, color extrinsics, depth intrinsics, depth extrinsics
-    int32[2]        compression of color (0 raw, 1 PNG, 2 JPEG) and depth (0 raw, 1 zlib, 2 Occipital's)
-    uint32[4]       width and height of color, of depth
+    int32[2]        compression of color (0 raw, 1 PNG, 2 JPEG) and depth (0 raw, 1 zlib, 2 Occipital)
+    uint32[4]       width and height of color, width and height of depth
     float32         depth units per meter
     uint64          number of frames
-    for each frame: float32[16] camera to world, uint64[2] times of color and depth (microseconds),
-                    uint64[2] sizes of color and depth (bytes), the two
-    (IMU readings at the end are not read)
+    for each frame: float32[16] camera to world, uint64[2] timestamps of color and depth (microseconds),
+                    uint64[2] sizes of color and depth (bytes), color image, depth image
+    (IMU measurements at the end are not read)
 
-All values are little-endian. Opening a file reads only the 96 bytes before each frame's images.
+All values are little-endian. `open_sens` reads only the header and the 96 bytes before each frame's images.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from framework.files.number_lines import PrintedMatrix
 
 VERSION = 4
 RAW, PNG, JPEG = 0, 1, 2  # compression of color
-ZLIB, OCCIPITAL = 1, 2  # compression of depth, or RAW
-LONGEST_NAME = 1024  # bytes, of the sensor: "StructureSensor" has 15
-MOST_FRAMES = 2**18  # two and a half hours at 30 Hz; ScanNet's longest has some 6,000
+ZLIB, OCCIPITAL = 1, 2  # compression of depth, in addition to RAW
+LONGEST_NAME = 1024  # bytes of the sensor name; "StructureSensor" has 15
+MOST_FRAMES = 2**18  # two and a half hours at 30 Hz; the longest ScanNet video has about 6,000 frames
 START = struct.Struct("<IQ")
 MATRIX_BYTES = 64
 IMAGES = struct.Struct("<iiIIIIfQ")
 FRAME = struct.Struct("<64s4Q")
-OVERHEAD = 2**16  # bytes by which a compressed image may be larger than twice the raw one
+OVERHEAD = 2**16  # bytes; a compressed image has at most twice the raw size plus this overhead
 
 
 @dataclass(frozen=True)
 class SensHeader:
-    """Properties of all frames."""
+    """Header of a .sens file: properties of all frames."""
 
     color_camera: Camera
     depth_camera: Camera
-    color_extrinsics: PrintedMatrix  # of undocumented direction: the identity in all published files
-    depth_extrinsics: PrintedMatrix  # of undocumented direction
+    color_extrinsics: PrintedMatrix  # direction undocumented; the identity in all published files
+    depth_extrinsics: PrintedMatrix  # direction undocumented
     color_compression: int  # RAW, PNG or JPEG
     depth_compression: int  # RAW or ZLIB
     depth_scale: float  # units per meter
@@ -60,21 +60,21 @@ class SensHeader:
 
 @dataclass(frozen=True)
 class SensFrame:
-    """One frame, images not read yet."""
+    """One frame, with images read on demand."""
 
     path: Path
     header: SensHeader
     number: int
-    byte: int  # start of its images: color, then depth
+    byte: int  # file position of the color image, which the depth image follows
     color_bytes: int
     depth_bytes: int
     color_time: int  # microseconds
     depth_time: int  # microseconds
-    camera_to_world: PrintedMatrix  # T_world_camera; -inf = not known
+    camera_to_world: PrintedMatrix  # T_world_camera; -inf = unknown
 
     @property
     def images(self) -> StoredImages:
-        """The two images, each in its own camera."""
+        """The two images, each in the camera of its sensor."""
         return StoredImages(self._color_name, self._depth_name, self.color, self.depth)
 
     @property
@@ -86,7 +86,7 @@ class SensFrame:
         return f"{self.path}, depth of frame {self.number} at byte {self.byte + self.color_bytes}"
 
     def color(self) -> UInt8:
-        """Return color (H, W, 3), RGB, in the color camera. Raises FrameError."""
+        """Return the color (H, W, 3), RGB, of the color camera. Raises FrameError."""
         data = self._read(self._color_name, self.byte, self.color_bytes)
         if self.header.color_compression != RAW:
             return decode_color(self._color_name, data)
@@ -95,7 +95,7 @@ class SensFrame:
         return np.frombuffer(data, np.uint8).reshape(shape)
 
     def depth(self) -> UInt16:
-        """Return depth (H, W) in the depth camera, 0 = no reading. Raises FrameError."""
+        """Return the depth (H, W) of the depth camera, 0 = no reading. Raises FrameError."""
         data = self._read(self._depth_name, self.byte + self.color_bytes, self.depth_bytes)
         shape = self.header.depth_camera.shape
         length = 2 * prod(shape)
@@ -106,7 +106,7 @@ class SensFrame:
 
     def _read(self, name: str, byte: int, length: int) -> bytes:
         try:
-            with self.path.open("rb") as file:  # not shared: frames are read in several threads
+            with self.path.open("rb") as file:  # opened for each image, because several threads read frames
                 file.seek(byte)
                 data = file.read(length)
         except OSError as error:
@@ -117,15 +117,15 @@ class SensFrame:
 
 @dataclass(frozen=True)
 class SensFile:
-    """Contents of a file."""
+    """Contents of a .sens file."""
 
     header: SensHeader
-    frames: tuple[SensFrame, ...]  # the complete frames before the first incomplete one
-    cut: str  # reason for fewer frames than header.frames; "" = all are complete
+    frames: tuple[SensFrame, ...]  # complete frames before the first incomplete frame
+    cut: str  # reason for fewer frames than header.frames; "" = all frames are complete
 
 
 def open_sens(path: Path) -> SensFile:
-    """Read the header and the positions of the frames. Raises DataError, with the byte, for an invalid header."""
+    """Read the header and the frame positions. Raises DataError that names the byte of an invalid header."""
     check_regular(path)
     try:
         with path.open("rb", buffering=0) as file:
@@ -188,7 +188,7 @@ def _matrix(where: str, data: bytes) -> PrintedMatrix:
 
 
 def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) -> tuple[list[SensFrame], str]:
-    """Return the complete frames and the reason for missing ones; "" = all frames are complete."""
+    """Return the complete frames, and the reason for missing frames; "" = all frames are complete."""
     most_color = 2 * 3 * prod(header.color_camera.shape) + OVERHEAD
     most_depth = 2 * 2 * prod(header.depth_camera.shape) + OVERHEAD
     frames: list[SensFrame] = []
@@ -220,9 +220,9 @@ def _inflate(name: str, data: bytes, length: int) -> bytes:
     except zlib.error as error:
         raise FrameError(f"{name}: cannot be decompressed: {error}") from error
     if len(unpacked) > length:
-        raise FrameError(f"{name}: expected {length} bytes, got more after decompression")
+        raise FrameError(f"{name}: expected {length} bytes after decompression, got at least {length + 1}")
     if not stream.eof:
-        raise FrameError(f"{name}: expected a complete zlib stream, got a truncated one")
+        raise FrameError(f"{name}: expected a complete zlib stream, got a truncated stream")
     return unpacked
 
 

@@ -1,6 +1,6 @@
-"""Frames of an OpenNI recording (.oni): color and depth, paired as in SceneNN's playback.
+"""Frames of an OpenNI recording (.oni): color and depth images, paired as in SceneNN's playback.
 
-Images are decoded by OpenNI 2's C library, which a damaged file can crash.
+OpenNI 2's C library decodes the images. A damaged file can crash the library.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from framework.data import UInt8, UInt16
 from framework.datasets.scenenn.oni_records import Images, OniContents, Stream, playable
 from framework.errors import ConfigError, DataError, InstanceMapError, errors_of
 
-LARGEST_TIME_DIFFERENCE = 33_000  # us between the two images of a frame, as in SceneNN's playback
+LARGEST_TIME_DIFFERENCE = 33_000  # us, between the two images of a frame, as in SceneNN's playback
 WAITING = 30  # maximum number of unpaired images of a stream (1 s), in case the other stream ends
 LIBRARIES = ("libOpenNI2.so.0", "libOpenNI2.so", "libOpenNI2.dylib", "OpenNI2.dll")
-LONGEST_PATH = 255  # bytes, of OpenNI 2
-PATIENCE = 10_000  # ms without an image before playback counts as stalled
+LONGEST_PATH = 255  # bytes, limit of OpenNI 2
+PATIENCE = 10_000  # ms, maximum time without an image; playback then counts as stalled
 
-# OniCAPI.h, OniCEnums.h and OniCProperties.h of OpenNI 2.2
+# constants from OniCAPI.h, OniCEnums.h and OniCProperties.h of OpenNI 2.2
 API_VERSION = 2002
 OK, TIME_OUT = 0, 102
 SENSORS = {Stream.DEPTH: 3, Stream.COLOR: 2}
 DEPTH_1_MM, DEPTH_100_UM, RGB888 = 100, 101, 200
 PLAYBACK_SPEED, PLAYBACK_REPEAT = 100, 101
-MANUAL = -1.0  # speed: images are delivered on request, so that none is lost
+MANUAL = -1.0  # playback speed: images are delivered on request, so that no image is lost
 
 
 class _VideoMode(ctypes.Structure):
@@ -61,12 +61,12 @@ class OniImage:
 
     stream: Stream
     time: int  # us
-    pixels: npt.NDArray[Any]  # (H, W) uint16 mm of depth, 0 = no reading; (H, W, 3) uint8 RGB of color
+    pixels: npt.NDArray[Any]  # depth (H, W) uint16 mm, 0 = no reading; color (H, W, 3) uint8 RGB
 
 
 @dataclass(frozen=True)
 class OniFrame:
-    """Color and depth of about the same time, registered or mirrored as recorded."""
+    """A color and a depth image of about the same time, registered or mirrored as recorded."""
 
     color: UInt8  # (H, W, 3) RGB
     depth_mm: UInt16  # (H, W) mm, 0 = no reading
@@ -75,10 +75,10 @@ class OniFrame:
 
 
 def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
-    """Yield the frames of a recording; a truncated recording is repaired in a copy in the folder `scratch`.
+    """Yield the frames of a recording.
 
-    Raises ConfigError without OpenNI 2, and DataError if OpenNI 2 cannot play the whole recording or color and depth
-    do not match.
+    A truncated recording is repaired in a copy in the folder `scratch`. Raises ConfigError if OpenNI 2 is not
+    installed. Raises DataError if OpenNI 2 cannot play the whole recording, or if color and depth do not match.
     """
     with (
         errors_of(contents.path),
@@ -89,10 +89,11 @@ def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
 
 
 def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
-    """Yield frames from images in the file's order; of two images too far apart, drop the earlier one.
+    """Yield frames from images in file order.
 
-    The published trajectories use the frame numbers of SceneNN's playback, which does the same. Raises DataError if
-    color and depth have different sizes.
+    If the first color and depth images are too far apart in time, the earlier image is dropped. The published
+    trajectories use the frame numbers of SceneNN's playback, which drops the same images. Raises DataError if color
+    and depth have different sizes.
     """
     waiting = {stream: deque[OniImage](maxlen=WAITING) for stream in Stream}
     colors, depths = waiting[Stream.COLOR], waiting[Stream.DEPTH]
@@ -112,7 +113,7 @@ def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
 
 
 def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Run `play` in its own process, because OpenNI 2 crashes on some damaged recordings."""
+    """Run `play` in a separate process, because OpenNI 2 crashes on some damaged recordings."""
     spawn = multiprocessing.get_context("spawn")  # the library's threads and locks do not survive a fork
     receiver, sender = spawn.Pipe(duplex=False)
     player = spawn.Process(target=_deliver, args=(sender, path, streams), daemon=True)
@@ -133,8 +134,8 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
 
 
 def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -> None:
-    """Send the images and then None, or an error."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to both processes; the parent ends this one
+    """Send the images and a final None, or an error."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the parent ends the child
     try:
         with closing(play(path, streams)) as images:
             for image in images:
@@ -147,7 +148,7 @@ def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -
 
 
 def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Yield the intact images of a file, up to the last of each stream, as decoded by OpenNI 2."""
+    """Decode a file with OpenNI 2 and yield its complete images, up to the last image of each stream."""
     openni = _library()
     file = os.fsencode(path)
     if len(file) > LONGEST_PATH:
@@ -174,7 +175,7 @@ def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
 
 
 def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """Return the images of `handles`, which are in the order of Stream."""
+    """Yield the images of the streams. `handles` are in the order of Stream."""
     waited = (ctypes.c_void_p * len(handles))(*handles)
     last = dict.fromkeys(Stream, 0)
     while any(last[stream] < streams[stream].last for stream in Stream):
@@ -198,7 +199,7 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
 
 
 def _pixels(stream: Stream, frame: _Frame) -> npt.NDArray[Any] | None:
-    """Return a copy of the pixels; None for an incomplete image."""
+    """Return a copy of the pixels, or None for an incomplete image."""
     pixel_format, shape = frame.mode.pixel_format, (frame.height, frame.width)
     if frame.data_size < frame.stride * frame.height:
         return None

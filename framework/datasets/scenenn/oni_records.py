@@ -1,6 +1,6 @@
-"""Records of an OpenNI recording (.oni): its streams, their numbers of images, and the position of a truncation.
+"""Records of an OpenNI recording (.oni): streams, image counts and the position of a truncation.
 
-OpenNI 2 decodes the images but can crash on a damaged file, so its records are checked first.
+OpenNI 2 decodes the images but can crash on a damaged file. The records are therefore checked first.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ VERSIONS = (1, 0, 0, 4), (1, 0, 1, 0)  # first and last version that OpenNI 2 su
 FIRST_WIDE = (1, 0, 1, 0)  # first version with 64-bit file positions
 IMAGE_FIELDS = struct.Struct("<QI")  # time, us; number
 RECORD_MAGIC = b"NIR\0"
-LARGEST_NODE = 255  # recorders number nodes from 1; OpenNI allocates as many as the file declares
-LARGEST_FIELDS = 2**20  # bytes; OpenNI has an unchecked buffer of 5.8 MB for them
+LARGEST_NODE = 255  # recorders number nodes from 1; OpenNI allocates the declared number of nodes
+LARGEST_FIELDS = 2**20  # bytes; OpenNI reads the fields into a buffer of 5.8 MB without a check
 
 
 class OniRecord(IntEnum):
-    """Kinds of records."""
+    """Record types."""
 
     NODE_ADDED_1_0_0_4 = 0x02
     NEW_DATA = 0x0A
@@ -50,9 +50,9 @@ class Stream(IntEnum):
 class Images:
     """The complete images of one stream."""
 
-    node: int  # of this stream's records
+    node: int  # node id of this stream's records
     count: int = 0
-    last: int = 0  # number of the last one, from 1
+    last: int = 0  # number of the last image, from 1
 
 
 @dataclass(frozen=True)
@@ -60,18 +60,18 @@ class OniContents:
     """Contents of a file's records."""
 
     path: Path
-    streams: Mapping[Stream, Images]  # both
+    streams: Mapping[Stream, Images]  # for depth and color
     end: int  # bytes of complete records
     cut_off: bool  # True if the recording has no end record
     largest_node: int
-    wide: bool  # 64-bit file positions, else 32-bit
+    wide: bool  # True = 64-bit file positions; False = 32-bit
     table_notes: tuple[int, ...]  # file positions of the fields that point to the seek tables
 
 
 def read_contents(path: Path) -> OniContents:
-    """Return the streams and their images, without pixels.
+    """Return the streams and image counts of a recording, without pixels.
 
-    Raises DataError if the file is not a recording, or has no depth or no color images.
+    Raises DataError if the file is not a recording, or if it has no depth images or no color images.
     """
     check_regular(path)
     try:
@@ -85,7 +85,7 @@ def read_contents(path: Path) -> OniContents:
 def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
     """Yield a file for OpenNI 2: the recording, or a repaired copy in `scratch` if it is truncated.
 
-    OpenNI reads the seek tables at the recording's end, and rejects a recording without them.
+    OpenNI reads the seek tables at the end of the recording. It rejects a recording without seek tables.
     """
     if not contents.cut_off:
         yield contents.path
@@ -145,7 +145,10 @@ def _read_contents(path: Path, file: BinaryIO) -> OniContents:
 
 
 def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
-    """Return the layouts of a file position and of a record header: magic, kind, node, two sizes, a position."""
+    """Return the struct layouts of a file position and a record header.
+
+    A header contains the magic, kind, node, two sizes and a file position.
+    """
     position = "Q" if wide else "I"
     return struct.Struct(f"<{position}"), struct.Struct(f"<4s4I{position}")
 
@@ -165,7 +168,7 @@ def _read_version(path: Path, file: BinaryIO) -> tuple[int, ...]:
 
 
 def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
-    """Yield the records up to the end record, or up to the first incomplete one."""
+    """Yield the records up to the end record or the first incomplete record."""
     size = file.seek(0, 2)
     position = FILE_HEADER.size
     while position + header.size <= size:
@@ -184,7 +187,7 @@ def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
 
 
 def _added_stream(path: Path, record: _Record) -> Stream | None:
-    """Return the stream of a node; None for a device, infrared or audio node."""
+    """Return the stream of a node, or None for a device, infrared or audio node."""
     try:
         (name_size,) = struct.unpack_from("<I", record.fields)
         (node_type,) = struct.unpack_from("<I", record.fields, 4 + name_size)

@@ -1,8 +1,8 @@
-"""SceneNN's text files: poses, times and intrinsics.
+"""SceneNN's text files: poses, timestamps and intrinsics.
 
-trajectory.log      each frame: a header of three integers, four rows of T_world_camera in meters
-timestamp.txt       each frame: its number (from 1), the times of color and depth in microseconds
-asus.ini            lines of a key and a value: fx, fy, cx, cy
+trajectory.log      per frame: a header of three integers, and the four rows of T_world_camera in meters
+timestamp.txt       per frame: number (from 1), and timestamps of color and depth in microseconds
+asus.ini            one key and value per line: fx, fy, cx, cy
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from framework.files.number_lines import SHOWN, number, read_lines
 from framework.geometry import nearest_rigid
 
 LARGEST_FRAME = 2**31 - 2  # frame+1 is also an int32
-BLOCK = 5  # lines of a frame
+BLOCK = 5  # lines per frame
 LAST_ROW = "0.000000 0.000000 0.000000 1.000000"  # as in the published files
 MICROSECONDS = 1e6  # per second
 INTRINSICS = ("fx", "fy", "cx", "cy")  # px
-SIZES = {"cx": "depth_width", "cy": "depth_height"}  # px; half of the size replaces a missing center
+SIZES = {"cx": "depth_width", "cy": "depth_height"}  # px; half of the size replaces a missing principal point
 POSITIVE = {"fx", "fy", *SIZES.values()}
-LARGEST_INTRINSICS = 2**20  # bytes; a file of intrinsics has a few hundred
+LARGEST_INTRINSICS = 2**20  # bytes; an intrinsics file has a few hundred
 
 
 @dataclass(frozen=True)
 class TrajectoryLog:
-    """The poses of a file. Absent frames are in neither mapping."""
+    """Poses of a trajectory.log. Absent frames are in neither mapping."""
 
-    poses: Mapping[int, Float64]  # frame from 0 -> T_world_camera (4, 4), exactly rigid
-    unusable: Mapping[int, str]  # frame from 0 -> reason: not rigid (tracking was lost), not finite, cut off, two
+    poses: Mapping[int, Float64]  # by frame, from 0: T_world_camera (4, 4), exactly rigid
+    unusable: Mapping[int, str]  # by frame, from 0: reason (lost tracking, not finite, truncated, or repeated)
 
 
 class _Line(NamedTuple):
-    number: int  # in the file, from 1
+    number: int  # line number in the file, from 1
     words: list[str]
 
     @property
@@ -51,9 +51,10 @@ class _Line(NamedTuple):
 
 
 def read_trajectory_log(path: Path) -> TrajectoryLog:
-    """Return the poses of a trajectory.log. A frame truncated by the file's end, or with two poses, is unusable.
+    """Return the poses of a trajectory.log.
 
-    Raises DataError, with the file and the line, for an invalid line elsewhere.
+    A frame with two poses is unusable. A last frame that is truncated is unusable, too. Raises DataError that names the
+    file and the line for other invalid lines.
     """
     content = read_bytes(path, MOST_TEXT).removeprefix(BOM_UTF8)
     numbered = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
@@ -64,7 +65,7 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
     for first in range(0, len(lines), BLOCK):
         header, *rows = lines[first : first + BLOCK]
         at_end = first + BLOCK >= len(lines)
-        cut = at_end and not rows  # within the header or after it
+        cut = at_end and not rows  # the file ends within the header or after it
         if cut and len(header.words) == 1 and _is_frame(header.words[0]):
             break  # the frame number itself may be truncated
         if not 3 - cut <= len(header.words) <= 3 or not all(map(_is_frame, header.words)):
@@ -90,9 +91,10 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
 
 
 def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
-    """Write T_world_camera (4, 4) of each frame atomically; reading returns the nearest exactly rigid transforms.
+    """Write the pose T_world_camera (4, 4) of each frame atomically.
 
-    Raises DataError if a frame's number is negative, its pose not rigid, or the file cannot be written.
+    The reader returns the nearest exactly rigid transforms. Raises DataError for a negative frame number, a pose that
+    is not rigid, or a failed write.
     """
     lines = []
     for frame, T_world_camera in sorted(poses.items()):
@@ -107,7 +109,7 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
 
 
 def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
-    """Return the four rows (4, 4), finite or not; None if the file ends before them."""
+    """Return the matrix (4, 4) of four rows, finite or not, or None if the file ends earlier."""
     matrix = np.empty((4, 4))
     for k, line in enumerate(rows):
         try:
@@ -125,14 +127,14 @@ def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
 
 
 def _is_frame(word: str) -> bool:
-    """Return True for a valid number of a header."""
+    """Return True for a valid number in a frame header."""
     return word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1
 
 
 def read_timestamps(path: Path) -> Mapping[int, float]:
-    """Return the depth timestamp of each image in s, by its number.
+    """Return the depth timestamp (s) of each image, by image number.
 
-    Raises DataError, with the file and the line, if a line is not a number and two times, or repeats a number.
+    Raises DataError that names the file and the line for an invalid line or a repeated image number.
     """
     times: dict[int, float] = {}
     for n, line in enumerate(read_lines(path), start=1):
@@ -145,7 +147,7 @@ def read_timestamps(path: Path) -> Mapping[int, float]:
             expected = f"expected `number color_us depth_us`, got {line[:SHOWN]!r}"
             raise DataError(f"{path}, line {n}: {expected}") from error
         if not math.isfinite(depth):
-            raise DataError(f"{path}, line {n}: expected a finite time, got {words[2]}")
+            raise DataError(f"{path}, line {n}: expected a finite timestamp, got {words[2]}")
         if image in times:
             raise DataError(f"{path}, line {n}: expected unique image numbers, got {image} twice")
         times[image] = depth / MICROSECONDS
@@ -153,7 +155,10 @@ def read_timestamps(path: Path) -> Mapping[int, float]:
 
 
 def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mapping[int, float] | None = None) -> None:
-    """Write the depth and color timestamps (s) of each image, by its number, atomically; None = those of depth."""
+    """Write the depth and color timestamps (s) of each image number atomically.
+
+    If `color_times` is None, the depth timestamps are also written for color.
+    """
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for image, time in times.items():
             color_time = time if color_times is None else color_times[image]
@@ -163,9 +168,9 @@ def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mappin
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     """Return fx, fy, cx, cy in px, from lines `key value`, `key = value` or `key: value`.
 
-    Keys may be in upper case; comments (# or ;), section headers and other keys are ignored. Without cx or cy, half of
-    depth_width or depth_height is used, as in ethz-asl/scenenn_to_rosbag. Raises DataError, with the file and the line,
-    if a key is missing or repeated, or its value is not finite, or not positive for focal lengths and sizes.
+    Keys may be in upper case. Comments (# or ;), section headers and other keys are ignored. Without cx or cy, half of
+    depth_width or depth_height is used, as in ethz-asl/scenenn_to_rosbag. Raises DataError that names the file and the
+    line for a missing or repeated key or a value that is not finite. Focal lengths and sizes must be positive.
     """
     values: dict[str, float] = {}
     lines = read_bytes(path, LARGEST_INTRINSICS).removeprefix(BOM_UTF8).decode("latin-1").splitlines()
@@ -182,19 +187,19 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
             wanted = "a value > 0 px" if key in POSITIVE else "a finite value in px"
             raise DataError(f"{path}, line {n}: {key}: expected {wanted}, got {text[:40]!r}")
         if key in values:
-            raise DataError(f"{path}, line {n}: {key}: expected one value, got a second one")
+            raise DataError(f"{path}, line {n}: {key}: expected one value, got {values[key]:g} and {value:g}")
         values[key] = value
     for center, size in SIZES.items():
         if size in values:
             values.setdefault(center, values[size] / 2)
     missing = [key for key in INTRINSICS if key not in values]
     if missing:
-        raise DataError(f"{path}: expected lines with {', '.join(INTRINSICS)}, got none with {missing[0]}")
+        raise DataError(f"{path}: expected values of {', '.join(INTRINSICS)}, got no {missing[0]}")
     return values["fx"], values["fy"], values["cx"], values["cy"]
 
 
 def write_intrinsics(path: Path, camera: Camera) -> None:
-    """Write the camera's intrinsics atomically, with all digits."""
+    """Write the camera's intrinsics atomically, in full precision."""
     sizes = {"depth_width": camera.width, "depth_height": camera.height}
     values = sizes | {key: getattr(camera, key) for key in INTRINSICS}
     with written_whole(path) as temporary:

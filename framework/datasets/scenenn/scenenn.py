@@ -2,12 +2,12 @@
 
     NNN/image/image00001.png    8-bit color, from 1
     NNN/depth/depth00001.png    uint16, mm, registered to color
-    NNN/timestamp.txt           optional: number, time of color, time of depth (microseconds)
+    NNN/timestamp.txt           optional: number, timestamps of color and depth (microseconds)
     NNN/trajectory.log          T_world_camera, m; the pose with id i belongs to image i + 1
-    NNN/NNN.ply, NNN/NNN.xml    optional: the mesh with a label for each vertex, and the classes of the labels
+    NNN/NNN.ply, NNN/NNN.xml    optional: mesh with vertex labels, and the class of each label
     intrinsic/asus.ini          fx, fy, cx, cy
-    release.txt                 optional, one line: the release of the annotation
-    synthesize.json             written only by `instancemap synthesize`: its parameters
+    release.txt                 optional, one line: annotation release
+    synthesize.json             parameters of `instancemap synthesize`, only in synthetic scenes
 
 The images are extracted from oni/NNN.oni by the official playback or by `instancemap convert-oni`.
 """
@@ -37,13 +37,13 @@ from framework.files.ply import read_ply
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 DEPTH_SCALE = 1000.0  # units per meter
-MADE_BY = "synthesize.json"  # in the folder of synthetic scenes
+MADE_BY = "synthesize.json"  # only in the root folder of synthetic scenes
 
 log = logging.getLogger(__name__)
 
 
 class SceneNNSensor(StrEnum):
-    """Depth sensors of the recordings, each with its own file of intrinsics."""
+    """Depth sensors of the recordings. Each sensor has an intrinsics file."""
 
     ASUS = "asus"
     KINECT2 = "kinect2"
@@ -51,9 +51,10 @@ class SceneNNSensor(StrEnum):
 
 @dataclass
 class SceneNN(LabeledRecording):
-    """A sequence of SceneNN, or of `instancemap synthesize` in its format.
+    """A SceneNN sequence, or a synthetic scene from `instancemap synthesize` in the same format.
 
-    A frame cannot be used if an image is missing, or if the sequence has a trajectory without a usable pose for it.
+    A frame is unusable if an image is missing. It is also unusable if the sequence has a trajectory without a valid
+    pose for the frame.
     """
 
     scene: str = "011"  # number of the sequence
@@ -86,24 +87,24 @@ def _recorded(images: StoredImages, pose_id: int, poses: TrajectoryLog | None, t
 
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:
-    """Return the timestamps of all images, or none if some are missing: two clocks are not mixed."""
+    """Return the timestamps (s) of all images, or no timestamps if some are missing, so that clocks are not mixed."""
     if not is_there(path):
         return {}
     times = read_timestamps(path)
     without = [k for k in images if k not in times]
     if not without:
         return times
-    message = "%s: expected times of all images, got none for %d of %d, first %d; timestamps set by a rate of %g Hz"
+    message = "%s: expected timestamps of all images, got none for %d of %d, first %d; using a frame rate of %g Hz"
     log.warning(message, path, len(without), len(images), without[0], FRAME_RATE)
     return {}
 
 
 def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
-    """Return the mesh with its labels as instances, with COCO's names for the nine evaluated classes.
+    """Return the mesh with its labels as instances, with COCO names for the nine evaluated classes.
 
-    Labels without a name, or that the annotation lacks, have the class None: detections there are not evaluated.
-    Labels of other classes (wall, cabinet, ...) and label 0 are instance 0: a detection of the nine classes there is
-    wrong. Raises DataError, with the file, if one cannot be read or the mesh has no labels.
+    Labels without a name or an annotation have the class None: detections there are not evaluated. Labels of other
+    classes (wall, cabinet, ...) and label 0 become instance 0: detections of the nine classes there are false
+    positives. Raises DataError that names the file if a file cannot be read or the mesh has no labels.
     """
     ply = read_ply(mesh)
     labels = ply.properties.get("label")
@@ -128,7 +129,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
 
 def _nyu_class(label: Annotated | None) -> str:
-    """Return the class of a label, "" = not known."""
+    """Return the NYU class of a label; "" = unknown."""
     if label is None or not label.text.strip():
         return ""
     name = label.nyu_class.strip().lower()

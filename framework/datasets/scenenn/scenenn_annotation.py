@@ -20,30 +20,31 @@ from framework.data import Box, Float64
 from framework.errors import DataError
 from framework.files.atomic_write import read_bytes, written_whole
 
-LARGEST_FILE = 2**24  # bytes; annotations have some 100 KB, and 16 MiB of crafted XML take 9 s and 0.5 GB
-LARGEST_ID = int(np.iinfo(np.int32).max)  # of a label of the mesh
-QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | from rounding of printed digits
+LARGEST_FILE = 2**24  # bytes; annotations have about 100 KB; 16 MiB of crafted XML take 9 s and 0.5 GB
+LARGEST_ID = int(np.iinfo(np.int32).max)  # of a mesh label
+QUATERNION_TOLERANCE = 1e-2  # maximum | |q| - 1 |, due to rounding of printed digits
 NO_COLOR = (0, 0, 0)
 NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True)
 class Annotated:
-    """One label of the mesh. Missing or unusable values are "", NO_COLOR or None."""
+    """A mesh label. Missing or invalid values are "", NO_COLOR or None."""
 
     id: int  # the value of the mesh's vertex property `label`, 0 to LARGEST_ID
     text: str  # name given by the annotators
-    nyu_class: str  # its class among NYU's
+    nyu_class: str  # NYU class
     color: tuple[int, int, int] = NO_COLOR  # RGB
-    aabb: Float64 | None = None  # (2, 3) m, smallest and largest corner
+    aabb: Float64 | None = None  # (2, 3) m, minimum and maximum corner
     obb: Box | None = None
 
 
 def read_annotation(path: Path) -> tuple[Annotated, ...]:
-    """Return the labels of an annotation, in the file's order; unknown elements and attributes are ignored.
+    """Return the labels of an annotation in file order.
 
-    Raises DataError, with the line, if the file is not XML, declares a document type (which brings entities and default
-    attributes), has no label, a label without an integer id, or two different labels with the same id.
+    Unknown elements and attributes are ignored. Raises DataError that names the line if the file is not XML or declares
+    a document type, which could define entities and default attributes. Raises DataError also for a file without
+    labels, a label without an integer id, or different labels with the same id.
     """
     content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)
@@ -53,7 +54,7 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
         parser.feed(content)
         parser.close()
     except DefusedXmlException as error:
-        raise labels.error("expected no document type or entity, got one; remove it") from error
+        raise labels.error("expected XML without a document type or entities, got a declaration; remove it") from error
     except ParseError as error:
         raise DataError(f"{path}, line {error.position[0]}: expected valid XML: {ErrorString(error.code)}") from error
     except (ValueError, LookupError) as error:
@@ -74,9 +75,10 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
 
 
 def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
-    """Write an annotation atomically; `read_annotation` returns the same, rotations to 1e-15.
+    """Write an annotation atomically.
 
-    Raises DataError for values that XML or the reader cannot represent, or a failed write.
+    `read_annotation` returns the same values, with a rotation error of about 1e-15. Raises DataError for values that
+    XML or the reader cannot represent, or for a failed write.
     """
     if not objects:
         raise DataError(f"{path}: expected at least one label, got none")
@@ -95,19 +97,20 @@ def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
         if (label.aabb is not None and _aabb(attributes["aabbox"]) is None) or (
             label.obb is not None and _obb(attributes["obbox"]) is None
         ):
-            raise DataError(f"{path}: label {label.id}: expected boxes of finite extent, got one without")
+            boxes = {name: attributes[name] for name in ("aabbox", "obbox") if name in attributes}
+            raise DataError(f"{path}: label {label.id}: expected finite boxes with extent >= 0, got {boxes}")
         lines.append(f"  <label {' '.join(f'{name}={quoteattr(value)}' for name, value in attributes.items())}/>")
     with written_whole(path) as temporary:
         temporary.write_text("\n".join([*lines, "</annotation>\n"]), encoding="utf-8")
 
 
 class _Labels:
-    """Parser target that collects the labels without building a tree."""
+    """XML parser target that collects the labels without a tree."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.expat: Any = None  # provides the line of an error
-        self.found: dict[int, tuple[dict[str, str], int]] = {}  # by id: the label's attributes and its line
+        self.found: dict[int, tuple[dict[str, str], int]] = {}  # by id: attributes and line of the label
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         if tag.rpartition("}")[2] != "label":  # without a namespace
@@ -118,7 +121,9 @@ class _Labels:
             raise self.error(f"label: expected an id from 0 to {LARGEST_ID}, got {found}")
         before, line = self.found.setdefault(id_, (attributes, self.expat.CurrentLineNumber))
         if attributes != before:
-            raise self.error(f"label {id_}: expected the attributes of line {line}, got others")
+            name = min(key for key, _ in attributes.items() ^ before.items())
+            expected = f"expected {name:.40}={before.get(name)!r:.40} as in line {line}"
+            raise self.error(f"label {id_}: {expected}, got {attributes.get(name)!r:.40}")
 
     def error(self, message: str) -> DataError:
         return DataError(f"{self._path}, line {self.expat.CurrentLineNumber}: {message}")
@@ -154,7 +159,7 @@ def _color(text: str) -> tuple[int, int, int]:
 
 
 def _aabb(text: str) -> Float64 | None:
-    """Return the box of `minx miny minz maxx maxy maxz`."""
+    """Parse a box `minx miny minz maxx maxy maxz`, or return None for an invalid box."""
     numbers = _numbers(text, 6)
     if numbers is None or (numbers[:3] > numbers[3:]).any():
         return None
@@ -162,7 +167,10 @@ def _aabb(text: str) -> Float64 | None:
 
 
 def _obb(text: str) -> Box | None:
-    """Return the box of a center, the dimensions and a quaternion xyzw (github.com/hkust-vgd/scenenn, issue 11)."""
+    """Parse a box of center, extent and quaternion xyzw, or return None for an invalid box.
+
+    The order of the numbers is documented in github.com/hkust-vgd/scenenn, issue 11.
+    """
     numbers = _numbers(text, 10)
     if numbers is None or (numbers[3:6] < 0).any():
         return None
@@ -172,7 +180,7 @@ def _obb(text: str) -> Box | None:
 
 
 def _numbers(text: str, count: int) -> Float64 | None:
-    """Return the `count` finite numbers of a text, None for any other text."""
+    """Parse `count` finite numbers, or return None for any other text."""
     try:
         numbers = np.array([float(word) for word in text.split(maxsplit=count)])
     except ValueError:

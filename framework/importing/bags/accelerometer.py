@@ -1,8 +1,8 @@
-"""Up directions from the accelerometer of a ROS bag (sensor_msgs/Imu) with known extrinsics to the camera.
+"""Up directions from the accelerometer in a ROS bag (sensor_msgs/Imu) with known extrinsics to the camera.
 
-At rest, an accelerometer measures an upward vector of 9.8 m/s^2 (REP 145) in the frame of its message. An image header
-names the optical frame of its camera, by the definition of sensor_msgs/Image. /tf_static contains the rotation between
-the two frames. RealSense's recorder stores it with each stream.
+At rest, an accelerometer measures an upward vector of 9.8 m/s^2 (REP 145) in the frame of its message. The header of a
+sensor_msgs/Image names the optical frame of the camera. /tf_static contains the rotation between the two frames.
+RealSense's recorder stores this rotation with each stream.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from framework.errors import DataError, FrameError
 from framework.importing.bags.ros_messages import IMU, RosBag
 from framework.importing.bags.ros_transforms import REALSENSE, static_rotation, stream_motion
 
-NEAR = 0.05  # s, averaging window before and after a frame, against hand tremor
+NEAR = 0.05  # s, averaging window before and after a frame, which reduces the effect of hand tremor
 GRAVITY = 9.81  # m/s^2
-OFF = 0.2  # maximum deviation of the median from gravity, as a fraction: allows a bias, but not removed gravity
-GYROSCOPE = re.compile("gyro", re.IGNORECASE)  # in names of topics without acceleration
+OFF = 0.2  # maximum deviation of the median from gravity, as a fraction; rejects data without gravity
+GYROSCOPE = re.compile("gyro", re.IGNORECASE)  # matches names of topics without acceleration
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """Measurements in the axes of the color camera."""
+    """Accelerometer measurements in the axes of the color camera."""
 
-    times: Float64  # (N,) s, in order
+    times: Float64  # (N,) s, ascending
     measured: Float64  # (N, 3) m/s^2
 
     def up(self, timestamp: float) -> Float64 | None:
-        """Return the unit vector (3,) up in the camera at a time in s, or None without measurements near it."""
+        """Return the up direction (3,) in the camera at a time in s, or None without measurements near this time."""
         first, end = np.searchsorted(self.times, (timestamp - NEAR, timestamp + NEAR))
         if first == end:
             return None
@@ -45,9 +45,10 @@ class Accelerometer:
 
 
 def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> Accelerometer | None:
-    """Return the first usable accelerometer of a bag by name, or None, with a warning if there are unusable ones.
+    """Return the first usable accelerometer of a bag by name, or None.
 
-    `color` is the topic of the color images, `timestamps` their times in s.
+    `color` is the topic of the color images, and `timestamps` are their times in s. A warning is logged if all
+    accelerometers are unusable.
     """
     reasons = []
     for topic in bag.topics(IMU):
@@ -61,12 +62,12 @@ def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> 
         else:
             return found
     if reasons:
-        log.warning("%s: up is unknown because no accelerometer is usable: %s", bag.path, "; ".join(reasons))
+        log.warning("%s: up direction unknown; no accelerometer is usable: %s", bag.path, "; ".join(reasons))
     return None
 
 
 def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
-    """Return the accelerometer of a topic, or the reason why it is unusable."""
+    """Return the accelerometer of a topic, or the reason if it is unusable."""
     times, measured, frame_id = _read(bag, topic)
     if not len(times):
         return f"{topic}: expected readable messages, got none"
@@ -85,7 +86,7 @@ def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
 
 
 def _rotation(bag: RosBag, topic: str, frame_id: str, color: str) -> Float64 | None:
-    """Return R_camera_imu (3, 3), None = not in the bag."""
+    """Return R_camera_imu (3, 3), or None if it is not in the bag."""
     if topic.startswith(REALSENSE):
         T_imu_reference = stream_motion(bag, topic.removesuffix("/imu/data"))
         T_color_reference = stream_motion(bag, color.removesuffix("/image/data"))
@@ -97,7 +98,10 @@ def _rotation(bag: RosBag, topic: str, frame_id: str, color: str) -> Float64 | N
 
 
 def _read(bag: RosBag, topic: str) -> tuple[Float64, Float64, str]:
-    """Return header times (N,) in s, measurements (N, 3) in m/s^2, and their frame, without damaged messages."""
+    """Return the header times (N,) in s, the measurements (N, 3) in m/s^2 and their frame.
+
+    Damaged messages are skipped.
+    """
     times, measured, frame_id, damaged = [], [], "", 0
     try:
         for message in bag.messages([topic]):
@@ -112,7 +116,7 @@ def _read(bag: RosBag, topic: str) -> tuple[Float64, Float64, str]:
                 measured.append(vector)
                 frame_id = frame_id or content.header.frame_id
     except DataError as error:
-        log.warning("%s; earlier messages are used", error)
+        log.warning("%s; using the messages before the error", error)
     if damaged:
         log.warning("%s: skipped %d damaged messages of %s", bag.path, damaged, topic)
     return np.array(times), np.array(measured, np.float64).reshape(-1, 3), frame_id

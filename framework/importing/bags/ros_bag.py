@@ -1,15 +1,15 @@
-"""ROS 1 and ROS 2 bags, and .bag files of RealSense's recorder: ROS 1 bags with special topics.
+"""ROS 1 and ROS 2 bags, including .bag files of RealSense's recorder (ROS 1 bags with other topics).
 
     sensor_msgs/Image, CompressedImage      color (8 bits) and depth (16UC1 and similar: mm; 32FC1: m)
     sensor_msgs/CameraInfo                  intrinsics of color, and of depth if it is not registered
-    nav_msgs/Odometry, geometry_msgs/PoseStamped    poses of the camera, optional; in optical axes if the frame name
-                                            contains "optical" or is absent, else in ROS axes (x forward)
-    sensor_msgs/Imu, tf2_msgs/TFMessage     up, optional: from the accelerometer and /tf_static
-    /device_0/sensor_1/Color_0/image/data   RealSense's color, and Depth_0; their .../tf/0 is T_stream_depth, with the
-                                            rotation as read by the recorder's own player; .../option/Depth Units is
-                                            m per unit. Depth is registered to color on import
+    nav_msgs/Odometry, geometry_msgs/PoseStamped    camera poses, optional; in optical axes if the frame name contains
+                                            "optical" or is missing, otherwise in ROS axes (x forward)
+    sensor_msgs/Imu, tf2_msgs/TFMessage     up direction, optional, from the accelerometer and /tf_static
+    /device_0/sensor_1/Color_0/image/data   RealSense's color; Depth_0 contains depth. .../tf/0 is T_stream_depth, with
+                                            the rotation as in the recorder's player. .../option/Depth Units is m per
+                                            unit. Depth is registered to color on import
 
-Color and depth are associated by time, as in TUM RGB-D; poses are interpolated at the time of color.
+Color and depth images are associated by time, as in TUM RGB-D. Poses are interpolated at the time of the color image.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from framework.importing.bags.ros_transforms import REALSENSE, stream_motion
 from framework.importing.depth_resampling import DepthRegistration
 from framework.importing.source import DeviceFrame, Format, Source, StoredFrame
 
-APART = 0.02  # s, maximum time between a color image and its depth
+APART = 0.02  # s, maximum time between a color image and its depth image
 POSE_APART = 0.1  # s, maximum time between a color image and the nearest pose
 MILLIMETER = 0.001  # m
-SAME_CAMERA = 0.01  # of focal length and image width: intrinsics that differ less belong to the same camera
+SAME_CAMERA = 0.01  # fraction of the image width; intrinsics that differ less belong to the same camera
 MOST_WAITING = 64  # maximum number of unpaired images
-BROWN = ("plumb_bob", "Brown Conrady", "")  # lens models with k1, k2, p1, p2, k3
-DEPTH_STREAM = "/Depth_"  # in RealSense's names
+BROWN = ("plumb_bob", "Brown Conrady", "")  # names of the lens model with k1, k2, p1, p2, k3
+DEPTH_STREAM = "/Depth_"  # in RealSense's topic names
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ def recognized(path: Path) -> bool:
 
 
 def open_source(path: Path, given: Topics) -> Source:
-    """Open a bag. Raises DataError, with the bag, if it cannot be read, and ConfigError for invalid topics."""
+    """Open a bag. Raises DataError if the bag cannot be read, and ConfigError for invalid topics."""
     bag = RosBag(path)
     topics = found_topics(bag, given)
     info = bag.first(topics.camera_info)
@@ -71,7 +71,7 @@ def open_source(path: Path, given: Topics) -> Source:
 
 @dataclass(frozen=True)
 class Pair:
-    """A color and a depth image of the same time, by their indices in their topics."""
+    """A color and a depth image of about the same time, as indices in their topics."""
 
     color: int
     depth: int
@@ -85,14 +85,14 @@ class Device:
     bag: RosBag
     topics: Topics
     camera: Camera  # of color
-    registration: DepthRegistration | None  # None: depth is registered to color, possibly at another resolution
+    registration: DepthRegistration | None  # None = depth is registered to color, possibly at another resolution
     depth_unit: float  # m
     accelerometer: Accelerometer | None
     trajectory: Trajectory | None
     pose_reading: PoseReading
 
     def frame(self, pair: Pair, color: Message, depth: Message) -> DeviceFrame:
-        """Return the frame of two messages. Raises DataError if they cannot be used."""
+        """Return the frame of two messages. Raises DataError if they are unusable."""
         where = f"{self.bag.path}, {pair.timestamp:.6f} s"
         stored = self.trajectory.at(pair.timestamp) if self.trajectory else None
         metric = depth_of(f"{where}: {depth.topic}", self.bag.decoded(depth), self.depth_unit)
@@ -113,7 +113,7 @@ class Device:
 
 
 def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
-    """Return pairs by header times, or by recording times if the headers have different clocks."""
+    """Return pairs by header timestamps, or by recording times if the header clocks differ."""
     sensed: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     stored: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     try:
@@ -121,7 +121,7 @@ def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
             sensed[message.topic].append(bag.sensed_at(message))
             stored[message.topic].append(message.stored_at)
     except DataError as error:
-        log.warning("%s; earlier messages are used", error)
+        log.warning("%s; using the messages before the error", error)
     by_header, by_record = (_associated(times[topics.color], times[topics.depth]) for times in (sensed, stored))
     if by_header and 2 * len(by_header) >= len(by_record):
         return by_header
@@ -134,8 +134,8 @@ def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
 
 
 def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> list[Pair]:
-    """Return pairs by times (s), with the first image of each time: some recorders leave all headers at 0."""
-    # sorted, the indices of first occurrences are in the order of recording
+    """Return pairs by time (s). Only the first image of each time is used: some recorders write only zeros."""
+    # the indices of first occurrences are sorted to restore the recording order
     colors, depths = (sorted(np.unique(times, return_index=True)[1].tolist()) for times in (color_times, depth_times))
     pairs = associate([color_times[i] for i in colors], [depth_times[j] for j in depths], APART)
     return [Pair(colors[i], depths[j], color_times[colors[i]]) for i, j in pairs]
@@ -169,7 +169,7 @@ def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:
 
 def _alone(device: Device, message: Message) -> DataError:
     place = f"{device.bag.path}, {message.stored_at:.6f} s"
-    return FrameError(f"{place}: expected a partner for the image of {message.topic}, got none nearby or a damaged one")
+    return FrameError(f"{place}: expected a match for the image of {message.topic}, got none; the bag may be damaged")
 
 
 def _raise(error: DataError) -> DeviceFrame:
@@ -177,7 +177,7 @@ def _raise(error: DataError) -> DeviceFrame:
 
 
 def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading]:
-    """Return the poses of a topic, and their convention."""
+    """Return the poses of a topic and their convention."""
     if not topic:
         return None, PoseReading()
     lines = []
@@ -202,7 +202,7 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
 
 
 def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistration | None:
-    """Return the registration of depth to the color camera. Raises DataError if it is required but unknown."""
+    """Return the registration of depth to color, None = already registered. Raises DataError if it is unknown."""
     own = camera_info_of(bag, topics.depth)
     if topics.depth_is_registered or not own or own == topics.camera_info:
         return None
@@ -219,7 +219,7 @@ def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistrati
         return None
     raise DataError(
         f"{bag.path}: {topics.depth}: expected depth in the camera of {topics.color}, or extrinsics in the bag, got "
-        f"another camera ({own}) without extrinsics; record registered depth, such as aligned_depth_to_color"
+        f"the camera of {own} without extrinsics; record registered depth, such as aligned_depth_to_color"
     )
 
 
@@ -231,7 +231,7 @@ def _is_same(depth: Camera, color: Camera) -> bool:
 
 
 def _depth_unit(bag: RosBag, topics: Topics) -> float:
-    """Return the unit of integer depth images, in m."""
+    """Return the unit of integer depth images in m."""
     if topics.depth.startswith(REALSENSE):
         sensor = topics.depth.partition(DEPTH_STREAM)[0]
         for name in ("Depth Units", "Depth_Units"):
@@ -242,7 +242,7 @@ def _depth_unit(bag: RosBag, topics: Topics) -> float:
 
 
 def _numbers(info: Any, name: str) -> list[float]:
-    """Return a field of a CameraInfo; the name is upper case in ROS 1."""
+    """Return a field of a CameraInfo. Field names are upper case in ROS 1."""
     return [float(value) for value in getattr(info, name.upper() if hasattr(info, name.upper()) else name)]
 
 
@@ -252,7 +252,7 @@ def _camera(where: str, info: Any) -> Camera:
 
 
 def _distortion(topics: Topics, info: Any) -> Distortion | None:
-    """Return the lens distortion of color; None without distortion, or for rectified images."""
+    """Return the lens distortion of color, or None without distortion or for rectified images."""
     values = _numbers(info, "d")
     if "rect" in topics.color.rpartition("/")[2] or not any(values):
         return None

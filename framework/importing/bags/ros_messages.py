@@ -1,7 +1,7 @@
-"""Messages of ROS bags and their images.
+"""Messages of ROS bags, and the images in these messages.
 
-Message definitions in a bag are not used, because rosbags would generate code from them. Only standard types are
-supported.
+Only standard message types are supported. Message definitions in a bag are ignored, because rosbags would generate code
+from these definitions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMU, TRANSFORMS = "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 
-COLOR_CHANNELS = {  # by encoding: number of 8-bit channels, and the indices of R, G, B
+COLOR_CHANNELS = {  # by encoding: number of 8-bit channels, and indices of R, G and B
     "rgb8": (3, (0, 1, 2)),
     "bgr8": (3, (2, 1, 0)),
     "8UC3": (3, (2, 1, 0)),
@@ -36,13 +36,13 @@ COLOR_CHANNELS = {  # by encoding: number of 8-bit channels, and the indices of 
     "8UC1": (1, (0, 0, 0)),
 }
 MILLIMETERS, METERS = ("16UC1", "mono16", "Z16"), ("32FC1",)
-COMPRESSED_DEPTH = "compressedDepth"  # in the format of such images, after the encoding
-DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: an unused number, quantization A and B
+COMPRESSED_DEPTH = "compressedDepth"  # in the format field of depth images, after the encoding
+DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: unused integer, quantization A and B
 
 
 @dataclass(frozen=True)
 class Message:
-    """One message, not decoded yet."""
+    """A message that is not yet decoded."""
 
     topic: str
     kind: str  # message type
@@ -51,17 +51,17 @@ class Message:
 
 
 class RosBag:
-    """A ROS 1 bag, or a ROS 2 bag: a folder, an .mcap or a .db3 file."""
+    """A ROS 1 bag, or a ROS 2 bag as a folder, .mcap file or .db3 file."""
 
     def __init__(self, path: Path) -> None:
-        """Raise DataError, with the bag, if it cannot be read."""
+        """Open a bag. Raises DataError that names the bag if it cannot be read."""
         self.path = path
         import_optional("rosbags", "reads ROS bags", "ros")
         from rosbags import rosbag1, rosbag2, typesys
 
         self._is_ros1 = path.suffix.lower() == ".bag"
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.LATEST)
-        if TRANSFORMS not in self._types.types:  # rosbags lacks it in ROS 1
+        if TRANSFORMS not in self._types.types:  # rosbags does not define this type for ROS 1
             definition = "geometry_msgs/TransformStamped[] transforms"
             self._types.register(typesys.get_types_from_msg(definition, TRANSFORMS))
         try:
@@ -76,7 +76,7 @@ class RosBag:
         return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
 
     def messages(self, topics: Sequence[str]) -> Iterator[Message]:
-        """Yield the messages of some topics in the order of recording. Raises DataError for a damaged bag."""
+        """Yield the messages of `topics` in the order of recording. Raises DataError for a damaged bag."""
         chosen = [found for found in self._reader.connections if found.topic in topics]
         if not chosen:
             return
@@ -87,12 +87,12 @@ class RosBag:
             raise DataError(f"{self.path}: damaged bag: {in_one_line(error)[:SHOWN]}") from error
 
     def first(self, topic: str) -> Any:
-        """Return the first message of a topic, decoded, or None without one. Raises DataError."""
+        """Return the decoded first message of a topic, or None without messages. Raises DataError."""
         message = next(self.messages([topic]), None)
         return None if message is None else self.decoded(message)
 
     def decoded(self, message: Message) -> Any:
-        """Return the content of a message. Raises FrameError, with the topic, if it is damaged."""
+        """Return the content of a message. Raises FrameError that names the topic if the message is damaged."""
         decode = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
         try:
             return decode(message.raw, message.kind)
@@ -101,7 +101,7 @@ class RosBag:
             raise FrameError(f"{self.path}: damaged message of {message.topic}: {reason}") from error
 
     def sensed_at(self, message: Message) -> float:
-        """Return the measurement time in s from the message's header (its first field)."""
+        """Return the measurement time in s from the header of a message. The header is the first field."""
         try:
             if self._is_ros1:
                 seconds, nanoseconds = struct.unpack_from("<xxxxII", message.raw)
@@ -114,7 +114,7 @@ class RosBag:
 
 
 def color_of(where: str, message: Any) -> UInt8:
-    """Return the color (H, W, 3), RGB, of an Image or a CompressedImage. Raises FrameError, with `where`."""
+    """Return the color (H, W, 3), RGB, of an Image or a CompressedImage. Raises FrameError that names `where`."""
     if hasattr(message, "format"):
         return decode_color(where, message.data.tobytes())
     if message.encoding not in COLOR_CHANNELS:
@@ -127,7 +127,7 @@ def color_of(where: str, message: Any) -> UInt8:
 def depth_of(where: str, message: Any, unit: float) -> Float32:
     """Return the depth (H, W) in m, 0 = no reading, of an Image or a CompressedImage.
 
-    `unit` is the unit of integer depth in m. Raises FrameError, with `where`.
+    `unit` is the unit of integer depth in m. Raises FrameError that names `where`.
     """
     if hasattr(message, "format"):
         return _compressed_depth(where, message, unit)
@@ -145,7 +145,10 @@ def _whole(stored: Array, unit: float) -> Float32:
 
 
 def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
-    """Return the depth of a PNG; compressedDepth has a 12-byte header with the quantization of inverse float depth."""
+    """Return the depth (H, W) in m of a PNG image.
+
+    compressedDepth has a 12-byte header with the quantization of inverse float depth.
+    """
     encoding, _, codec = message.format.partition(";")
     data = message.data.tobytes()
     if COMPRESSED_DEPTH not in codec:

@@ -1,4 +1,4 @@
-"""Topics of color, depth, their cameras and poses in a ROS bag: as given, else by type and name."""
+"""Topics of color, depth, cameras and poses in a ROS bag, set by the user or selected by type and name."""
 
 from __future__ import annotations
 
@@ -41,7 +41,10 @@ class Topics:
 
 
 def found_topics(bag: RosBag, given: Topics) -> Topics:
-    """Return all topics, selected if not given. Raises DataError or ConfigError, with the option, without a match."""
+    """Return the given topics, and select the others by type and name.
+
+    Raises DataError or ConfigError that names the option if no single topic matches.
+    """
     images = [topic for topic in bag.topics(*IMAGES) if not NEITHER.search(topic)]
     depth = given.depth or _one(bag, "depth", [topic for topic in images if DEPTH.search(topic)], REGISTERED)
     color = given.color or _one(bag, "color", [topic for topic in images if not DEPTH.search(topic)], COLOR)
@@ -64,18 +67,18 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
 
 
 def camera_info_of(bag: RosBag, image: str) -> str:
-    """Return the only CameraInfo topic, or the nearest one to an image topic in the tree of names; "" = none."""
+    """Return the only CameraInfo topic, or the nearest to an image topic in the tree of topic names; "" = none."""
     infos = bag.topics(CAMERA_INFO)
     folders = {topic: f"/{topic.strip('/').rpartition('/')[0]}" for topic in (image, *infos)}
     shared = {topic: len(PurePosixPath(commonpath([folders[topic], folders[image]])).parts) for topic in infos}
     if len(shared) == 1:
         return next(iter(shared))
-    best = max(shared.values(), default=1)  # 1 = nothing but the root
+    best = max(shared.values(), default=1)  # 1 = only the root is shared
     return min((topic for topic, count in shared.items() if count == best), key=len) if best > 1 else ""
 
 
 def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Pattern[str]) -> str:
-    """Return the single matching topic; uncompressed topics are preferred."""
+    """Return the single matching topic. Topics with the preferred name, and uncompressed topics, have precedence."""
     fitting = [topic for topic in candidates if preferred.search(topic)] or list(candidates)
     left = [topic for topic in fitting if bag.kinds[topic] == IMAGE] or fitting
     if len(left) == 1:

@@ -1,4 +1,4 @@
-"""Transforms between the sensors of a ROS bag."""
+"""Transforms between sensors in a ROS bag."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from framework.data import Float64
 from framework.errors import DataError
 from framework.importing.bags.ros_messages import TRANSFORMS, RosBag
 
-REALSENSE = "/device_"  # begins the topics of RealSense's recorder
-SMALLEST_QUATERNION = 0.5  # length of a valid rotation
+REALSENSE = "/device_"  # prefix of topics of RealSense's recorder
+SMALLEST_QUATERNION = 0.5  # minimum length of a valid quaternion
 
 
 def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
-    """Return T_stream_reference (4, 4) of a stream of a RealSense recording, such as /device_0/sensor_1/Color_0.
+    """Return T_stream_reference (4, 4) of a RealSense stream, such as /device_0/sensor_1/Color_0.
 
     None = not in the bag. Raises DataError for an invalid rotation.
     """
@@ -37,7 +37,7 @@ def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
 
 
 def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
-    """Return R_to_of (3, 3) of two frames from /tf_static, possibly through other frames; None = not in the bag."""
+    """Return R_to_of (3, 3) of two frames in /tf_static, if necessary through other frames; None = not in the bag."""
     neighbors: dict[str, dict[str, Float64]] = defaultdict(dict)
     for message in bag.messages([topic for topic in bag.topics(TRANSFORMS) if topic.endswith("tf_static")]):
         for stored in bag.decoded(message).transforms:
@@ -46,7 +46,7 @@ def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
             if R_parent_child is not None:
                 neighbors[parent][child], neighbors[child][parent] = R_parent_child, R_parent_child.T
     start = to.lstrip("/")
-    R_to: dict[str, Float64] = {start: np.eye(3)}  # by reached frame
+    R_to: dict[str, Float64] = {start: np.eye(3)}  # rotation of each reached frame
     waiting = [start]
     while waiting:
         reached = waiting.pop()
@@ -58,7 +58,7 @@ def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
 
 
 def _rotation(quaternion: Any) -> Float64 | None:
-    """Return the rotation (3, 3), None if it is not valid."""
+    """Return the rotation (3, 3) of a quaternion message, or None if it is invalid."""
     quat_xyzw = [getattr(quaternion, name) for name in "xyzw"]
     if not np.isfinite(quat_xyzw).all() or np.linalg.norm(quat_xyzw) < SMALLEST_QUATERNION:
         return None

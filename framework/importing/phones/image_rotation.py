@@ -1,7 +1,7 @@
-"""Rotation of images by quarter turns, with camera, pose and lens: phones store images in sensor orientation.
+"""Rotation of images, cameras, poses and lenses by quarter turns, because phones store images in sensor orientation.
 
-A quarter clockwise moves the pixel (u, v) of an image of height H to (H - 1 - v, u), and the point (x, y, z) of the
-camera to (-y, x, z).
+A clockwise quarter turn moves the pixel (u, v) of an image of height H to (H - 1 - v, u). It moves the point (x, y, z)
+of the camera to (-y, x, z).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from framework.datasets.calibration.undistortion import Distortion
 
 Value = TypeVar("Value", bound=np.generic)
 QUARTER = 90  # degrees
-SIDEWAYS = 0.5  # minimum mean length of up in the image plane, in [0, 1]; less for a camera facing up or down
+SIDEWAYS = 0.5  # minimum length of the mean up direction in the image plane; smaller if the camera faces up or down
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Turn:
 
     @property
     def R_turned_camera(self) -> Float64:
-        """Rotation (3, 3) from the camera before to the camera after the turn."""
+        """Rotation (3, 3) from the camera before the turn to the camera after the turn."""
         quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         return np.linalg.matrix_power(quarter, self.quarters)
 
@@ -44,7 +44,7 @@ class Turn:
         return camera
 
     def pose(self, T_world_camera: Float64) -> Float64:
-        """Return T_world_turned (4, 4)."""
+        """Return T_world_turned (4, 4) of the rotated camera."""
         T = T_world_camera.copy()
         T[:3, :3] = T[:3, :3] @ self.R_turned_camera.T
         return T
@@ -56,9 +56,9 @@ class Turn:
 
 
 def upright(ups_camera: Sequence[Float64 | None]) -> Turn | None:
-    """Return the turn to upright images, or None if it is unknown.
+    """Return the rotation to upright images, or None if it is unknown.
 
-    `ups_camera` has up (3,) in the camera of each frame, None = unknown.
+    `ups_camera` contains the up direction (3,) in the camera of each frame, None = unknown.
     """
     known = [up for up in ups_camera if up is not None]
     if not known:

@@ -1,12 +1,12 @@
 """Polycam's raw data (developer mode, https://github.com/PolyCam/polyform).
 
-    keyframes/images/1442008525605.jpg          8-bit color in sensor orientation; the name is a time in microseconds
-    keyframes/cameras/1442008525605.json        fx, fy, cx, cy, width, height and t_00 ... t_23, ARKit's T_world_camera
-    keyframes/corrected_cameras/, corrected_images/     the same with optimized poses and without lens distortion,
-                                                        unless the session was too long
-    keyframes/depth/1442008525605.png           uint16 mm, 256x192; corrected_depth/ goes with corrected_images/
-    keyframes/confidence/1442008525605.png      uint8: 0 low, 255 high, between them medium (127 in the description, 54
-                                                in exports)
+    keyframes/images/1442008525605.jpg          8-bit color in sensor orientation; named by timestamp (microseconds)
+    keyframes/cameras/1442008525605.json        fx, fy, cx, cy, width, height and t_00 ... t_23: ARKit's T_world_camera
+    keyframes/corrected_cameras/, corrected_images/     same content with optimized poses, undistorted; missing if the
+                                                        session was too long
+    keyframes/depth/1442008525605.png           uint16 mm, 256x192; corrected_depth/ belongs to corrected_images/
+    keyframes/confidence/1442008525605.png      uint8: 0 low, 255 high, other values medium (127 as documented, 54 in
+                                                exports)
 
 Corrected files are preferred. Up is taken from the recorded poses, because the y axis of optimized poses is
 undocumented.
@@ -28,7 +28,7 @@ from framework.files.image_files import read_color, read_uint8, read_uint16
 from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, meters
 
 MICROSECONDS = 1e6  # per second
-LEVELS = (1, 255)  # lowest values of medium and high confidence
+LEVELS = (1, 255)  # minimum values of medium and high confidence
 ROWS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 
 
@@ -78,7 +78,7 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
 
 
 def _pose(path: Path, content: dict[str, Any]) -> Float64:
-    """Return T_world_camera (4, 4). Raises DataError, with the file."""
+    """Return T_world_camera (4, 4) in the content of a camera file. Raises DataError that names the file."""
     rows = np.reshape(numbers_of(path, content, *ROWS), (3, 4))
     return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
 

@@ -1,14 +1,16 @@
-"""Record3D (https://record3d.app): its "EXR + RGB" export and its .r3d files.
+"""Record3D (https://record3d.app): "EXR + RGB" exports and .r3d files.
 
-    metadata.json           w, h and dw, dh px of color and depth; K, 3 x 3 in columns, of color; fps; poses, a list
-                            [qx, qy, qz, qw, x, y, z] per frame; newer: frameTimestamps, s, and
-                            perFrameIntrinsicCoeffs, [fx, fy, cx, cy] per frame
-    rgb/0.jpg, depth/0.exr  8-bit color; depth in m, half or single floats in the one channel R
+    metadata.json           w, h: size of color, px; dw, dh: size of depth, px; K: intrinsics of color, 3 x 3,
+                            column-major; fps; poses: [qx, qy, qz, qw, x, y, z] per frame; in newer versions
+                            frameTimestamps, s, and perFrameIntrinsicCoeffs: [fx, fy, cx, cy] per frame
+    rgb/0.jpg, depth/0.exr  8-bit color; depth in m, as half or single floats in the single channel R
 
-An .r3d file is a zip: metadata (the same JSON), rgbd/0.jpg, rgbd/0.depth (float32, m) and rgbd/0.conf (uint8, 0 to 2,
-only with a LiDAR), the last two compressed by LZFSE. Images are upright in both, and poses are T_world_camera of the
-upright camera in ARKit's axes. Older versions began with the identity, without known up; newer ones have
-`arframe.camera.transform` (marek-simonik/record3d, issues 27 and 64): up is known if the first pose is rotated.
+An .r3d file is a zip archive of metadata (the same JSON), rgbd/0.jpg, rgbd/0.depth (float32, m) and rgbd/0.conf.
+Confidence (uint8, 0 to 2) requires a LiDAR. Depth and confidence are compressed with LZFSE.
+
+Images are upright in both formats. Poses are T_world_camera of the upright camera in ARKit's axes. In older versions,
+the first pose is the identity and the up direction is unknown. Newer versions store `arframe.camera.transform`
+(marek-simonik/record3d, issues 27 and 64). The up direction is therefore known if the first pose is rotated.
 """
 
 from __future__ import annotations
@@ -37,9 +39,9 @@ from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, 
 
 CHANNEL = "R"  # of the EXR files
 LZFSE_BLOCK = b"bvx"  # first bytes of each block of compressed data
-BYTES_A_BLOCK = 20_000  # minimum of an image; the compressor ends a block after 40,000 bytes without repetitions
-UNTURNED = 1e-3  # sine of half the angle; a hand-held phone is never aligned with the world axes this exactly
-MOST_BLOCKS = 8  # allowed in addition: each block may decompress to 27 MB, whatever its header declares
+BYTES_A_BLOCK = 20_000  # minimum block size of an image; blocks end after 40,000 bytes without repetitions
+UNTURNED = 1e-3  # sine of half the angle; a hand-held phone is never aligned this exactly with the world axes
+MOST_BLOCKS = 8  # additional blocks; the number is limited because a block may decompress to 27 MB
 
 _load_openexr = partial(import_optional, "OpenEXR", "reads Record3D's depth", "phone")
 _load_lzfse = partial(import_optional, "lzfse", "unpacks Record3D's .r3d files", "phone")
@@ -64,25 +66,25 @@ def open_file(path: Path) -> Source:
 
 @dataclass(frozen=True)
 class ExrFolder:
-    """Images of an export, by frame number. Reading may raise DataError."""
+    """Images of an export by frame number. Reading may raise DataError."""
 
     folder: Path
 
     def color(self, number: int) -> UInt8:
-        """Return color (H, W, 3), RGB."""
+        """Return the color (H, W, 3), RGB."""
         return read_color(self.folder / f"rgb/{number}.jpg")
 
     def depth(self, number: int, shape: tuple[int, int]) -> Float32:
-        """Return depth (h, w) in m, 0 = no reading."""
+        """Return the depth (h, w) in m, 0 = no reading."""
         path = self.folder / f"depth/{number}.exr"
         return readings(_read_exr(path, read_bytes(path, LARGEST_FILE), shape))
 
     def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
-        """Return the confidence (h, w) of depth, 0 to 2; None = not known."""
+        """Return the confidence (h, w) of depth, 0 to 2; None = unknown."""
         return None
 
     def name(self, number: int) -> str:
-        """Return the file of a frame, for messages."""
+        """Return the depth file of a frame, for messages."""
         return str(self.folder / f"depth/{number}.exr")
 
 
@@ -90,7 +92,7 @@ class R3dFile:
     """Images of an .r3d file, with the methods of `ExrFolder`."""
 
     def __init__(self, path: Path) -> None:
-        """Raise DataError, with the file, if it is not a zip archive."""
+        """Open an .r3d file. Raises DataError that names the file if it is not a zip archive."""
         self.path = path
         try:
             self._zip = zipfile.ZipFile(path)
@@ -113,7 +115,7 @@ class R3dFile:
         return f"{self.path}: rgbd/{number}.depth"
 
     def read(self, name: str, most: int) -> bytes:
-        """Return the content of a member. Raises DataError for unreadable members and sizes above `most` bytes."""
+        """Return the content of an archive member. Raises DataError if it is unreadable or larger than `most` bytes."""
         try:
             info = self._zip.getinfo(name)
             if info.file_size > most:
@@ -129,8 +131,11 @@ class R3dFile:
     def _unpacked(self, name: str, dtype: str, shape: tuple[int, int]) -> np.typing.NDArray[np.generic]:
         size = math.prod(shape) * np.dtype(dtype).itemsize
         packed = self.read(name, 2 * size + 1000)
-        if packed.count(LZFSE_BLOCK) > MOST_BLOCKS + size // BYTES_A_BLOCK:
-            raise FrameError(f"{self.path}: {name}: expected LZFSE blocks for {size} bytes, got too many blocks")
+        blocks, most = packed.count(LZFSE_BLOCK), MOST_BLOCKS + size // BYTES_A_BLOCK
+        if blocks > most:
+            raise FrameError(
+                f"{self.path}: {name}: expected at most {most} LZFSE blocks for {size} bytes, got {blocks}"
+            )
         lzfse = _load_lzfse()
         try:
             raw = lzfse.decompress(packed)
@@ -180,7 +185,7 @@ def _pose(where: str, values: Any) -> Float64:
 
 
 def _is_turned(pose: Any) -> bool:
-    """Return True for a valid stored pose with a rotation."""
+    """Return True if a stored pose is valid and rotated."""
     try:
         quat_xyzw = number_list("pose", pose, 7)[:4]
     except DataError:
@@ -198,7 +203,7 @@ def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> li
 
 
 def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[float]:
-    """Return the timestamp of each frame in s, from the frame rate in older recordings."""
+    """Return the timestamp (s) of each frame, derived from the frame rate in older recordings."""
     if "frameTimestamps" in content:
         return number_list(f"{where}: frameTimestamps", content.get("frameTimestamps"), count)
     [rate] = numbers_of(where, content, "fps")
@@ -208,7 +213,7 @@ def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[fl
 
 
 def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
-    """Return the size (h, w) of depth in px; in older versions, without the keys, that of color."""
+    """Return the size (h, w) of depth in px. Older versions lack the keys and use the size of color."""
     if "dw" not in content:
         return camera.shape
     width, height = numbers_of(where, content, "dw", "dh")
@@ -216,7 +221,7 @@ def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) 
 
 
 def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDArray[np.floating]:
-    """Return the channel (h, w). The header is checked first, because it determines the required memory."""
+    """Return the depth channel (h, w). The header is checked first, because it determines the required memory."""
     OpenEXR = _load_openexr()
     try:
         header = OpenEXR.File(io.BytesIO(data), header_only=True).header()

@@ -1,10 +1,10 @@
 """3D Scanner App by Laan Labs (https://3dscannerapp.com): the export "All Data" of a low-resolution scan.
 
-frame_00000.json        intrinsics, 3 x 3 in rows, of color; cameraPoseARFrame, 4 x 4 in rows, ARKit's
-                        T_world_camera; time, s
-frame_00000.jpg         8-bit color in sensor orientation, only of some frames
+frame_00000.json        intrinsics of color, 3 x 3, row-major; cameraPoseARFrame, ARKit's T_world_camera, 4 x 4,
+                        row-major; time, s
+frame_00000.jpg         8-bit color in sensor orientation, only for some frames
 depth_00000.png         uint16 mm, 256x192
-conf_00000.png          uint8 0 to 2, ARKit's, optional
+conf_00000.png          uint8 0 to 2, from ARKit, optional
 """
 
 from __future__ import annotations

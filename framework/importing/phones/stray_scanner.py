@@ -1,13 +1,13 @@
 """Stray Scanner (https://github.com/strayrobots/scanner, docs/format.md): iPhones and iPads with LiDAR.
 
-    rgb.mp4                 HEVC, 1920x1440, in sensor orientation: rotated if the phone was held upright
-    depth/000000.png        uint16 mm, 256x192, one per frame of the video
-    confidence/000000.png   uint8 0 to 2, ARKit's
+    rgb.mp4                 HEVC, 1920x1440, in sensor orientation; appears rotated if the phone was held upright
+    depth/000000.png        uint16 mm, 256x192, one image per video frame
+    confidence/000000.png   uint8 0 to 2, from ARKit
     camera_matrix.csv       3 x 3 intrinsics of the video
-    odometry.csv            timestamp, frame, x, y, z, qx, qy, qz, qw, and of newer versions fx, fy, cx, cy
+    odometry.csv            timestamp, frame, x, y, z, qx, qy, qz, qw; in newer versions also fx, fy, cx, cy
 
-The app rotates ARKit's camera about its x axis before writing (q_WA * q_AC in its OdometryEncoder). Poses are therefore
-T_world_camera in OpenCV's axes, which the accelerometer of a real recording confirms.
+The app rotates ARKit's camera about its x axis before writing (q_WA * q_AC in OdometryEncoder). Poses are therefore
+T_world_camera in OpenCV's axes. The accelerometer data of a real recording confirm this.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ from framework.files.number_lines import SHOWN, numbers, read_lines
 from framework.files.tum_trajectory import TumLine
 from framework.importing.source import DeviceFrame, Format, Source, arkit_up, meters
 
-POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # the first columns of odometry.csv
-INTRINSICS = ("fx", "fy", "cx", "cy")  # the next ones, of newer versions
-KIND_AT, KIND = 4, b"ftyp"  # of an MP4 or QuickTime file; other types may reference files that FFmpeg would open
-QUIET = "-8"  # FFmpeg's AV_LOG_QUIET: damage is reported by DataError
+POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # first columns of odometry.csv
+INTRINSICS = ("fx", "fy", "cx", "cy")  # next columns, in newer versions
+# type of MP4 and QuickTime files; other types may make FFmpeg open other files
+KIND_AT, KIND = 4, b"ftyp"
+QUIET = "-8"  # FFmpeg's AV_LOG_QUIET; DataError reports damage
 LAST_FRAME = 10**6 - 1  # six digits
 
 
@@ -41,7 +42,7 @@ class OdometryRow:
     """A line of odometry.csv."""
 
     line: TumLine
-    frame: int  # number of the images
+    frame: int  # frame number of the images
     camera: Camera  # of the video in this frame
 
 
@@ -76,7 +77,7 @@ def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: b
 
 
 def _read_odometry(path: Path, camera: Camera) -> list[OdometryRow | DataError]:
-    """Return each frame's row or error; `camera` is used for rows without intrinsics."""
+    """Return the row or error of each frame. `camera` is used for rows without intrinsics."""
     lines = read_lines(path)
     header = [word.strip() for word in lines[0].split(",")] if lines else []
     if tuple(header[: len(POSE)]) != POSE:
@@ -113,14 +114,14 @@ def _read_camera(path: Path, video: Video) -> Camera:
 
 
 class Video:
-    """Reader of video frames in sensor orientation, as for depth, without the rotation in the metadata."""
+    """Reader of video frames in sensor orientation, as for depth. The rotation in the metadata is ignored."""
 
     def __init__(self, path: Path) -> None:
-        """Raise DataError, with the file, if it cannot be decoded."""
+        """Open a video. Raises DataError that names the file if it cannot be decoded."""
         check_regular(path)
         with path.open("rb") as file:
-            if not file.read(KIND_AT + len(KIND)).endswith(KIND):
-                raise DataError(f"{path}: expected an MP4 or QuickTime file, got another format")
+            if not (start := file.read(KIND_AT + len(KIND))).endswith(KIND):
+                raise DataError(f"{path}: expected an MP4 or QuickTime file, got a file that begins with {start!r}")
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", QUIET)
         self.path = path
         before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -136,7 +137,7 @@ class Video:
         self._next = 0
 
     def frame(self, number: int) -> UInt8:
-        """Return color (H, W, 3), RGB, of a frame from 0. Frames must be read in order. Raises FrameError."""
+        """Return the color (H, W, 3), RGB, of a frame, from 0. Frames must be read in order. Raises FrameError."""
         if number < self._next - 1:
             raise FrameError(f"{self.path}: expected increasing frames, got {number} after {self._next - 1}")
         while self._next <= number:

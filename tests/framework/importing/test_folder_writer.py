@@ -87,7 +87,7 @@ def test_interrupted_import_has_no_camera_json(tmp_path: Path) -> None:
         ({"depth": np.zeros((1, 16), np.float32)}, "expected depth of at least 2x2 px, got 16x1 px"),
         (
             {"confidence": np.zeros((12, 15), np.uint8)},
-            r"expected confidence of shape \(12, 16\) as depth, got \(12, 15\)",
+            r"expected confidence of shape \(12, 16\), as for depth, got \(12, 15\)",
         ),
     ],
 )
@@ -129,7 +129,7 @@ def test_image_of_other_size_is_resampled_to_first_camera(tmp_path: Path) -> Non
 
 
 def test_unknown_format_error_lists_formats(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"expected a supported format, got an unknown one; supported: stray_scanner"):
+    with pytest.raises(DataError, match=r"expected a supported format, got an unknown format; supported: stray"):
         open_source(tmp_path)
     with pytest.raises(DataError, match="expected a recording, got no such file or folder"):
         open_source(tmp_path / "nowhere")

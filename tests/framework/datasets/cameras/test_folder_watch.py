@@ -138,7 +138,7 @@ def test_decreasing_frame_number_is_reported(folder: Path) -> None:
     write(folder, 7)
     assert watched.look() == [7]
     write(folder, 3)
-    assert watched.look() == [f"{folder}/color/000003.jpg: expected frames in order, got it after frame 7"]
+    assert watched.look() == [f"{folder}/color/000003.jpg: expected ascending frames, got 3 after 7"]
     write(folder, 9)
     assert watched.look() == [9]
 

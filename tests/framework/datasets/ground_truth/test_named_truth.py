@@ -152,7 +152,7 @@ def test_frame_without_a_pose_has_no_rendered_truth(folder: Path, tracked_run: P
     times, poses = read_tum(tracked_run / "trajectory.txt")
     write_tum(tracked_run / "trajectory.txt", times[:2], poses[:2])
     frame = RgbdFolder(folder, ground_truth=tracked_run)[2]
-    with pytest.raises(NoPoseError, match="frame 2: expected a pose to render its true instances from"):
+    with pytest.raises(NoPoseError, match="frame 2: expected a pose to render ground-truth instances"):
         GroundTruthDetector().detect(frame)
     assert frame_hash(frame, ("color", "truth")), "a stored detection is found without rendering"
 

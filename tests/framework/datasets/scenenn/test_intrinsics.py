@@ -47,8 +47,8 @@ def test_intrinsics_syntax_variants_are_read(tmp_path, text):
         ("cx 320", "cx nan", "line 4: cx: expected a finite value in px, got 'nan'"),
         ("cx 320", "cx 320 240", "line 4: cx: expected a finite value in px, got '320 240'"),
         ("cx 320", "depth_width 0", "line 4: depth_width: expected a value > 0 px"),
-        ("cx 320", "fx 544", "line 4: fx: expected one value, got a second one"),
-        ("cy 240\n", "", "asus.ini: expected lines with fx, fy, cx, cy, got none with cy"),
+        ("cx 320", "fx 544", "line 4: fx: expected one value, got 544 and 544"),
+        ("cy 240\n", "", "asus.ini: expected values of fx, fy, cx, cy, got no cy"),
     ],
 )
 def test_invalid_intrinsics_error_gives_file_and_line(tmp_path, old, new, message):

@@ -180,7 +180,7 @@ def test_nonincreasing_timestamps_default_to_30_hz(root: Path, caplog: pytest.Lo
 def test_incomplete_timestamps_are_ignored(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_timestamps(root / "016" / "timestamp.txt", {k: 7 + k / 10 for k in (1, 2, 4)})
     assert [frame.timestamp for frame in SceneNN(root, "016")] == [k / 30 for k in range(FRAMES)]
-    assert caplog.text.count("timestamp.txt: expected times of all images, got none for 1 of 4, first 3") == 1
+    assert caplog.text.count("timestamp.txt: expected timestamps of all images, got none for 1 of 4, first 3") == 1
 
 
 @pytest.mark.parametrize("line", ["2 x 5", "2 5", "1 0 0", "2 0 nan"])

@@ -119,7 +119,7 @@ def test_invalid_oriented_box_reads_as_none(path, text):
         ('<label id="-1"/>', "line 3: .* got '-1'"),
         ('<label id="1.0"/>', "line 3: .* got '1.0'"),
         ('<label id="2147483648"/>', "line 3: .* got '2147483648'"),
-        ('<label id="5" text="a"/>', "line 3: label 5: expected the attributes of line 2, got others"),
+        ('<label id="5" text="a"/>', "line 3: label 5: expected text=None as in line 2, got 'a'"),
         ("<label id=5/>", r"line 3: expected valid XML: not well-formed \(invalid token\)"),
         ('<label id="6">', "line 4: expected valid XML: mismatched tag"),
         ('<label id="&a;"/>', "line 3: expected valid XML: undefined entity"),
@@ -147,7 +147,7 @@ BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10 if k else "ha"}">' for k in 
 def test_xml_entities_and_document_types_raise(path, prologue):
     path.write_text(f'<?xml version="1.0"?>\n{prologue}\n<l><label id="1" text="&a11;"/></l>')
     began = time.perf_counter()
-    with pytest.raises(DataError, match=r"011.xml, line 2: expected no document type or entity, got one") as caught:
+    with pytest.raises(DataError, match=r"011.xml, line 2: expected XML without a document type or entities") as caught:
         read_annotation(path)
     assert time.perf_counter() - began < 1
     assert "\n" not in str(caught.value)
@@ -191,8 +191,8 @@ def test_missing_or_oversized_annotation_raises(path, monkeypatch):
         ({"color": (0, 0, 256)}, "label 5: color: expected 3 values"),
         ({"text": "a\0b"}, r"label 5: expected a name .*, got 'a\\x00b'"),
         ({"nyu_class": "\ud800"}, "label 5"),
-        ({"aabb": np.full((2, 3), np.nan)}, "label 5: expected boxes of finite extent"),
-        ({"obb": dataclasses.replace(BOX, extent=np.array([1, 1, -1.0]))}, "label 5: expected boxes of finite extent"),
+        ({"aabb": np.full((2, 3), np.nan)}, "label 5: expected finite boxes with extent >= 0, got {'aabbox': 'nan nan"),
+        ({"obb": dataclasses.replace(BOX, extent=np.array([1, 1, -1.0]))}, "label 5: expected finite boxes"),
     ],
 )
 def test_writing_invalid_label_raises_and_leaves_no_file(path, change, message):

@@ -177,7 +177,7 @@ def test_decompression_bomb_loses_its_frame(r3d: Path, tmp_path: Path) -> None:
     packed = lzfse.compress(bytes(10**6))
     bomb = 100 * packed[:-4] + packed[-4:]  # the last four bytes end the stream
     written = write_folder(open_source(rewritten(r3d, "rgbd/1.depth", bomb)), tmp_path / "out", Writing())
-    assert re.search("expected at most .* bytes|too many blocks", written.errors[0])
+    assert re.search("expected at most .* (bytes|LZFSE blocks)", written.errors[0])
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no zip at all" * 100])
