@@ -1,1 +1,1 @@
-"""The numerical pieces that detectors share: box arithmetic, non-maximum suppression, RoIAlign and masks."""
+"""Numerical code shared by detectors: box arithmetic, non-maximum suppression, RoIAlign and masks."""

@@ -1,6 +1,6 @@
 """Box candidates: the output layouts of common box detectors, and the selection of the best candidates.
 
-Boxes are x1 y1 x2 y2 px of the network's input, as borders: 0 is the left border of the first pixel.
+Boxes are borders x1 y1 x2 y2 in px of the network's input: 0 is the left border of the first pixel.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class OutputLayout(Enum):
 
 @dataclass(frozen=True)
 class Candidates:
-    """K boxes with a score for each of C classes; a candidate's own score is the largest of them."""
+    """K boxes with scores for C classes; the score of a candidate is its largest class score."""
 
     boxes: Float32  # (K, 4) px
     class_scores: Float32  # (K, C) in [0, 1], multiplied by the objectness
@@ -39,7 +39,7 @@ class Candidates:
     def best(self, threshold: float, nms: float, limit: int) -> Int32:
         """Return the indices of at most `limit` candidates with scores above `threshold`, best first.
 
-        `nms`: IoU above which a candidate is suppressed by a better one of the same best class.
+        `nms`: A candidate is suppressed if its IoU with a better candidate of the same best class exceeds `nms`.
         """
         scores = self.class_scores.max(axis=1)
         x1, y1, x2, y2 = self.boxes.T
@@ -50,8 +50,9 @@ class Candidates:
 
 
 def decode(layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
-    """Return the candidates in a network's `outputs` by name, for an input of `shape` (height, width) px and C classes.
+    """Return the candidates in a network's `outputs`.
 
+    `outputs`: the arrays by name. `shape`: (height, width) px of the input. `classes`: the number of classes, C.
     Raises DataError if the outputs do not have the layout.
     """
     if layout not in (OutputLayout.yolox, OutputLayout.yolo, OutputLayout.yolo_objectness):
@@ -73,7 +74,10 @@ def _checked(boxes: Float32, class_scores: Float32) -> Candidates:
 
 
 def check_scores(class_scores: Float32) -> None:
-    """Raise DataError unless all scores are in [0, 1]; some networks are exported without sigmoid or softmax."""
+    """Raise DataError unless all scores are in [0, 1].
+
+    Networks exported without their sigmoid or softmax have other scores.
+    """
     if class_scores.size and (class_scores.min() < -1e-3 or class_scores.max() > 1 + 1e-3):
         raise DataError(
             f"detector.layout: expected scores in [0, 1], got {class_scores.min():.3g} to "
@@ -83,12 +87,15 @@ def check_scores(class_scores: Float32) -> None:
 
 
 def described(outputs: Mapping[str, Float32]) -> str:
-    """Return the names and shapes of outputs, for messages."""
+    """Format the names and shapes of outputs for messages."""
     return ", ".join(f"{name} {array.shape}" for name, array in outputs.items())
 
 
 def _rows(output: Float32, columns: int, other_layout: str) -> Float32:
-    """Return the candidates (K, columns) of an output (K, columns) or (columns, K), with or without a leading axis."""
+    """Return the candidates (K, columns) of an output (K, columns) or (columns, K).
+
+    The output may have a leading axis of length 1.
+    """
     table = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
     if table.ndim == 2 and table.shape[1] == columns:
         return table
@@ -102,13 +109,13 @@ def _rows(output: Float32, columns: int, other_layout: str) -> Float32:
 
 
 def corners(boxes: Float32) -> Float32:
-    """Return boxes (K, 4) of center x, y, width, height as x1 y1 x2 y2."""
+    """Convert boxes (K, 4) from center x, y, width, height to x1 y1 x2 y2."""
     half = boxes[:, 2:] / 2
     return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
 
 
 def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
-    """Return boxes (K, 4) of center x, y, width, height in px.
+    """Decode boxes (K, 4) of center x, y, width, height in px.
 
     Source: Ge et al., "YOLOX", 2021; github.com/Megvii-BaseDetection/YOLOX, yolox/utils/demo_utils.py.
     """
@@ -131,13 +138,14 @@ def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
 def _decode_ssd(
     layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int
 ) -> Candidates:
-    """Return boxes with scores by class if the network has them, else with a score and a label for each box.
+    """Return the candidates of an SSD.
 
-    Outputs are identified by name, as in TensorFlow's object detection API (detection_boxes, detection_classes,
-    detection_scores, detection_multiclass_scores) and torchvision's models.detection (boxes, labels, scores). Label 0
-    and the first of C + 1 scores are the background.
+    The class scores are outputs of the network, or derived from one score and one label per box. Outputs are identified
+    by name. TensorFlow's object detection API uses detection_boxes, detection_classes, detection_scores and
+    detection_multiclass_scores. torchvision's models.detection uses boxes, labels and scores. Label 0 and the first of
+    C + 1 scores are the background.
     """
-    # raw: the candidates before TensorFlow's own suppression
+    # "raw" outputs are the candidates before TensorFlow's non-maximum suppression
     tables = {name: array for name, array in outputs.items() if "raw" not in name and "num" not in name}
     boxes = [array for name, array in tables.items() if "box" in name and array.shape[-1] == 4 and array.ndim in (2, 3)]
     if len(boxes) == 1:
@@ -166,10 +174,10 @@ def _ssd_boxes(layout: OutputLayout, boxes: Float32, shape: tuple[int, int]) -> 
 
 
 def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
-    """Return scores by class (K, C) from one score and one label, from 1, for each of K boxes.
+    """Return the class scores (K, C) of K boxes with one score and one label each.
 
-    1 - score is distributed evenly over the other classes, but none of them exceeds the label. Rows of the background
-    and of score 0 (padding) are 0.
+    Labels start at 1. The remainder, 1 - score, is distributed evenly over the other classes, but no class exceeds the
+    label. Rows of the background and rows with score 0 (padding) are 0.
     """
     column = np.rint(labels).astype(np.int64) - 1
     used = (column != -1) & (scores > 0)
@@ -186,10 +194,10 @@ def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
 
 
 def spread_rest(one_hot: Float32, scores: Float32, spread: float) -> Float32:
-    """Return class distributions (N, C) from one-hot labels and scores (N,).
+    """Return the class distributions (N, C) for one-hot labels (N, C) and scores (N,).
 
-    The label gets 1 - spread * (1 - score), but at least 1 / C, and the other classes get equal parts of the rest.
-    spread in [0, 1]: with 1 the label's probability is its score, with 0 the label is certain.
+    The label gets 1 - spread * (1 - score), but at least 1 / C. The other classes share the remainder equally.
+    `spread` is in [0, 1]: with 1, the probability of the label is its score; with 0, the label is certain.
     """
     c = one_hot.shape[1]
     if c == 1:

@@ -1,4 +1,4 @@
-"""Image domains: a detector trained on rendered rooms is confidently wrong in photographs."""
+"""Image domains: a detector trained only on rendered images is unreliable on photographs, even at high confidence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RENDERED_ROOMS = "rendered rooms"
 
 
 def warn_outside_domain(detector: Detector, video: RGBDVideo | None) -> None:
-    """Log a warning if the detector is not for the images of `video`; None = unknown images."""
+    """Log a warning if the detector was trained on another domain than the images of `video`; None = unknown images."""
     if detector.domain in ("", video.domain if video else ""):
         return
     log.warning(

@@ -1,4 +1,4 @@
-"""Locations of false positives that recur in all frames that show them."""
+"""Locations of recurring false positives: a location has a false positive in every frame that shows it."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from framework.data import Frame, Int64
 from framework.geometry import transform
 
 CELL = 0.5  # m, side of a cell
-STEP = 8  # px between the sampled readings
-LEAST_READINGS = 4  # of a visible cell
-KEYS = 2**30  # number of keys; a negated key is a free instance id
+STEP = 8  # px between the sampled depth readings
+LEAST_READINGS = 4  # minimum number of readings in a visible cell
+KEYS = 2**30  # number of keys; negated keys serve as instance ids, which are otherwise positive
 
 
 @dataclass(frozen=True)
 class FalsePositiveCell:
-    """A visible cell of the world, and the mean of its readings."""
+    """A visible cell of the world frame, with the mean of its depth readings."""
 
-    key: int  # of the cell, in [1, KEYS]; cells with smaller keys come first
+    key: int  # hash of the cell, in [1, KEYS]; cells are sorted by key
     u: float  # px
     v: float  # px
     z: float  # m
 
 
 def false_positive_cells(frame: Frame, seed: int, count: int) -> list[FalsePositiveCell]:
-    """Return at most `count` cells that `frame` shows outside of objects of known class, by key.
+    """Return at most `count` visible cells outside of objects of known class, sorted by key.
 
-    Empty if the frame has no pose.
+    Return an empty list if the frame has no pose or no ground truth.
     """
     if count == 0 or frame.T_world_camera is None or frame.truth is None:
         return []
@@ -48,7 +48,7 @@ def false_positive_cells(frame: Frame, seed: int, count: int) -> list[FalsePosit
 
 
 def _keys(cells: Int64, seed: int) -> Int64:
-    """Return keys (N,) in [1, KEYS] of cells (N, 3): a hash by the finalizer of SplitMix64 (Steele et al. 2014)."""
+    """Hash cells (N, 3) to keys (N,) in [1, KEYS] with the finalizer of SplitMix64 (Steele et al. 2014)."""
     mixed = np.zeros(len(cells), np.uint64)
     for number in (np.full(len(cells), seed), *cells.T):
         mixed += number.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)

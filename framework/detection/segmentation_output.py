@@ -1,7 +1,7 @@
 """Output layouts of segmentation networks with prototypes, as in exports of the YOLO family.
 
-Besides the prototypes there is one table: a row for every cell of the network, with a score for each class, or, if
-suppression and the choice of the class are part of the network, a row for each detection.
+A network has two outputs: prototypes and a table. Usually the table has a row with C class scores for every cell. If
+the network contains non-maximum suppression and the choice of the class, the table has a row for each detection.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from framework.detection.runtimes.onnx_network import ExportMetadata, Outputs
 from framework.errors import DataError
 
 MIN_ORDERED_CORNERS = 0.9  # fraction of the boxes whose third and fourth number are not below the first two
-MAX_ORDERED_CENTERS = 0.5  # the same fraction for centers and sizes, typically a few percent
-MIN_ROWS = 20  # for these fractions
-LARGEST_UNIT = 2.0  # boxes in 0..1 may exceed the image; no box in px lies within 2 px of the upper left corner
-CONFIDENT = 0.5  # score of a detection whose box must be ordered
+MAX_ORDERED_CENTERS = 0.5  # the same fraction of boxes with centers and sizes; typically a few percent
+MIN_ROWS = 20  # minimum number of rows for these fractions
+LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
+CONFIDENT = 0.5  # minimum score of a detection with required x1 <= x2, y1 <= y2
 STRIDES = (8, 16, 32, 64)  # px per cell in the YOLO family, the last only in large networks
 BOXES_PER_CELL = (1, 3)  # 3 up to YOLOv7
 SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, after x1 y1 x2 y2
 
 
 class BoxKind(Enum):
-    """The four numbers of a box."""
+    """Meaning of the four numbers of a box."""
 
     AUTO = "detected from the outputs for a black image"
     CENTER = "center x, y, width, height"
@@ -36,7 +36,7 @@ class BoxKind(Enum):
 
 @dataclass(frozen=True)
 class SegmentationOutput:
-    """K candidates with the M coefficients of their masks."""
+    """K candidates with M mask coefficients each."""
 
     candidates: Candidates
     coefficients: Float32  # (K, M)
@@ -45,10 +45,10 @@ class SegmentationOutput:
 
 @dataclass(frozen=True)
 class SegmentationLayout:
-    """How to read the two outputs of a network; None = undetermined by its outputs for a black image."""
+    """The layout of a network's two outputs; None = undetermined by the outputs for a black image."""
 
     classes: int  # C
-    objectness: bool  # there is one before the class scores
+    objectness: bool  # the class scores follow an objectness score
     shape: tuple[int, int]  # (height, width) px of the network's input
     suppressed: bool  # rows x1 y1 x2 y2, score, label, coefficients; one for each detection
     rows_first: bool  # the table is (1, K, columns), not (1, columns, K)
@@ -72,7 +72,7 @@ class SegmentationLayout:
         return SegmentationOutput(Candidates(self._boxes_px(rows, class_scores), class_scores), coefficients, maps)
 
     def determined_by(self, outputs: Outputs) -> SegmentationLayout:
-        """Return the layout with `boxes` and `unit` as determined by these outputs. Raises DataError if ambiguous."""
+        """Return the layout with `boxes` and `unit` determined from outputs. Raises DataError if they are ambiguous."""
         table, _ = _table_and_prototypes(outputs)
         rows = self._rows(table)
         used = rows[rows[:, SCORE] > 0] if self.suppressed else rows
@@ -84,7 +84,7 @@ class SegmentationLayout:
         return rows
 
     def _one_class_scores(self, rows: Float32) -> Float32:
-        """Return scores (K, C): the score of each row at its label, 0 elsewhere."""
+        """Return the class scores (K, C): the score of each row at its label, 0 elsewhere."""
         labels = rows[:, LABEL]
         if not _are_labels(labels, self.classes):
             raise DataError(
@@ -96,18 +96,17 @@ class SegmentationLayout:
         return class_scores
 
     def _boxes_px(self, rows: Float32, class_scores: Float32) -> Float32:
-        """Return boxes (K, 4) x1 y1 x2 y2 in px of the input."""
+        """Return the boxes (K, 4) x1 y1 x2 y2 in px of the input."""
         boxes = rows[:, :4]
         unit = _is_unit(boxes[rows[:, SCORE] > 0], self.shape, self.suppressed) if self.unit is None else self.unit
         confident = class_scores.max(axis=1, initial=0.0) >= CONFIDENT
         if self.boxes is BoxKind.CENTER:
             boxes = corners(boxes)
-        elif (
-            boxes[confident, 2:] < boxes[confident, :2]
-        ).any():  # None: every known export with suppression has corners
+        # None is treated as CORNER, because every known export with suppression has corners
+        elif len(unordered := boxes[confident][(boxes[confident, 2:] < boxes[confident, :2]).any(axis=1)]):
             raise DataError(
-                "detector.box_format: expected corners with x1 <= x2 and y1 <= y2, got others in a confident "
-                "detection; set detector.box_format=CENTER"
+                "detector.box_format: expected corners with x1 <= x2 and y1 <= y2 in confident detections, got "
+                f"{unordered[0].tolist()}; set detector.box_format=CENTER"
             )
         return boxes * np.array([self.shape[1], self.shape[0]] * 2, np.float32) if unit else boxes
 
@@ -121,10 +120,11 @@ def detect_layout(
     input_channels_last: bool,
     metadata: ExportMetadata,
 ) -> SegmentationLayout:
-    """Return the layout of a network from its outputs for a black image. Raises DataError if there is none.
+    """Return the layout of a network from its outputs for a black image. Raises DataError if no layout matches.
 
-    shape: (height, width) px of its input. Shapes determine everything except the kind of boxes. That follows from the
-    rows of cells, which cover the image: centers reach almost 1 or its size in px, and sizes do not exceed them.
+    `shape`: (height, width) px of the input. The shapes of the outputs determine everything except the kind of boxes.
+    The rows determine the kind of boxes, because the cells cover the image. Centers reach almost 1, or the image size
+    in px, and sizes do not exceed them.
     """
     table, prototypes = _table_and_prototypes(outputs)
     channels_last = _is_channels_last(prototypes, shape, input_channels_last, metadata)
@@ -139,7 +139,7 @@ def detect_layout(
     given = None if boxes is BoxKind.AUTO else boxes
     layout = SegmentationLayout(classes, objectness, shape, suppressed, suppressed or is_rows, channels_last, given)
     layout = layout.determined_by(outputs)
-    layout.read(outputs)  # raises DataError if another layout is used
+    layout.read(outputs)  # raises DataError for another layout
     return layout
 
 
@@ -157,16 +157,19 @@ def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
 def _is_channels_last(
     prototypes: Float32, shape: tuple[int, int], input_channels_last: bool, metadata: ExportMetadata
 ) -> bool:
-    """Return whether channels are last: cells are square, so the map has the input's proportions in one order only."""
+    """Return True if channels are last.
+
+    Cells are square, so the prototypes have the input's aspect ratio in only one order of the axes.
+    """
     _, a, b, c = prototypes.shape
     height, width = shape
     first, last = (abs(rows * width - columns * height) < max(shape) for rows, columns in ((b, c), (a, b)))
     if first and last and metadata.author.startswith("Ultralytics"):
-        return input_channels_last  # their exports transpose both or none
+        return input_channels_last  # Ultralytics exports transpose both input and output, or neither
     if first == last:
-        why = "ambiguous (1, M, h, w) or (1, h, w, M); export for another size" if first else "other proportions"
+        why = "ambiguous (1, M, h, w) or (1, h, w, M); export for another size" if first else "another aspect ratio"
         raise DataError(
-            f"detector.weights: expected prototypes with the proportions of the input {height}x{width}, got "
+            f"detector.weights: expected prototypes with the aspect ratio of the input {height}x{width}, got "
             f"{prototypes.shape} with {why}"
         )
     return bool(last)
@@ -177,9 +180,10 @@ def _are_labels(column: Float32, classes: int) -> bool:
 
 
 def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bool:
-    """Return whether an ambiguous table has detections: integer labels, and another number of rows than of cells.
+    """Return True if an ambiguous table contains detections.
 
-    The count matters for 8-bit networks, where most scores are 0.
+    Detections have integer labels, and their number differs from the number of cells. The labels are not sufficient in
+    8-bit networks, where most scores are 0.
     """
     cells = [-(-shape[0] // stride) * -(-shape[1] // stride) for stride in STRIDES]
     counts = {boxes * sum(cells[:levels]) for boxes in BOXES_PER_CELL for levels in (3, 4)}
@@ -189,7 +193,7 @@ def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bo
 def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness: bool, both: bool) -> str:
     if both:
         return (
-            f"detector.weights: expected different numbers of candidates and columns, got {columns} of both; "
+            f"detector.weights: expected different numbers of candidates and columns, got {columns} for both; "
             "export for another size"
         )
     other = columns - 1 if objectness else columns + 1
@@ -202,7 +206,10 @@ def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness:
 
 
 def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
-    """Return CENTER or CORNER for boxes (K, 4), None if detections are ambiguous. Raises DataError if cells are."""
+    """Return CENTER or CORNER for boxes (K, 4), None for ambiguous detections.
+
+    Raises DataError for ambiguous cells.
+    """
     if suppressed and len(boxes) < MIN_ROWS:
         return None
     ordered = (boxes[:, 2:] >= boxes[:, :2]).all(axis=1).mean()
@@ -219,15 +226,18 @@ def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
 
 
 def _is_unit(boxes: Float32, shape: tuple[int, int], suppressed: bool) -> bool | None:
-    """Return whether boxes (K, 4) are in 0..1; None without boxes. Raises DataError if they are not in px either."""
+    """Return True if boxes (K, 4) are in 0..1, False if they are in px, None without boxes.
+
+    Raises DataError for other units.
+    """
     if not len(boxes):
         return None
     if float(np.abs(boxes).max()) <= LARGEST_UNIT:
         return True
-    # cells cover the input; detections may not
+    # cells cover the input, but detections may not
     if not suppressed and (boxes[:, 0].max() < shape[1] / 4 or boxes[:, 1].max() < shape[0] / 4):
         raise DataError(
             f"detector.weights: expected boxes in px of the input {shape[0]}x{shape[1]} or in 0..1, got "
-            f"starts of up to {boxes[:, 0].max():.3g}, {boxes[:, 1].max():.3g}; export with decoded boxes"
+            f"x, y of at most {boxes[:, 0].max():.3g}, {boxes[:, 1].max():.3g}; export with decoded boxes"
         )
     return False

@@ -1,4 +1,4 @@
-"""The true instances of a frame."""
+"""Ground-truth instances of a frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.errors import DataError
 
 @dataclass(frozen=True)
 class TrueInstances:
-    """The N visible instances of known class, largest first, equal ones by id."""
+    """The N visible ground-truth instances of known class, largest first; ties are sorted by id."""
 
     ids: Int32  # (N,)
     class_ids: Int32  # (N,) index into the detector's classes
@@ -24,13 +24,13 @@ class TrueInstances:
 
 
 def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) -> TrueInstances:
-    """Return the instances of `frame` with a known class and at least `min_pixels`.
+    """Return the ground-truth instances of `frame` with a known class and at least `min_pixels` pixels.
 
-    Raises DataError if the sequence has no instance ground truth, or has a class that is not in `classes`.
+    Raises DataError if the sequence has no instance ground truth, or if a class is missing in `classes`.
     """
     if frame.truth is None:
         raise DataError(
-            f"frame {frame.index}: expected instance ground truth, which this detector needs, got none; set "
+            f"frame {frame.index}: expected instance ground truth for this detector, got none; set "
             "dataset.frame_ground_truth=true (scenenn, scannet) or dataset.ground_truth=PATH, or choose "
             "another dataset or detector"
         )

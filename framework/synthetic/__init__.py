@@ -1,1 +1,1 @@
-"""Synthetic furnished rooms: furniture, layout, light, camera trajectory and depth sensor."""
+"""Synthetic scenes: furniture, layout, light, camera trajectory and depth sensor."""

@@ -1,8 +1,8 @@
 """The ten scenes of the synthetic benchmark.
 
-`bedroom`, `couches`, `student` and `one_room` have objects on beds and couches; `living_chairs`, `meeting` and
-`kitchen` have rows of equal chairs; `books` and `office` have many books. Each of the nine classes is in several
-scenes, and clutter without class is on and next to the furniture of all.
+`bedroom`, `couches`, `student` and `one_room` have objects on beds and couches. `living_chairs`, `meeting` and
+`kitchen` have rows of identical chairs. `books` and `office` have many books. Each of the nine classes is in several
+scenes. All scenes have clutter without class on and next to the furniture.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from framework.synthetic.walk import CameraPath, plan_path
 SMALLEST = (4.8, 4.2)  # m, width and depth of the smallest candidate room
 STREWN = 9  # maximum number of objects on the floor next to furniture
 ATTEMPTS = 6  # candidate scenes; the trajectory with the best visibility is kept
-JUDGED_VIEWS = 30  # views of a trajectory for the visibility score
-WELL_SEEN, LONG_SEEN = 10, 1 / 6  # px of a visible object in a view; minimum fraction of such views
-SMALL_VIEW = Camera(80, 60, 68.0, 68.0, 39.5, 29.5)  # camera of these views, with a Kinect's field of view
+JUDGED_VIEWS = 30  # number of views for the visibility score of a trajectory
+WELL_SEEN, LONG_SEEN = 10, 1 / 6  # px, minimum area of a visible object in a view; minimum fraction of such views
+SMALL_VIEW = Camera(80, 60, 68.0, 68.0, 39.5, 29.5)  # camera of these views, with the field of view of a Kinect
 
 MakeGroup = Callable[[Rng], Group]
 
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """Purpose and contents of a room, in addition to the contents of all rooms."""
+    """Role and contents of a scene, in addition to the common contents of all scenes."""
 
     role: str  # description for messages
-    groups: tuple[MakeGroup, ...]  # largest first, for placement
+    groups: tuple[MakeGroup, ...]  # furniture groups, placed largest first
     holds: Mapping[str, int]  # COCO class -> minimum number of objects
 
 
@@ -64,7 +64,7 @@ def cupboard(rng: Rng) -> Group:
 
 
 def kitchen(rng: Rng) -> Group:
-    """Return a kitchen with objects on top of the refrigerator."""
+    """Return a kitchen group with objects on top of the refrigerator."""
     group = kitchen_group(rng)
     fridge = next(piece for piece in group.pieces if piece.kind == "refrigerator")
     strew_on(group, fridge, rng, small_things.some(rng, small_things.ON_TOPS, 1))
@@ -78,7 +78,7 @@ def shelf(rng: Rng) -> Group:
 
 SCENES: Mapping[str, SceneSpec] = {
     "living_chairs": SceneSpec(
-        "living room with a row of equal chairs",
+        "living room with a row of identical chairs",
         (cluttered_couch_group, laid_table_group, partial(chair_row, count=4), tv_group),
         {"couch": 1, "chair": 7, "dining table": 2, "tv": 1, "book": 2},
     ),
@@ -98,12 +98,12 @@ SCENES: Mapping[str, SceneSpec] = {
         {"couch": 2, "dining table": 1, "tv": 1, "backpack": 4, "book": 3},
     ),
     "office": SceneSpec(
-        "office with three equal desks and a refrigerator",
+        "office with three identical desks and a refrigerator",
         (partial(desk_row, count=3), partial(chair_row, count=2), kitchen, board_group, shelf),
         {"dining table": 3, "chair": 5, "refrigerator": 1, "book": 6, "backpack": 1},
     ),
     "meeting": SceneSpec(
-        "office and meeting room with many equal chairs",
+        "office and meeting room with many identical chairs",
         (partial(chair_row, count=4), laid_table_group, partial(desk_row, count=2), tv_group, shelf, bag, bag),
         {"chair": 9, "dining table": 3, "tv": 1, "backpack": 3, "book": 3},
     ),
@@ -118,22 +118,22 @@ SCENES: Mapping[str, SceneSpec] = {
         {"bed": 1, "couch": 1, "dining table": 2, "chair": 1, "toilet": 1, "backpack": 3, "book": 6},
     ),
     "kitchen": SceneSpec(
-        "kitchen with a table, a row of equal chairs and bags",
+        "kitchen with a table, a row of identical chairs and bags",
         (laid_table_group, kitchen, partial(chair_row, count=3), cupboard, bag, bag),
         {"dining table": 1, "chair": 6, "refrigerator": 1, "backpack": 3},
     ),
     "flat": SceneSpec(
-        "kitchen to live in, with a bed and a toilet",
+        "kitchen with a bed and a toilet",
         (cluttered_bed_group, kitchen, laid_table_group, toilet_group, board_group),
         {"bed": 1, "refrigerator": 1, "dining table": 1, "chair": 3, "toilet": 1, "book": 5},
     ),
 }
-"""The rooms by name."""
+"""Scenes by name."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A furnished room, the camera path through it, and the random generator for later steps."""
+    """A furnished room, a camera path through the room, and the random generator for later steps."""
 
     room: Room
     path: CameraPath
@@ -141,11 +141,9 @@ class Scene:
 
 
 def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: float) -> Scene:
-    """Return the candidate scene of this spec with the best visibility along `frames` frames.
+    """Return the candidate scene with the best visibility along `frames` frames.
 
-    `stride` is the stride of walk.plan_path.
-
-    Raises DataError if the furniture fits in no candidate.
+    `stride` is the stride of walk.plan_path. Raises DataError if no candidate has a layout for the furniture.
     """
     best: Scene | None = None
     most_shown = (-1.0, -1.0)
@@ -160,12 +158,12 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: floa
         if min(shown) == 1:
             break
     if best is None:
-        raise DataError(f"{spec.role}: furniture does not fit; set another seed")
+        raise DataError(f"{spec.role}: expected a furniture layout, got none in {ATTEMPTS} attempts; set another seed")
     return best
 
 
 def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
-    """Return a scene and the well-visible fractions of its classes and same-class objects."""
+    """Draw a random scene; return it with the well-visible fractions of its classes and of its objects."""
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
@@ -182,7 +180,7 @@ def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[
 
 
 def furnish_scene(spec: SceneSpec, rng: Rng) -> Room:
-    """Return a random room of this spec. Raises DataError if its furniture does not fit."""
+    """Return a random room for a spec. Raises DataError if there is no layout for its furniture."""
     contents = [make(rng) for make in spec.groups]
     contents += [
         single("door", clutter.door(rng)),

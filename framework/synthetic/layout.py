@@ -1,7 +1,7 @@
 """Furniture layout: groups against walls, without intersections, with free space for the camera path.
 
-Groups are placed at random positions along the walls. Of several complete layouts, the one with the most free space is
-kept. If none has enough, the room is enlarged.
+Groups are placed at random positions along the walls. The best of several complete layouts has the most free space. If
+its free space is too small, the room is enlarged.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ CLEARANCE = 0.06  # m, between groups
 MARGIN = 0.05  # m, between a group and the corner of the room
 LAYOUTS = 16  # complete candidate layouts
 TRIES = 50  # candidate positions of each group
-GROWTH = (1.0, 1.06, 1.12, 1.2, 1.3, 1.4, 1.5)  # relative side lengths of candidate rooms
+GROWTH = (1.0, 1.06, 1.12, 1.2, 1.3, 1.4, 1.5)  # scale factors of the side lengths of candidate rooms
 WALK_RADIUS = 1.3  # m, minimum radius of the free circle for a camera path
-HEAD_ROOM = 1.9  # m, objects above do not block the camera path
+HEAD_ROOM = 1.9  # m, higher objects do not block the camera path
 CONTACT = 0.003  # m, between the boxes of touching objects on the floor
 PLACES = 60  # candidate positions of each object on the floor
-ON_FLOOR = 0.05  # m, objects with a lower base stand on the floor
-NO_HOSTS = ("door", "window", "rug")  # no objects are placed against these
+ON_FLOOR = 0.05  # m, maximum height of the base of objects on the floor
+NO_HOSTS = ("door", "window", "rug")  # kinds without objects next to them
 CELL = 0.05  # m, cell size of the grid of free floor
 
 
@@ -38,14 +38,14 @@ class Layout:
 
     width: float  # m, along x
     depth: float  # m, along y
-    pieces: list[Furniture]  # in room coordinates: x and y along the walls, z up, origin at the center of the floor
-    free: Float64  # (rows along y, columns along x) m from each CELL of the floor to furniture or walls
+    pieces: list[Furniture]  # objects in the room frame: x, y along the walls, z up, origin at the center of the floor
+    free: Float64  # (rows along y, columns along x) distance (m) of each floor CELL to furniture or walls
 
 
 def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout:
-    """Return the groups in the smallest room, at least `width` x `depth` m, with space for a camera path.
+    """Arrange groups in the smallest possible room with space for a camera path.
 
-    Raises DataError if a room with 1.5 times these sides is too small.
+    The room has at least `width` x `depth` m. Raises DataError if a room with 1.5 times these sides is too small.
     """
     boxes = [group.boxes for group in groups]
     for factor in GROWTH:
@@ -59,7 +59,10 @@ def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout
             placed = [g.placed(*at) for g, at in zip(groups, complete[best].places, strict=True)]
             pieces = [piece for group in placed for piece in group.pieces]
             return Layout(factor * width, factor * depth, pieces, free[best])
-    raise DataError(f"synthetic room: {len(groups)} groups of furniture do not fit; set another seed or scene")
+    raise DataError(
+        f"synthetic scene: expected a layout of {len(groups)} furniture groups, got none in {len(GROWTH) * LAYOUTS} "
+        "attempts; set another seed or scene"
+    )
 
 
 @dataclass
@@ -71,7 +74,7 @@ class _Plan:
 def _try_layout(
     groups: list[Group], boxes_of_groups: list[Float64], width: float, depth: float, rng: Rng
 ) -> _Plan | None:
-    """Return a random layout, None if a group does not fit. Uses boxes only, whose quarter turns are exact."""
+    """Return a random layout of boxes, None if a group does not fit. Quarter turns of boxes are exact."""
     plan = _Plan()
     taken = np.zeros((0, 2, 3))
     walls: dict[str, tuple[int, float]] = {}
@@ -117,7 +120,7 @@ def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
 
 
 def _turned_boxes(boxes: Float64, quarters: int, place: Place) -> Float64:
-    """Return boxes (N, 2, 3) after quarter turns and a translation."""
+    """Apply quarter turns and a translation to boxes (N, 2, 3)."""
     R = np.rint(axis_rotation("z", quarters * np.pi / 2))
     corners = boxes @ R.T + np.array([place[0], place[1], 0.0])
     return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
@@ -135,7 +138,7 @@ def _inside(boxes: Float64, width: float, depth: float) -> bool:
 
 
 def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
-    """Return a lower bound of the distance (m) to boxes and walls for each CELL (rows along y, columns along x)."""
+    """Return a lower bound of the distance (m) of each CELL (rows along y, columns along x) to boxes and walls."""
     rows, columns = int(depth / CELL), int(width / CELL)
     free = np.zeros((rows + 2, columns + 2), np.uint8)
     free[1:-1, 1:-1] = 1
@@ -148,9 +151,10 @@ def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
 
 
 def strew(layout: Layout, things: Sequence[Furniture], rng: Rng) -> Layout:
-    """Return the layout with things next to furniture, omitting those that do not fit or block the camera path.
+    """Place `things` on the floor next to furniture.
 
-    The things are rotated by quarter turns, which keeps their boxes tight.
+    Objects are omitted if they do not fit or block the camera path. They are rotated by quarter turns, which keeps
+    their boxes tight.
     """
     for thing in things:
         layout = _with_thing(layout, thing, rng)
@@ -180,7 +184,7 @@ def _with_thing(layout: Layout, thing: Furniture, rng: Rng) -> Layout:
 
 
 def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
-    """Place `thing` next to the box `host` (2, 3), with at least half of it along the touched side."""
+    """Place `thing` at a random side of the box `host` (2, 3); at least half of the object is along the side."""
     turned = thing.placed(0, 0, 0, np.pi / 2 * int(rng.integers(4)))
     low, high = turned.bounds()
     axis, sign = int(rng.integers(2)), (-1 if rng.uniform() < 0.5 else 1)
@@ -192,5 +196,5 @@ def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
 
 
 def _meets(box: Float64, others: Float64) -> bool:
-    """Return True if the box (2, 3) intersects one of the others (N, 2, 3)."""
+    """Return True if the box (2, 3) intersects any of the boxes `others` (N, 2, 3)."""
     return bool((np.minimum(box[1], others[:, 1]) > np.maximum(box[0], others[:, 0])).all(axis=1).any())

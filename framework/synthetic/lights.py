@@ -1,7 +1,7 @@
 """Light baked into the vertices: soft shadows of lamps and windows, and three diffuse bounces between surfaces.
 
 Light is static and surfaces are Lambertian, as assumed by photometric tracking. All vertices gather light along the
-same directions, which avoids noise between neighbors.
+same directions to avoid noise between neighbors.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from framework.synthetic.surfaces import Surfaces
 GATHER_DIRECTIONS = 48  # rays per vertex for light from other surfaces
 BOUNCES = 3
 LIFT = 4e-3  # m, height above the surface from which rays start
-CHUNK = 8192  # vertices at a time, limits memory
-WALL_BRIGHTNESS = 0.60  # mean irradiance of the room's shell after exposure, with headroom for bright spots
+CHUNK = 8192  # vertices per chunk, to limit memory
+WALL_BRIGHTNESS = 0.60  # mean irradiance of floor, walls and ceiling after exposure, with headroom for bright areas
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class Lamp:
 
     points: Float64  # (S, 3) m
     normals: Float64  # (S, 3) unit, 0 = emits in all directions
-    power: Color  # linear RGB, for the whole lamp
+    power: Color  # linear RGB, total of the lamp
 
 
 def globe(center: Float64, radius: float, power: Color, samples: int = 16) -> Lamp:
-    """Return a lamp that emits light in all directions."""
+    """Return a spherical lamp with emission in all directions."""
     k = np.arange(samples) + 0.5  # on a Fibonacci sphere
     z, angle = 1 - 2 * k / samples, np.pi * (1 + 5**0.5) * k
     r = np.sqrt(1 - z * z)
@@ -42,7 +42,7 @@ def globe(center: Float64, radius: float, power: Color, samples: int = 16) -> La
 
 
 def rectangle(corner: Float64, along: Float64, up: Float64, normal: Float64, power: Color, side: int = 5) -> Lamp:
-    """Return a window with the edges `along` and `up`."""
+    """Return a rectangular lamp, such as a window, with the edges `along` and `up`."""
     f = (np.arange(side) + 0.5) / side
     s, t = np.meshgrid(f, f)
     points = corner + s.reshape(-1, 1) * along + t.reshape(-1, 1) * up
@@ -50,7 +50,7 @@ def rectangle(corner: Float64, along: Float64, up: Float64, normal: Float64, pow
 
 
 def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
-    """Return the irradiance (V, 3) of each vertex, exposed so that the mean of the shell is WALL_BRIGHTNESS."""
+    """Compute the irradiance (V, 3) of vertices, scaled to a mean of WALL_BRIGHTNESS on floor, walls and ceiling."""
     origins = surfaces.vertices + np.float32(LIFT) * surfaces.normals
     direct = np.zeros((len(origins), 3))
     for begin in range(0, len(origins), CHUNK):
@@ -69,11 +69,11 @@ def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
 
 def _direct(origins: Float32, normals: Float32, caster: RayCaster, lamp: Lamp) -> Float64:
     to_lamp = lamp.points[None].astype(np.float32) - origins[:, None]
-    square = np.maximum((to_lamp**2).sum(axis=-1), 0.04)  # point samples closer than 20 cm are too bright
+    square = np.maximum((to_lamp**2).sum(axis=-1), 0.04)  # limits the brightness of point samples closer than 20 cm
     direction = to_lamp / np.sqrt(square)[..., None]
     received = np.maximum(np.einsum("vsc,vc->vs", direction, normals), 0)
     sent = np.maximum(-np.einsum("vsc,sc->vs", direction, lamp.normals.astype(np.float32)), 0)
-    sent[:, ~lamp.normals.any(axis=1)] = 0.25  # from a globe of the same power in each direction
+    sent[:, ~lamp.normals.any(axis=1)] = 0.25  # a globe emits equal power in all directions
     weight = received * sent / square
     vertex, sample = np.nonzero(weight > 0)
     blocked = caster.occluded(origins[vertex], lamp.points[sample].astype(np.float32))
@@ -82,7 +82,7 @@ def _direct(origins: Float32, normals: Float32, caster: RayCaster, lamp: Lamp) -
 
 
 def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int32, Float32]:
-    """Return the triangles (V, D) visible from each vertex, -1 = none, and barycentric weights (V, D, 2)."""
+    """Return the visible triangles (V, D) from each vertex, -1 = none, and barycentric weights (V, D, 2)."""
     local = _cosine_directions(GATHER_DIRECTIONS)
     triangle = np.empty((len(origins), len(local)), np.int32)
     uv = np.empty((*triangle.shape, 2), np.float32)
@@ -102,7 +102,7 @@ def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int3
 
 
 def _cosine_directions(count: int) -> Float64:
-    """Return directions (D, 3) about +z with a density proportional to the cosine (Malley's method)."""
+    """Return cosine-distributed directions (D, 3) about +z (Malley's method)."""
     k = np.arange(count) + 0.5
     r, angle = np.sqrt(k / count), np.pi * (1 + 5**0.5) * k
     return np.stack([r * np.cos(angle), r * np.sin(angle), np.sqrt(1 - r * r)], axis=1)

@@ -27,7 +27,7 @@ WALLS: tuple[Color, ...] = (
     (0.87, 0.84, 0.77), (0.78, 0.84, 0.85), (0.83, 0.86, 0.78), (0.90, 0.80, 0.72), (0.82, 0.80, 0.86),
 )  # fmt: skip
 
-DARKEST = 0.35  # mean sRGB of a surface below which it absorbs a projector's infrared light
+DARKEST = 0.35  # mean sRGB; darker surfaces absorb infrared light of a projector
 ABSORBED = 0.8  # fraction of the readings lost on a black surface
 MATTE_SCREEN = 0.75  # `dark` of a matte screen
 POLISHED, GLAZED = 0.7, 0.5  # `shiny` of metal and of ceramics
@@ -64,15 +64,18 @@ class Material:
     color: Color
     second: Color  # second color of the pattern
     scale: float = 0.1  # m, size of the pattern
-    extent: tuple[float, float] = (1.0, 1.0)  # m, of a picture
+    extent: tuple[float, float] = (1.0, 1.0)  # m, size of a painting or screen
     seed: int = 0
-    emission: float = 0.0  # relative to a white wall in the room's mean light
-    dark: float = 0.0  # in [0, 1], fraction of a structured-light camera's readings lost in all directions
-    shiny: float = 0.0  # in [0, 1], fraction of the others lost at slanted angles, see shading_kernels.GLANCED_OFF
+    emission: float = 0.0  # emitted light, 1 = a white wall in the mean light of the room
+    dark: float = 0.0  # in [0, 1], fraction of a structured-light camera's depth readings lost in all directions
+    shiny: float = 0.0  # in [0, 1], fraction of the other readings lost at slanted angles (shading_kernels.GLANCED_OFF)
 
 
 def material_table(materials: list[Material]) -> Float32:
-    """Return (M, 14) rows: texture, linear color, linear second color, scale, extent, seed, emission, dark, shiny."""
+    """Return a table of materials (M, 14).
+
+    Columns: texture, linear color, linear second color, scale, extent, seed, emission, dark, shiny.
+    """
     rows = np.zeros((len(materials), 14))
     for row, m in zip(rows, materials, strict=True):
         row[0] = m.texture
@@ -87,23 +90,23 @@ def _to_linear(srgb: Float64) -> Float64:
 
 
 def absorbed(color: Color) -> float:
-    """Return the fraction of a depth camera's readings lost on a surface of this color."""
+    """Return the fraction of depth readings lost on a surface with this color."""
     return ABSORBED * max(0.0, 1 - sum(color) / 3 / DARKEST)
 
 
 def pick(rng: np.random.Generator, choices: tuple[Color, ...]) -> Color:
-    """Return a random choice."""
+    """Draw a random color from `choices`."""
     return choices[int(rng.integers(len(choices)))]
 
 
 def shade(color: Color, factor: float) -> Color:
-    """Make the color darker (below 1) or lighter (above 1)."""
+    """Make a color darker (factor below 1) or lighter (factor above 1)."""
     r, g, b = (min(1.0, factor * c) for c in color)
     return r, g, b
 
 
 def vivid(rng: np.random.Generator) -> Color:
-    """Draw a saturated color, for books, bags and pictures."""
+    """Draw a saturated color for books, bags and paintings."""
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0.55, 0.9), rng.uniform(0.35, 0.85))
 
 
@@ -116,7 +119,7 @@ def wood(rng: np.random.Generator) -> Material:
 
 
 def cloth(rng: np.random.Generator, color: Color | None = None) -> Material:
-    """Return upholstery of one color."""
+    """Return plain upholstery fabric."""
     base = pick(rng, CLOTHS) if color is None else color
     scale = rng.uniform(0.10, 0.2)
     return Material(Texture.FABRIC, base, shade(base, 0.72), scale, seed=new_seed(rng), dark=absorbed(base))
@@ -128,7 +131,7 @@ def leather(rng: np.random.Generator) -> Material:
 
 
 def patterned_cloth(rng: np.random.Generator) -> Material:
-    """Return bed linen: striped, checked or plain."""
+    """Return striped, checked or plain bed linen."""
     base, other = pick(rng, CLOTHS), (0.90, 0.88, 0.84)
     texture = (Texture.STRIPES, Texture.CHECKS, Texture.FABRIC)[int(rng.integers(3))]
     second = shade(base, 0.75) if texture is Texture.FABRIC else base
@@ -142,7 +145,7 @@ def paint(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale:
 
 
 def glaze(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
-    """Return glossy paint."""
+    """Return a glossy painted material."""
     return replace(paint(rng, color, contrast, scale), shiny=GLAZED)
 
 
@@ -153,12 +156,12 @@ def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Materi
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
-    """Return a painting or a screen of this size (m); the glossy half of the screens has no depth readings."""
+    """Return a painting or screen of this size (m); half of the screens are glossy, without depth readings."""
     first, second, seed = vivid(rng), vivid(rng), new_seed(rng)
     dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
     return Material(texture, first, second, 0.1, (width, height), seed, emission, dark)
 
 
 def new_seed(rng: np.random.Generator) -> int:
-    """Draw the seed of a texture."""
+    """Draw a random seed for a texture."""
     return int(rng.integers(4096))

@@ -19,33 +19,33 @@ Numbers = npt.NDArray[np.floating] | npt.NDArray[np.integer]
 
 @dataclass(frozen=True)
 class RayHits:
-    """Intersections of rays with the surface; leading dimensions as those of the rays."""
+    """Intersections of rays with the surface; the leading dimensions match the rays."""
 
-    distance: Float32  # in lengths of the ray's direction, inf = no intersection
+    distance: Float32  # in multiples of the ray's direction vector, inf = no intersection
     triangle: Int32  # NO_TRIANGLE = no intersection
-    uv: Float32  # (..., 2) barycentric weights of the triangle's second and third vertex
+    uv: Float32  # (..., 2) barycentric weights of the second and third vertex of the triangle
 
 
 class RayCaster:
-    """Ray caster of a fixed triangle mesh with numba's number of threads. Thread-safe."""
+    """Thread-safe ray caster of a fixed triangle mesh, with numba's number of threads."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
         import open3d as o3d
 
-        # one thread builds the tree, so that ties between triangles are deterministic
+        # the tree is built in one thread, so that ties between triangles are deterministic
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(
             _tensor(np.ascontiguousarray(vertices, np.float32)), _tensor(np.ascontiguousarray(triangles, np.uint32))
         )
 
     def cast(self, rays: Float32) -> RayHits:
-        """Return the first hits of rays (..., 6), origin and direction."""
+        """Return the first intersections of rays (..., 6) of origin and direction."""
         answer = self._scene.cast_rays(_tensor(np.ascontiguousarray(rays)), get_num_threads())
         triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's invalid id 2^32 - 1 becomes -1
         return RayHits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
     def occluded(self, origins: Float32, ends: Float32) -> Bool:
-        """Return True where a surface lies between the points (..., 3) and (..., 3), except at the ends."""
+        """Return a mask (...) of the pairs of points (..., 3) with a surface in between, excluding the points."""
         rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
         return np.asarray(self._scene.test_occlusions(_tensor(rays), 1e-3, 0.999, get_num_threads()).numpy())
 
@@ -57,13 +57,14 @@ def _tensor(array: Array) -> o3d.core.Tensor:
 
 
 def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:
-    """Return rays (A, B, 6) through the image points u, v (px, pixel centers at integers), broadcast to (A, B).
+    """Return the rays (A, B, 6) through image points u, v (px, pixel centers at integers), broadcast to (A, B).
 
-    The direction has length 1 along the optical axis, so that the distance of an intersection is its depth.
+    Directions have length 1 along the optical axis, so that the distance of an intersection equals its depth.
     """
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     rays = np.empty((*np.broadcast_shapes(x.shape, y.shape), 6), np.float32)
-    for axis, (to_right, down, ahead, at) in enumerate(T_world_camera[:3]):  # BLAS might round by number of threads
+    # without BLAS, because its rounding may depend on the number of threads
+    for axis, (to_right, down, ahead, at) in enumerate(T_world_camera[:3]):
         rays[..., axis] = at
         rays[..., 3 + axis] = to_right * x + (down * y + ahead)
     return rays

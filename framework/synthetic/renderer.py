@@ -1,4 +1,4 @@
-"""Rendering of a lit room: color, exact depth and instance ids, with smooth edges between parts."""
+"""Rendering of a lit room: antialiased color, exact depth and instance ids."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from framework.synthetic.shading_kernels import (
 )
 from framework.synthetic.surfaces import Surfaces
 
-EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, a rotated grid
+EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, rotated grid
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Images of an ideal camera."""
+    """Images from an ideal camera."""
 
     color: UInt8  # (H, W, 3) RGB
     depth: Float32  # (H, W) m along z, 0 = no surface
     instance_ids: Int32  # (H, W)
-    incidence: Float32  # (H, W) cosine of the angle between ray and surface normal, in [0, 1]
-    unread: Float32  # (H, W) in [0, 1], fraction of a depth camera's readings lost on dark and shiny materials
+    incidence: Float32  # (H, W) in [0, 1], cosine of the angle between ray and surface normal
+    unread: Float32  # (H, W) in [0, 1], fraction of depth readings lost on dark and shiny materials
 
 
 class Renderer:
-    """Renderer of `surfaces` under `lamps`, with light baked once. Thread-safe."""
+    """Thread-safe renderer of `surfaces` under `lamps`; light is baked once."""
 
     def __init__(self, surfaces: Surfaces, lamps: list[Lamp]) -> None:
         self.surfaces = surfaces
@@ -58,7 +58,7 @@ class Renderer:
         self._rasterizer = Rasterizer(surfaces.vertices, surfaces.triangles)
 
     def render(self, camera: Camera, T_world_camera: Float64, material_table: Float32 | None = None) -> Rendering:
-        """Return the images of the room, optionally with another paints.material_table under the same light."""
+        """Render the room, optionally with another paints.material_table under the same light."""
         surfaces = self._lit if material_table is None else self._lit._replace(table=material_table)
         buffer = self._rasterizer.draw(camera, T_world_camera)
         triangle, depth = buffer.triangle, buffer.depth
@@ -78,23 +78,23 @@ class Renderer:
         return Rendering(to_srgb(light), depth, _ids_of(self.surfaces, triangle), incidence, unread)
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Return only exact depth and instance ids, (H, W) each."""
+        """Render only exact depth (H, W) m and instance ids (H, W)."""
         buffer = self._rasterizer.draw(camera, T_world_camera)
         return buffer.depth, _ids_of(self.surfaces, buffer.triangle)
 
 
 def cast_ids(surfaces: Surfaces, caster: RayCaster, camera: Camera, T_world_camera: Float64) -> Int32:
-    """Return the instance ids (H, W) by ray casting: faster than a Renderer for small pictures."""
+    """Render instance ids (H, W) by ray casting, which is faster than a Renderer for small images."""
     return _ids_of(surfaces, caster.cast(image_rays(camera, T_world_camera)).triangle)
 
 
 def _ids_of(surfaces: Surfaces, triangle: Int32) -> Int32:
-    """Return the instances (H, W) of triangles (H, W), 0 for NO_TRIANGLE, which is -1."""
+    """Return the instance ids (H, W) of triangles (H, W), 0 for NO_TRIANGLE (-1)."""
     return np.append(surfaces.instance_ids, np.int32(0))[triangle]
 
 
 def to_srgb(light: Float32) -> UInt8:
-    """Return 8-bit sRGB of linear light by Reinhard's curve with a white point (Reinhard et al. 2002, eq. 4)."""
+    """Convert linear light to 8-bit sRGB by Reinhard's curve with a white point (Reinhard et al. 2002, eq. 4)."""
     color = np.empty(light.shape, np.uint8)
     apply_tone_curve(light.reshape(-1), _tone_curve(), color.reshape(-1))
     return color

@@ -1,7 +1,7 @@
-"""Error model of an RGB-D camera like the Kinect v1.
+"""Error model of an RGB-D camera similar to the Kinect v1.
 
 - Axial depth noise grows with the square of depth and towards grazing angles: see `framework.sensors.noise_models`.
-- Disparity is quantized to 1/8 px, so depth comes in steps of 2.9e-3 z^2: Khoshelham and Oude Elberink, "Accuracy and
+- Disparity is quantized to 1/8 px, so the step of depth is 2.9e-3 z^2: Khoshelham and Oude Elberink, "Accuracy and
   Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012.
 - Lateral noise moves readings across edges by about a pixel (Nguyen et al.), applied as by Handa et al., "A Benchmark
   for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
@@ -32,13 +32,13 @@ from framework.synthetic.rgbd_camera_kernels import (
 )
 
 LATERAL_SIGMA = 0.8  # px at 640 px width: the constant term of Nguyen et al.
-PATCH = 14.0  # px at 640 px width, between the random numbers of patches without readings
-COLOR_SIGMA = 1.5  # gray levels of 255
+PATCH = 14.0  # px at 640 px width, spacing of the random numbers for patches without readings
+COLOR_SIGMA = 1.5  # gray levels, 0..255
 
 
 @dataclass(frozen=True)
 class DepthSensor:
-    """Sensor model from exact depth to readings."""
+    """Model of depth readings from exact depth."""
 
     noise: float  # 0 = exact, 1 = as measured; scales standard deviations and probabilities
     max_range: float  # m
@@ -51,9 +51,10 @@ class DepthSensor:
         rng: np.random.Generator,
         unread: Float32 | None = None,
     ) -> Float32:
-        """Return the readings (H, W) m of exact `depth` (H, W) m at the cosines `incidence` (H, W), 0 = no reading.
+        """Simulate depth readings (H, W) m of the exact `depth` (H, W) m; 0 = no reading.
 
-        `unread` (H, W) is the fraction of readings lost on materials, in patches; None = no loss.
+        `incidence`: (H, W), cosines of incidence. `unread`: (H, W), fraction of readings lost on materials, in patches;
+        None = no loss.
         """
         if self.noise == 0:
             return np.where(depth <= self.max_range, depth, np.float32(0))
@@ -75,7 +76,7 @@ class DepthSensor:
 
 
 def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
-    """Return `color` with the noise of a camera indoors, scaled by `noise`."""
+    """Add the noise of an indoor camera, scaled by `noise`, to `color`."""
     if noise == 0:
         return color
     noisy = np.empty_like(color)
@@ -87,9 +88,9 @@ def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
 def blurred(
     color: UInt8, depth: Float32, camera: Camera, T_world_camera: Float64, T_world_open: Float64, T_world_close: Float64
 ) -> UInt8:
-    """Return `color` (H, W, 3), seen from T_world_camera, with the motion blur from T_world_open to T_world_close.
+    """Add the motion blur from T_world_open to T_world_close to `color` (H, W, 3), rendered at T_world_camera.
 
-    Pixels move by the exact `depth` (H, W) m of the static scene; 0 = no blur.
+    The motion of a pixel follows from the exact `depth` (H, W) m of the static scene; depth 0 = no blur.
     """
     picture = np.empty_like(color)
     K = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
@@ -101,7 +102,7 @@ def blurred(
 
 
 def random_bits(shape: tuple[int, ...], rng: np.random.Generator) -> UInt16:
-    """Return 16 random bits per element; several times faster than sampling a distribution."""
+    """Draw 16 random bits per element, several times faster than sampling a distribution."""
     count = math.prod(shape)
     words = rng.integers(0, 2**64, -(-count // 4), np.uint64)
     return words.view(np.uint16)[:count].reshape(shape)
@@ -109,7 +110,7 @@ def random_bits(shape: tuple[int, ...], rng: np.random.Generator) -> UInt16:
 
 @lru_cache
 def normal_quantiles() -> Float32:
-    """Return (2^QUANTILE_BITS,) equally likely values of a standard normal distribution."""
+    """Return equally likely values (2^QUANTILE_BITS,) of a standard normal distribution."""
     count = 1 << QUANTILE_BITS
     quantiles = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
     return np.asarray(quantiles / quantiles.std(), np.float32)

@@ -10,22 +10,22 @@ from framework.sensors.noise_models import axial_sigma_at_angle
 
 BASELINE = 0.075  # m, between projector and camera
 DISPARITY_STEPS = 8.0  # per px
-FOCAL_KINECT = 580.0  # px, of the depth camera at 640 px width; quantization does not depend on our image size
+FOCAL_KINECT = 580.0  # px at 640 px width, depth camera; the quantization is independent of the image size here
 MIN_RANGE = 0.4  # m
 EDGE_JUMP = 0.05  # relative step of depth at which the sensor's correlation window fails
 EDGE_DROP = 0.5  # probability of no reading next to such a step
-GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # from all readings to none
-QUANTILE_BITS = 12  # a normal error is one of 2^QUANTILE_BITS equally likely values: up to 3.7 standard deviations
+GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # rad; all readings below, no readings above
+QUANTILE_BITS = 12  # bits of a normal error: 2^QUANTILE_BITS equally likely values, up to 3.7 standard deviations
 SPARE_BITS = 16 - QUANTILE_BITS
-MAX_SAMPLES = 9  # of blur along the path of a pixel; more are not visible
-SHARP = np.float32(0.5)  # px, a shorter path is not blurred
+MAX_SAMPLES = 9  # blur samples along the path of a pixel; more samples make no visible difference
+SHARP = np.float32(0.5)  # px, minimum path length for blur
 
 _SCALE = np.float32(DISPARITY_STEPS * FOCAL_KINECT * BASELINE)  # m, depth times steps of disparity
 
 
 @njit(cache=True, nogil=True)
 def depth_step(z: np.float32) -> np.float32:
-    """Return the distance (m) between neighboring depth values at depth z (m)."""
+    """Return the quantization step (m) of depth at depth z (m)."""
     return np.float32(z * z / _SCALE)
 
 
@@ -41,17 +41,18 @@ def read_depth(
     max_range: np.float32,
     reading: Float32,
 ) -> None:
-    """Write the readings (H, W) m; pixels without a reading stay unchanged.
+    """Write the depth readings (H, W) m; pixels without a reading remain unchanged.
 
-    depth (H, W) m; theta (H, W) rad, of incidence; random (H, W, 4) bits: loss of a reading, lateral error along y and
-    x, axial error; normal (N,): normal_quantiles; lateral_sigma: px; disparity_scale: px m.
+    `depth`: (H, W) m. `theta`: (H, W) rad, angle of incidence. `random`: (H, W, 4) bits for the loss of a reading, the
+    lateral error along y and x, and the axial error. `normal`: (N,) normal_quantiles. `lateral_sigma`: px.
+    `disparity_scale`: px m.
     """
     height, width = depth.shape
     near_edge = _near_edge(depth)
     largest_loss = min(noise, np.float32(1))
     for v in range(height):
-        # The projector, to the right of the camera, sees pixel u at u - f b / z. A pixel that is not to the left of all
-        # pixels to its right is in the shadow of a nearer surface.
+        # The projector is to the right of the camera. Pixel u is at u - f b / z in the projector. A pixel is in the
+        # shadow of a nearer surface unless it is to the left of all pixels on its right.
         leftmost = np.float32(np.inf)
         for u in range(width - 1, -1, -1):
             z = depth[v, u]
@@ -69,7 +70,7 @@ def read_depth(
             lateral_v = lateral_sigma * normal[random[v, u, 1] >> SPARE_BITS]
             lateral_u = lateral_sigma * normal[random[v, u, 2] >> SPARE_BITS]
             noisy = _shifted(depth, v, u, lateral_v, lateral_u)
-            # Gaussian noise that has the measured deviation together with the following quantization
+            # Gaussian noise; its deviation and the following quantization add up to the measured deviation
             sigma, step = noise * axial_sigma_at_angle(noisy, theta[v, u]), depth_step(noisy)
             variance = sigma * sigma - step * step / np.float32(12)
             noisy += np.sqrt(max(variance, np.float32(0))) * normal[random[v, u, 3] >> SPARE_BITS]
@@ -83,10 +84,11 @@ def read_depth(
 def drop_patches(
     unread: Float32, field: Float32, cell: np.float32, normal: Float32, largest_loss: np.float32, reading: Float32
 ) -> None:
-    """Remove readings (H, W) in patches, so that a share of `largest_loss` times `unread` (H, W) is lost.
+    """Remove a fraction `largest_loss` * `unread` (H, W) of the readings (H, W), in patches.
 
-    A reading is lost where a smooth random field is below the quantile of that share. The field interpolates the normal
-    numbers `field` (R, C), `cell` px apart; divided by the norm of the weights it is normal in each pixel.
+    A reading is lost if a smooth random field is below the quantile of the fraction. The field interpolates the normal
+    numbers `field` (R, C) with a spacing of `cell` px. The division by the norm of the weights makes it normal in each
+    pixel.
     """
     one, count = np.float32(1), np.float32(len(normal))
     for v in range(reading.shape[0]):
@@ -109,9 +111,10 @@ def drop_patches(
 
 @njit(cache=True, nogil=True)
 def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> np.float32:
-    """Return a pixel's depth, or that of the neighbor (dv, du) px away, rounded, across an edge.
+    """Return the depth of a pixel, or of the pixel (dv, du) px away across a depth edge.
 
-    Only across edges: within a smooth surface the axial noise already contains all measured deviation.
+    The offset is rounded. Smooth surfaces have no lateral error, because the axial noise contains all measured
+    deviation.
     """
     y = min(max(v + int(np.rint(dv)), 0), depth.shape[0] - 1)
     x = min(max(u + int(np.rint(du)), 0), depth.shape[1] - 1)
@@ -122,7 +125,7 @@ def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> 
 
 @njit(cache=True, nogil=True)
 def _near_edge(depth: Float32) -> Bool:
-    """Return the pixels (H, W) on either side of a step of depth."""
+    """Return a mask (H, W) of the pixels on both sides of a depth step."""
     height, width = depth.shape
     edge = np.zeros((height, width), np.bool_)
     for v in range(height):
@@ -138,7 +141,7 @@ def _near_edge(depth: Float32) -> Bool:
 
 @njit(cache=True, nogil=True)
 def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, noisy: UInt8) -> None:
-    """Write `color` (N,) with normal noise added, rounded; random (N,) bits, normal: normal_quantiles."""
+    """Add normal noise to `color` (N,), and round; `random` (N,) bits, `normal` = normal_quantiles."""
     for n in range(len(color)):
         value = np.rint(np.float32(color[n]) + sigma * normal[random[n] >> SPARE_BITS])
         noisy[n] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))
@@ -148,9 +151,9 @@ def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, 
 def blur(
     color: UInt8, depth: Float32, K: Float32, T_open_camera: Float32, T_close_camera: Float32, picture: UInt8
 ) -> None:
-    """Write the mean of up to MAX_SAMPLES samples of `color`, evenly spaced along each pixel's path.
+    """Write the mean of up to MAX_SAMPLES samples of `color`, evenly spaced along the path of each pixel.
 
-    K is (fx, fy, cx, cy) px.
+    `K`: (fx, fy, cx, cy) px.
     """
     height, width = depth.shape
     for v in range(height):
@@ -186,7 +189,7 @@ def blur(
 
 @njit(cache=True, nogil=True, inline="always")
 def _reprojected(T, K, u, v, z):
-    """Return the pixel (px, px) of the other pose that shows the point of pixel u, v at depth z; u, v at z = 0."""
+    """Reproject pixel u, v at depth z to another pose; return its coordinates (px), or u, v for z = 0."""
     px, py = (np.float32(u) - K[2]) / K[0] * z, (np.float32(v) - K[3]) / K[1] * z
     z_other = T[2, 0] * px + T[2, 1] * py + T[2, 2] * z + T[2, 3]
     if z <= 0 or z_other <= 0:

@@ -1,4 +1,7 @@
-"""Furnished room: shell, furniture and lamps. World: x, y along the walls, z up, origin at the center of the floor."""
+"""Furnished room: shell (floor, walls and ceiling), furniture and lamps.
+
+The world frame has x, y along the walls, z up, and its origin at the center of the floor.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from framework.synthetic.paints import Material, Texture
 from framework.synthetic.surfaces import Surfaces, assemble
 
 HEIGHT = 2.55  # m
-WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear color of lamps and of daylight
+WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear colors of lamps and daylight
 
 
 class RoomKind(StrEnum):
@@ -44,12 +47,12 @@ SMALLEST = {  # m, width and depth of the smallest candidate room
 
 @dataclass(frozen=True)
 class Room:
-    """A complete room."""
+    """A furnished room with lamps."""
 
     layout: Layout
-    objects: tuple[tuple[int, Furniture], ...]  # (instance id, piece); 0 = shell
+    objects: tuple[tuple[int, Furniture], ...]  # (instance id, object); 0 = shell
     lamps: tuple[Lamp, ...]
-    surfaces: Surfaces  # the exact triangles of all objects
+    surfaces: Surfaces  # exact triangles of all objects
 
 
 def furnish(kind: RoomKind, rng: Rng) -> Room:
@@ -58,9 +61,9 @@ def furnish(kind: RoomKind, rng: Rng) -> Room:
 
 
 def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, strewn: Sequence[Furniture] = ()) -> Room:
-    """Return a room of at least `width` x `depth` m with these contents, placed largest first.
+    """Return a room of at least `width` x `depth` m with `contents`, placed largest first.
 
-    `strewn` objects are placed on the floor next to furniture, as far as they fit.
+    `strewn` objects are placed on the floor next to furniture if they fit.
     """
     layout = strew(arrange(contents, width, depth, rng), strewn, rng)
     globe_lamp = clutter.ceiling_lamp(rng).placed(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), HEIGHT)
@@ -70,7 +73,7 @@ def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, st
 
 
 def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
-    """Return the contents of the room, largest first, for placement."""
+    """Return the contents of a room, largest first."""
     door, window = single("door", clutter.door(rng)), single("window", clutter.window(rng), z=0.95, hung=True)
     bag = single("backpack", fixtures.backpack(rng))
     extras = [
@@ -100,7 +103,7 @@ def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
 
 
 def _shell(width: float, depth: float, rng: Rng) -> Furniture:
-    """Return floor, ceiling and four walls with baseboards; one wall has wallpaper."""
+    """Return the shell: floor, ceiling and four walls with baseboards; one wall has wallpaper."""
     shell = Furniture("shell")
     shell.add(panel(width, depth).turned("x", np.pi / 2), _floor(rng), y=depth / 2)
     ceiling = panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
@@ -132,7 +135,7 @@ def _floor(rng: Rng) -> Material:
 
 
 def _lamps(pieces: list[Furniture]) -> list[Lamp]:
-    """Return the light of all emitters."""
+    """Return the lamps of all emitting objects."""
     lamps: list[Lamp] = []
     for piece in pieces:
         low, high = piece.bounds()
@@ -141,7 +144,7 @@ def _lamps(pieces: list[Furniture]) -> list[Lamp]:
             lamps.append(globe(np.array([*center[:2], HEIGHT - 0.22]), 0.24, _scaled(WARM, 9.0), 24))
         elif piece.kind in ("floor lamp", "table lamp"):
             strength, below = (3.0, 0.10) if piece.kind == "floor lamp" else (0.9, 0.08)
-            # sample points are outside of the shade, which would otherwise block its own light
+            # sample points are outside of the lampshade, because the shade would block the light
             lamps.append(
                 globe(np.array([*center[:2], high[2] - below]), 0.24 if strength > 1 else 0.16, _scaled(WARM, strength))
             )
@@ -151,7 +154,7 @@ def _lamps(pieces: list[Furniture]) -> list[Lamp]:
 
 
 def _daylight(low: Float64, high: Float64) -> Lamp:
-    """Return the light of a window, emitted between its curtains; the window is at the nearest wall."""
+    """Return the daylight of a window at the nearest wall, emitted between its curtains."""
     thin = int(np.argmin((high - low)[:2]))
     wide = 1 - thin
     normal = np.zeros(3)

@@ -1,4 +1,4 @@
-"""Labeled ground-truth mesh of a video: the observed part of the exact surfaces, in small triangles."""
+"""Labeled ground-truth mesh of a sequence: the visible part of the exact surfaces, in small triangles."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.surfaces import Surfaces
 
-ON_SURFACE = 1.001  # relative distance tolerance for the surface of a vertex
+ON_SURFACE = 1.001  # distance of a vertex divided by the distance of its surface, at most
 LONGEST_EDGE = 0.02  # m
 
 
 @dataclass(frozen=True)
 class RoomMesh:
-    """Triangle mesh with one instance per vertex."""
+    """Triangle mesh with an instance id per vertex."""
 
-    vertices: Float32  # (V, 3) m, world
-    triangles: Int32  # (F, 3), counter-clockwise seen from outside
+    vertices: Float32  # (V, 3) m, world frame
+    triangles: Int32  # (F, 3), counter-clockwise as seen from outside
     instance_ids: Int32  # (V,), 0 = floor, wall or ceiling
 
     def only(self, kept: Bool) -> RoomMesh:
-        """Return the vertices `kept` (V,) in order, and the triangles between them."""
+        """Keep the vertices of the mask `kept` (V,) in order, and the triangles between them."""
         number = np.cumsum(kept, dtype=np.int32) - 1
         triangles = self.triangles[kept[self.triangles].all(axis=1)]
         return RoomMesh(self.vertices[kept], number[triangles], self.instance_ids[kept])
@@ -38,18 +38,19 @@ def visible_mesh(
     reach: tuple[float, float],
     longest_edge: float = LONGEST_EDGE,
 ) -> RoomMesh:
-    """Return the surfaces visible from the poses T_world_camera at a depth within `reach` (m, m).
+    """Return the mesh of the visible surfaces from `poses` (T_world_camera), at a depth within `reach` (m, m).
 
-    `caster` has the triangles of `surfaces`. Surfaces without depth readings, and surfaces behind them, are invisible.
+    `caster` contains the triangles of `surfaces`. Surfaces without depth readings, and surfaces behind them, are
+    invisible.
     """
     mesh = tessellate(surfaces, longest_edge)
     return mesh.only(seen_from(mesh.vertices, caster, camera, poses, reach, surfaces.unreadable))
 
 
 def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
-    """Return the surfaces in triangles whose edges are at most `longest_edge` m long.
+    """Subdivide the surfaces into triangles with edges of at most `longest_edge` m.
 
-    Longer edges are halved repeatedly, in all adjacent triangles, so that the mesh has no gaps.
+    Longer edges are halved repeatedly in all adjacent triangles, so that the mesh has no gaps.
     """
     instance_ids = np.zeros(len(surfaces.vertices), np.int32)
     instance_ids[surfaces.triangles.ravel()] = np.repeat(surfaces.instance_ids, 3)
@@ -58,7 +59,7 @@ def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
     done: list[Int32] = []
     while len(open_triangles):
         corners = vertices[open_triangles]
-        square = ((np.roll(corners, -1, axis=1) - corners) ** 2).sum(axis=2)  # (F, 3), of the edge from each corner
+        square = ((np.roll(corners, -1, axis=1) - corners) ** 2).sum(axis=2)  # (F, 3)
         too_long = square.max(axis=1) > np.float32(longest_edge) ** 2
         done.append(open_triangles[~too_long])
         first = square[too_long].argmax(axis=1)[:, None]
@@ -73,9 +74,9 @@ def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
 
 
 def _welded(mesh: RoomMesh) -> RoomMesh:
-    """Merge vertices of one instance at identical positions, and remove triangles without area."""
+    """Merge vertices of an instance at identical positions, and remove triangles without area."""
     rows = np.empty((len(mesh.vertices), 4), np.int32)
-    rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # -0 equals 0
+    rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # turns -0 into 0
     rows[:, 3] = mesh.instance_ids
     order = np.lexsort(rows.T)
     new = np.ones(len(rows), np.bool_)
@@ -98,9 +99,9 @@ def seen_from(
     reach: tuple[float, float],
     unreadable: Bool,
 ) -> Bool:
-    """Return (V,) true for vertices in the view of a pose, at a depth within `reach` and without occlusion.
+    """Return a mask (V,) of the visible vertices: in the view of a pose, not occluded, at a depth within `reach`.
 
-    Vertices on one of the `unreadable` triangles (F,) of the caster, or closely behind, count as occluded.
+    Vertices on the `unreadable` triangles (F,) of the caster, or closely behind them, count as occluded.
     """
     seen = np.zeros(len(vertices), np.bool_)
     for T_world_camera in poses:
@@ -117,7 +118,7 @@ def seen_from(
 def _in_view(
     vertices: Float32, skip: Bool, camera: Camera, T_world_camera: Float64, reach: tuple[float, float]
 ) -> Int64:
-    """Return the indices of the vertices in view regardless of occlusion, except those to `skip`."""
+    """Return the indices of the vertices in view, including occluded vertices, except the mask `skip`."""
     index = np.flatnonzero(~skip)
     dx, dy, dz = vertices[index].T - T_world_camera[:3, 3:]
     x, y, z = (R[0] * dx + R[1] * dy + R[2] * dz for R in T_world_camera[:3, :3].T)

@@ -1,7 +1,7 @@
-"""Parallel writing of the scenes of a benchmark folder; existing files are kept.
+"""Parallel writing of the scenes in a benchmark folder; existing files are kept.
 
-A process continues with its scene until it is complete, because furnishing and lighting a room takes seconds. A process
-without an unstarted scene helps with another process's scene.
+A process works on a scene until the scene is complete, because furnishing and lighting a room takes seconds. If all
+scenes are started, a free process works on the scene of another process.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from framework.files.json_file import read_json
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import GENERATION, BenchmarkSettings, SceneNNScene, frame_files, trajectory_file
 
-FRAMES_AT_ONCE = 8  # small, so that all processes end at about the same time
+FRAMES_AT_ONCE = 8  # frames per task; small, so that all processes end at about the same time
 
-Piece = Callable[[SceneNNScene], int]  # writes some files, returns the number of frames
+Piece = Callable[[SceneNNScene], int]  # task that writes some files and returns the number of frames
 
 
 def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: BenchmarkSettings, jobs: int) -> None:
-    """Write the scenes into `root` with `jobs` processes; files of the same scenes are kept.
+    """Write the scenes into `root` with `jobs` processes; existing files of these scenes are kept.
 
-    Raises ConfigError if `root` has other content, DataError if a file or a process fails.
+    Raises ConfigError if `root` has other content, and DataError if a file or a process fails.
     """
     _begin(root, recording)
     scenes = [_Scene(root / name, spec, recording) for name, spec in specs.items()]
@@ -50,8 +50,8 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Benchmar
     bar = tqdm(total=total, initial=total - missing, desc="rendering", unit=" frames", disable=None)
     with ExitStack() as stack:
         stack.enter_context(bar)
-        # spawned: threads of numba and OpenCV do not survive a fork; one pool per process, so that each process can
-        # continue with the scene in its memory
+        # Processes are spawned, because threads of numba and OpenCV do not survive a fork. Each process has its own
+        # pool, so that it can keep its scene in memory.
         spawn = multiprocessing.get_context("spawn")
         pools = [stack.enter_context(ProcessPoolExecutor(1, spawn, _begin_process)) for _ in range(jobs)]
         running: dict[Future[int], ProcessPoolExecutor] = {}
@@ -73,18 +73,23 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Benchmar
 
 
 def _begin(root: Path, recording: BenchmarkSettings) -> None:
-    """Write the files shared by all scenes. Raises ConfigError for a folder with other content."""
+    """Write the common files of all scenes. Raises ConfigError for a folder with other content."""
     made_by = root / MADE_BY
     wanted = {"generation": GENERATION, **asdict(recording)}
     if made_by.exists():
         try:
             found = read_json(made_by)
         except DataError as error:
-            raise DataError(f"{made_by}: damaged; delete its folder, or set another folder") from error
+            raise DataError(
+                f"{made_by}: expected valid JSON, got a damaged file; delete the folder or set another folder"
+            ) from error
         if found != wanted:
             raise ConfigError(f"{root}: expected rooms with the parameters {wanted}, got {found}; set another folder")
     elif root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise ConfigError(f"{root}: expected a new or empty folder, or one of this command, got other content")
+        found = next(iter(root.iterdir())).name if root.is_dir() else "a file"
+        raise ConfigError(
+            f"{root}: expected a new or empty folder, or a benchmark folder, got {found}; set another folder"
+        )
     (root / "intrinsic").mkdir(parents=True, exist_ok=True)
     with written_whole(made_by) as temporary:
         temporary.write_text(json.dumps(wanted) + "\n")
@@ -98,9 +103,9 @@ class _Scene:
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.spec = folder, spec
-        self.running = 0  # pieces being written
+        self.running = 0  # number of running tasks
         self.touched = False
-        self.missing = 0  # frames
+        self.missing = 0  # number of missing frames
         self._left: list[Piece] = []
         self._complete = trajectory_file(folder).exists()
         if self._complete:
@@ -113,7 +118,7 @@ class _Scene:
 
     @property
     def ready(self) -> int:
-        """Number of pieces that can be written now."""
+        """Number of tasks that can start now."""
         waiting_for_walk = not self._left and not self.running and not self._complete
         return len(self._left) + waiting_for_walk
 
@@ -127,7 +132,7 @@ class _Scene:
 
 
 def _choose(scenes: list[_Scene], last: _Scene | None) -> _Scene | None:
-    """Return the next scene of a process: its `last` one, else an unstarted one, else the longest."""
+    """Choose the next scene of a process: its `last` scene, else an unstarted scene, else the scene with most tasks."""
     if last is not None and last.ready:
         return last
     ready = [scene for scene in scenes if scene.ready]
@@ -140,8 +145,8 @@ def _result(future: Future[int], folder: Path) -> int:
         return future.result()
     except BrokenProcessPool as error:
         raise DataError(
-            f"{folder}: a writing process was terminated, possibly for lack of memory; run the same command again to "
-            "resume"
+            f"{folder}: expected a running writer process, got a terminated process (possibly out of memory); run the "
+            "same command again to resume"
         ) from error
 
 
@@ -161,11 +166,11 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-_in_memory: list[SceneNNScene] = []  # of this process: the last written scene, if any
+_in_memory: list[SceneNNScene] = []  # the latest scene of this process, if any
 
 
 def _write(folder: Path, spec: SceneSpec, recording: BenchmarkSettings, piece: Piece) -> int:
-    """Write a part of the scene in one of the processes."""
+    """Run a task of a scene in a writer process."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         if not _in_memory or _in_memory[0].folder != folder:

@@ -1,6 +1,6 @@
-"""A room of the synthetic benchmark as a recording in SceneNN's format.
+"""Scene of the synthetic benchmark as a recording in SceneNN's format.
 
-SceneNN's world is y-up and the room is z-up, so all output is rotated by a quarter turn about x.
+The world frame of SceneNN is y-up and the room is z-up, so all output is rotated by a quarter turn about x.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from framework.synthetic.room_mesh import visible_mesh
 from framework.synthetic.walk import FRAME_RATE
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
-GENERATION = 3  # version of the generated rooms: increment it when they change, so that versions are not mixed
+GENERATION = 3  # version of the generated rooms; increment it after a change to prevent a mix of versions
 ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini
-NOISE, MAX_RANGE = 1.0, 6.0  # noise of the sensor, 1 = a Kinect v1; its range, m
-EXPOSURE = 1 / 60  # s, of color, centered at the pose: typical for indoor light
-TRUTH_VIEWS = 60  # frames that determine the labeled mesh; neighbors have nearly the same view
+NOISE, MAX_RANGE = 1.0, 6.0  # noise of the sensor, 1 = Kinect v1; range of the sensor, m
+EXPOSURE = 1 / 60  # s, exposure of color images, centered at the pose; typical for indoor light
+TRUTH_VIEWS = 60  # frames for the labeled mesh; neighboring frames have nearly the same view
 FASTEST = 5.0  # maximum haste: 2.2 m/s
-LARGEST_ID = 934338  # of SceneNN's labels, which are unordered
+LARGEST_ID = 934338  # largest label in SceneNN; labels are unordered
 PNG = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB),
 )
-"""PNG options for noisy images: no search for repetitions, and a single filter. Files are within 5 % of the size with
-slow options, in 10 ms."""
+"""PNG options for noisy images: no search for repetitions, and a single filter. Encoding takes 10 ms, and files are at
+most 5% larger than with slow options."""
 
 T_YUP_ZUP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""Rotation from the room's axes to SceneNN's. It only swaps and negates, which avoids rounding."""
+"""Rotation from the axes of the room to the axes of SceneNN. It only swaps and negates, which avoids rounding."""
 
 _COCO_TO_SCENENN = {coco: name for name, coco in SCENENN_TO_COCO.items()}
 _NYU_CLASSES = {
@@ -64,7 +64,7 @@ _NYU_CLASSES = {
     "table lamp": "lamp",
     "window": "window",
 }
-"""NYU classes of clutter. Other objects have a text but no nyu_class, as in SceneNN."""
+"""NYU classes of clutter. Other objects have a text, but no nyu_class, as in SceneNN."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ class BenchmarkSettings:
     """Settings shared by all scenes of a benchmark folder."""
 
     seed: int = 0
-    frames: int = 120  # of each scene
-    rate: float = 10.0  # Hz, frame rate; low, to limit redundant frames
+    frames: int = 120  # number of frames of each scene
+    rate: float = 10.0  # Hz, frame rate; a low rate limits redundant frames
     width: int = 640  # px; the height is 3/4 of the width
-    haste: float = 2.0  # relative camera speed, 1 = as recommended for recording; higher = fewer views and more blur
+    haste: float = 2.0  # relative camera speed, 1 = recommended speed; higher values give fewer views and more blur
 
     def __post_init__(self) -> None:
         for name, lowest in (("seed", 0), ("frames", 1), ("width", 16)):
@@ -104,7 +104,7 @@ class BenchmarkSettings:
 
 
 class SceneNNScene:
-    """A furnished room and its camera path, written in pieces to its folder, in any order."""
+    """A furnished room and its camera path; parts are written to its folder in any order."""
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.recording = folder, recording
@@ -118,17 +118,17 @@ class SceneNNScene:
         self._sensor = DepthSensor(NOISE, MAX_RANGE)
         ids = 1 + scene.rng.choice(LARGEST_ID, len(self.room.objects), replace=False)
         ids[0] = 0  # the shell is not an instance
-        self.labels = ids.astype(np.int32)  # (N + 1,) label in the files of each instance id of the room
-        self.colors = scene.rng.integers(64, 256, (len(ids), 3))  # RGB, of each
+        self.labels = ids.astype(np.int32)  # (N + 1,) label in the files by instance id
+        self.colors = scene.rng.integers(64, 256, (len(ids), 3))  # RGB by instance id
 
     def write_frames(self, frames: Sequence[int]) -> int:
-        """Write color and depth of some frames; return their number."""
+        """Write color and depth of `frames`; return the number of frames."""
         for index in frames:
             self.write_frame(index)
         return len(frames)
 
     def write_frame(self, index: int) -> None:
-        """Write color and depth of frame `index`, counted from 0."""
+        """Write color and depth of the frame `index`, starting at 0."""
         T_world_camera = self.path.pose(index)
         picture = self.renderer.render(self.camera, T_world_camera)
         rng = np.random.default_rng([*self._stream, index])
@@ -141,7 +141,7 @@ class SceneNNScene:
         _write_png(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
 
     def write_truth(self) -> int:
-        """Write the labeled mesh and its labels, but no frames."""
+        """Write the labeled mesh and its labels; return 0, the number of written frames."""
         frames, name = self.recording.frames, self.folder.name
         every = -(-frames // TRUTH_VIEWS)
         views = (self.path.pose(index) for index in range(0, frames, every))
@@ -153,7 +153,7 @@ class SceneNNScene:
         return 0
 
     def _annotated(self, vertices: Float32, instance_ids: Int32) -> list[Annotated]:
-        """Return the objects in the mesh by label; `vertices` (V, 3) m are y-up."""
+        """Return the annotated objects in the mesh, sorted by label; `vertices` (V, 3) m are y-up."""
         annotated = []
         for instance, piece in self.room.objects[1:]:
             points = vertices[instance_ids == instance].astype(np.float64)
@@ -175,7 +175,7 @@ class SceneNNScene:
         return sorted(annotated, key=lambda one: one.id)
 
     def write_walk(self) -> int:
-        """Write the timestamps and the trajectory last: a scene with a trajectory is complete."""
+        """Write the timestamps and then the trajectory, which marks the scene as complete."""
         frames = range(self.recording.frames)
         with written_whole(self.folder / "timestamp.txt") as temporary:
             times = [round(1e6 * index / self.recording.rate) for index in frames]
@@ -186,7 +186,7 @@ class SceneNNScene:
 
 
 def frame_files(folder: Path, index: int) -> tuple[Path, Path]:
-    """Return the color and depth files of frame `index` from 0; file names count from 1."""
+    """Return the color and depth files of the frame `index`, starting at 0; file names start at 1."""
     return folder / "image" / f"image{index + 1:05d}.png", folder / "depth" / f"depth{index + 1:05d}.png"
 
 

@@ -1,4 +1,4 @@
-"""Synthetic sequence: a seeded, furnished room, rendered frame by frame in memory, with full ground truth."""
+"""Synthetic sequence: a seeded, furnished room, rendered frame by frame in memory, with complete ground truth."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from framework.synthetic.rgbd_camera import DepthSensor, noisy_color
 from framework.synthetic.room import RoomKind, furnish
 from framework.synthetic.walk import FRAME_RATE, plan_path
 
-MOST_FRAMES = 10**6  # nine hours
+MOST_FRAMES = 10**6  # nine hours at 30 Hz
 MOST_SIDE = 5792  # px; its square is MOST_PIXELS
-FOCAL_LENGTH = 525.0 / 640  # image widths: a Kinect's color camera
-TRUTH_VIEWS = 60  # frames that determine the true surface; neighbors have nearly the same view
+FOCAL_LENGTH = 525.0 / 640  # image widths, color camera of a Kinect
+TRUTH_VIEWS = 60  # frames for the ground-truth surface; neighboring frames have nearly the same view
 
 
 @dataclass
 class Synthetic(RGBDSequence):
     """A hand-held camera path through a furnished room; `room.surfaces` is its exact geometry.
 
-    Frames are bit-identical for the same parameters, in any order and from any thread.
+    Frames are bit-identical for equal parameters, in any order and from any thread.
     """
 
     seed: int = 0  # seed of the room and the camera path, combined with scene
@@ -100,11 +100,11 @@ class Synthetic(RGBDSequence):
         )
 
     def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Return exact depth (H, W) m and instance ids (H, W) from any pose."""
+        """Return the exact depth (H, W) m and instance ids (H, W) at any pose."""
         return self._renderer.depth_and_ids(self.camera, T_world_camera)
 
     def scene_truth(self) -> SceneTruth:
-        """Return the labeled surface within the sensor's range in the selected frames, from their exact depth."""
+        """Return the labeled surface within the range of the sensor, from the exact depth of the selected frames."""
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
         chosen = sorted({*self._chosen[::every], self._chosen[-1]})
         return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)

@@ -12,26 +12,26 @@ from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.synthetic.paints import DARK, EMISSION, SHINY
 from framework.synthetic.texture_kernels import surface_color
 
-EDGE_STEP = 0.04  # relative step of depth that counts as an edge
-WHITE = 2.2  # linear light that becomes full white: lamps and windows may saturate
-GLANCED_OFF = np.float32(np.deg2rad(60.0))  # rad, of incidence, from which a mirror reflects the projector's light away
-GRAZING = np.float32(0.05)  # least cosine of a pixel's footprint
+EDGE_STEP = 0.04  # relative depth step of an edge
+WHITE = 2.2  # linear light of full white; lamps and windows may saturate
+GLANCED_OFF = np.float32(np.deg2rad(60.0))  # rad, incidence at which a mirror loses all readings
+GRAZING = np.float32(0.05)  # minimum cosine for the footprint of a pixel
 
 
 class LitSurfaces(NamedTuple):
-    """The triangles of a room with baked light."""
+    """Triangles of a room with baked light."""
 
     texture: Float32  # (V, 3) m
     irradiance: Float32  # (V, 3) linear RGB
     triangles: Int32  # (F, 3)
-    normals: Float32  # (F, 3) unit, towards no particular side
-    materials: Int32  # (F,) row of the table
+    normals: Float32  # (F, 3) unit, towards either side
+    materials: Int32  # (F,) rows of the table
     parts: Int32  # (F,)
     table: Float32  # (M, 14), see paints.material_table
 
 
 class Viewpoint(NamedTuple):
-    """The pose and intrinsics (px) of a camera."""
+    """Pose and intrinsics (px) of a camera."""
 
     T_world_camera: Float64
     fx: float
@@ -44,7 +44,7 @@ class Viewpoint(NamedTuple):
 def gather_light(
     triangle: Int32, uv: Float32, triangles: Int32, materials: Int32, reflectance: Float32, irradiance: Float32
 ) -> Float32:
-    """Return the mean light (V, 3) that the seen points reflect: the irradiance, for cosine-distributed rays."""
+    """Return the mean reflected light (V, 3) of the visible points, the irradiance for cosine-distributed rays."""
     out = np.zeros((len(triangle), 3), np.float32)
     for v in range(len(triangle)):
         for d in range(triangle.shape[1]):
@@ -67,7 +67,7 @@ def gather_light(
 def shade(
     s: LitSurfaces, view: Viewpoint, triangle: Int32, depth: Float32, uv: Float32, light: Float32, incidence: Float32
 ) -> None:
-    """Write the linear light (H, W, 3) of each pixel and the cosines (H, W) of incidence; 0 without a surface."""
+    """Write the linear light (H, W, 3) and the cosines of incidence (H, W) of each pixel; 0 without a surface."""
     texture, irradiance, triangles, normals, materials, _, table = s
     fx = np.float32(view.fx)
     for v in range(triangle.shape[0]):
@@ -85,7 +85,7 @@ def shade(
 
 @njit(cache=True, nogil=True)
 def lose_readings(materials: Int32, table: Float32, triangle: Int32, incidence: Float32, lost: Float32) -> None:
-    """Write the share (H, W) of lost readings: `dark`, and of the rest `shiny` times the slant of the surface."""
+    """Write the fraction (H, W) of lost readings: dark + (1 - dark) * shiny * slant of the surface."""
     one = np.float32(1)
     mirrored_away = one - np.cos(GLANCED_OFF)
     for v in range(triangle.shape[0]):
@@ -111,10 +111,10 @@ def _cosine(view, normals, f, u, v):
 
 @njit(cache=True, nogil=True, inline="always")
 def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, cosine):
-    """Return the RGB light that leaves the point of triangle f at barycentric b, c; a pixel there is `pixel` m wide."""
+    """Return the emitted and reflected RGB light at barycentric b, c of triangle f; `pixel`: width of a pixel, m."""
     i, j, k = triangles[f, 0], triangles[f, 1], triangles[f, 2]
     a = np.float32(1) - b - c
-    # The footprint is an ellipse at grazing angles; its geometric mean loses the least of both axes.
+    # The footprint is an ellipse at grazing angles; its geometric mean is the best compromise between both axes.
     footprint = pixel / np.sqrt(max(cosine, GRAZING))
     material = table[materials[f]]
     red, green, blue = surface_color(
@@ -134,7 +134,7 @@ def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, 
 
 @njit(cache=True, nogil=True)
 def find_edges(triangle: Int32, parts: Int32, depth: Float32) -> Bool:
-    """Return the pixels (H, W) on either side of a border between two parts or of a step of depth."""
+    """Return a mask (H, W) of the pixels on both sides of a border between two parts or of a depth step."""
     height, width = depth.shape
     edge = np.zeros((height, width), np.bool_)
     for v in range(height):
@@ -164,10 +164,11 @@ def smooth_edges(
     depth: Float32,
     light: Float32,
 ) -> None:
-    """Write to the pixels u, v (N,) of `light` (H, W, 3) the mean of their samples, each at most white.
+    """Write the mean of the samples of pixels u, v (N,) to `light` (H, W, 3); each sample is clipped to white.
 
-    triangle, distance (N, S) and uv (N, S, 2) are the hits of the samples at `offsets` (S, 2) px from the pixel center.
-    A sample on the pixel's `own` (H, W) triangle's part, at about its `depth` (H, W), has the light of the center.
+    `triangle`, `distance` (N, S) and `uv` (N, S, 2): intersections of the samples at `offsets` (S, 2) px from the pixel
+    center. `own`: (H, W), triangle of each pixel. A sample has the light of the center if its triangle is on the
+    same part and its depth is close to `depth` (H, W).
     """
     texture, irradiance, triangles, normals, materials, parts, table = s
     white, fx = np.float32(WHITE), np.float32(view.fx)
@@ -192,7 +193,7 @@ def smooth_edges(
 
 @njit(cache=True, nogil=True)
 def apply_tone_curve(light: Float32, curve: UInt8, color: UInt8) -> None:
-    """Write the nearest entry of the curve for each light (N,), clipped to 0 to WHITE."""
+    """Write the nearest entry of the tone curve for each light (N,), clipped to [0, WHITE]."""
     white, entries = np.float32(WHITE), np.float32((len(curve) - 1) / WHITE)
     for n in range(len(light)):
         index = min(max(light[n], np.float32(0)), white) * entries

@@ -1,4 +1,4 @@
-"""Triangles of a furnished room, as arrays for ray casting and shading."""
+"""Arrays of a furnished room's triangles for ray casting and shading."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from framework.synthetic.paints import DARK, Material, material_table
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Exact geometry of a room, the reference for reconstructions."""
+    """Exact geometry of a room, the ground truth for reconstructions."""
 
-    vertices: Float32  # (V, 3) m, world
+    vertices: Float32  # (V, 3) m, world frame
     normals: Float32  # (V, 3) unit, smoothed over each part
     texture: Float32  # (V, 3) m
     triangles: Int32  # (F, 3)
     instance_ids: Int32  # (F,), 0 = floor, wall or ceiling
-    materials: Int32  # (F,) row of material_table
-    parts: Int32  # (F,) part of each triangle: images have edges between parts
-    material_table: Float32  # (M, 14), see textures.material_table
+    materials: Int32  # (F,) rows of material_table
+    parts: Int32  # (F,) part of each triangle; images have edges between parts
+    material_table: Float32  # (M, 14), see paints.material_table
     class_names: Mapping[int, str | None]  # instance id -> COCO class; None = clutter
 
     @property
     def unreadable(self) -> Bool:
-        """Mask (F,) of triangles without depth readings: screens and window panes."""
+        """Mask (F,) of triangles without depth readings, on screens and window panes."""
         return np.asarray(self.material_table[self.materials, DARK] >= 1)
 
 
 def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:
-    """Return all parts of the (instance id, object) pairs in their final poses."""
+    """Combine all parts of (instance id, object) pairs in their final poses."""
     vertices: list[Float64] = []
     normals: list[Float64] = []
     texture: list[Float64] = []

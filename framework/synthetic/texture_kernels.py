@@ -1,8 +1,8 @@
 """Procedural textures, evaluated per pixel: no seams, no image files, enough gradient for photometric alignment.
 
-Solid textures (wood, fabric, paint, metal) use all three texture coordinates, pictures (planks, tiles, rug, painting)
-the first two. Detail below a pixel is faded out, so that nothing flickers between frames. `footprint` is the size of a
-pixel on the surface, m; lengths without a unit are m.
+Solid textures (wood, fabric, paint, metal) use all three texture coordinates. Planar textures (planks, tiles, rug,
+painting) use the first two. Detail below the size of a pixel is faded out to prevent flicker between frames.
+`footprint` is the size of a pixel on the surface, m. Lengths without a unit are in m.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from numba import njit
 from framework.data import Float32
 from framework.synthetic.paints import Texture
 
-# numba compares plain integers.
+# Integers, because numba compares plain integers.
 PAINT, WOOD, FABRIC, STRIPES, PLANKS, TILES, RUG, PAINTING = (int(texture) for texture in list(Texture)[:8])
 SCREEN, METAL, BOOK, SKY, WALLPAPER, LEAF, CHECKS, PAGES = (int(texture) for texture in list(Texture)[8:])
 
-# Odd 64-bit constants that scatter lattice coordinates and seeds over all bits.
+# Odd 64-bit constants to distribute lattice coordinates and seeds over all bits.
 STEP_X, STEP_Y = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 STEP_Z, STEP_SEED = np.uint64(0x165667B19E3779F9), np.uint64(0x27D4EB2F165667C5)
 
 
 @njit(cache=True, nogil=True)
 def _mixed(h: np.uint64) -> float:
-    """Return a number in [0, 1) that depends on every bit of `h`."""
+    """Hash all bits of `h` to a number in [0, 1)."""
     h ^= h >> np.uint64(32)
     h *= np.uint64(0xD6E8FEB86659FD93)
     h ^= h >> np.uint64(29)
@@ -33,7 +33,7 @@ def _mixed(h: np.uint64) -> float:
 
 @njit(cache=True, nogil=True)
 def _lattice(i: int, j: int, k: int, seed: int) -> float:
-    """Return a number in [0, 1) for each lattice point."""
+    """Return a pseudorandom number in [0, 1) for a lattice point."""
     h = np.uint64(i) * STEP_X ^ np.uint64(j) * STEP_Y ^ np.uint64(k) * STEP_Z ^ np.uint64(seed) * STEP_SEED
     return float(_mixed(h))
 
@@ -56,13 +56,13 @@ def _noise(x: float, y: float, z: float, seed: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _visible(wavelength: float, footprint: float) -> float:
-    """Return how much of a detail of this wavelength a pixel can show, 0 to 1."""
+    """Return the visible fraction, 0 to 1, of detail with this wavelength in a pixel."""
     return min(1.0, max(0.0, wavelength / (2.0 * footprint) - 0.75))
 
 
 @njit(cache=True, nogil=True)
 def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, footprint: float, seed: int) -> float:
-    """Return noise in [-1, 1] of halving wavelengths, without those that a pixel cannot show."""
+    """Return the sum of noise octaves in [-1, 1] with halving wavelengths, without invisible octaves."""
     value, amplitude, total = 0.0, 1.0, 0.0
     x, y, z = x / wavelength, y / wavelength, z / wavelength
     for octave in range(octaves):
@@ -70,7 +70,7 @@ def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, foot
         total += amplitude
         if shown > 0.0:
             value += shown * amplitude * (2.0 * _noise(x, y, z, seed + octave) - 1)
-        x, y, z = 2 * x, 2 * y, 2 * z  # exact, and faster than a division by each wavelength
+        x, y, z = 2 * x, 2 * y, 2 * z  # exact and faster than a division by each wavelength
         wavelength *= 0.5
         amplitude *= 0.7
     return value / total
@@ -85,7 +85,7 @@ def _step(low: float, high: float, x: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _line(x: float, width: float, footprint: float) -> float:
-    """Return 1 on the lines at whole x, else 0; x, width and footprint in periods."""
+    """Return 1 on lines at integer x, else 0; x, width and footprint in periods."""
     d = abs(x - float(np.floor(x + 0.5)))
     blur = max(footprint, 0.25 * width)
     return float((1.0 - _step(0.5 * width - 0.5 * blur, 0.5 * width + 0.5 * blur, d)) * min(1.0, 2.0 * width / blur))
@@ -101,7 +101,7 @@ def _within(x: float, low: float, high: float, soft: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: int) -> float:
-    """Return the mix of grain along x: growth rings bent by noise, and fibers."""
+    """Return the color mix of wood grain along x: growth rings bent by noise, and fibers."""
     bend = 2.2 * _noise(0.9 * x, 5 * y, 5 * z, seed)
     rings = 0.5 + 0.5 * float(np.sin(2 * np.pi * (0.7 * (y + 0.6 * z) / scale + bend)))
     mix = 0.3 + 0.45 * rings * _visible(scale, footprint)
@@ -115,7 +115,7 @@ def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: in
 
 @njit(cache=True, nogil=True)
 def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """Return the color of a sunset over three ranges of hills in the material's two colors."""
+    """Return the color of a painting: a sunset over three ranges of hills in the two colors of the material."""
     sun_u, sun_v = 0.25 + 0.5 * _lattice(1, 2, 3, seed), 0.6 + 0.15 * _lattice(3, 2, 1, seed)
     glow = np.exp(-8 * ((u - sun_u) ** 2 + (v - sun_v) ** 2))
     disc = 1 - _step(0.055, 0.07, np.sqrt((u - sun_u) ** 2 + 0.6 * (v - sun_v) ** 2))
@@ -135,13 +135,13 @@ def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, floa
 
 @njit(cache=True, nogil=True)
 def _cloth(x: float, y: float, z: float, footprint: float, seed: int) -> float:
-    """Return the gain of woven threads."""
+    """Return the brightness factor of woven threads."""
     return 1.0 + float(0.2 * _fractal(x, y, z, 0.012, 2, footprint, seed))
 
 
 @njit(cache=True, nogil=True)
 def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tuple[float, float]:
-    """Return (mix, gain) of a floor of boards along x, each cut from another tree."""
+    """Return the color mix and brightness factor of a floor of boards along x with different grain."""
     length, gap = 1.1, 0.004
     board = np.int64(np.floor(y / width))
     shift = _lattice(board, 3, 5, seed)
@@ -154,7 +154,7 @@ def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tu
 
 @njit(cache=True, nogil=True)
 def _tiles(x: float, y: float, side: float, footprint: float, seed: int) -> tuple[float, float]:
-    """Return (mix, gain) of square tiles; the grout is mix = 1."""
+    """Return the color mix and brightness factor of square tiles; the mix of the grout is 1."""
     i, j = np.int64(np.floor(x / side)), np.int64(np.floor(y / side))
     grout = 0.006 / side
     mix = max(_line(x / side, grout, footprint / side), _line(y / side, grout, footprint / side))
@@ -164,7 +164,7 @@ def _tiles(x: float, y: float, side: float, footprint: float, seed: int) -> tupl
 
 @njit(cache=True, nogil=True)
 def _rug(x: float, y: float, scale: float, width: float, height: float, footprint: float) -> float:
-    """Return the mix of diamonds within border bands."""
+    """Return the color mix of a rug: diamonds within border bands."""
     edge = min(min(x, width - x), min(y, height - y))
     if edge < 0.16:
         return float(0.5 + 0.5 * np.sin(2 * np.pi * edge / 0.08))
@@ -176,7 +176,7 @@ def _rug(x: float, y: float, scale: float, width: float, height: float, footprin
 
 @njit(cache=True, nogil=True)
 def _book(u: float, v: float, soft: float) -> float:
-    """Return the mix of a cover over [0, 1]^2: a frame, a title of several lines, an emblem."""
+    """Return the color mix of a book cover over [0, 1]^2: a frame, a title in several lines, an emblem."""
     frame = _within(u, 0.07, 0.93, soft) * _within(v, 0.05, 0.95, soft)
     inner = _within(u, 0.10, 0.90, soft) * _within(v, 0.07, 0.93, soft)
     lines = _within(u, 0.18, 0.82, soft) * _within(v, 0.62, 0.86, soft) * _line(v * 12.5, 0.5, 12.5 * soft)
@@ -186,7 +186,7 @@ def _book(u: float, v: float, soft: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
-    """Return the mix of stripes with flowers, every other row shifted."""
+    """Return the color mix of wallpaper: stripes with flowers, every second row shifted."""
     u, v = x / scale, y / (1.6 * scale)
     cell = np.floor(u)
     v += 0.5 * (cell % 2)
@@ -200,7 +200,7 @@ def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """Return the color of a window: clouds, and trees below."""
+    """Return the color of the view through a window: clouds, with trees below."""
     line = 0.30 + 0.22 * _noise(5 * u, 0.5, 0.5, seed) + 0.08 * _noise(23 * u, 0.5, 0.5, seed)
     tree = 1 - _step(line - 0.02, line + 0.02, v)
     leaf = 0.45 + 0.4 * _noise(40 * u, 40 * v, 0.0, seed)
@@ -214,7 +214,7 @@ def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
 
 @njit(cache=True, nogil=True)
 def _screen(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
-    """Return the color of a television: a landscape with a caption."""
+    """Return the color of a television screen: a landscape with a caption."""
     r, g, b = _landscape(row, u, v, seed)
     caption = 1.0 if (0.07 < v < 0.16 and 0.06 < u < 0.55) else 0.0
     return r * (1 - caption) + 0.02 * caption, g * (1 - caption) + 0.05 * caption, b * (1 - caption) + 0.35 * caption

@@ -1,4 +1,4 @@
-"""Hand-held camera path: an ellipse through the free floor, facing the furniture on the far side."""
+"""Hand-held camera path: an ellipse above free floor; the camera faces the furniture on the opposite side."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ MAX_SPEED = 0.45  # m/s
 MAX_TURN = np.deg2rad(28.0)  # rad/s
 DISTANCE = 0.5  # m, minimum distance to furniture and walls
 RADII = np.arange(0.30, 1.06, 0.15)  # m, radii of candidate ellipses
-EYE_HEIGHT = (1.38, 1.58)  # m, range of the mean height of a path
+EYE_HEIGHT = (1.38, 1.58)  # m, range of the mean camera height
 PITCH = np.deg2rad(14.0)  # mean downward pitch of the camera
-PHASES = 48  # positions on the ellipse for the visibility score
+PHASES = 48  # number of positions on the ellipse for the visibility score
 
 
 @dataclass(frozen=True)
@@ -27,14 +27,14 @@ class CameraPath:
 
     center: Float64  # (2,) m
     radii: Float64  # (2,) m
-    height: float  # m, on average
+    height: float  # m, mean height
     start: float  # rad, phase of the first frame
-    turn: int  # 1 = counter-clockwise seen from above, -1 = clockwise
+    turn: int  # 1 = counter-clockwise as seen from above, -1 = clockwise
     sway: Float64  # (4,) rad, phases of the hand motion
     phase_speed: float = 1.0  # rad/s
 
     def pose(self, frame: float) -> Float64:
-        """Return T_world_camera (4, 4) of a frame at FRAME_RATE, or between frames."""
+        """Return T_world_camera (4, 4) of a frame at FRAME_RATE; fractions are between frames."""
         return self.pose_at(self.start + self.turn * self.phase_speed * frame / FRAME_RATE)
 
     def pose_at(self, phase: float) -> Float64:
@@ -42,7 +42,7 @@ class CameraPath:
         return look(position[0], float(yaw[0]), float(pitch[0]), float(roll[0]))
 
     def _state(self, phase: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """Return position (N, 3) m and yaw, pitch, roll (N,) rad, from integer harmonics, which close the path."""
+        """Return position (N, 3) m and yaw, pitch, roll (N,) rad; integer harmonics close the path."""
         a, b, c, d = self.sway
         position = np.empty((len(phase), 3))
         position[:, 0] = self.center[0] + self.radii[0] * np.cos(phase)
@@ -65,9 +65,9 @@ class LabelView(Protocol):
 def plan_path(
     layout: Layout, frames: int, labels: LabelView, wanted: set[int], rng: np.random.Generator, stride: float = 1.0
 ) -> CameraPath:
-    """Return the path with the best visibility of the `wanted` instances in `frames` frames, `stride` apart.
+    """Return the path with the best visibility of the `wanted` instances in `frames` frames with a step of `stride`.
 
-    Raises DataError without enough free floor.
+    Raises DataError if the free floor is too small.
     """
     center, radii = _widest_ellipse(layout)
     turn = 1 if rng.uniform() < 0.5 else -1
@@ -78,7 +78,7 @@ def plan_path(
 
 
 def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
-    """Return center and radii of the longest ellipse (of RADII) with the minimum DISTANCE."""
+    """Return the center and radii of the longest ellipse (from RADII) that keeps the minimum DISTANCE."""
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     free, width, depth = layout.free, layout.width, layout.depth
     rows, columns = free.shape
@@ -98,12 +98,12 @@ def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
                 center = np.array([(x[at] + 0.5) * CELL - width / 2, (y[at] + 0.5) * CELL - depth / 2])
                 best = (*score, center, np.array([rx, ry]))
     if best is None:
-        raise DataError("synthetic room: no free camera path between the furniture; set another seed or scene")
+        raise DataError("synthetic scene: expected free floor for a camera path, got none; set another seed or scene")
     return best[2], best[3]
 
 
 def _allowed_phase_speed(path: CameraPath) -> float:
-    """Return the phase speed (rad/s) at which neither MAX_SPEED nor MAX_TURN is exceeded anywhere."""
+    """Return the maximum phase speed (rad/s) within MAX_SPEED and MAX_TURN along the whole path."""
     phase = np.linspace(0, 2 * np.pi, 721)
     step = phase[1]
     position, yaw, pitch, roll = path._state(phase)
@@ -114,7 +114,7 @@ def _allowed_phase_speed(path: CameraPath) -> float:
 
 
 def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[int]) -> float:
-    """Return the start phase of a path over `sweep` rad with the most visible wanted instances, then pixels."""
+    """Return the start phase with the most visible wanted instances over `sweep` rad; then by visible pixels."""
     phases = 2 * np.pi * np.arange(PHASES) / PHASES
     ids = sorted(wanted)
     pixels = np.array(
@@ -123,7 +123,7 @@ def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[i
     steps = min(PHASES, max(1, round(abs(sweep) / (2 * np.pi) * PHASES) + 1))
     direction = 1 if sweep >= 0 else -1
     windows = (np.arange(PHASES)[:, None] + direction * np.arange(steps)) % PHASES
-    seen = pixels[windows].max(axis=1)  # (PHASES, ids): the best view of each
+    seen = pixels[windows].max(axis=1)  # (PHASES, ids), best view of each instance
     score = (seen >= 40).sum(axis=1) + 1e-3 * np.minimum(seen, 400).mean(axis=1)
     return float(phases[int(score.argmax())])
 

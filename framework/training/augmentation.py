@@ -1,4 +1,4 @@
-"""Random augmentation of pictures and masks."""
+"""Random augmentation of images and masks."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from framework.data import UInt8
 from framework.training.room_pictures import Example
 
-ZOOM = (0.55, 1.0)  # side lengths of a crop, relative
-ZOOMED = 0.5  # fraction of the pictures
-LEAST_LEFT = 0.25  # minimum fraction of an object inside the crop
+ZOOM = (0.55, 1.0)  # side length of a crop divided by the side length of the image
+ZOOMED = 0.5  # fraction of the images
+LEAST_LEFT = 0.25  # minimum fraction of an object's area inside the crop
 SMALLEST = 40  # px, minimum area of an object
-GAIN, CHANNEL_GAIN, GAMMA = 0.35, 0.12, 0.35  # logarithms of the largest factors
-BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of the pictures
+GAIN, CHANNEL_GAIN, GAMMA = 0.35, 0.12, 0.35  # logarithms of the maximum factors
+BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of the images
 
 
 def augmented(example: Example, rng: np.random.Generator) -> Example:
-    """Return the picture randomly mirrored, zoomed, relit, blurred and noisy; hidden objects are dropped."""
+    """Randomly mirror, zoom, relight, blur and add noise to an image; drop objects outside of the crop."""
     color, masks = example.color, example.masks
     if rng.uniform() < 0.5:
         color, masks = color[:, ::-1], masks[:, :, ::-1]
@@ -32,7 +32,7 @@ def augmented(example: Example, rng: np.random.Generator) -> Example:
 
 
 def _zoomed(color: UInt8, masks: np.ndarray, rng: np.random.Generator) -> tuple[UInt8, np.ndarray, float]:
-    """Return a crop at the picture's size, and the factor by which areas grow."""
+    """Return a random crop resized to the image size, its masks and the scale factor of areas."""
     height, width = color.shape[:2]
     share = rng.uniform(*ZOOM)
     h, w = round(share * height), round(share * width)

@@ -1,6 +1,6 @@
 """The loss of Mask R-CNN (He et al. 2017) on Faster R-CNN's anchors (Ren et al. 2015).
 
-Boxes are x1 y1 x2 y2 px, of extent 0. `own` (N,) is the index of the object of each box, or BACKGROUND or IGNORED.
+Boxes are x1 y1 x2 y2 px with extent 0. `own` (N,) contains the object index of each box, or BACKGROUND or IGNORED.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from torch.nn import functional
 from framework.detection.mask_rcnn.network import DELTA_WEIGHTS, MaskRCNN, propose
 from framework.detection.mask_rcnn.roi_align import roi_align
 
-BETA = 1.0 / 9.0  # where the smooth L1 loss becomes linear
-ANCHORS = 256  # sampled per image
-ANCHORS_POSITIVE = 0.5  # maximum fraction
-PROPOSALS_POSITIVE = 0.25  # maximum fraction
+BETA = 1.0 / 9.0  # error at the transition of the smooth L1 loss from quadratic to linear
+ANCHORS = 256  # sampled anchors per image
+ANCHORS_POSITIVE = 0.5  # maximum fraction of anchors with an object
+PROPOSALS_POSITIVE = 0.25  # maximum fraction of proposals with an object
 BACKGROUND, IGNORED = -1, -2
 
 
 @dataclass(frozen=True)
 class Objects:
-    """The N objects of one picture."""
+    """The N objects in one image."""
 
     boxes: Tensor  # (N, 4) px, extent 0
     labels: Tensor  # (N,) from 1
@@ -37,17 +37,17 @@ class Objects:
 
 @dataclass(frozen=True)
 class Budget:
-    """Limits for each image in a step."""
+    """Limits per image in a training step."""
 
-    before_nms: int = 500  # anchors per level that become proposals
-    after_nms: int = 300  # proposals
-    proposals: int = 96  # sampled from these
+    before_nms: int = 500  # decoded anchors per level
+    after_nms: int = 300  # proposals after non-maximum suppression
+    proposals: int = 96  # sampled proposals
 
 
 def losses(
     network: MaskRCNN, images: Tensor, objects: Sequence[Objects], budget: Budget, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Return the five terms, each a mean over the images (N, 3, H, W) RGB 0..255; training minimizes their sum."""
+    """Compute the five terms of the loss as means over the images (N, 3, H, W), RGB 0..255; the loss is their sum."""
     shape = (images.shape[2], images.shape[3])
     pyramid = network.extract(network.normalize(images))
     objectness, deltas = (output.float() for output in network.score_anchors(pyramid))
@@ -92,7 +92,7 @@ def _proposal_losses(
     labels = torch.zeros(len(chosen), dtype=torch.int64, device=boxes.device)
     labels[is_object] = true.labels[own[is_object]]
     logits, deltas = (output.float() for output in network.classify(pyramid, boxes))
-    n = len(positive)  # the first ones
+    n = len(positive)  # positive boxes come first
     index = torch.arange(n, device=boxes.device)
     targets = encode(boxes[:n], true.boxes[own[:n]]) * torch.tensor(DELTA_WEIGHTS, device=boxes.device)
     distance = functional.smooth_l1_loss(deltas[index, labels[:n]], targets, beta=BETA, reduction="sum")
@@ -102,12 +102,12 @@ def _proposal_losses(
         covered = mask_targets(true.masks, boxes[:n], own[:n], mask_logits.shape[-1])
         terms["masks"] = functional.binary_cross_entropy_with_logits(mask_logits, covered)
     else:
-        terms["masks"] = logits.sum() * 0.0  # every image needs a gradient
+        terms["masks"] = logits.sum() * 0.0  # keeps a gradient path for images without objects
     return terms
 
 
 def box_iou(a: Tensor, b: Tensor) -> Tensor:
-    """Return the (N, M) intersections over unions of boxes (N, 4) and (M, 4)."""
+    """Return the intersection over union (N, M) of boxes (N, 4) and (M, 4)."""
     low = torch.maximum(a[:, None, :2], b[None, :, :2])
     high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
     shared = (high - low).clamp(min=0).prod(dim=2)
@@ -116,9 +116,10 @@ def box_iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def match(iou: Tensor, foreground: float, background: float, each_object: bool) -> Tensor:
-    """Return `own` (N,) from iou (N, M): the best object from `foreground` on, BACKGROUND below `background`.
+    """Assign objects to boxes by `iou` (N, M); return `own` (N,).
 
-    With `each_object`, every object also gets the boxes with its highest IoU above 0.
+    A box gets its best object at an IoU of at least `foreground`, BACKGROUND below `background`, otherwise IGNORED.
+    With `each_object`, the boxes with the highest IoU of an object also get their best object, if the IoU is above 0.
     """
     if iou.shape[1] == 0:
         return torch.full((len(iou),), BACKGROUND, device=iou.device)
@@ -134,7 +135,10 @@ def match(iou: Tensor, foreground: float, background: float, each_object: bool) 
 
 
 def sample(own: Tensor, count: int, positive_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Draw at most `count` boxes; return the indices of boxes with an object (at most a fraction) and of background."""
+    """Draw at most `count` boxes; return the indices of boxes with an object and of background boxes.
+
+    `positive_share`: maximum fraction of boxes with an object.
+    """
     positive = _draw(torch.nonzero(own >= 0)[:, 0], int(count * positive_share), generator)
     negative = _draw(torch.nonzero(own == BACKGROUND)[:, 0], count - len(positive), generator)
     return positive, negative
@@ -146,16 +150,16 @@ def _draw(indices: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 
 def encode(boxes: Tensor, objects: Tensor) -> Tensor:
-    """Return the deltas dx dy dw dh (N, 4) from `boxes` to `objects` (N, 4): the inverse of boxes.decode."""
+    """Return the deltas dx dy dw dh (N, 4) from `boxes` to `objects` (N, 4), the inverse of boxes.decode."""
     sizes, wanted = boxes[:, 2:] - boxes[:, :2], objects[:, 2:] - objects[:, :2]
     centers, targets = boxes[:, :2] + sizes / 2, objects[:, :2] + wanted / 2
     return torch.cat([(targets - centers) / sizes, torch.log(wanted / sizes)], dim=1)
 
 
 def mask_targets(masks: Tensor, boxes: Tensor, own: Tensor, bins: int) -> Tensor:
-    """Return (N, bins, bins), 1 where the mask of its object covers at least half of a bin of boxes (N, 4), else 0.
+    """Return the target masks (N, bins, bins) of boxes (N, 4): 1 in bins at least half covered by the object, else 0.
 
-    masks (M, H, W) bool, with pixel centers half a pixel inside the borders, as in boxes of extent 0.
+    `masks`: (M, H, W) bool. Pixel centers are half a pixel inside the borders, as in boxes with extent 0.
     """
     targets = torch.empty((len(boxes), bins, bins), device=boxes.device)
     for k in torch.unique(own).tolist():

@@ -1,9 +1,10 @@
-"""Pictures of many synthetic rooms with instance ids, for training.
+"""Training images of synthetic scenes with instance ids.
 
 Each room has its own random stream and is rendered from random poses towards its objects. Domain randomization (Tobin
-et al. 2017) changes the colors of all surfaces in most pictures, so that a network learns shapes.
+et al. 2017) changes the colors of all surfaces in most images, so that a network learns shapes.
 
-A room is a folder, written atomically: 000000.jpg, 000000.png (16-bit instance ids), ... and classes.json.
+The folder of a room contains 000000.jpg, 000000.png (16-bit instance ids), ... and classes.json. It is written
+atomically.
 """
 
 from __future__ import annotations
@@ -35,20 +36,20 @@ from framework.synthetic.walk import look
 
 STREAM = 0x7261_696E  # differs from the random streams of all datasets
 WIDTH, HEIGHT = 320, 240  # px
-FOCAL = (0.7, 1.0)  # image widths
-EYE_HEIGHT = (0.9, 1.75)  # m
-CLEAR = 0.35  # m, between camera and furniture or walls
-TINT = 0.5  # logarithm of the largest factor of a surface's colors
-TINTED = 0.7  # fraction of the pictures with changed colors
-STUDIOS = 0.5  # fraction of the rooms with all classes: some classes occur in no other kind of room
+FOCAL = (0.7, 1.0)  # range of the focal length, image widths
+EYE_HEIGHT = (0.9, 1.75)  # m, range of the camera height
+CLEAR = 0.35  # m, minimum distance of the camera to furniture and walls
+TINT = 0.5  # logarithm of the maximum factor for the colors of a surface
+TINTED = 0.7  # fraction of the images with changed colors
+STUDIOS = 0.5  # fraction of rooms with all classes, because some classes occur only in studios
 QUALITY = 93  # of the JPEG files
-LEAST = 100  # px, minimum area of objects in a picture
-TRIES = 20  # views tried for each picture
+LEAST = 100  # px, minimum area of objects in an image
+TRIES = 20  # candidate views for each image
 
 
 @dataclass(frozen=True)
 class Example:
-    """One picture and its N objects of known class."""
+    """One image with N objects of known class."""
 
     color: UInt8  # (H, W, 3) RGB
     masks: Bool  # (N, H, W)
@@ -56,12 +57,12 @@ class Example:
 
 
 def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: int) -> None:
-    """Render the rooms from number `first` on into `folder`; existing ones are kept."""
+    """Render `rooms` rooms, starting at number `first`, into `folder`; existing rooms are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     missing = [number for number in range(first, first + rooms) if not room_folder(folder, number).is_dir()]
     if not missing:
         return
-    # Not forked: threads of numba and OpenCV do not survive a fork.
+    # Processes are spawned, because threads of numba and OpenCV do not survive a fork.
     workers = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), numba.set_num_threads, (1,))
     with workers, tqdm(total=len(missing), desc="rendering rooms", unit="room", disable=None) as bar:
         for _ in workers.map(partial(render_room, folder, views), missing):
@@ -74,7 +75,7 @@ def room_folder(folder: Path, number: int) -> Path:
 
 
 def render_room(folder: Path, views: int, number: int) -> None:
-    """Write `views` pictures of room `number`."""
+    """Render and write `views` images of room `number`."""
     with tempfile.TemporaryDirectory(dir=folder, prefix=".room_") as unfinished:
         target = Path(unfinished) / "room"
         target.mkdir()
@@ -87,7 +88,7 @@ def render_room(folder: Path, views: int, number: int) -> None:
 
 
 def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[int, str]]]:
-    """Yield (color (H, W, 3), instance ids (H, W) uint16, their COCO classes) of random views of room `number`."""
+    """Yield color (H, W, 3), instance ids (H, W) uint16 and COCO classes by id for random views of room `number`."""
     rng = np.random.default_rng([STREAM, number])
     kinds = list(RoomKind)
     room = furnish(RoomKind.STUDIO if rng.uniform() < STUDIOS else kinds[int(rng.integers(len(kinds)))], rng)
@@ -101,7 +102,7 @@ def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[
 def _random_views(
     room: Room, renderer: Renderer, names: Mapping[int, str], views: int, rng: np.random.Generator
 ) -> Iterator[tuple[Camera, Float64]]:
-    """Yield (camera, T_world_camera (4, 4)) of views of objects with a class."""
+    """Yield the camera and T_world_camera (4, 4) of random views of objects with a class."""
     centers = [_centers(room, [i for i in names if names[i] == name]) for name in sorted(set(names.values()))]
     for _ in range(views):
         for _ in range(TRIES):
@@ -115,14 +116,14 @@ def _random_views(
 
 
 def _centers(room: Room, ids: Sequence[int]) -> Float64:
-    """Return the center (N, 3) m of each object's box."""
+    """Return the centers (N, 3), m, of the objects' boxes."""
     surfaces = room.surfaces
     corners = [surfaces.vertices[surfaces.triangles[surfaces.instance_ids == i]].reshape(-1, 3) for i in ids]
     return np.array([(c.min(axis=0) + c.max(axis=0)) / 2 for c in corners], np.float64)
 
 
 def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> Float64:
-    """Return a random T_world_camera (4, 4) on free floor, roughly towards an object, all classes equally often."""
+    """Draw a random T_world_camera (4, 4) above free floor, roughly towards an object of a random class."""
     layout = room.layout
     rows, columns = np.nonzero(layout.free >= CLEAR)
     at = int(rng.integers(len(rows)))
@@ -136,7 +137,7 @@ def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> F
 
 
 def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the material table with the colors of each material multiplied by random factors."""
+    """Multiply the colors of each material in the table by random factors, in a fraction TINTED of the calls."""
     if rng.uniform() > TINTED:
         return table
     gains = np.exp(rng.uniform(-TINT, TINT, (len(table), 1)) + rng.uniform(-TINT, TINT, (len(table), 3)))
@@ -147,7 +148,7 @@ def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 class RoomPictures:
-    """The pictures of rendered rooms, read on demand."""
+    """Images of rendered rooms, read on demand."""
 
     def __init__(self, folder: Path, first: int, rooms: int) -> None:
         self.files: list[Path] = []
@@ -155,7 +156,7 @@ class RoomPictures:
         for number in range(first, first + rooms):
             room = room_folder(folder, number)
             if not room.is_dir():
-                raise DataError(f"{room}: expected a rendered room, got no such folder; render the rooms first")
+                raise DataError(f"{room}: expected a rendered room, got no folder; render the rooms first")
             self.files += sorted(room.glob("*.jpg"))
             classes = read_json(room / "classes.json")
             self._names[room] = {int(i): str(name) for i, name in classes.items()}

@@ -1,6 +1,6 @@
 """Training run: render rooms, train, evaluate on held-out rooms.
 
-Writes network.safetensors (for `detector=mask_rcnn detector.weights=...`), checkpoint.pt (to resume from), losses.csv,
+Outputs: network.safetensors (for `detector=mask_rcnn detector.weights=...`), checkpoint.pt (to resume), losses.csv,
 losses.png and average_precision.json.
 """
 
@@ -60,11 +60,11 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
     device = str(torch_device(config.device, "device"))
     pictures = RoomPictures(rooms, 0, wanted.rooms)
     trainer = Trainer(network, pictures, schedule, folder, device)
-    log.info("%d pictures, step %d of %d, on %s", len(pictures), trainer.step, schedule.steps, device)
+    log.info("%d images, step %d of %d, on %s", len(pictures), trainer.step, schedule.steps, device)
     trainer.run()
 
     card: dict[str, Fact] = {
-        "data": f"{len(pictures)} pictures of {wanted.rooms} rendered rooms",
+        "data": f"{len(pictures)} images of {wanted.rooms} rendered rooms",
         "steps": trainer.step,
         "batch": schedule.batch,
         "seed": int(config.seed),
@@ -86,19 +86,23 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
 
 
 def _started(config: DictConfig) -> MaskRCNN:
-    """Return the initial network; raise ConfigError if `start_from` has another architecture."""
+    """Return the initial network. Raises ConfigError if `start_from` has another architecture."""
     network = MaskRCNN(architecture(config))
     if config.start_from:
         start = load_network(Path(config.start_from))
         if start.architecture != network.architecture:
-            expected = "expected weights of the configured architecture"
-            raise ConfigError(f"network.start_from: {expected}, got others in {config.start_from}")
+            wanted, found = asdict(network.architecture), asdict(start.architecture)
+            key = next(key for key in wanted if wanted[key] != found[key])
+            raise ConfigError(
+                f"network.start_from: expected weights of the configured architecture ({key}={wanted[key]}), got "
+                f"{key}={found[key]} in {config.start_from}"
+            )
         network.load_state_dict(start.state_dict())
     return network
 
 
 def architecture(network: DictConfig) -> Architecture:
-    """Return the configured architecture, for the classes of synthetic rooms."""
+    """Return the configured architecture for the classes of synthetic scenes."""
     require(network.backbone in DEPTHS, "network.backbone", network.backbone, f"one of {', '.join(DEPTHS)}")
     return Architecture(
         classes=tuple(name for name in COCO if name in SCENENN_TO_COCO.values()),
@@ -114,14 +118,14 @@ def architecture(network: DictConfig) -> Architecture:
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace NaN by None: JSON has no NaN."""
+    """Replace non-finite numbers with None, because JSON cannot represent them."""
     inner = {name: _known(value) if isinstance(value, Mapping) else value for name, value in values.items()}
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in inner.items()}
 
 
 def _detected(detector: Detector, pictures: RoomPictures) -> Iterator[tuple[Bool, Sequence[str], Detections]]:
-    """Yield the true masks, their classes and the detections of each picture."""
-    for k in tqdm(range(len(pictures)), desc="evaluating", unit="picture", disable=None):
+    """Yield the ground-truth masks, their classes and the detections of each image."""
+    for k in tqdm(range(len(pictures)), desc="evaluating", unit="image", disable=None):
         example = pictures[k]
         height, width = example.color.shape[:2]
         camera = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)

@@ -1,6 +1,6 @@
 """Training loop: batches, steps, checkpoints and the loss curve.
 
-The random draws of a step depend only on the seed and the step, so that a resumed run equals an uninterrupted one.
+The random numbers of a step depend only on the seed and the step, so that a resumed run equals an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from framework.training.losses import Budget, Objects, losses
 from framework.training.room_pictures import Example, RoomPictures
 
 CHECKPOINT, CURVE, HISTORY = "checkpoint.pt", "losses.png", "losses.csv"
-LARGEST_GRADIENT = 10.0  # norm
+LARGEST_GRADIENT = 10.0  # maximum norm of the gradient
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Length and speed of a training."""
+    """Length and optimizer parameters of a training run."""
 
     steps: int = 8000  # training steps, >= 1
     batch: int = 4  # images per step, >= 1
@@ -40,7 +40,7 @@ class Schedule:
     warmup: int = 300  # steps of linear warmup, >= 0, followed by a cosine decay of the learning rate to a hundredth
     ema_decay: float = 0.998  # decay of the moving average of the weights, in [0, 1); the average is saved
     checkpoint_interval: int = 250  # interval between checkpoints, steps, >= 1
-    bfloat16: bool = False  # 16-bit matrix products; sums and weights in 32 bits
+    bfloat16: bool = False  # matrix products in 16 bits, sums and weights in 32 bits
     seed: int = 0
     budget: Budget = field(default_factory=Budget)
 
@@ -61,7 +61,7 @@ class Schedule:
 
 
 class Trainer:
-    """Trainer of a network on pictures; resumes from the last checkpoint in `folder`, if any."""
+    """Trainer of a network on images; resumes from the last checkpoint in `folder`, if any."""
 
     def __init__(
         self, network: MaskRCNN, pictures: RoomPictures, schedule: Schedule, folder: Path, device: str
@@ -72,10 +72,10 @@ class Trainer:
         self.schedule = schedule
         self.folder = folder
         self.step = 0
-        self.history: list[dict[str, float]] = []  # the terms of the loss in each step
+        self.history: list[dict[str, float]] = []  # terms of the loss in each step
         self.averaged = {name: value.detach().clone() for name, value in network.state_dict().items()}
         decayed = [p for p in network.parameters() if p.ndim > 1]
-        rest = [p for p in network.parameters() if p.ndim <= 1]  # biases and norms
+        rest = [p for p in network.parameters() if p.ndim <= 1]  # biases and normalization parameters
         self._optimizer = torch.optim.AdamW(
             [{"params": decayed, "weight_decay": schedule.weight_decay}, {"params": rest, "weight_decay": 0.0}],
             lr=schedule.learning_rate,
@@ -85,7 +85,7 @@ class Trainer:
             self._resume()
 
     def run(self) -> None:
-        """Run the remaining steps; Ctrl-C loses the steps after the last checkpoint."""
+        """Run the remaining steps; Ctrl-C discards the steps after the last checkpoint."""
         with tqdm(total=self.schedule.steps, initial=self.step, desc="training", unit="step", disable=None) as bar:
             while self.step < self.schedule.steps:
                 terms = self._learn()
@@ -129,7 +129,7 @@ class Trainer:
         unknown = sorted(set(example.class_names) - set(index))
         if unknown:
             raise DataError(f"pictures: expected classes of the network, got {', '.join(unknown)}")
-        boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # from pixels to their borders
+        boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # from pixel centers to borders
         return Objects(
             boxes=torch.from_numpy(boxes),
             labels=torch.tensor([index[name] for name in example.class_names], dtype=torch.int64),
@@ -138,7 +138,7 @@ class Trainer:
 
     @torch.no_grad()
     def _average(self) -> None:
-        keep = min(self.schedule.ema_decay, (1 + self.step) / (10 + self.step))  # forgets the first weights faster
+        keep = min(self.schedule.ema_decay, (1 + self.step) / (10 + self.step))  # the first weights decay faster
         for name, value in self.network.state_dict().items():
             if value.is_floating_point():
                 self.averaged[name].lerp_(value, 1 - keep)
@@ -170,15 +170,15 @@ class Trainer:
             self.averaged = state["averaged"]
             self._optimizer.load_state_dict(state["optimizer"])
             self.step, self.history = state["step"], state["history"]
-        except Exception as error:  # torch raises many types for a damaged file
+        except Exception as error:  # torch raises many exception types for a damaged file
             raise DataError(
-                f"{path}: expected an intact checkpoint of this network: {in_one_line(error)}; remove it, or train in "
-                "another folder"
+                f"{path}: expected an intact checkpoint of this network, got {in_one_line(error)}; remove it, or train "
+                "in another folder"
             ) from error
 
 
 def draw_losses(history: Sequence[dict[str, float]], path: Path) -> None:
-    """Plot running means of the terms of the loss over the steps, on a logarithmic scale."""
+    """Plot the running means of the loss terms over the steps on a logarithmic scale."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
     width = max(1, len(history) // 60)

@@ -1,4 +1,4 @@
-"""Color names: the basic color terms of English (Berlin and Kay 1969), and beige."""
+"""Color names: the basic color terms of English (Berlin and Kay 1969) and beige."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _SAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
 }  # sRGB, 0..255: samples of each name, saturated, muted and dark
 
 COLOR_NAMES = tuple(_SAMPLES)
-CONFUSED = 12.0  # units of CIELAB: distance of colors that get either name, in changing light
+CONFUSED = 12.0  # CIELAB units: distance at which changing light makes two names interchangeable
 OTHER_SPELLINGS = {"grey": "gray", "violet": "purple", "turquoise": "blue", "teal": "blue", "navy": "blue"}
 
 
 def lab(srgb: Float32) -> Float32:
-    """Return CIELAB (N, 3), in which distances are about perceptual, of sRGB colors (N, 3) in [0, 1]."""
+    """Convert sRGB colors (N, 3) in [0, 1] to CIELAB (N, 3), where distances are approximately perceptual."""
     return np.asarray(cv2.cvtColor(srgb.reshape(1, -1, 3).astype(np.float32), cv2.COLOR_RGB2LAB)[0], np.float32)
 
 
 def nearest_names(srgb: Float32) -> Int32:
-    """Return the index (N,) in COLOR_NAMES of the nearest sample to sRGB colors (N, 3) in [0, 1]."""
+    """Return the indices (N,) in COLOR_NAMES of the names nearest to sRGB colors (N, 3) in [0, 1]."""
     distances = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
     return np.asarray(_NAME_OF_SAMPLE[distances.argmin(axis=1)], np.int32)
 
@@ -43,7 +43,8 @@ def nearest_names(srgb: Float32) -> Int32:
 def fits(srgb: Float32, name: str) -> Float32:
     """Return the fit (N,) in [0, 1] of a name of COLOR_NAMES to sRGB colors (N, 3) in [0, 1].
 
-    A Gaussian of the additional distance to this name compared with the nearest name, for which the fit is 1.
+    The fit is a Gaussian of the distance to this name minus the distance to the nearest name. It is 1 for the nearest
+    name.
     """
     distances = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
     additional = distances[:, COLOR_NAMES.index(name) == _NAME_OF_SAMPLE].min(axis=1) - distances.min(axis=1)
@@ -52,7 +53,10 @@ def fits(srgb: Float32, name: str) -> Float32:
 
 @cache
 def _samples_lab() -> Float32:
-    """Return CIELAB (S, 3) of all samples; not at import, because OpenCV's first conversion is slow."""
+    """Return the CIELAB colors (S, 3) of all samples.
+
+    They are computed on demand, because the first conversion in OpenCV is slow.
+    """
     samples = [sample for samples in _SAMPLES.values() for sample in samples]
     return lab(np.array(samples, np.float32) / np.float32(255))
 

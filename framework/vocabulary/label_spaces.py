@@ -14,29 +14,29 @@ from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import read_text
 from framework.files.search_paths import expanded
 
-LARGEST_FILE = 2**20  # bytes of a list of labels
-_OTHER_NAMES = "other_names"  # section of the file for spellings of no space
+LARGEST_FILE = 2**20  # bytes, maximum size of a list of labels
+_OTHER_NAMES = "other_names"  # section for spellings outside of all spaces
 
 
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled one is ten times as fast, but optional
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loader is ten times as fast, but optional
 _SECTIONS: dict[str, dict[str, str | None]] = yaml.load(Path(__file__).with_suffix(".yaml").read_text("utf-8"), _LOADER)
 """Section -> name -> COCO name; None = no object class of COCO."""
 
 SPACES: Mapping[str, tuple[str, ...]] = {k: tuple(names) for k, names in _SECTIONS.items() if k != _OTHER_NAMES}
-"""The names of each label space, in the order of the detectors trained on it."""
+"""Names of each label space, in the label order of detectors trained on the space."""
 
 COCO = SPACES["coco"]  # 80 classes
 NO_CLASS = "n/a"  # name of an unused id, in any space
-_UNUSED_IDS = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # classes that were planned but not annotated
+_UNUSED_IDS = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # planned classes without annotations
 _COCO_IDS = [k for k in range(91) if k not in _UNUSED_IDS]
 COCO_BY_ID = tuple(COCO[_COCO_IDS.index(k)] if k in _COCO_IDS else NO_CLASS for k in range(91))
-"""COCO's classes by the ids of its annotation files, 0 to 90, as in DETR and RF-DETR; unused ids are NO_CLASS."""
+"""COCO classes by id in the annotation files, 0 to 90, as in DETR and RF-DETR; unused ids are NO_CLASS."""
 
 SCENENN_TO_COCO = {name: coco for name, coco in _SECTIONS["scenenn"].items() if coco is not None}
-"""Nine SceneNN classes with their COCO names: our choice, as the paper does not name its nine."""
+"""Nine SceneNN classes with their COCO names. This choice is ours, because the paper does not list its nine classes."""
 
 MEANINGS: Mapping[str, str | None] = {name: coco for names in _SECTIONS.values() for name, coco in names.items()}
-"""The COCO name of any name of any space, in lower case; None = no object class of COCO."""
+"""COCO names by lower-case name in any space; None = no object class of COCO."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,11 @@ class LabelMapping:
     meaning: Int32  # (C,) index of each label in `classes`; -1 = no object class of COCO
 
     def apply(self, probabilities: Float32) -> tuple[Float32, Bool]:
-        """Return distributions (N, C') float32 over `classes`, and known (N,): whether the best label means a class.
+        """Convert `probabilities` (N, C) of labels to float32 distributions (N, C') over `classes`.
 
-        probabilities (N, C), not negative. Labels with the same meaning are added, labels without a meaning are
-        dropped, and the rest is normalized. A row without any class becomes uniform and is not known.
+        Labels with the same meaning are added, labels without a meaning are removed, and the result is normalized. Also
+        return a mask (N,) of the rows whose best label has a meaning. A row without any class becomes uniform, and its
+        mask is False. `probabilities` must not be negative.
         """
         has_meaning = self.meaning >= 0
         sums = np.zeros((len(probabilities), len(self.classes)))
@@ -62,7 +63,7 @@ class LabelMapping:
 
 
 def read_labels(name_or_path: str) -> tuple[str, ...]:
-    """Return the names of a label space ("coco", "nyu40", ...), or of a text file with one name per line.
+    """Return the names of a label space ("coco", "nyu40", ...), or read a text file with one name per line.
 
     Raises ConfigError for other values.
     """
@@ -84,16 +85,16 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
 
 
 def to_coco(labels: Sequence[str]) -> LabelMapping:
-    """Return the mapping of `labels` to COCO names by `label_spaces.yaml`.
+    """Map `labels` to COCO names with `label_spaces.yaml`.
 
-    Case, outer spaces and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises ConfigError with all
-    labels that the file does not have, and if no label means an object class.
+    Case, outer spaces and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises ConfigError that
+    names all unknown labels, and ConfigError if no label is an object class of COCO.
     """
     keys = [label.partition(",")[0].strip().lower() for label in labels]
     unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]
     if unknown:
         raise ConfigError(
-            f"labels: expected names of a label space, got {len(unknown)} of {len(labels)} others: "
+            f"labels: expected names of a label space, got {len(unknown)} unknown names in {len(labels)} labels: "
             f"{', '.join(map(repr, unknown))}; add them to framework/vocabulary/{Path(__file__).stem}.yaml"
         )
     meanings = [MEANINGS[key] for key in keys]

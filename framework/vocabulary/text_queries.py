@@ -13,31 +13,31 @@ STOP_WORDS = frozenset((
     "a", "an", "the", "that", "this", "these", "those", "some", "any", "all", "my", "our", "your", "of", "with", "and",
     "or", "one", "two", "three",
 ))  # fmt: skip
-SHADES = frozenset(("light", "dark", "bright", "pale", "deep"))  # of a color; ignored, because light changes them too
+SHADES = frozenset(("light", "dark", "bright", "pale", "deep"))  # ignored, because light changes them too
 IRREGULAR = {"people": "person", "men": "person", "women": "person", "mice": "mouse", "knives": "knife",
              "shelves": "shelf", "scissors": "scissors", "skis": "skis", "glasses": "glass"}  # fmt: skip
 EVERYDAY = {"fridge": "refrigerator", "plant": "potted plant", "phone": "cell phone", "mug": "cup", "screen": "tv",
             "rucksack": "backpack", "settee": "couch", "armchair": "couch", "stool": "chair",
             "telly": "tv"}  # fmt: skip
-"""Everyday words that no label space has, with their COCO names."""
+"""Everyday words outside of all label spaces, with their COCO names."""
 
-LONGEST = 4  # words of a class name
+LONGEST = 4  # maximum number of words in a class name
 
 
 @dataclass(frozen=True)
 class ObjectWords:
-    """The words of a query."""
+    """Classes, colors and unknown words of a query."""
 
     classes: tuple[str, ...]  # in the order of the query
     colors: tuple[str, ...]  # of COLOR_NAMES
-    unknown: tuple[str, ...]  # words that are neither
+    unknown: tuple[str, ...]  # other words
 
 
 def object_words(query: str, classes: Collection[str]) -> ObjectWords:
-    """Parse a query; `classes` are the names of the classes.
+    """Parse a query into class names from `classes`, colors and unknown words.
 
-    Case, articles, plurals and shades of colors are ignored, and words of other label spaces are mapped (sofa = couch).
-    A word that is a color and a class (orange) is a color if another class follows.
+    Case, articles, plurals and shades of colors are ignored. Words of other label spaces are mapped (sofa = couch). An
+    ambiguous word (orange) is a color if a class follows, otherwise a class.
     """
     words = re.findall(r"[^\W_]+(?:[-'][^\W_]+)*", query.lower())
     known = {name.lower(): name for name in classes}
@@ -62,12 +62,12 @@ def object_words(query: str, classes: Collection[str]) -> ObjectWords:
 
 
 def _color(word: list[str]) -> str:
-    """Return a word, with the spelling of COLOR_NAMES for colors; "" for no word."""
+    """Return the first word, with the spelling of COLOR_NAMES for colors; "" for an empty list."""
     return OTHER_SPELLINGS.get(word[0], word[0]) if word else ""
 
 
 def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, str]:
-    """Return the number of words from `at` on in the longest class name, and that name; 0 and "" without any."""
+    """Find the longest class name starting at word `at`; return its number of words and the name, or 0 and ""."""
     for length in range(min(LONGEST, len(words) - at), 0, -1):
         phrase = words[at : at + length]
         for last in _singulars(phrase[-1]):
@@ -79,7 +79,7 @@ def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, st
 
 
 def _singulars(word: str) -> list[str]:
-    """Return the possible singulars of a word, itself first."""
+    """Return the possible singulars of a word, starting with the word itself."""
     endings = (("ies", "y"), ("es", ""), ("s", ""))
     regular = [word.removesuffix(plural) + singular for plural, singular in endings if word.endswith(plural)]
     return [word, IRREGULAR.get(word, word), *regular]

@@ -1,4 +1,4 @@
-"""Models of huggingface.co: downloaded once into the cache of huggingface_hub, and checked."""
+"""Models from huggingface.co, which are downloaded once into the cache of huggingface_hub and verified."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ HUB_OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
 CONFIG, PREPROCESSING = "config.json", "preprocessor_config.json"
 WHOLE, INDEX, PICKLED = "model.safetensors", "model.safetensors.index.json", "pytorch_model.bin"
 TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
-OLDER_TOKENIZER = ("vocab.json", "merges.txt", "tokenizer_config.json")  # OWLv2's, as published
+OLDER_TOKENIZER = ("vocab.json", "merges.txt", "tokenizer_config.json")  # as published for OWLv2
 
 log = logging.getLogger(__name__)
 
 
 def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
-    """Return the folder `model`, or that of a model id in the cache, which is downloaded if missing.
+    """Return the folder of a model: a local folder, or the cached download of a model id.
 
-    `more`: files needed in addition to config, preprocessing and weights, such as the tokenizer's. A cached model id is
-    not looked up again. Requires huggingface_hub, which transformers installs. Raises DataError, with the fix, if there
-    is no such model, it cannot be downloaded, or it differs from what was published.
+    A missing model is downloaded. A cached model is used without a network request. Requires huggingface_hub, a
+    dependency of transformers. `more`: required files in addition to config, preprocessing and weights, such as the
+    tokenizer files. Raises DataError if the model does not exist, cannot be downloaded, or has a wrong hash.
     """
     folder = expanded(Path(model))
     if folder.is_dir():
         for file in filter(Path.exists, (folder / name for name in (CONFIG, PREPROCESSING, WHOLE, INDEX, PICKLED))):
-            check_regular(file)  # transformers would block on a pipe
+            check_regular(file)  # transformers would block on a named pipe
         return folder
     cached = _cached(model, revision, more)
     if cached is None:
@@ -50,12 +50,12 @@ def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
 
 
 def commit_of(folder: Path) -> str:
-    """Return the downloaded commit of a model id's folder; "" for a local folder."""
+    """Return the commit hash of a downloaded model's folder; "" for a local folder."""
     return folder.name if folder.parent.name == "snapshots" else ""
 
 
 def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
-    """Return the folder of a model id in the cache if it has all needed files."""
+    """Return the cached folder of a model id, None if a required file is missing."""
     from huggingface_hub import try_to_load_from_cache
     from huggingface_hub.errors import HFValidationError
 
@@ -76,18 +76,18 @@ def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
 
 
 def _listed(index: Path) -> list[str]:
-    """Return the weight files in an index."""
+    """Return the names of the weight files in an index."""
     try:
         return [*read_json(index)["weight_map"].values()]
     except (DataError, KeyError, TypeError, AttributeError) as error:
         raise DataError(
-            f"detector.model: expected an index of weight files, got a damaged {index}; delete "
+            f"detector.model: expected an index of weight files, got a damaged file {index}; delete "
             f"{index.parents[2]} and run again"
         ) from error
 
 
 def _weights(names: Collection[str]) -> list[str]:
-    """Return the weight files among a model's files, chosen as transformers does; empty if it has none."""
+    """Select the weight files among `names` as transformers does; return an empty list if there are none."""
     if WHOLE in names:
         return [WHOLE]
     if INDEX in names:
@@ -96,13 +96,13 @@ def _weights(names: Collection[str]) -> list[str]:
 
 
 def _published(more: Sequence[str], names: Collection[str]) -> Sequence[str]:
-    """Return `more`, with the tokenizer's files in their older form if the model has those."""
+    """Return `more`, with the older tokenizer files if the model has only these."""
     older = more == TOKENIZER and TOKENIZER[0] not in names and {*OLDER_TOKENIZER} <= {*names}
     return OLDER_TOKENIZER if older else more
 
 
 def _download(model: str, revision: str, more: Sequence[str]) -> None:
-    """Download the needed files with huggingface_hub, which writes each file atomically and shows progress."""
+    """Download the required files with huggingface_hub, which writes files atomically and shows progress."""
     if variable := forbidden_by():
         raise DataError(
             f"detector.model: expected a local folder with {variable} set, got {model}; unset {variable} or "
@@ -126,7 +126,7 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
         paths = {name: Path(hub.hf_hub_download(model, name, revision=revision)) for name in wanted}
     except DataError:
         raise
-    except Exception as error:  # huggingface_hub and the HTTP library below it have separate errors
+    except Exception as error:  # huggingface_hub and its HTTP library have no common base class of errors
         raise DataError(
             f"detector.model: expected a local folder or a download of {model} from {constants.ENDPOINT}, "
             f"got an error ({in_one_line(error)}); check the name and the network, or give a local folder"
@@ -136,33 +136,33 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
 
 
 def forbidden_by() -> str:
-    """Return the environment variable that forbids downloads, or ""."""
+    """Return the name of the environment variable that disables downloads, or ""."""
     forbidding = [name for name in HUB_OFFLINE if os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE")]
     return (forbidding + [OFFLINE] * bool(os.environ.get(OFFLINE)) + [""])[0]
 
 
 def _check(path: Path, published: Any) -> None:
     """Raise DataError unless a large file has its listed SHA-256; huggingface_hub checks only the size."""
-    if published.lfs is None or path_hash(path) == published.lfs.sha256:
+    if published.lfs is None or (found := path_hash(path)) == published.lfs.sha256:
         return
-    path.resolve().unlink()  # the content, if the cache uses links
+    path.resolve().unlink()  # the content, if the cache uses symbolic links
     path.unlink(missing_ok=True)
     raise DataError(
-        f"detector.model: expected sha256 {published.lfs.sha256} for {path.name}, got another one; the "
+        f"detector.model: expected sha256 {published.lfs.sha256} for {path.name}, got {found}; the "
         "file was deleted, try again"
     )
 
 
 def imported_transformers() -> Any:
-    """Import transformers. Raises ConfigError, naming the extra, if it is not installed."""
+    """Import transformers. Raises ConfigError that names the extra if transformers is not installed."""
     return import_optional("transformers", "loads models of huggingface.co", "transformers")
 
 
 def read_part(parameter: str, folder: Path, what: str, auto_class: Any, **options: Any) -> Any:
-    """Read a part of a model in a folder. Raises DataError, naming the parameter, if it cannot be read."""
+    """Load a part of a model from a folder. Raises DataError that names `parameter` if loading fails."""
     try:
         return auto_class.from_pretrained(str(folder), local_files_only=True, **options)
-    except Exception as error:  # transformers, tokenizers and safetensors raise many types on foreign files
+    except Exception as error:  # transformers, tokenizers and safetensors raise many types for invalid files
         raise DataError(
             f"{parameter}: expected {what} in {folder}, got an unreadable file: {in_one_line(error)}"
         ) from error

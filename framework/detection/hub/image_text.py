@@ -1,4 +1,4 @@
-"""CLIP and SigLIP, versions 1 and 2, of Hugging Face transformers: image and text embeddings in one space."""
+"""CLIP, SigLIP and SigLIP 2 from Hugging Face transformers: image and text embeddings in one space."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from framework.files.hashing import path_hash
 from framework.files.json_file import read_json
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-LONGEST_SIDE = 1024  # px of a model's input
-HASH_DIGITS = 16  # of a local folder's content, in the name of its space
-MOST_TOKENS = 64  # of a text; CLIP takes 77 and SigLIP 64
+LONGEST_SIDE = 1024  # px, largest input of a model
+HASH_DIGITS = 16  # digits of a local folder's content hash in the name of its space
+MOST_TOKENS = 64  # maximum length of a text; the limit is 77 for CLIP and 64 for SigLIP
 GRAY = 128
 
 
@@ -39,9 +39,9 @@ class ImageTextFamily(NamedTuple):
     """The conventions of a family of models."""
 
     prompt: str  # template around a class name, as in the published evaluation
-    padding: str  # of texts, as in training
-    lower: bool  # true if texts are lowercased
-    mean: tuple[float, ...]  # RGB, if the preprocessing file has none
+    padding: str  # padding of texts, as in training
+    lower: bool  # True = texts are converted to lower case
+    mean: tuple[float, ...]  # RGB, default if missing in the preprocessing file
     std: tuple[float, ...]
 
 
@@ -50,11 +50,11 @@ FAMILIES = {
     # https://huggingface.co/docs/transformers/model_doc/siglip2: padded to 64 tokens, in lower case
     "siglip": ImageTextFamily("This is a photo of {}.", "max_length", True, (0.5,) * 3, (0.5,) * 3),
 }
-"""By the `model_type` in config.json, which is `siglip` also for SigLIP 2 of a fixed size."""
+"""Families by `model_type` of config.json. SigLIP 2 with a fixed image size also has the type `siglip`."""
 
 
 class ImageTextModel:
-    """A model with an image tower and a text tower (Radford et al. 2021, "CLIP").
+    """A model with an image encoder and a text encoder (Radford et al. 2021, "CLIP").
 
     Attributes:
         space: Name and version of the model. Only embeddings of the same space are comparable.
@@ -62,10 +62,10 @@ class ImageTextModel:
     """
 
     def __init__(self, model: str, revision: str, device: str, half_precision: bool) -> None:
-        """Load a model by its id on huggingface.co, or from a folder written by `save_pretrained`.
+        """Load a model by its huggingface.co id, or from a folder written by `save_pretrained`.
 
         Raises:
-            ConfigError: The model is neither CLIP nor a SigLIP of a fixed size, or the device is missing.
+            ConfigError: The model is neither CLIP nor SigLIP with a fixed image size, or the device is missing.
             DataError: The model cannot be downloaded or read.
         """
         transformers = imported_transformers()
@@ -79,7 +79,9 @@ class ImageTextModel:
         self._family = FAMILIES[config.model_type]
         self.side = int(config.vision_config.image_size)
         if not 16 <= self.side <= LONGEST_SIDE:
-            raise DataError(f"detector.model: expected images of 16 to 1024 px, got {self.side} px of {self._folder}")
+            raise DataError(
+                f"detector.model: expected an image size of 16 to 1024 px, got {self.side} px in {self._folder}"
+            )
         self._mean, self._std, self._factor = _normalization(self._folder / PREPROCESSING, self._family)
         self._tokenizer = read_part("detector.model", self._folder, "the tokenizer", transformers.AutoTokenizer)
         network = read_part("detector.model", self._folder, "the weights", transformers.AutoModel)
@@ -88,7 +90,7 @@ class ImageTextModel:
 
     @torch.inference_mode()
     def embed_crops(self, crops: UInt8) -> Float32:
-        """Return unit vectors (N, D) of crops (N, side, side, 4): RGB and a mask, which is ignored."""
+        """Return the unit vectors (N, D) of crops (N, side, side, 4), RGB and mask; masks are ignored."""
         images = torch.from_numpy(crops[..., :3]).to(self._device).permute(0, 3, 1, 2).float() * self._factor
         mean, std = (torch.tensor(values, device=self._device)[:, None, None] for values in (self._mean, self._std))
         pixels = ((images - mean) / std).to(self._network.dtype)
@@ -103,28 +105,28 @@ class ImageTextModel:
             [prompt], padding=self._family.padding, max_length=length, truncation=True, return_tensors="pt"
         )
         given = {"input_ids": tokens["input_ids"].to(self._device)}
-        if self._family.padding == "longest":  # SigLIP was trained without
+        if self._family.padding == "longest":  # SigLIP was trained without attention mask
             given["attention_mask"] = tokens["attention_mask"].to(self._device)
         return np.asarray(self._unit(self._network.get_text_features(**given))[0])
 
     def _unit(self, features: Any) -> Float32:
-        """Return the features (N, D) with unit length. Raises DataError for zero or non-finite features."""
+        """Normalize features (N, D) to unit length. Raises DataError for zero or non-finite features."""
         tensor: Tensor = features if isinstance(features, Tensor) else features.pooler_output
         vectors = tensor.float().cpu().numpy()
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
         if not np.isfinite(lengths).all() or (lengths == 0).any():
             raise DataError(
-                f"{self.space}: expected finite embeddings other than 0, got NaN, infinity or 0; set "
+                f"{self.space}: expected finite, nonzero embeddings, got NaN, infinity or 0; set "
                 "detector.half_precision=false"
             )
         return np.asarray(vectors / lengths, np.float32)
 
 
 def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ...], tuple[float, ...], float]:
-    """Return mean, standard deviation, and the factor applied before them, from preprocessor_config.json."""
+    """Read the mean, standard deviation and rescale factor from preprocessor_config.json."""
     content = read_json(path)
     if not isinstance(content, Mapping):
-        raise DataError(f"detector.model: {path}: expected an object, got another value")
+        raise DataError(f"detector.model: {path}: expected a JSON object, got {content!r:.100}")
     mean, std = tuple(content.get("image_mean", family.mean)), tuple(content.get("image_std", family.std))
     factor = content.get("rescale_factor", 1 / 255)
     numbers = (*mean, *std, factor)
@@ -136,7 +138,7 @@ def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ..
 
 
 def _space(folder: Path, model: str) -> str:
-    """Return the model id with the downloaded commit, or the folder's name with a hash of its config and weights."""
+    """Return the model id with its commit, or the folder name with a hash of config and weights."""
     if commit := commit_of(folder):
         return f"{model}@{commit}"
     weights = sorted(folder.glob("*.safetensors")) + sorted(folder.glob("pytorch_model*.bin"))
@@ -145,10 +147,11 @@ def _space(folder: Path, model: str) -> str:
 
 
 def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundings: float = 1.0) -> UInt8:
-    """Return a crop (side, side, 4) of the image for each of the masks (N, H, W): RGB, and 255 inside the mask.
+    """Crop the image around each of the masks (N, H, W); return crops (N, side, side, 4) of RGB and mask (0 or 255).
 
-    A crop is a square around the center of the mask's box, with `context` times its longer side; pixels beyond the
-    image are black. The background keeps the fraction `surroundings` of its contrast. An empty mask gives black.
+    A crop is a square around the center of the mask's box. Its side is `context` times the longer side of the box.
+    Pixels outside of the image are black. The background keeps the fraction `surroundings` of its contrast. The crop of
+    an empty mask is black.
     """
     crops = np.zeros((len(masks), side, side, 4), np.uint8)
     for k, box in enumerate(tight_boxes(masks)):
@@ -159,7 +162,7 @@ def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundi
 
 
 def _square_crop(image: UInt8, box: Float32, side: int, context: float, surroundings: float) -> UInt8:
-    """Return the crop of an image (H, W, 4), RGB and mask, around the mask's tight box."""
+    """Crop an image (H, W, 4) of RGB and mask around the mask's tight box."""
     height, width = image.shape[:2]
     x1, y1, x2, y2 = (int(value) for value in box)
     wide = max(1, round(context * (max(x2 - x1, y2 - y1) + 1)))  # px

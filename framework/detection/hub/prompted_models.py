@@ -1,4 +1,4 @@
-"""Models with prompts, of Hugging Face transformers: boxes for text by OWLv2, masks for boxes by the SAM family."""
+"""Prompted models from Hugging Face transformers: OWLv2 (boxes for texts) and the SAM family (masks for boxes)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from framework.detection.runtimes.device import ready
 from framework.errors import ConfigError, DataError
 
 PROMPT = "a photo of a {}"  # Minderer et al. 2023
-MOST_TOKENS = 16  # of a text, as in OWLv2's training
-PADDING = 128  # gray value right of or below the image, which makes OWLv2's input a square
+MOST_TOKENS = 16  # maximum length of a text, as in the training of OWLv2
+PADDING = 128  # gray value right of or below the image in the square input of OWLv2
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 SAM_FAMILY = {
     "sam": ("SamModel", False),
@@ -27,11 +27,11 @@ SAM_FAMILY = {
     "edgetam": ("EdgeTamModel", True),
     "edgetam_video": ("EdgeTamModel", True),
 }
-"""By `model_type`: the class, and whether the image is stretched to the square input; else black is padded."""
+"""Class by `model_type`, and True if the image is stretched to the square input; otherwise it is padded with black."""
 
 
 class TextPromptedBoxes:
-    """OWLv2 (Minderer et al. 2023), by its id on huggingface.co or a folder, for fixed texts."""
+    """OWLv2 (Minderer et al. 2023) with fixed texts, loaded by its huggingface.co id or from a folder."""
 
     def __init__(
         self, model: str, revision: str, texts: Sequence[str], device: torch.device, half_precision: bool
@@ -54,7 +54,7 @@ class TextPromptedBoxes:
 
     @torch.inference_mode()
     def __call__(self, color: UInt8) -> tuple[Float32, Float32]:
-        """Return boxes (P, 4) x1 y1 x2 y2 px, pixel centers at integers, and independent probabilities (P, texts)."""
+        """Return the boxes (P, 4) x1 y1 x2 y2 px, pixel centers at integers, and the probabilities (P, texts)."""
         long = max(color.shape[:2])
         square = np.full((long, long, 3), PADDING, np.uint8)
         square[: color.shape[0], : color.shape[1]] = color
@@ -66,14 +66,14 @@ class TextPromptedBoxes:
         probabilities = torch.sigmoid(output.logits[0].float()).cpu().numpy()
         if not (np.isfinite(boxes).all() and np.isfinite(probabilities).all()):
             raise DataError(
-                f"detector.model: expected finite outputs of {self.folder}, got NaN or infinity; set "
+                f"detector.model: expected finite outputs from {self.folder}, got NaN or infinity; set "
                 "detector.half_precision=false"
             )
         return boxes.astype(np.float32), probabilities
 
 
 class BoxPromptedMasks:
-    """SAM (Kirillov et al. 2023), SAM 2 or EdgeTAM, by its id on huggingface.co or a folder."""
+    """SAM (Kirillov et al. 2023), SAM 2 or EdgeTAM, loaded by its huggingface.co id or from a folder."""
 
     def __init__(self, model: str, revision: str, device: torch.device, half_precision: bool) -> None:
         transformers = imported_transformers()
@@ -107,7 +107,7 @@ class BoxPromptedMasks:
         logits = output.pred_masks[0, :, 0].float()
         if not torch.isfinite(logits).all():
             raise DataError(
-                f"detector.mask_model: expected finite outputs of {self._model}, got NaN or infinity; set "
+                f"detector.mask_model: expected finite outputs from {self._model}, got NaN or infinity; set "
                 "detector.half_precision=false"
             )
         whole = functional.interpolate(logits[None], (self._side, self._side), mode="bilinear", align_corners=False)

@@ -1,4 +1,4 @@
-"""Reading of a Mask R-CNN from this project's, torchvision's (github.com/pytorch/vision) or detectron2's files."""
+"""Reader of Mask R-CNN files from this project, torchvision (github.com/pytorch/vision) and detectron2."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from framework.files.atomic_write import check_regular
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
 COCO_ROWS = [0, *(k for k, name in enumerate(COCO_BY_ID) if name != NO_CLASS)]
-"""Labels of torchvision's 91 that are the background or were annotated in COCO."""
+"""Rows of the background and the 80 annotated classes among the 91 labels of torchvision."""
 
-NEWER_NAMES = (  # since 0.13, torchvision wraps its convolutions; older checkpoints have the bare names
+NEWER_NAMES = (  # torchvision 0.13 introduced wrapped convolutions; older checkpoints have names without the wrapper
     (r"(fpn\.(?:inner|layer)_blocks\.\d)\.(weight|bias)", r"\1.0.\2"),
     (r"rpn\.head\.conv\.(weight|bias)", r"rpn.head.conv.0.0.\1"),
     (r"roi_heads\.mask_head\.mask_fcn(\d)\.(weight|bias)", lambda m: f"roi_heads.mask_head.{int(m[1]) - 1}.0.{m[2]}"),
@@ -40,9 +40,9 @@ def read_network(
 ) -> MaskRCNN:
     """Return the network in `path`, in float32 and inference mode.
 
-    .safetensors is this project's format and describes itself. For .pkl and .pth, `kind` None = by the names of the
-    weights; see `from_torchvision` and `from_detectron2` for the other arguments. Code in the file is never run.
-    Raises DataError if the file has no such network.
+    A .safetensors file is in this project's format and contains its description. For .pkl and .pth files, `kind` None =
+    detected from the names of the weights. See `from_torchvision` and `from_detectron2` for the other arguments. Code
+    in the file is never run. Raises DataError if the file does not contain a Mask R-CNN.
     """
     if path.suffix == ".safetensors":
         return load_network(path)
@@ -52,12 +52,13 @@ def read_network(
     if kind is CheckpointKind.TORCHVISION or "backbone.body.conv1.weight" in state:
         return from_torchvision(state, str(path), classes, norm_eps)
     raise DataError(
-        f"{path}: expected a Mask R-CNN of torchvision or detectron2 with a feature pyramid, got other weights"
+        f"{path}: expected a Mask R-CNN of torchvision or detectron2 with a feature pyramid, got the weights "
+        f"{', '.join(sorted(map(str, state))[:3]) or 'none'}"
     )
 
 
 def domain_of_network(path: Path) -> str:
-    """Return the only domain that the network in `path` is for, from its card; "" = any."""
+    """Return the image domain of the network in `path` from its model card; "" = any."""
     return str(describe_network(path).card.get("domain", "")) if path.suffix == ".safetensors" else ""
 
 
@@ -66,25 +67,25 @@ def _read_torch(path: Path) -> dict[str, Tensor]:
     check_regular(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged file can raise almost anything
+    except Exception as error:  # a damaged file can raise almost any exception
         reason = str(error).splitlines() or [type(error).__name__]
         raise DataError(
-            f"{path}: expected a file of weights only, got a damaged or another file: {reason[0]}"
+            f"{path}: expected a file with weights only, got a damaged or unsupported file: {reason[0]}"
         ) from error
     state = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(tensor, Tensor) for tensor in state.values()):
-        raise DataError(f"{path}: expected a state_dict (names and tensors), alone or as `model`, got another object")
+        raise DataError(f"{path}: expected a state_dict of tensors, alone or as `model`, got {type(content).__name__}")
     return state
 
 
 def from_torchvision(
     state: Mapping[str, Tensor], where: str, classes: tuple[str, ...] | None = None, norm_eps: float = 0.0
 ) -> MaskRCNN:
-    """Return the network of a state_dict with torchvision's conventions.
+    """Return the network from a state_dict with torchvision's conventions.
 
-    `classes`: the labels after the background; None = COCO's 91 labels, without the rows of the gaps in COCO's ids,
-    which were trained only as negatives. `norm_eps`: 0 for torchvision's published checkpoint, 1e-5 for networks
-    trained with its defaults. Raises DataError, starting with the source `where`, for other networks.
+    `classes`: the labels after the background; None = COCO's 91 labels. The rows of unused COCO ids, which were trained
+    only as negatives, are removed. `norm_eps`: 0 for torchvision's published checkpoint, 1e-5 for networks trained with
+    the default. Raises DataError that names the source `where` for other networks.
     """
     tensors = {_newer_name(name): tensor for name, tensor in state.items()}
     labels = len(required(tensors, "roi_heads.box_predictor.cls_score.bias", where))
@@ -113,7 +114,7 @@ def _newer_name(name: str) -> str:
 
 
 def _without_gaps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors with the predictors' rows of the background and the 80 classes only."""
+    """Remove the rows of unused COCO ids from the predictors; keep the background and the 80 classes."""
     rows = torch.tensor(COCO_ROWS)
     sliced = dict(tensors)
     for kind in ("weight", "bias"):
@@ -126,7 +127,7 @@ def _without_gaps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _backbone(tensors: Mapping[str, Tensor], norm_eps: float, where: str) -> ResNetShape:
-    """Return the residual network, by the number of blocks of each level."""
+    """Identify the residual network by the number of blocks in each level."""
     depths = tuple(
         len({match[1] for name in tensors if (match := re.match(rf"backbone\.body\.layer{level}\.(\d+)\.", name))})
         for level in (1, 2, 3, 4)

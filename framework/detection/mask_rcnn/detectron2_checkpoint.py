@@ -1,8 +1,12 @@
-"""detectron2's Mask R-CNN with ResNet-FPN (github.com/facebookresearch/detectron2), as a MaskRCNN.
+"""Conversion of detectron2's Mask R-CNN with ResNet-FPN (github.com/facebookresearch/detectron2) to a MaskRCNN.
 
-Its conventions differ from torchvision's: images are BGR with a standard deviation of 1; the first convolution of a
-bottleneck has the stride, as in MSRA's networks; the background is the last class, without deltas or masks; RoIAlign
-is aligned, with one sample per cell; anchors are not rounded.
+Its conventions differ from torchvision:
+
+- Images are BGR with a standard deviation of 1.
+- The first convolution of a bottleneck has the stride, as in MSRA's networks.
+- The background is the last class and has no deltas or masks.
+- RoIAlign is aligned, with one sample per cell.
+- Anchors are not rounded.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ from framework.vocabulary.label_spaces import COCO
 
 PIXEL_MEAN = (123.675, 116.28, 103.53)  # RGB
 PIXEL_STD = (1.0, 1.0, 1.0)
-NAMES = (  # detectron2's, ours
+NAMES = (  # detectron2 name, name in this project
     (r"backbone\.bottom_up\.stem\.conv1\.weight", r"backbone.body.conv1.weight"),
     (r"backbone\.bottom_up\.stem\.conv1\.norm\.(\w+)", r"backbone.body.bn1.\1"),
     (r"backbone\.bottom_up\.res(\d)\.(\d+)\.conv(\d)\.weight", r"backbone.body.layer\1.\2.conv\3.weight"),
@@ -46,15 +50,15 @@ NAMES = (  # detectron2's, ours
     (r"roi_heads\.mask_head\.predictor\.(\w+)", r"roi_heads.mask_predictor.mask_fcn_logits.\1"),
 )
 COUNTED_FROM = {"layer": 1, "inner_blocks": 2, "layer_blocks": 2, "mask_head": 1}
-"""detectron2's first index: res2 is layer1, fpn_lateral2 is inner block 0, mask_fcn1 is layer 0."""
+"""First index in detectron2: res2 is layer1, fpn_lateral2 is inner block 0, mask_fcn1 is layer 0."""
 
 NOT_WEIGHTS = r"(pixel_mean|pixel_std|.*\.cell_anchors\.\d+|.*\.num_batches_tracked)"
 
 
 def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str, ...] | None = None) -> MaskRCNN:
-    """Return the network of a state_dict; `classes`: None = COCO's 80.
+    """Return the network from a detectron2 state_dict; `classes`: None = COCO's 80 classes.
 
-    Raises DataError, starting with the source `where`, for other networks.
+    Raises DataError that names the source `where` for other networks.
     """
     _check_input(state, where)
     tensors = {_renamed(name, where): tensor for name, tensor in state.items() if not re.fullmatch(NOT_WEIGHTS, name)}
@@ -83,27 +87,28 @@ def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str,
 
 
 def read_pickle(path: Path) -> dict[str, Tensor]:
-    """Return the state_dict in a `model_final_*.pkl` of detectron2 without running code from the file.
+    """Read the state_dict from a `model_final_*.pkl` of detectron2 without running code from the file.
 
-    Raises DataError if it is damaged or holds other objects than arrays.
+    Raises DataError if the file is damaged or contains objects other than arrays.
     """
     check_regular(path)
     try:
         with path.open("rb") as file:
             content = ArraysOnly(file, encoding="latin1").load()
-    except Exception as error:  # a damaged pickle can raise almost anything
+    except Exception as error:  # a damaged pickle can raise almost any exception
         raise DataError(f"{path}: expected a pickle of numpy arrays, got {in_one_line(error)}") from error
     state = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(array, np.ndarray) for array in state.values()):
-        raise DataError(f"{path}: expected a dictionary of numpy arrays, as written by detectron2, got another object")
+        raise DataError(f"{path}: expected a dictionary of detectron2's numpy arrays, got {type(content).__name__}")
     numeric = {name: array for name, array in state.items() if array.dtype.kind in "fiu"}
     if len(numeric) < len(state):
-        raise DataError(f"{path}: expected arrays of numbers, got {min(state.keys() - numeric.keys())}")
+        name = min(state.keys() - numeric.keys())
+        raise DataError(f"{path}: expected arrays of numbers, got {name} of type {state[name].dtype}")
     return {str(name): torch.from_numpy(np.array(array)) for name, array in numeric.items()}
 
 
 class ArraysOnly(pickle.Unpickler):
-    """Unpickler of numpy arrays that refuses everything else a pickle can call."""
+    """Unpickler of numpy arrays that rejects all other calls in a pickle."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (allowed := ALLOWED.get((module.replace("numpy._core", "numpy.core"), name))) is None:
@@ -112,9 +117,9 @@ class ArraysOnly(pickle.Unpickler):
 
 
 def _encoded(text: str, encoding: str) -> bytes:
-    """Return bytes as Python 3 pickles them in older protocols."""
+    """Encode the text in which Python 3 stores bytes in older pickle protocols."""
     if encoding != "latin1":
-        raise pickle.UnpicklingError(f"an encoding as {encoding}")
+        raise pickle.UnpicklingError(f"the encoding {encoding}")
     return text.encode("latin1")
 
 
@@ -141,15 +146,18 @@ def _renamed(name: str, where: str) -> str:
 
 
 def _check_input(state: Mapping[str, Tensor], where: str) -> None:
-    """Check the normalization in older checkpoints; other values also mean another backbone."""
+    """Check the normalization in older checkpoints; other values indicate another backbone."""
     for name, expected in (("pixel_mean", PIXEL_MEAN[::-1]), ("pixel_std", PIXEL_STD)):
         if name in state and not torch.allclose(state[name].float().flatten(), torch.tensor(expected), atol=1e-2):
             found = [round(value, 3) for value in state[name].flatten().tolist()]
-            raise DataError(f"{where}: {name}: expected {expected} as in networks that start from MSRA's, got {found}")
+            raise DataError(f"{where}: {name}: expected {expected}, as in networks initialized from MSRA, got {found}")
 
 
 def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
-    """Return the sides from the anchors in older checkpoints; newer ones have none, and detectron2's are returned."""
+    """Return the anchor sides in px.
+
+    Only older checkpoints contain anchors. The default is detectron2's anchor sides.
+    """
     sides = list(Architecture.anchor_sides)
     for level in range(len(sides)):
         if (anchors := state.get(f"proposal_generator.anchor_generator.cell_anchors.{level}")) is None:
@@ -158,12 +166,13 @@ def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
         sides[level] = round(float((width * height).sqrt().mean()), 3)
         ratios = torch.tensor(Architecture.anchor_ratios, dtype=torch.float64)
         if len(anchors) != len(ratios) or not torch.allclose(height / width, ratios, rtol=1e-3):
-            raise DataError(f"{where}: expected three anchors of the ratios 0.5, 1 and 2 in level {level}, got others")
+            found = [round(ratio, 3) for ratio in (height / width).tolist()]
+            raise DataError(f"{where}: expected anchors with the ratios 0.5, 1 and 2 in level {level}, got {found}")
     return tuple(sides)
 
 
 def _put_background_first(tensors: dict[str, Tensor], where: str) -> None:
-    """Move the background's column from the end to the front, with unused zeros as its deltas and masks."""
+    """Move the scores of the background from the end to the front; add zeros as its deltas and masks."""
     for kind in ("weight", "bias"):
         name = f"roi_heads.box_predictor.cls_score.{kind}"
         tensors[name] = required(tensors, name, where).roll(1, dims=0)
@@ -174,7 +183,7 @@ def _put_background_first(tensors: dict[str, Tensor], where: str) -> None:
 
 
 def _depth(tensors: Mapping[str, Tensor], where: str) -> str:
-    """Return the name of the residual network, by the number of blocks of its third level."""
+    """Identify the residual network by the number of blocks in its third level."""
     blocks = len({name.split(".")[3] for name in tensors if name.startswith("backbone.body.layer3.")})
     for name in WITH_BOTTLENECKS:
         if DEPTHS[name][2] == blocks:

@@ -2,9 +2,9 @@
 
     image ─► ResNet ─► feature pyramid ─► region proposals ─► boxes and class distributions ─► masks
 
-The network is described by an Architecture, which is stored with its weights. Parameters of a run, such as thresholds,
-are given to `propose` and `select`. Boxes are x1 y1 x2 y2 px of the network's input, with extent 0
-(framework.detection.masks.boxes) unless stated otherwise, and class 0 is the background.
+An Architecture describes the network and is stored with the weights. `propose` and `select` take the parameters of a
+run, such as thresholds. Boxes are x1 y1 x2 y2 px of the network's input, with extent 0
+(framework.detection.masks.boxes) unless stated otherwise. Class 0 is the background.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from framework.detection.mask_rcnn.roi_align import roi_align
 from framework.detection.masks.boxes import anchor_grid, clip, decode, suppress_boxes
 
 STRIDES = (4, 8, 16, 32, 64)  # px of the input per cell of a level, P2 to P6
-POOLED_LEVELS = 4  # P2 to P5; P6 is only for proposals
+POOLED_LEVELS = 4  # P2 to P5; only proposals use P6
 BOX_BINS, MASK_BINS = 7, 14  # of RoIAlign, per side
 CANONICAL_SIDE, CANONICAL_LEVEL = 224.0, 2  # px: a box of this side is pooled from P4 (Lin et al. 2017, eq. 1)
 DELTA_WEIGHTS = (10.0, 10.0, 5.0, 5.0)  # factors in the box head's deltas
@@ -35,24 +35,23 @@ PROPOSAL_NMS = 0.7  # IoU
 
 @dataclass(frozen=True)
 class Architecture:
-    """The parameters of a network that are not in its weights."""
+    """Parameters of a network that its weights do not contain."""
 
-    classes: tuple[str, ...]  # without the background, in the order of the network's columns after it
+    classes: tuple[str, ...]  # without the background, in the order of the network's columns
     backbone: ResNetShape = field(default_factory=ResNetShape)
     fpn_channels: int = 256
-    head_features: int = 1024  # of the box head
+    head_features: int = 1024  # features of the box head
     anchor_sides: tuple[float, ...] = (32.0, 64.0, 128.0, 256.0, 512.0)  # px, one per level
     anchor_ratios: tuple[float, ...] = (0.5, 1.0, 2.0)  # height / width
-    rounded_anchors: bool = True  # to whole pixels, as torchvision does
-    truncated_strides: bool = (
-        False  # P6's stride is the input's size over P6's, rounded down: 61 at 800 px (torchvision)
-    )
-    sampling_ratio: int = 2  # of RoIAlign; 0 = one sample per cell
-    half_pixel: bool = False  # RoIAlign's convention; True = "aligned"
+    rounded_anchors: bool = True  # anchors are rounded to whole pixels, as in torchvision
+    # True = the stride of P6 is the input size divided by the size of P6, rounded down: 61 at 800 px (torchvision)
+    truncated_strides: bool = False
+    sampling_ratio: int = 2  # samples per side of a bin in RoIAlign; 0 = one sample per cell
+    half_pixel: bool = False  # convention of RoIAlign; True = "aligned"
     pixel_mean: tuple[float, float, float] = (123.675, 116.28, 103.53)  # RGB, 0..255
     pixel_std: tuple[float, float, float] = (58.395, 57.12, 57.375)
-    short_side: int = 800  # px, to which images were resized in training
-    long_side: int = 1333  # px, bound on the other side
+    short_side: int = 800  # px, short side of the resized images in training
+    long_side: int = 1333  # px, largest long side
 
 
 class MaskRCNN(nn.Module):
@@ -67,18 +66,18 @@ class MaskRCNN(nn.Module):
                 fpn=FeaturePyramid(architecture.backbone.channels, architecture.fpn_channels),
             )
         )
-        head = ProposalHead(architecture.fpn_channels, len(architecture.anchor_ratios))  # one for all levels
+        head = ProposalHead(architecture.fpn_channels, len(architecture.anchor_ratios))  # shared by all levels
         self.rpn = nn.ModuleDict({"head": head})
         self.roi_heads = RoiHeads(architecture)
         self._anchors = [_anchors(side, architecture) for side in architecture.anchor_sides]
-        self._grids: tuple[list[tuple[int, int]], list[Float32]] = [], []  # the last levels' shapes and anchors
+        self._grids: tuple[list[tuple[int, int]], list[Float32]] = [], []  # shapes and anchors of the latest levels
 
     @property
     def dtype(self) -> torch.dtype:
         return self.roi_heads.box_predictor.cls_score.weight.dtype
 
     def normalize(self, images: Tensor) -> Tensor:
-        """Return the network's input of RGB images (N, 3, H, W), 0..255, padded at the end to multiples of 32 px."""
+        """Normalize RGB images (N, 3, H, W), 0..255, and pad them at the end to multiples of 32 px."""
         mean, std = (
             torch.tensor(values, device=images.device)[:, None, None]
             for values in (self.architecture.pixel_mean, self.architecture.pixel_std)
@@ -88,12 +87,12 @@ class MaskRCNN(nn.Module):
         return padded.to(self.dtype)
 
     def extract(self, images: Tensor) -> list[Tensor]:
-        """Return the pyramid of normalized images: P2 to P6, each (N, C, H / stride, W / stride)."""
+        """Return the feature pyramid of normalized images: P2 to P6, each (N, C, H / stride, W / stride)."""
         levels: list[Tensor] = self.backbone(images)
         return levels
 
     def score_anchors(self, pyramid: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return (objectness (N, A), deltas (N, A, 4)) of the anchors of all levels, in the order of `anchors`."""
+        """Return the objectness (N, A) and deltas (N, A, 4) of all levels' anchors, in the order of `anchors`."""
         objectness, deltas = zip(*(self.rpn["head"](level) for level in pyramid), strict=True)
         n = len(pyramid[0])
         return (
@@ -102,7 +101,7 @@ class MaskRCNN(nn.Module):
         )
 
     def anchors(self, pyramid: Sequence[Tensor]) -> list[Float32]:
-        """Return the (A, 4) anchors of each level; the next call for the same shapes returns the same arrays."""
+        """Return the anchors (A, 4) of each level; repeated calls with equal shapes return the same arrays."""
         shapes = [(level.shape[2], level.shape[3]) for level in pyramid]
         known, grids = self._grids
         if shapes != known:
@@ -116,18 +115,18 @@ class MaskRCNN(nn.Module):
         return grids
 
     def classify(self, pyramid: Sequence[Tensor], boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (logits (P, 1 + C), deltas (P, 1 + C, 4)) of boxes (P, 4) of one image."""
+        """Return the logits (P, 1 + C) and deltas (P, 1 + C, 4) of boxes (P, 4) in one image."""
         x = self.roi_heads.box_head(self.pool(pyramid, boxes, BOX_BINS))
         logits, deltas = self.roi_heads.box_predictor(x)
-        return logits, deltas.view(*logits.shape, 4)  # a -1 would be ambiguous without boxes
+        return logits, deltas.view(*logits.shape, 4)  # -1 would be ambiguous without boxes
 
     def segment(self, pyramid: Sequence[Tensor], boxes: Tensor) -> Tensor:
-        """Return the mask logits (P, 1 + C, 28, 28) of each class, over each box of one image."""
+        """Return the mask logits (P, 1 + C, 28, 28) of each class over boxes (P, 4) in one image."""
         logits: Tensor = self.roi_heads.mask_predictor(self.roi_heads.mask_head(self.pool(pyramid, boxes, MASK_BINS)))
         return logits
 
     def pool(self, pyramid: Sequence[Tensor], boxes: Tensor, bins: int) -> Tensor:
-        """Return RoIAlign (P, C, bins, bins) of each box, from the level for its size (Lin et al. 2017, eq. 1)."""
+        """Pool features (P, C, bins, bins) of each box from the level for its size (Lin et al. 2017, eq. 1)."""
         sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=0).prod(dim=1).sqrt()
         level = torch.floor(CANONICAL_LEVEL + torch.log2(sides / CANONICAL_SIDE) + 1e-6)
         level = level.clamp(0, POOLED_LEVELS - 1)
@@ -204,7 +203,7 @@ class RoiHeads(nn.Module):
 
 
 class BoxPredictor(nn.Module):
-    """A distribution over the labels, and a box for each."""
+    """A distribution over the labels, and a box for each label."""
 
     def __init__(self, features: int, labels: int) -> None:
         super().__init__()
@@ -220,7 +219,7 @@ def _convolution(channels: int, out: int) -> nn.Sequential:
 
 
 def _anchors(side: float, architecture: Architecture) -> Float32:
-    """Return the (R, 4) anchors of one cell, around the origin."""
+    """Return the anchors (R, 4) of one cell, centered on the origin."""
     ratios = np.array(architecture.anchor_ratios)
     widths, heights = side / np.sqrt(ratios), side * np.sqrt(ratios)
     anchors = np.stack([-widths, -heights, widths, heights], axis=1).astype(np.float64) / 2
@@ -236,10 +235,10 @@ def propose(
     after_nms: int,
     extent: float = 0.0,
 ) -> Float32:
-    """Return the boxes (P, 4), best first, where one image of `shape` (height, width) may have objects.
+    """Return the box proposals (P, 4) for one image of `shape` (height, width), best first.
 
-    anchors: (A, 4) of each level; objectness (A,) and deltas (A, 4) of all levels in order. `before_nms` anchors of
-    each level are decoded, and `after_nms` boxes of all levels are kept.
+    `anchors`: (A, 4) of each level. `objectness` (A,) and `deltas` (A, 4): of all levels in order. `before_nms` anchors
+    of each level are decoded, and `after_nms` boxes of all levels are kept.
     """
     boxes, scores, levels = [], [], []
     start = 0
@@ -258,7 +257,7 @@ def propose(
 
 
 def best_first(scores: Float32, count: int) -> Int64:
-    """Return the indices of the `count` highest scores, best first and equal ones in order, without a full sort."""
+    """Return the indices of the `count` highest scores, best first, without a full sort; ties keep their order."""
     if count >= len(scores):
         return np.asarray(np.argsort(-scores, kind="stable"), np.int64)
     lowest = np.partition(scores, len(scores) - count)[len(scores) - count]
@@ -276,10 +275,10 @@ def select(
     limit: int,
     extent: float = 0.0,
 ) -> tuple[Float32, Int32, Int32]:
-    """Return the surviving boxes (N, 4) of one image, best first, their proposals (N,) and labels (N,) from 1.
+    """Return the boxes (N, 4), indices of their proposals (N,) and labels (N,) after suppression, best first.
 
-    probabilities (P, 1 + C), deltas (P, 1 + C, 4): each label of a proposal above `score_threshold` is a candidate,
-    moved by its own deltas. `nms`: IoU for suppression within a label.
+    `probabilities`: (P, 1 + C). `deltas`: (P, 1 + C, 4). Labels start at 1. Each label of a proposal with a score above
+    `score_threshold` is a candidate with its own deltas. `nms`: IoU threshold of the suppression within a label.
     """
     proposal, label = np.nonzero(probabilities[:, 1:] > score_threshold)
     label += 1
@@ -293,9 +292,9 @@ def select(
 
 
 def fuse_batch_norms(network: nn.Module) -> None:
-    """Fold each nn.BatchNorm2d, in place, into the convolution registered directly before it.
+    """Fold each nn.BatchNorm2d into the preceding convolution, in place.
 
-    The network must be in inference mode, because in training the normalization depends on the batch.
+    The network must be in inference mode, because the normalization depends on the batch in training.
     """
     for module in network.modules():
         for (name, layer), (next_name, next_layer) in pairwise(list(module.named_children())):

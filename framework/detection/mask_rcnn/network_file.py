@@ -1,7 +1,7 @@
 """Networks as safetensors files with metadata.
 
 architecture     the Architecture as JSON
-card             the model card as JSON: data, steps, AP, limits, ...; `domain`: the only images the network is for
+card             the model card as JSON: data, steps, AP, limits, ...; `domain`: the image domain of the training
 tensors_sha256   of all names, shapes and values, to detect damage
 """
 
@@ -27,7 +27,7 @@ from framework.files.atomic_write import written_whole
 from framework.files.json_file import parse_json
 
 Fact = str | int | float | bool | None
-COUNTERS = ".num_batches_tracked"  # of the batch normalization; used only in training
+COUNTERS = ".num_batches_tracked"  # of the batch normalization, used only in training
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,10 @@ class NetworkDescription:
 
 
 def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: bool = False) -> None:
-    """Write the network to `path` atomically; `half`: weights as float16.
+    """Write the network to `path` atomically; `half`: store weights as float16.
 
-    Only weights of two or more dimensions are halved: biases and statistics are few, and variances may exceed float16.
+    Only weights with two or more dimensions become float16. Biases and statistics are few, and variances may exceed the
+    range of float16.
     Raises DataError if a weight is not finite or the file cannot be written.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in _stored(network).items()}
@@ -61,31 +62,32 @@ def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: 
 
 
 def load_network(path: Path) -> MaskRCNN:
-    """Return the network in `path`, in float32 and inference mode. Raises DataError for other files."""
+    """Read the network in `path`, in float32 and inference mode. Raises DataError for other files."""
     with _opened(path) as file:
         description = _description(file.metadata(), path)
         names = file.keys()
         tensors = {name: file.get_tensor(name) for name in names}
-        if file.metadata().get("tensors_sha256") != _digest(tensors):
+        expected, found = file.metadata().get("tensors_sha256"), _digest(tensors)
+        if expected != found:
             raise DataError(
-                f"{path}: expected the checksum of its tensors, got another one; the file is damaged, get it again"
+                f"{path}: expected tensors with sha256 {expected}, got {found}; the file is damaged, download it again"
             )
     return filled(description.architecture, tensors, str(path))
 
 
 def describe_network(path: Path) -> NetworkDescription:
-    """Return the metadata of `path` without reading the weights."""
+    """Read the metadata of `path` without the weights."""
     with _opened(path) as file:
         return _description(file.metadata(), path)
 
 
 def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str) -> MaskRCNN:
-    """Return a network with these weights, in float32 and inference mode.
+    """Build a network with these weights, in float32 and inference mode.
 
-    Raises DataError, starting with the source `where`, unless the tensors are the network's; counters are ignored.
+    Counters are ignored. Raises DataError that names the source `where` if the tensors do not match the architecture.
     """
     try:
-        with torch.device("meta"):  # no memory or random numbers for weights that are replaced
+        with torch.device("meta"):  # saves memory and random numbers for weights that are replaced below
             network = MaskRCNN(architecture)
     except (KeyError, ValueError, RuntimeError) as error:
         raise DataError(f"{where}: expected a known architecture, got {in_one_line(error)}") from error
@@ -103,7 +105,7 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
 
 
 def required(tensors: Mapping[str, Tensor], name: str, where: str) -> Tensor:
-    """Return the tensor `name`. Raises DataError, starting with the source `where`, if it is missing."""
+    """Return the tensor `name`. Raises DataError that names the source `where` if the tensor is missing."""
     if name not in tensors:
         raise DataError(f"{where}: expected the weights {name} of a Mask R-CNN with a feature pyramid, got none")
     return tensors[name]
@@ -127,7 +129,7 @@ def _check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:
-    """Return the SHA-256 (hex) of names, types, shapes and values."""
+    """Compute the SHA-256 (hex) of names, types, shapes and values."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -143,13 +145,13 @@ def _opened(path: Path) -> Any:
         return safetensors.safe_open(path, framework="pt")
     except (safetensors.SafetensorError, OSError) as error:
         raise DataError(
-            f"{path}: expected a safetensors file, got a damaged or another file: {in_one_line(error)}"
+            f"{path}: expected a safetensors file, got a damaged or unsupported file: {in_one_line(error)}"
         ) from error
 
 
 def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescription:
     if not metadata or "architecture" not in metadata:
-        raise DataError(f"{path}: expected an architecture in the metadata, got none; it is not a network file")
+        raise DataError(f"{path}: expected an architecture in the metadata, got none; choose a network file")
     try:
         card = parse_json(path, metadata.get("card", "{}"))
         architecture = parse_json(path, metadata["architecture"])
@@ -159,13 +161,13 @@ def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescr
 
 
 def _parsed(kind: Any, value: Any, name: str) -> Any:
-    """Return a value from JSON as the annotated type `kind`. Raises ValueError, in one line, for other types."""
+    """Convert a JSON value to the annotated type `kind`. Raises ValueError for other types."""
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
             raise ValueError(f"{name}: expected fields, got {value!r}")
         kinds = typing.get_type_hints(kind)
         if unknown := sorted(value.keys() - kinds.keys()):
-            raise ValueError(f"{name}: expected known fields, got {unknown[0]}, perhaps of a newer version")
+            raise ValueError(f"{name}: expected known fields, got {unknown[0]}; the file may be from a newer version")
         fields = {field: _parsed(kinds[field], part, f"{name}.{field}") for field, part in value.items()}
         try:
             return typing.cast(Any, kind)(**fields)

@@ -1,4 +1,4 @@
-"""Network files: the user's own, or published ones, which are downloaded once and checked."""
+"""Network files: local files, and published files that are downloaded once and verified."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from framework.files.search_paths import candidates
 OFFLINE = "INSTANCEMAP_OFFLINE"
 """Environment variable that disables downloads if set."""
 
-TIMEOUT = 30.0  # s without an answer
+TIMEOUT = 30.0  # s without a response
 BLOCK = 1 << 20  # bytes
 
 log = logging.getLogger(__name__)
@@ -29,11 +29,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PublishedNetwork:
-    """A file identified by the first digits of its hash, which its authors put into its name."""
+    """A published file. Its name contains the first digits of its hash."""
 
     url: str
-    algorithm: str  # of hashlib
-    digest: str  # hex, the first digits or all
+    algorithm: str  # name in hashlib
+    digest: str  # hex, complete or only the first digits
     license: str
     megabytes: int = 0  # 0 = unknown before the download
 
@@ -43,7 +43,7 @@ class PublishedNetwork:
         return networks_folder() / self.url.rpartition("/")[2]
 
     def digest_of(self, path: Path) -> str:
-        """Return as many digits of a file's hash as are published."""
+        """Compute the hash of a file, truncated to the number of published digits."""
         with path.open("rb") as file:
             return hashlib.file_digest(file, self.algorithm).hexdigest()[: len(self.digest)]
 
@@ -61,7 +61,7 @@ PUBLISHED = {
         f"{DETECTRON2}mask_rcnn_R_101_FPN_3x/138205316/model_final_a3ec72.pkl", "md5", "a3ec72", "CC BY-SA 3.0"
     ),
 }
-"""torchvision's first network (COCO mask AP 34.6 as published) and detectron2's (37.2 and 38.6)."""
+"""Published networks of torchvision (published COCO mask AP 34.6) and detectron2 (37.2 and 38.6)."""
 
 
 def networks_folder() -> Path:
@@ -70,10 +70,10 @@ def networks_folder() -> Path:
 
 
 def find_network(weights: Path) -> Path:
-    """Return the file of `weights`: a name in PUBLISHED, which is downloaded if missing, or a path.
+    """Return the file of `weights`, a path or a name in PUBLISHED.
 
-    A relative path is searched in the working, then in the project folder. Raises DataError, with the fix, if there is
-    no such file, it cannot be downloaded, or its hash differs from the published one.
+    A missing published file is downloaded. A relative path is searched in the working folder, then in the project
+    folder. Raises DataError if the file does not exist, cannot be downloaded, or has a wrong hash.
     """
     if published := PUBLISHED.get(str(weights)):
         if not published.file.exists():
@@ -88,7 +88,7 @@ def find_network(weights: Path) -> Path:
 
 
 def check(published: PublishedNetwork) -> None:
-    """Raise DataError unless the cached file is the published one."""
+    """Raise DataError unless the cached file has the published hash."""
     try:
         found = published.digest_of(published.file)
     except OSError as error:
@@ -104,7 +104,7 @@ def download(published: PublishedNetwork) -> None:
     """Download the file into the cache with a progress bar, and write it atomically."""
     by_hand = f"download {published.url} and put it at {published.file}"
     if os.environ.get(OFFLINE):
-        raise DataError(f"{published.file}: expected a file because {OFFLINE} forbids downloads, got none; {by_hand}")
+        raise DataError(f"{published.file}: expected a file while {OFFLINE} disables downloads, got none; {by_hand}")
     path = published.file
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -119,7 +119,7 @@ def download(published: PublishedNetwork) -> None:
 
 
 def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
-    """Yield the blocks from the server. Raises DataError, with the fix `by_hand`, for connection errors only."""
+    """Yield the blocks from the server. Raises DataError that contains the fix `by_hand` for connection errors."""
     url, name = published.url, published.file.name
     try:
         with (

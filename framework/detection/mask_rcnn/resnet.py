@@ -14,7 +14,7 @@ DEPTHS = {
     "resnet101": (3, 4, 23, 3),
 }
 WITH_BOTTLENECKS = ("resnet50", "resnet101")
-EXPANSION = 4  # of a bottleneck: output channels per inner channel
+EXPANSION = 4  # output channels per inner channel of a bottleneck
 
 
 @dataclass(frozen=True)
@@ -23,19 +23,20 @@ class ResNetShape:
 
     name: str = "resnet50"  # a key of DEPTHS
     width: int = 64  # channels of the stem; 64 in He et al. 2016
-    stride_in_1x1: bool = False  # convolution of a bottleneck with the stride: True = the first (He et al., Detectron's
-    # networks), False = the second (torchvision, "v1.5")
-    norm_eps: float = 1e-5  # of the batch normalization
+    # convolution with the stride in a bottleneck: True = the first (He et al., Detectron), False = the second
+    # (torchvision, "v1.5")
+    stride_in_1x1: bool = False
+    norm_eps: float = 1e-5  # epsilon of the batch normalization
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """The channels of the four levels."""
+        """Numbers of channels of the four levels."""
         factor = EXPANSION if self.name in WITH_BOTTLENECKS else 1
         return tuple(self.width * 2**level * factor for level in range(4))
 
 
 class ResNet(nn.Module):
-    """The levels C2 to C5 of a residual network, of strides 4, 8, 16 and 32."""
+    """The levels C2 to C5 of a residual network, with strides of 4, 8, 16 and 32."""
 
     def __init__(self, shape: ResNetShape) -> None:
         super().__init__()
@@ -61,7 +62,7 @@ def _layer(channels: int, out: int, stride: int, blocks: int, shape: ResNetShape
 
 
 class Block(nn.Module):
-    """Convolutions with a shortcut: two of 3x3, or a bottleneck of 1x1, 3x3 and 1x1 on a quarter of the channels."""
+    """Convolutions with a shortcut: two 3x3, or a bottleneck of 1x1, 3x3 and 1x1 with a quarter of the channels."""
 
     def __init__(self, channels: int, out: int, stride: int, shape: ResNetShape) -> None:
         super().__init__()

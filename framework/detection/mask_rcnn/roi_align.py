@@ -1,6 +1,6 @@
 """RoIAlign (He et al., "Mask R-CNN", 2017) as two matrix products or as weighted sums of cells, whichever is cheaper.
 
-Not torchvision's, whose extension loads only with its own build of torch.
+torchvision's implementation is not used, because its extension loads only with a matching build of torch.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-PRODUCT_SPEED = 10.0  # speed of a multiplication in a matrix product relative to a weighted sum, measured on a CPU
+PRODUCT_SPEED = 10.0  # speed of a multiplication in a matrix product divided by the speed in a weighted sum, on a CPU
 CHUNK = 1 << 22  # weights in memory at once
 
 
@@ -23,15 +23,16 @@ def roi_align(
     sampling_ratio: int = 0,
     half_pixel: bool = False,
 ) -> Tensor:
-    """Return the features (N, C, bins, bins), channels last, of each box: means of bilinear samples on a regular grid.
+    """Return the pooled features (N, C, bins, bins) of each box, channels last.
 
-    features (1, C, H, W); boxes (N, 4) x1 y1 x2 y2 px of the image. `spatial_scale`: cells per pixel. `sampling_ratio`:
-    samples per side of a bin, 0 = one per covered cell. `half_pixel`: False = the old convention, where the center of
-    cell i is at image coordinate i / spatial_scale and a box is at least one cell wide; True = "aligned".
+    A bin is the mean of bilinear samples on a regular grid. `features`: (1, C, H, W). `boxes`: (N, 4) x1 y1 x2 y2 px of
+    the image. `spatial_scale`: cells per pixel. `sampling_ratio`: samples per side of a bin, 0 = one per covered cell.
+    `half_pixel`: True = "aligned"; False = the older convention. In the older convention, the center of cell i is at
+    image coordinate i / spatial_scale, and a box is at least one cell wide.
 
-    Bilinear weights factorize into x and y, and so does their mean over a grid: a pooled box is A_y F A_x^T with a
-    (bins, H) and a (bins, W) matrix, which costs O(bins H W) per box. Each row of the matrices is zero outside a window
-    of a few cells; a weighted sum over the windows costs O(bins^2 window^2). Both are differentiable.
+    Bilinear weights factorize into x and y, and so does their mean over a grid. A pooled box is A_y F A_x^T with a
+    (bins, H) and a (bins, W) matrix, which costs O(bins H W) per box. Each row of the matrices is zero outside of a
+    window of a few cells. A weighted sum over the windows costs O(bins^2 window^2). Both are differentiable.
     """
     channels, height, width = features.shape[1:]
     boxes_cells = boxes.float() * spatial_scale - (0.5 if half_pixel else 0.0)
@@ -46,31 +47,31 @@ def roi_align(
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of N boxes along one axis of a map."""
+    """Samples of N boxes along one axis of a feature map."""
 
     start: Tensor  # (N,) in cells
     size: Tensor  # (N,) in cells
     counts: Tensor  # (N,) samples per bin
-    windows: Tensor  # (N,) int64, cells that the samples of one bin can reach
+    windows: Tensor  # (N,) int64, number of cells in reach of the samples of one bin
     bins: int
-    cells: int  # of the map
+    cells: int  # size of the feature map
 
     @classmethod
     def along(cls, start: Tensor, end: Tensor, bins: int, cells: int, ratio: int, shortest: float) -> Samples:
-        """Return the samples between `start` and `end` (N,) in cells; a box is at least `shortest` cells long."""
+        """Create the samples between `start` and `end` (N,) in cells; boxes are extended to `shortest` cells."""
         size = (end - start).clamp(min=shortest)
         counts = torch.full_like(size, ratio) if ratio else (size / bins).ceil().clamp(min=1.0)
-        spread = size / bins * (counts - 1) / counts  # from a bin's first sample to its last
+        spread = size / bins * (counts - 1) / counts  # distance between the first and last sample of a bin
         windows = (spread.ceil() + 2).clamp(max=cells).long()
         return cls(start, size, counts, windows, bins, cells)
 
     def of(self, chosen: Tensor) -> Samples:
-        """Return the samples of the boxes at an index."""
+        """Return the samples of the boxes at the indices `chosen`."""
         start, size, counts, windows = (array[chosen] for array in (self.start, self.size, self.counts, self.windows))
         return Samples(start, size, counts, windows, self.bins, self.cells)
 
     def weights(self) -> tuple[Tensor, Tensor]:
-        """Return (first cell (N, bins) int64, weights (N, bins, window)) of the window of each bin's samples."""
+        """Return the first cell (N, bins) int64 and the weights (N, bins, window) of each bin's window."""
         most, window = (int(array.max()) if len(array) else 1 for array in (self.counts, self.windows))
         k = torch.arange(most, device=self.start.device)
         counts = self.counts[:, None, None]
@@ -84,7 +85,7 @@ class Samples:
         return first.long(), weights.sum(dim=2) / counts
 
     def matrices(self) -> Tensor:
-        """Return the weights as (N, bins, cells)."""
+        """Return the weights as matrices (N, bins, cells)."""
         first, weights = self.weights()
         cells = first[..., None] + torch.arange(weights.shape[2], device=first.device)
         return weights.new_zeros((*first.shape, self.cells)).scatter_(2, cells, weights)
@@ -98,7 +99,7 @@ def _products(cells: Tensor, x: Samples, y: Samples) -> Tensor:
 
 
 def _sums(cells: Tensor, x: Samples, y: Samples) -> Tensor:
-    """Return the sums over windows, for chunks of similar windows, because the widest one sets the cost of a chunk."""
+    """Compute sums over windows in chunks of similar windows, because the widest window determines a chunk's cost."""
     sizes = x.windows * y.windows
     largest = int(sizes.max()) if len(sizes) else 1
     at_once = max(1, CHUNK // (x.bins * y.bins * largest))
@@ -111,7 +112,7 @@ def _sums(cells: Tensor, x: Samples, y: Samples) -> Tensor:
 
 
 def _sum_chunk(cells: Tensor, x: Samples, y: Samples) -> Tensor:
-    """Return (N, bins, bins, C): each bin is a bag of cells with the products of their two weights."""
+    """Return the pooled features (N, bins, bins, C) as sums over bags of weighted cells."""
     first_x, weights_x = x.weights()
     first_y, weights_y = y.weights()
     column = first_x[..., None] + torch.arange(weights_x.shape[2], device=cells.device)

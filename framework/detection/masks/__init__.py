@@ -1,1 +1,1 @@
-"""Masks and boxes."""
+"""Masks and bounding boxes."""

@@ -1,4 +1,4 @@
-"""Binary masks: from box grids and prototypes to the image; their boxes, overlaps and duplicates."""
+"""Binary masks: creation from box grids or prototypes, bounding boxes, overlaps and duplicates."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from framework.detection.masks.letterbox import Letterbox
 
 
 def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], threshold: float = 0.5) -> Bool:
-    """Return the masks (N, H, W), for an image of `shape`, where bilinearly resized grids exceed `threshold`.
+    """Resize grids of probabilities to boxes in an image of `shape`; return the masks (N, H, W).
 
-    grids (N, G, G): probabilities over each box; borders (N, 4): boxes x1 y1 x2 y2 px, pixel centers at integers. A
-    ring of zero cells is added, as in Detectron, so that an object that fills its box ends at the border of the box.
+    Pixels above `threshold` after bilinear interpolation are inside a mask. `grids`: (N, G, G) probabilities over each
+    box. `borders`: (N, 4) boxes x1 y1 x2 y2 px, pixel centers at integers. A ring of zero cells is added, as in
+    Detectron. It ends an object at the border of a completely filled box.
     """
     ringed = np.pad(grids.astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
     masks = np.zeros((len(grids), *shape), np.bool_)
@@ -31,16 +32,16 @@ def masks_from_prototypes(
     shape: tuple[int, int],
     threshold: float = 0.5,
 ) -> Bool:
-    """Return the masks (N, H, W) where the weighted sums of prototypes exceed `threshold` (Bolya et al., "YOLACT").
+    """Threshold weighted sums of prototypes (Bolya et al., "YOLACT"); return the masks (N, H, W).
 
-    coefficients (N, M); prototypes (M, h, w), whose cells cover the network's whole input; borders (N, 4): boxes
-    x1 y1 x2 y2 px of the image, which bound the masks. The sums are logits, interpolated bilinearly between cell
-    centers before they are compared.
+    `coefficients`: (N, M). `prototypes`: (M, h, w), whose cells cover the complete input of the network. `borders`:
+    (N, 4) boxes x1 y1 x2 y2 px of the image, the limits of the masks. The sums are logits. They are interpolated
+    bilinearly between cell centers before the comparison with `threshold`.
     """
     count, rows, columns = prototypes.shape
     logits = (coefficients @ prototypes.reshape(count, -1)).reshape(len(coefficients), rows, columns)
     cells_y, cells_x = rows / letterbox.input_shape[0], columns / letterbox.input_shape[1]  # cells per px of the input
-    # the cell of pixel u is ((u + 0.5) scale + left) cells - 0.5: centers map to centers
+    # pixel u maps to cell ((u + 0.5) scale + left) cells - 0.5, because centers map to centers
     affine = np.array(
         [
             [letterbox.scale_x * cells_x, (0.5 * letterbox.scale_x + letterbox.left) * cells_x - 0.5],
@@ -55,19 +56,20 @@ def masks_from_prototypes(
 
 
 def tight_boxes(masks: Bool) -> Float32:
-    """Return the boxes (N, 4) x1 y1 x2 y2 px of masks (N, H, W): first and last column and row; 0 for an empty mask."""
+    """Return the boxes (N, 4) of masks (N, H, W): first and last column and row in px; 0 for an empty mask."""
     return np.asarray(mask_bounds(masks.view(np.uint8)), np.float32)
 
 
 def mask_overlaps(masks: Bool, boxes: Float32) -> Float64:
-    """Return the numbers of pixels (N, N) that masks (N, H, W) share; boxes (N, 4) must be their `tight_boxes`."""
+    """Return the intersections (N, N), in pixels, of masks (N, H, W); boxes (N, 4) must be their `tight_boxes`."""
     return np.asarray(shared_pixels(masks.view(np.uint8), boxes.astype(np.int64)), np.float64)
 
 
 def suppress_duplicates(masks: Bool, boxes: Float32, iou: float) -> Int32:
-    """Return the indices of the non-empty masks, best first, whose IoU with each better survivor is at most `iou`.
+    """Return the indices of the remaining masks after suppression of duplicates, best first.
 
-    masks (N, H, W), best first; boxes (N, 4) must be their `tight_boxes`.
+    A mask is removed if it is empty or its IoU with a better remaining mask exceeds `iou`. `masks`: (N, H, W), best
+    first. `boxes` (N, 4) must be their `tight_boxes`.
     """
     overlaps = mask_overlaps(masks, boxes)
     areas = overlaps.diagonal()
@@ -81,7 +83,7 @@ def suppress_duplicates(masks: Bool, boxes: Float32, iou: float) -> Int32:
 def without_duplicates(
     masks: Bool, scores: Float32, class_probabilities: Float32, classes: tuple[str, ...], iou: float
 ) -> Detections:
-    """Return the detections, with tight boxes, of the masks (N, H, W) that `suppress_duplicates` keeps."""
+    """Return the detections of masks (N, H, W) after `suppress_duplicates`, with tight boxes."""
     boxes = tight_boxes(masks)
     kept = suppress_duplicates(masks, boxes, iou)
     return Detections(masks[kept], boxes[kept], scores[kept], class_probabilities[kept], classes)

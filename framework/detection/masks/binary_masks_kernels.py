@@ -10,7 +10,10 @@ CONTACT_DEPTH = 0.1  # m, largest difference in depth between neighboring pixels
 
 @njit(cache=True, nogil=True)
 def mask_bounds(masks):
-    """Test each row 64 pixels at a time, because most rows are empty, then scan it from both ends."""
+    """Return the bounds (N, 4) x1 y1 x2 y2 of masks, 0 for an empty mask.
+
+    Each row is tested in blocks, because most rows are empty, then scanned from both ends.
+    """
     n, height, width = masks.shape
     bounds = np.zeros((n, 4), np.int64)
     for i in range(n):
@@ -36,7 +39,7 @@ def mask_bounds(masks):
 
 @njit(cache=True, nogil=True)
 def shared_pixels(masks, bounds):
-    """Count the pixels that two masks share where their bounds (N, 4) intersect."""
+    """Count the common pixels of each pair of masks, only where their bounds (N, 4) intersect."""
     n = len(masks)
     shared = np.zeros((n, n), np.int64)
     for i in range(n):
@@ -54,9 +57,9 @@ def shared_pixels(masks, bounds):
 
 @njit(cache=True, nogil=True)
 def _grid_cells(start, end, cells, pixels):
-    """Return, along one axis, the first pixel in reach of a ringed grid, then each pixel's lower cell and upper weight.
+    """Return the first pixel in reach of a grid along one axis, and each pixel's lower cell and upper weight.
 
-    `cells` excludes the ring. Pixels are in reach inside the box and up to half a cell outside.
+    `cells` excludes the ring of zeros. Pixels are in reach inside the box and up to half a cell outside of it.
     """
     cell = (end - start) / cells  # px
     first = max(0, int(np.ceil(start - 0.5 * cell)))
@@ -74,7 +77,7 @@ def _grid_cells(start, end, cells, pixels):
 
 @njit(cache=True, nogil=True)
 def paste(ringed, borders, threshold, masks):
-    """Blend along y first: one blended row of the grid serves a whole row of pixels."""
+    """Write the masks of ringed grids in boxes. Interpolation along y comes first and is shared by a row of pixels."""
     n, height, width = masks.shape
     cells = ringed.shape[1] - 2
     row = np.empty(cells + 2, np.float32)
@@ -94,7 +97,7 @@ def paste(ringed, borders, threshold, masks):
 
 @njit(cache=True, nogil=True)
 def _prototype_cells(start, end, pixels, scale, shift, cells):
-    """Return, along one axis, the first pixel inside a box, then each pixel's lower cell and upper weight."""
+    """Return the first pixel inside a box along one axis, and each pixel's lower cell and upper weight."""
     first, stop = max(0, int(np.ceil(start))), min(pixels, int(np.ceil(end)))
     n = max(0, stop - first)
     lower = np.empty(n, np.int64)
@@ -108,7 +111,7 @@ def _prototype_cells(start, end, pixels, scale, shift, cells):
 
 @njit(cache=True, nogil=True)
 def sample_prototypes(logits, borders, affine, least, masks):
-    """Blend along y first: one blended row of cells serves a whole row of pixels."""
+    """Write the masks of prototype logits. Interpolation along y comes first and is shared by a row of pixels."""
     n, height, width = masks.shape
     rows, columns = logits.shape[1:]
     for i in range(n):
@@ -125,7 +128,7 @@ def sample_prototypes(logits, borders, affine, least, masks):
 
 @njit(cache=True, nogil=True)
 def contacts(ids, depth):
-    """Return the pairs (M, 2) of touching instances, the smaller id first; pairs may repeat."""
+    """Return the pairs (M, 2) of touching instances, smaller id first; pairs may repeat."""
     height, width = ids.shape
     pairs = np.empty((2 * height * width, 2), np.int32)
     n = 0

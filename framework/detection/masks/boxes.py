@@ -1,7 +1,7 @@
 """Boxes x1 y1 x2 y2 in px: anchors, deltas, non-maximum suppression.
 
-A network works only with the box convention of its training. `extent` selects it: 1 = the older convention, where x2 is
-the last pixel inside and a box is x2 - x1 + 1 px wide; 0 = the newer one, where x2 is the right border.
+A network requires the box convention of its training. `extent` selects the convention. 1 = the older convention: x2 is
+the last pixel inside, and a box is x2 - x1 + 1 px wide. 0 = the newer convention: x2 is the right border.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from framework.data import Float32, Int32
 from framework.detection.masks.boxes_kernels import suppress_sorted
 
 LARGEST_LOG_SCALE = float(np.log(1000.0 / 16.0))
-"""Bound on the growth of a box against overflow (Girshick et al., github.com/facebookresearch/Detectron)."""
+"""Limit of the log scale of a box against overflow (Girshick et al., github.com/facebookresearch/Detectron)."""
 
 
 def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple[float, float]) -> Float32:
-    """Return the (A, 4) anchors of cell (0, 0) for every cell: (rows * columns * A, 4), the anchor index fastest.
+    """Repeat the anchors (A, 4) of cell (0, 0) in every cell; return the anchors (rows * columns * A, 4).
 
-    `stride`: px per cell, for both axes or as (y, x).
+    The anchor index varies fastest. `stride`: px per cell, for both axes or as (y, x).
     """
     stride_y, stride_x = stride if isinstance(stride, tuple) else (stride, stride)
     x, y = np.meshgrid(np.arange(columns) * stride_x, np.arange(rows) * stride_y)
@@ -27,7 +27,7 @@ def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple
 
 
 def decode(boxes: Float32, deltas: Float32, extent: float = 1.0) -> Float32:
-    """Return the (N, 4) boxes moved by (N, 4) deltas dx dy dw dh, relative to the boxes' centers and sizes.
+    """Apply deltas dx dy dw dh (N, 4), relative to centers and sizes, to boxes (N, 4).
 
     Source: Girshick et al., "Rich feature hierarchies ...", 2014, appendix C, with Detectron's pixel conventions.
     """
@@ -40,7 +40,7 @@ def decode(boxes: Float32, deltas: Float32, extent: float = 1.0) -> Float32:
 
 
 def clip(boxes: Float32, shape: tuple[int, int], extent: float = 1.0) -> Float32:
-    """Return the boxes (N, 4) clipped to an image of `shape` (height, width)."""
+    """Clip boxes (N, 4) to an image of `shape` (height, width)."""
     height, width = shape
     largest = np.array([width, height, width, height], np.float32) - np.float32(extent)
     return np.clip(boxes, np.float32(0), largest)
@@ -49,7 +49,7 @@ def clip(boxes: Float32, shape: tuple[int, int], extent: float = 1.0) -> Float32
 def to_original_image(
     boxes: Float32, resized: tuple[int, int], original: tuple[int, int], extent: float = 1.0
 ) -> Float32:
-    """Return the borders (N, 4), in the original image, of boxes in the resized image; shapes are (height, width).
+    """Convert boxes in the resized image to borders (N, 4) in the original image; shapes are (height, width).
 
     Pixel centers are at integers: the borders of pixel (u, v) are u - 0.5 and u + 0.5.
     """
@@ -66,11 +66,11 @@ def suppress_boxes(
     limit: int | None = None,
     extent: float = 1.0,
 ) -> Int32:
-    """Return the indices that survive greedy non-maximum suppression, best first, ties in input order.
+    """Return the indices of boxes after greedy non-maximum suppression, best first; ties keep the input order.
 
-    A box of `boxes` (N, 4) is removed if its IoU with a better survivor of its class exceeds `iou`. `classes` (N,):
-    None = one class. `limit`: largest number of survivors. Not OpenCV's: that offsets boxes by class, which rounds the
-    IoU. Not torchvision's: its extension loads only with its own build of torch.
+    A box of `boxes` (N, 4) is removed if its IoU with a better remaining box of its class exceeds `iou`. `classes`:
+    (N,), None = one class. `limit`: maximum number of remaining boxes. OpenCV's implementation is not used, because it
+    offsets boxes by class, which rounds the IoU. torchvision's extension loads only with a matching build of torch.
     """
     order = np.argsort(-scores, kind="stable").astype(np.int32)
     if classes is None:

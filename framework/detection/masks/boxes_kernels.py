@@ -8,7 +8,10 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def suppress_sorted(boxes, classes, order, iou, extent, limit):
-    """Compare each box only with the survivors: with the limit, these are far fewer than all pairs."""
+    """Return the indices of the remaining boxes.
+
+    Each box is compared only with the remaining boxes. The limit makes these far fewer than all pairs.
+    """
     survivors = np.empty(min(limit, len(boxes)), np.int32)
     n = 0
     for i in range(len(boxes)):

@@ -1,4 +1,4 @@
-"""Placement of an image of any shape in a network's input of fixed shape."""
+"""Placement of an image of any shape in the fixed input of a network."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ class Placement(Enum):
 
     top_left = "top_left"
     center = "center"
-    stretch = "stretch"  # fills the input without keeping the aspect ratio
+    stretch = "stretch"  # the image fills the input with a changed aspect ratio
 
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Resizing and shifting from an image to a network's input, for each axis.
+    """Scale and offset from an image to a network's input for each axis.
 
-    In the input, 0 is the left border of the first pixel. Images have pixel centers at integers. Therefore
+    In the input, 0 is the left border of the first pixel. In images, pixel centers are at integers. Therefore,
     x_input = scale_x (u + 0.5) + left.
     """
 
     input_shape: tuple[int, int]  # (height, width) px of the network's input
-    resized: tuple[int, int]  # (height, width) px of the image in it
+    resized: tuple[int, int]  # (height, width) px of the resized image
     top: int  # px
     left: int  # px
     scale_x: float  # px of the input per px of the image
@@ -49,7 +49,7 @@ class Letterbox:
         return cls(input_shape, resized, top, left, resized[1] / width, resized[0] / height)
 
     def fill(self, color: UInt8, padding: int) -> UInt8:
-        """Return the input (H, W, 3) for the image `color` (h, w, 3), with the value `padding` around it."""
+        """Return the input (H, W, 3) for the image `color` (h, w, 3), padded with the value `padding`."""
         height, width = self.resized
         canvas = np.full((*self.input_shape, 3), padding, np.uint8)
         canvas[self.top : self.top + height, self.left : self.left + width] = cv2.resize(
@@ -58,16 +58,16 @@ class Letterbox:
         return canvas
 
     def to_image(self, boxes: Float32) -> Float32:
-        """Return the borders (N, 4), px of the image, of boxes x1 y1 x2 y2 in the input."""
+        """Convert boxes x1 y1 x2 y2 in the input to borders (N, 4) in px of the image."""
         shift = np.array([self.left, self.top] * 2)
         scale = np.array([self.scale_x, self.scale_y] * 2)
         return np.asarray((boxes - shift) / scale - 0.5, np.float32)
 
 
 def network_input(canvas: UInt8, dtype: str, bgr: bool, black: float, white: float) -> np.ndarray[Any, Any]:
-    """Return an RGB image (H, W, 3) in a network's dtype, with 0 mapped to `black` and 255 to `white`.
+    """Convert an RGB image (H, W, 3) to a network's dtype, with 0 mapped to `black` and 255 to `white`.
 
-    A uint8 network gets 0..255.
+    The input of a uint8 network is 0..255.
     """
     image = canvas[..., ::-1] if bgr else canvas
     if dtype == "uint8":

@@ -2,13 +2,15 @@
 
 For each box:
 
-1. Its depth readings, weighted from 1 at the box's center to 0 at its border, form a histogram over log depth, because
-   sensor noise and the depth step per pixel of a slanted surface grow with depth.
-2. A mode is a run of bins between two valleys, bins below `VALLEY` of the run's peak. The nearest mode with at least
-   `significance` of the weight is the foreground: thin things in front have less, and the wall behind is farther.
-3. Foreground pixels are connected to their four neighbors if a surface less slanted than `max_slant`, that is
-   z tan(max_slant) / f per pixel, and the sensor's noise explain the depth step. The heaviest component is the object.
-4. Its holes are closed if they have no readings or are small.
+1. The depth readings form a histogram over log depth, because sensor noise and the depth step per pixel of a slanted
+   surface grow with depth. The weight of a reading decreases from 1 at the center of the box to 0 at its border.
+2. A mode is a run of bins between two valleys. Valleys are bins below `VALLEY` of the run's peak. The foreground is the
+   nearest mode with at least `significance` of the weight. Thin objects in front have less weight, and the wall behind
+   is farther.
+3. Two neighboring foreground pixels (4-connectivity) are connected if their depth step is small enough. The limit is
+   the step of a surface with the slant `max_slant`, z tan(max_slant) / f per pixel, plus the sensor's noise. The
+   connected component with the largest weight is the object.
+4. Holes of the object are closed if they have no readings or are small.
 """
 
 from __future__ import annotations
@@ -21,21 +23,23 @@ import numpy as np
 from framework.data import Bool, Camera, Float32
 from framework.detection.masks.masks_from_boxes_kernels import fill_masks
 
-LARGEST_CLOSED_HOLE = 0.01  # fraction of the box; the background is visible through larger holes with readings
+LARGEST_CLOSED_HOLE = 0.01  # fraction of the box; larger holes with readings show the background
 
 
 def masks_in_boxes(
     borders: Float32, depth: Float32, camera: Camera, significance: float, max_slant: float, min_readings: float
 ) -> tuple[Bool, Bool]:
-    """Return the masks (N, H, W) of the objects in boxes, and (N,) True for boxes with enough depth; others are empty.
+    """Return the masks (N, H, W) of the objects in boxes, and a mask (N,) of the boxes with enough depth readings.
+
+    The masks of other boxes are empty.
 
     Args:
         borders: (N, 4) x1 y1 x2 y2 px, pixel centers at integers.
         depth: (H, W) m, 0 = no reading.
         camera: The camera of the depth image.
-        significance: Smallest fraction of the weighted readings in the foreground.
-        max_slant: Largest angle between the image plane and a surface, degrees.
-        min_readings: Smallest fraction of the box's pixels with a reading.
+        significance: Minimum fraction of the weighted readings in the foreground.
+        max_slant: Maximum angle between the image plane and a surface, degrees.
+        min_readings: Minimum fraction of the box's pixels with a reading.
     """
     height, width = depth.shape
     masks = np.zeros((len(borders), height, width), np.bool_)
@@ -50,7 +54,7 @@ def masks_in_boxes(
 
 
 def _close_holes(mask: Bool, has_reading: Bool) -> None:
-    """Add the holes of `mask` (h, w) that do not touch the border and have no readings or are small."""
+    """Close the holes of `mask` (h, w), except holes at the border and large holes with readings."""
     count, component = cv2.connectedComponents((~mask).view(np.uint8), connectivity=4)
     sizes = np.bincount(component.ravel(), minlength=count)
     readings = np.bincount(component[has_reading], minlength=count)

@@ -15,7 +15,7 @@ NOISE = 3.0  # standard deviations of the depth noise
 
 @njit(cache=True, nogil=True)
 def fill_masks(borders, windows, depth, significance, step, min_readings, masks):
-    """Write the object's mask of each box, holes included; `windows` (N, 4) are the boxes in whole pixels."""
+    """Write the mask of the object in each box, with its holes; `windows` (N, 4) are the boxes in whole pixels."""
     found = np.zeros(len(masks), np.bool_)
     for i in range(len(masks)):
         u0, v0, u1, v1 = windows[i]
@@ -42,7 +42,7 @@ def _tent(start, end, first, stop):
 
 @njit(cache=True, nogil=True)
 def _foreground(window, weight_x, weight_y, significance):
-    """Return the depth interval (near, far), m, of the nearest significant mode, else of the heaviest."""
+    """Return the depth interval (near, far), m, of the nearest significant mode, else of the mode with most weight."""
     bins = int(np.log(FARTHEST / NEAREST) / BIN) + 1
     histogram = np.zeros(bins + 2)
     total = 0.0
@@ -83,7 +83,7 @@ def _foreground(window, weight_x, weight_y, significance):
 
 @njit(cache=True, nogil=True)
 def _grow(window, weight_x, weight_y, near, far, step, mask):
-    """Write the heaviest connected component of the pixels between near and far to `mask`."""
+    """Write the connected component with most weight, of the pixels between near and far, to `mask`."""
     height, width = window.shape
     label = np.zeros((height, width), np.int32)
     stack = np.empty((height * width, 2), np.int32)

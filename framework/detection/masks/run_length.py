@@ -1,8 +1,9 @@
 """Masks as run lengths in COCO's format: the lengths of alternating runs of 0 and 1, column by column.
 
-In a file they are a list of numbers or a packed string (pycocotools' `rleToString`): groups of five bits, the lowest
-first, each number from the third on as its difference to the number two before it. pycocotools packs and decodes.
-Strings are checked here, because pycocotools leaves pixels after a short string uninitialized (seen in 2.0.11).
+A file contains run lengths as a list of numbers or as a packed string (pycocotools' `rleToString`). A packed string
+consists of groups of five bits, lowest first. From the third number on, it stores the difference to the number two
+before. pycocotools packs and decodes. This module validates strings, because pycocotools 2.0.11 leaves the pixels after
+a short string uninitialized.
 """
 
 from __future__ import annotations
@@ -16,19 +17,22 @@ from pycocotools import mask as coco
 from framework.data import Bool, Int64
 from framework.errors import DataError
 
-FIRST_CHARACTER = 48  # stands for 0; each character has five bits of the number, and a sixth if more follow
+FIRST_CHARACTER = 48  # encodes 0; a character has five bits of a number, and a sixth bit if more characters follow
 MORE, SIGN, BITS = 0x20, 0x10, 5
-LONGEST = 7  # characters of one number: more bits than any image has pixels
+LONGEST = 7  # maximum number of characters per number; its range exceeds the pixels of any image
 
 
 def encode(masks: Bool) -> list[bytes]:
-    """Return the packed run lengths of masks (N, H, W)."""
+    """Encode masks (N, H, W) as packed run lengths."""
     columns_first = np.asfortranarray(masks.transpose(1, 2, 0).view(np.uint8))
     return [run["counts"] for run in coco.encode(columns_first)] if len(masks) else []
 
 
 def decode(counts: Sequence[bytes], shape: tuple[int, int]) -> Bool:
-    """Return the masks (N, H, W) of `shape` (height, width); call `check` first for untrusted `counts`."""
+    """Decode packed run lengths to masks (N, H, W) of `shape` (height, width).
+
+    Call `check` first for untrusted `counts`.
+    """
     masks = np.zeros((len(counts), *shape), np.uint8)
     size = list(shape)
     for mask, packed in zip(masks, counts, strict=True):
@@ -38,9 +42,9 @@ def decode(counts: Sequence[bytes], shape: tuple[int, int]) -> Bool:
 
 
 def pack(lengths: Sequence[int], shape: tuple[int, int]) -> bytes:
-    """Return run lengths as a packed string. Raises DataError unless they fill an image of `shape` (height, width)."""
+    """Pack run lengths. Raises DataError unless they fill an image of `shape` (height, width)."""
     if not all(isinstance(length, int) and not isinstance(length, bool) for length in lengths):
-        raise DataError("run lengths: expected integers, got other values")
+        raise DataError(f"run lengths: expected integers, got {lengths!r:.200}")
     _check_filled(np.array(lengths, np.float64), shape)
     packed: bytes = coco.frPyObjects({"size": list(shape), "counts": list(lengths)}, *shape)["counts"]
     return packed
@@ -52,15 +56,17 @@ def check(counts: bytes, shape: tuple[int, int]) -> None:
 
 
 def unpack(counts: bytes) -> Int64:
-    """Return the run lengths (R,) of a packed string. Raises DataError for other strings."""
+    """Unpack a packed string to run lengths (R,). Raises DataError for invalid strings."""
     codes = np.frombuffer(counts, np.uint8).astype(np.int64) - FIRST_CHARACTER
     if not len(codes) or codes.min() < 0 or codes.max() >= 2 * MORE or codes[-1] & MORE:
-        raise DataError("run lengths: expected a packed string of COCO, got a damaged one")
+        raise DataError(f"run lengths: expected a packed string in COCO's format, got {counts!r:.100}")
     ends = np.flatnonzero((codes & MORE) == 0)
     starts = np.concatenate([[0], ends[:-1] + 1])
     position = np.arange(len(codes)) - np.repeat(starts, ends - starts + 1)
     if position.max() >= LONGEST:
-        raise DataError("run lengths: expected numbers within the image size, got a larger one")
+        raise DataError(
+            f"run lengths: expected numbers of at most {LONGEST} characters, got {position.max() + 1} characters"
+        )
     numbers = np.add.reduceat((codes & (MORE - 1)) << (BITS * position), starts)
     numbers -= np.where(codes[ends] & SIGN, 1 << (BITS * (position[ends] + 1)), 0)
     lengths = numbers.copy()

@@ -1,8 +1,8 @@
-"""Networks written by Caffe2 in 8-bit integers, computed in these integers on a CPU or in float on any device.
+"""Caffe2 networks with 8-bit integers, computed in integers on a CPU or in float on any device.
 
-An integer q of a blob stands for scale * (q - zero point) (Jacob et al., "Quantization and Training of Neural Networks
-for Efficient Integer-Arithmetic-Only Inference", 2018). Integer convolutions are oneDNN's, through torch, on x86
-processors with VNNI: on others, sums of 8-bit products overflow 16 bits.
+An integer q of a blob represents scale * (q - zero point) (Jacob et al., "Quantization and Training of Neural Networks
+for Efficient Integer-Arithmetic-Only Inference", 2018). torch provides the integer convolutions of oneDNN. They require
+an x86 processor with VNNI. On other processors, sums of 8-bit products overflow 16 bits.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from framework.detection.runtimes.caffe2_network_kernels import MOST, round_to_b
 from framework.errors import DataError
 
 Operator = Mapping[str, Any]  # type, inputs (blobs, then weights), outputs (one blob), args
-Tensors = Mapping[str, Tensor]  # float32; kernels are (out, in, h, w), those of transposed convolutions (in, out, h, w)
-Run = Callable[..., Tensor]  # from an operator's blobs (N, C, H, W) to its output
+Tensors = Mapping[str, Tensor]  # float32; kernels are (out, in, h, w), or (in, out, h, w) in transposed convolutions
+Run = Callable[..., Tensor]  # computes an operator's output from its blobs (N, C, H, W)
 Window = tuple[list[int], list[int], list[int], int]  # strides, pads, dilations, groups
 
 CONVOLUTIONS = ("Int8Conv", "Int8ConvRelu")
-MOST_OF_WEIGHTS = 127  # of int8, which oneDNN requires to be symmetric about 0
+MOST_OF_WEIGHTS = 127  # largest int8 weight; oneDNN requires weights symmetric about 0
 
 
 class Step(NamedTuple):
@@ -40,7 +40,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Network:
-    """The steps that compute the blobs `outputs` from the blobs `inputs`, all of them float32."""
+    """Computation of the blobs `outputs` from the blobs `inputs`, all in float32."""
 
     steps: tuple[Step, ...]
     inputs: tuple[str, ...]
@@ -60,7 +60,7 @@ class Quantization(NamedTuple):
     zero_point: int
 
     def quantize(self, x: Tensor) -> Tensor:
-        """Return x (N, C, H, W) on the CPU as uint8, rounded to nearest."""
+        """Quantize x (N, C, H, W) on the CPU to uint8, rounded to nearest."""
         channels_last = x.permute(0, 2, 3, 1).contiguous()
         rounded = torch.empty_like(channels_last, dtype=torch.uint8)
         flat = channels_last.numpy().reshape(-1), rounded.numpy().reshape(-1)
@@ -72,20 +72,21 @@ class Quantization(NamedTuple):
 
 
 def dequantized_weights(values: Array, scale_zero: tuple[float, int] | None) -> Tensor:
-    """Return scale * (q - zero point) as float32; kernels (out, h, w, in) and (in, h, w, out) get torch's axis order.
+    """Return the weights scale * (q - zero point) as float32.
 
-    `scale_zero`: None = the values are not quantized.
+    Kernels (out, h, w, in) and (in, h, w, out) are permuted to the axis order of torch. `scale_zero`: None = the values
+    are not quantized.
     """
     if scale_zero is None:
         return torch.from_numpy(values)
     scale, zero_point = scale_zero
     tensor = torch.from_numpy(((values.astype(np.float64) - zero_point) * scale).astype(np.float32))
-    return tensor.permute(0, 3, 1, 2) if tensor.ndim == 4 else tensor  # a permuted view is channels last already
+    return tensor.permute(0, 3, 1, 2) if tensor.ndim == 4 else tensor  # a permuted view is already channels last
 
 
 @cache
 def has_int8_kernels() -> bool:
-    """Return whether torch computes integer convolutions on this processor, and the largest values correctly."""
+    """Return True if torch computes integer convolutions correctly on this processor, also for the largest values."""
     has_mkldnn = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
     if not has_mkldnn or torch.backends.quantized.engine != "x86":
         return False
@@ -104,12 +105,13 @@ def network_between(
     outputs: tuple[str, ...],
     spacings: Mapping[str, float] | None = None,
 ) -> Network:
-    """Return the part of a graph between some blobs.
+    """Build the network between the blobs `inputs` and `outputs` of a graph.
 
-    `spacings`: the kernels' quantization steps for convolutions in integers; None = float, with quantized weights but
-    no rounding between operators. In integers, these are not rounded either, at little cost: the linear channels
-    between blocks (Sandler et al., "MobileNetV2", 2018), whose rounding errors would add up, the outputs, means, fully
-    connected layers and transposed convolutions.
+    `spacings`: quantization steps of the kernels for integer convolutions; None = float. A float network has quantized
+    weights, but no rounding between operators. An integer network does not round the following values, at little cost:
+
+    - the linear channels between blocks (Sandler et al., "MobileNetV2", 2018), because rounding errors would accumulate
+    - outputs, means, fully connected layers and transposed convolutions
 
     Raises DataError for an unknown operator.
     """
@@ -124,7 +126,7 @@ def network_between(
 def _between(
     graph: list[Operator], tensors: Tensors, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> list[Operator]:
-    """Return the operators that the outputs need, in order."""
+    """Return the operators required for the outputs, in order."""
     needed, found = set(outputs), []
     for operator in reversed(graph):
         name = operator["outputs"][0]
@@ -139,7 +141,7 @@ def _blobs(operator: Operator, tensors: Tensors) -> tuple[str, ...]:
 
 
 def _weights(operator: Operator, tensors: Tensors) -> tuple[Tensor, ...]:
-    """Return kernel and bias, or nothing for an operator without weights."""
+    """Return kernel and bias; empty for an operator without weights."""
     return tuple(tensors[name] for name in operator["inputs"] if name in tensors)
 
 
@@ -173,8 +175,8 @@ def _int8_steps(
         operator["outputs"][0]: Quantization(operator["args"]["Y_scale"], operator["args"]["Y_zero_point"])
         for operator in operators
     }
-    in_integers: set[str] = set()  # blobs that are uint8; the others are float32
-    converted: dict[str, str] = {}  # blobs to their names in the other type
+    in_integers: set[str] = set()  # uint8 blobs; other blobs are float32
+    converted: dict[str, str] = {}  # blob -> its name in the other type
     for operator in operators:
         kind, name, blobs = operator["type"], operator["outputs"][0], _blobs(operator, tensors)
         on_integers = kind in CONVOLUTIONS and name not in outputs
@@ -210,10 +212,10 @@ def _int8_convolution(
     result: Quantization | None,
     relu: bool,
 ) -> Run:
-    """Return oneDNN's convolution (out, in, h, w) from uint8 to uint8 or, with `result` None, to float32.
+    """Return a oneDNN convolution (out, in, h, w) from uint8 to uint8, or to float32 if `result` is None.
 
-    The kernel's integers, `spacing` apart, are kept in all channels where they fit into int8 (30,194 of 2Go's 30,381);
-    the other channels are rounded to a coarser step.
+    The quantization step of the kernel is `spacing` in channels whose integers fit into int8. Other channels are
+    rounded to a coarser step. In Mask R-CNN2Go, 30,194 of 30,381 channels fit.
     """
     scales = torch.clamp(kernel.abs().amax(dim=(1, 2, 3)) / MOST_OF_WEIGHTS, min=spacing)
     integers = torch.round(kernel / scales[:, None, None, None]).to(torch.int8)

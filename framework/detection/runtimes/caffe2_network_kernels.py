@@ -1,16 +1,16 @@
-"""Kernels of caffe2_network.py, without torch, so that their compilation does not load it."""
+"""Kernels of caffe2_network.py. A module without torch, because kernel compilation should not load torch."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-MOST = 255  # of uint8
+MOST = 255  # largest uint8
 
 
 @njit(cache=True, nogil=True)
 def round_to_bytes(values, rounded, per_unit, zero_point):
-    """Write values (N,) * per_unit + zero_point to rounded (N,) uint8, in one pass where torch needs five."""
+    """Write values (N,) * per_unit + zero_point to rounded (N,) uint8, in one pass instead of five in torch."""
     for i in range(values.shape[0]):
         nearest = np.rint(values[i] * per_unit + zero_point)
         rounded[i] = np.uint8(np.int32(min(max(nearest, np.float32(0)), np.float32(MOST))))

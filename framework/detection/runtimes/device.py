@@ -12,13 +12,13 @@ import torch
 from framework.config.validation import require
 
 _changing = Lock()
-_before: list[int] = []  # torch's number of threads before, once for each thread inside one_torch_thread()
+_before: list[int] = []  # previous number of torch threads, once for each thread inside one_torch_thread()
 
 
 def torch_device(device: str, name: str = "detector.device") -> torch.device:
-    """Return the device for auto, cpu or cuda; auto = cuda if available.
+    """Return the torch device for auto, cpu or cuda; auto = cuda if available.
 
-    Raises ConfigError, naming the parameter, for other words and for cuda without a GPU.
+    Raises ConfigError that names the parameter for other values and for cuda without a GPU.
     """
     require(device in ("auto", "cpu", "cuda"), name, device, "auto, cpu or cuda")
     available = torch.cuda.is_available()
@@ -27,17 +27,18 @@ def torch_device(device: str, name: str = "detector.device") -> torch.device:
 
 
 def ready(network: Any, device: torch.device, half_precision: bool) -> Any:
-    """Return the network in inference mode on the device, in half precision only on CUDA."""
+    """Move the network to the device in inference mode; half precision is used only on CUDA."""
     dtype = torch.float16 if half_precision and device.type == "cuda" else torch.float32
     return network.to(device, dtype).eval()
 
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Let torch compute in the calling thread alone: short operations end before other threads wake up.
+    """Limit torch to the calling thread, because short operations end before other threads wake up.
 
-    Several threads may be inside at once. Torch stores the number per thread, and a thread gets the number that any
-    thread set last when it first asks. So each thread asks before it sets its own, and restores the number on exit.
+    Several threads may use this context at once. Torch stores the number of threads per thread. At its first query, a
+    thread gets the latest number set by any thread. So each thread queries the number before setting it, and restores
+    it on exit.
     """
     with _changing:
         asked = torch.get_num_threads()

@@ -1,4 +1,4 @@
-"""Networks in ONNX files, run by onnxruntime, for images of fixed and of any shape."""
+"""ONNX networks in onnxruntime, with fixed or dynamic image shapes."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession, NodeArg
 
 Outputs = dict[str, Float32]
-Shape = tuple[int, ...]  # 0 = any
-INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # numpy's names
+Shape = tuple[int, ...]  # 0 = dynamic
+INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # -> numpy dtype
 CUDA = "CUDAExecutionProvider"
 
 
 class OnnxNetwork:
     """A network from one image to named arrays, on the CPU or with CUDA.
 
-    It uses as many threads as OpenCV (`threads` of the config), because onnxruntime would take all cores. Idle threads
-    sleep, because the map is built at the same time.
+    It uses as many threads as OpenCV (`threads` in the config), because the default of onnxruntime is all cores. Idle
+    threads sleep, because mapping runs at the same time.
     """
 
     def __init__(self, path: Path, sha256: str, device: str, input_size: int) -> None:
-        """Load the network of the file `path`; see `find_file` for a relative path.
+        """Load the network from `path`; see `find_file` for relative paths.
 
         Args:
             path: The ONNX file.
             sha256: The expected hash; "" = any.
             device: auto, cpu or cuda.
-            input_size: Side of the square input, px, of a network that takes any size; 0 = the network's own size.
+            input_size: Side of the square input of a network with dynamic size, px; 0 = the network's own size.
 
         Raises:
-            DataError: The file is missing, damaged, not the expected one, or cannot be run.
+            DataError: The file is missing or damaged, has another hash, or cannot be run.
             ConfigError: onnxruntime or the device is missing, or `input_size` does not fit the network.
         """
         self.path = find_file(path)
@@ -57,11 +57,11 @@ class OnnxNetwork:
             raise DataError(f"{self.path}: expected one of {wanted} as input, got {_described(image)}")
         self._name = image.name
         self.dtype = INPUT_DTYPES[image.type]
-        self.channels_last = shape[3] == 3 and shape[1] != 3  # (1, H, W, 3), as in networks from TensorFlow
+        self.channels_last = shape[3] == 3 and shape[1] != 3  # (1, H, W, 3), as in TensorFlow networks
         self.shape = _input_shape(self.path, image, self.channels_last, input_size, self.metadata)
 
     def __call__(self, image: Array) -> Outputs:
-        """Return the outputs by name, in float32, for an image (H, W, 3) of the network's `shape` and dtype.
+        """Return the float32 outputs by name for an image (H, W, 3) with the network's `shape` and dtype.
 
         Raises DataError if the network fails or its outputs are not finite.
         """
@@ -69,9 +69,9 @@ class OnnxNetwork:
         names = [output.name for output in self._session.get_outputs()]
         try:
             arrays = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
-        except Exception as error:  # onnxruntime's errors have no common base
+        except Exception as error:  # errors of onnxruntime have no common base class
             raise DataError(
-                f"{self.path}: expected a run in onnxruntime, got an error: {in_one_line(error)}"
+                f"{self.path}: expected a successful run in onnxruntime, got {in_one_line(error)}"
             ) from error
         outputs = {name: np.asarray(array, np.float32) for name, array in zip(names, arrays, strict=True)}
         for name, array in outputs.items():
@@ -81,7 +81,7 @@ class OnnxNetwork:
 
 
 class ImageNetworkParameters(Protocol):
-    """The parameters that detectors with an image network share; see their fields."""
+    """Common parameters of detectors with an image network; see the fields of the detectors."""
 
     weights: Path
     sha256: str
@@ -95,10 +95,10 @@ class ImageNetworkParameters(Protocol):
 
 
 class ImageNetwork:
-    """An ONNX network with the preparation of images of any shape, which are fitted into its input."""
+    """An ONNX network with preprocessing that fits images of any shape into its input."""
 
     def __init__(self, detector: ImageNetworkParameters) -> None:
-        """Load the network. Raises ConfigError for a parameter out of its bounds, and the errors of `OnnxNetwork`."""
+        """Load the network. Raises ConfigError for parameters out of bounds, and the errors of `OnnxNetwork`."""
         path, device, black, white = detector.weights, detector.device, detector.black_level, detector.white_level
         require(len(detector.sha256) in (0, 64), "detector.sha256", detector.sha256, "64 hexadecimal digits, or empty")
         allowed = f"0 (size of the network) or a value in [1, {LONGEST_SIDE}] px"
@@ -126,7 +126,7 @@ class ImageNetwork:
         return self._network(network_input(canvas, self._network.dtype, detector.bgr, *levels)), letterbox
 
     def outputs_for_black(self) -> Outputs:
-        """Return the outputs for a black image, so that a detector can check their form when it is built."""
+        """Return the outputs for a black image, for example to validate their shapes when a detector is built."""
         outputs, _ = self(np.zeros((*self.shape, 3), np.uint8))
         return outputs
 
@@ -137,7 +137,7 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     if device == "cuda" and not cuda:
         raise ConfigError("detector.device: expected cpu or auto without onnxruntime-gpu and a GPU, got cuda")
     if cuda and device != "cpu":
-        onnxruntime.preload_dlls()  # from pip's nvidia packages, which the dynamic linker does not search
+        onnxruntime.preload_dlls()  # in nvidia packages from pip, which the dynamic linker does not search
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = cv2.getNumThreads()
     options.inter_op_num_threads = 1
@@ -146,17 +146,15 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     providers = [CUDA] * (cuda and device != "cpu") + ["CPUExecutionProvider"]
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
-    except Exception as error:  # onnxruntime's errors have no common base
-        raise DataError(
-            f"{path}: expected an ONNX file that onnxruntime can load, got an error: {in_one_line(error)}"
-        ) from error
+    except Exception as error:  # errors of onnxruntime have no common base class
+        raise DataError(f"{path}: expected an ONNX file for onnxruntime, got {in_one_line(error)}") from error
     if device == "cuda" and CUDA not in session.get_providers():
         raise ConfigError("detector.device: expected cpu or auto because CUDA did not start, got cuda")
     return session
 
 
 def _image_input(path: Path, inputs: Sequence[NodeArg]) -> tuple[NodeArg, Shape]:
-    """Return the only input, an image, and its shape. Raises DataError for other inputs."""
+    """Return the single image input and its shape. Raises DataError for other inputs."""
     found = ", ".join(map(_described, inputs))
     wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
     if len(inputs) != 1:
@@ -170,7 +168,10 @@ def _image_input(path: Path, inputs: Sequence[NodeArg]) -> tuple[NodeArg, Shape]
 def _input_shape(
     path: Path, image: NodeArg, channels_last: bool, input_size: int, metadata: ExportMetadata
 ) -> tuple[int, int]:
-    """Return (height, width) px of the input; open dimensions come from `input_size`, else from the file's metadata."""
+    """Return the (height, width) px of the input.
+
+    Dynamic dimensions are set to `input_size`, else to the size in the file's metadata.
+    """
     shape, described = _shape(image), _described(image)
     height, width = shape[1:3] if channels_last else shape[2:]
     if height and width:
@@ -182,7 +183,7 @@ def _input_shape(
     open_height, open_width = (input_size, input_size) if input_size else metadata.image_size
     if not (open_height and open_width):
         raise ConfigError(
-            f"detector.input_size: expected a size in px, got 0 for {path}, whose input has any size ({described})"
+            f"detector.input_size: expected a size in px, got 0 for {path} with dynamic input size ({described})"
         )
     return height or open_height, width or open_width
 
@@ -193,11 +194,11 @@ def _described(tensor: NodeArg) -> str:
 
 
 def _shape(tensor: NodeArg) -> Shape:
-    return tuple(n if isinstance(n, int) else 0 for n in tensor.shape)  # an open dimension has a name, or None
+    return tuple(n if isinstance(n, int) else 0 for n in tensor.shape)  # a dynamic dimension is a name or None
 
 
 def find_file(path: Path) -> Path:
-    """Return the file `path`; a relative path is searched in the working, then in the project folder."""
+    """Return the file `path`. A relative path is searched in the working folder, then in the project folder."""
     for candidate in candidates(path):
         if candidate.is_file():
             return candidate
@@ -208,7 +209,7 @@ def find_file(path: Path) -> Path:
 
 
 def checked_hash(path: Path, sha256: str) -> str:
-    """Return the SHA-256 (hex) of a file. Raises DataError if it is not `sha256`; "" = any."""
+    """Compute the SHA-256 (hex) of a file. Raises DataError if it differs from `sha256`; "" = any."""
     try:
         found = path_hash(path)
     except OSError as error:
@@ -220,20 +221,20 @@ def checked_hash(path: Path, sha256: str) -> str:
 
 @dataclass(frozen=True)
 class ExportMetadata:
-    """Metadata that the exporter wrote to the file; empty if missing or in another form."""
+    """Metadata from the exporter; empty if missing or in an unknown format."""
 
-    names: tuple[str, ...] = ()  # of the classes, in the order of the scores
-    image_size: tuple[int, int] = (0, 0)  # (height, width) px of the export; 0 = unknown
+    names: tuple[str, ...] = ()  # class names, in the order of the scores
+    image_size: tuple[int, int] = (0, 0)  # (height, width) px of the exported input; 0 = unknown
     author: str = ""
 
     @classmethod
     def parse(cls, texts: Mapping[str, str]) -> ExportMetadata:
-        """Parse the file's key-value pairs, whose values are Python or JSON literals."""
+        """Parse key-value pairs with Python or JSON literals as values."""
         return cls(_names(texts.get("names", "")), _size(texts.get("imgsz", "")), texts.get("author", ""))
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """Return the names of {0: "person", ...}, with numbers or numerals as keys."""
+    """Parse class names such as {0: "person", ...}; keys are integers or strings of digits."""
     names = _literal(text)
     if not isinstance(names, dict):
         return ()
@@ -242,7 +243,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Return (height, width) of [height, width] or of one number for both."""
+    """Parse the (height, width) from [height, width] or from one number for both."""
     sides = _literal(text)
     height, width = sides if isinstance(sides, list) and len(sides) == 2 else (sides, sides)
     if isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0:

@@ -1,1 +1,1 @@
-"""Stored detections."""
+"""Readers and writers of stored detections."""

@@ -1,4 +1,4 @@
-"""Cache of detections on disk: an ablation over refiners and fusers runs its network once."""
+"""Cache of detections on disk. An ablation over refiners and fusers runs its network only once."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from framework.interfaces import Detector
 
 log = logging.getLogger(__name__)
 
-FORMAT = 2  # of the entries; part of the keys, so that entries of another format are never found
-CHECKSUM_BYTES = 32  # SHA-256 of an entry's name and content, in front of the content
+FORMAT = 2  # version of the entries; part of the keys, so that other versions are never read
+CHECKSUM_BYTES = 32  # SHA-256 of an entry's name and content, stored before the content
 SUFFIX = ".detections"
-LARGEST_ENTRY = 2**30  # bytes; a thousand masks of 1 MB of run lengths
-EMBEDDINGS, SPACE = "embeddings", "embedding_space"  # of Detections, in entries that have them
+LARGEST_ENTRY = 2**30  # bytes; 1000 masks with 1 MB of run lengths each
+EMBEDDINGS, SPACE = "embeddings", "embedding_space"  # optional fields of Detections
 FRAME_FIELDS = tuple(field.name for field in fields(Frame))
-KEPT = ("boxes", "scores", "class_probabilities")  # of Detections: arrays that are stored unchanged
+KEPT = ("boxes", "scores", "class_probabilities")  # fields of Detections that are stored unchanged
 
 
 class CacheMode(Enum):
-    """The values of `detection_cache`."""
+    """Values of `detection_cache`."""
 
     OFF = "off"
     READ_WRITE = "read_write"
@@ -44,28 +44,28 @@ class CacheMode(Enum):
 
 @runtime_checkable
 class ReadsFields(Protocol):
-    """Interface of detectors that read only some fields of a frame, so that more frames share an entry."""
+    """Interface of detectors with a declared set of input fields, so that more frames share an entry."""
 
     reads: tuple[str, ...]  # names of fields of Frame
 
 
 @runtime_checkable
 class Fingerprinted(Protocol):
-    """A detector whose weights are not identified by its parameters, for example a name on the network."""
+    """Interface of detectors with weights that parameters do not identify, such as a model name on a hub."""
 
     def fingerprint(self) -> str:
-        """Return a hash of everything besides the frame that the detections depend on, `fingerprint(self)` included."""
+        """Return a hash of all inputs of the detections except the frame, including `fingerprint(self)`."""
 
 
 @dataclass
 class CachedDetector(Detector):
     """Cache of byte-identical detections for frames already processed by `detector`.
 
-    The key of an entry consists of the detector's fingerprint, its classes, and the fields of the frame that it reads.
-    So another parameter, weight or image misses, and the same image in another video hits. Several processes may share
-    a folder: writes are atomic, and equal keys have equal entries. A damaged entry is logged and computed again.
-    Entries are never removed here; they can be deleted at any time. Frames are processed one at a time even if
-    `detector` is concurrent, because equal frames at once would each count as a miss.
+    The key of an entry consists of the fingerprint and classes of the detector and its input fields of the frame. A
+    different parameter, weight or image is a cache miss. The same image in another video is a hit. Several processes
+    may share a folder, because writes are atomic and equal keys have equal entries. A damaged entry is logged and
+    computed again. Entries are never removed automatically, and you can delete them at any time. Frames are processed
+    one at a time even if `detector` is concurrent, because concurrent equal frames would each count as a miss.
     """
 
     detector: Detector
@@ -113,9 +113,12 @@ class CachedDetector(Detector):
             log.warning("detection cache: %s; detecting the frame again", error)
             return None
         content = data[CHECKSUM_BYTES:]
-        if _checksum(path, content) != data[:CHECKSUM_BYTES]:
+        if (found := _checksum(path, content)) != data[:CHECKSUM_BYTES]:
             log.warning(
-                "detection cache: %s: expected a matching checksum, got another one; detecting the frame again", path
+                "detection cache: %s: expected sha256 %s, got %s; detecting the frame again",
+                path,
+                data[:CHECKSUM_BYTES].hex(),
+                found.hex(),
             )
             return None
         return unpack(content, self.classes)
@@ -127,35 +130,35 @@ class CachedDetector(Detector):
                 temporary.write_bytes(_checksum(path, content) + content)
         except DataError as error:
             self._writes = False
-            log.warning("detection cache: %s; storing nothing more in this run", error)
+            log.warning("detection cache: %s; storing no more detections in this run", error)
 
 
 def _checksum(path: Path, content: bytes) -> bytes:
-    """Return the SHA-256 of an entry's name and content, which fails for an entry moved to another key."""
+    """Compute the SHA-256 of an entry's name and content; the name detects entries moved to another key."""
     return hashlib.sha256(f"{path.parent.name}/{path.name}\n".encode() + content).digest()
 
 
 def fields_read(detector: Detector) -> tuple[str, ...]:
-    """Return the fields of Frame that the detections depend on; all unless the detector declares them."""
+    """Return the input fields of the detector; all fields of Frame unless the detector declares `reads`."""
     return detector.reads if isinstance(detector, ReadsFields) else FRAME_FIELDS
 
 
 def identity_of(detector: Detector) -> str:
-    """Return the detector's own fingerprint, else that of its class, code and parameters."""
+    """Return the fingerprint defined by the detector, or the hash of its class, code and parameters."""
     if not isinstance(detector, Fingerprinted):
         return fingerprint(detector)
     try:
         return detector.fingerprint()
-    except AttributeError as error:  # plugins written when Detector had this method call super()
+    except AttributeError as error:  # older plugins call super().fingerprint(), which Detector no longer defines
         raise ConfigError(
             f"{type(detector).__name__}.fingerprint: {error}; call fingerprint() of {fingerprint.__module__}"
         ) from error
 
 
 def with_cache(detector: Detector, config: DictConfig) -> Detector:
-    """Return `detector` with the cache of the config's `detection_cache` and `detection_cache_dir`."""
+    """Add the cache configured by `detection_cache` and `detection_cache_dir` to a detector."""
     asked = config.detection_cache
-    named = "off" if asked is False else asked  # YAML reads an unquoted off as false
+    named = "off" if asked is False else asked  # YAML parses an unquoted off as false
     modes = {mode.value: mode for mode in CacheMode}
     if named not in modes:
         raise ConfigError(f"detection_cache: expected one of {', '.join(modes)}, got {asked!r}")
@@ -171,16 +174,17 @@ def with_cache(detector: Detector, config: DictConfig) -> Detector:
 
 
 def cache_metrics(detector: Detector) -> Mapping[str, int]:
-    """Return the hits and misses for metrics.json, empty without a cache. A frame with an error is neither."""
+    """Return the hits and misses for metrics.json, empty without a cache; frames with errors do not count."""
     if not isinstance(detector, CachedDetector):
         return {}
     return {"detection_cache.hits": detector.hits, "detection_cache.misses": detector.misses}
 
 
 def frame_hash(frame: Frame, reads: tuple[str, ...]) -> str:
-    """Return the SHA-256 (hex) of these fields of a frame; with SHA instructions it is faster than BLAKE2.
+    """Compute the SHA-256 (hex) of the fields `reads` of a frame.
 
-    Truth that is not rendered yet is identified by its origin, so that a hit avoids rendering.
+    SHA-256 is faster than BLAKE2 on processors with SHA instructions. Ground truth that is not rendered yet is
+    identified by its origin, so that a hit avoids rendering.
     """
     digest = hashlib.sha256()
     for name in sorted(reads):
@@ -191,19 +195,19 @@ def frame_hash(frame: Frame, reads: tuple[str, ...]) -> str:
                 digest.update(f"of {value.origin};".encode())
             else:
                 add_array(digest, value.instance_ids)
-            # repr distinguishes None from "None"; sorting removes the insertion order
+            # repr distinguishes None from "None"; sorting makes the hash independent of the insertion order
             digest.update(repr(sorted(value.class_names.items())).encode())
         elif isinstance(value, np.ndarray):
             add_array(digest, value)
-        else:  # numbers, the camera and None: repr of a float is exact
+        else:  # numbers, camera and None; repr of a float is exact
             digest.update(f"{value!r};".encode())
     return digest.hexdigest()
 
 
 def pack(detections: Detections) -> bytes:
-    """Return an entry: safetensors with the arrays, and the run lengths of each mask inside its tight box.
+    """Pack detections into an entry: safetensors of the arrays, with run lengths of each mask inside its tight box.
 
-    The runs go along rows, not columns as in COCO's format, so that nothing is transposed.
+    Runs are along rows. COCO's format has runs along columns, which would require a transposition.
     """
     from safetensors.numpy import save
 
@@ -229,7 +233,7 @@ def pack(detections: Detections) -> bytes:
 
 
 def unpack(content: bytes, classes: tuple[str, ...]) -> Detections:
-    """Return the detections of an entry with a valid checksum."""
+    """Unpack the detections from an entry with a valid checksum."""
     from safetensors.numpy import load
 
     stored = load(content)
@@ -246,7 +250,7 @@ def unpack(content: bytes, classes: tuple[str, ...]) -> Detections:
         exact=bool(stored["exact"][0]),
         embeddings=stored[EMBEDDINGS].copy() if EMBEDDINGS in stored else None,
         embedding_space=stored[SPACE].tobytes().decode() if SPACE in stored else "",
-        boxes=stored["boxes"].copy(),  # writable, as the detector's own arrays
+        boxes=stored["boxes"].copy(),  # a copy is writable, like the arrays from a detector
         scores=stored["scores"].copy(),
         class_probabilities=stored["class_probabilities"].copy(),
     )

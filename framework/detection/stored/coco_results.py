@@ -1,7 +1,7 @@
 """COCO result files: a JSON list with an object for each detection of each image (cocodataset.org/#format-results).
 
-In addition to COCO's keys an entry may have `category_name` and `class_probabilities`, the whole distribution. Not read
-by pycocotools, which requires the annotations of the images and does not validate entries.
+In addition to COCO's keys, an entry may have `category_name` and the complete distribution `class_probabilities`.
+pycocotools is not used for reading, because it requires the annotations of the images and does not validate entries.
 """
 
 from __future__ import annotations
@@ -31,36 +31,37 @@ from framework.files.atomic_write import written_whole
 from framework.files.json_file import read_json
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
-MOST_DIGITS = 18  # of a frame number
+MOST_DIGITS = 18  # maximum length of a frame number
 
 
 class CategoryIds(Enum):
-    """The numbering of `category_id`."""
+    """Numbering of `category_id`."""
 
     COCO_91 = "ids of COCO's annotation files: 1 to 90, with gaps"
     FROM_ONE = "indices of the labels, from 1"
     FROM_ZERO = "indices of the labels, from 0"
 
     def of(self, labels: Sequence[str]) -> list[int]:
-        """Return the id of each label. Raises ConfigError if the labels do not have these ids."""
+        """Return the id of each label. Raises ConfigError if the labels do not match this numbering."""
         if self is not CategoryIds.COCO_91:
             return list(range(len(labels))) if self is CategoryIds.FROM_ZERO else list(range(1, len(labels) + 1))
         if tuple(labels) != COCO:
             raise ConfigError(
-                "detector.category_ids: expected FROM_ONE or FROM_ZERO unless label_space is coco, got COCO"
+                "detector.category_ids: expected FROM_ONE or FROM_ZERO unless label_space is coco, got COCO_91"
             )
         return [k for k, name in enumerate(COCO_BY_ID) if name != NO_CLASS]
 
 
 def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:
-    """Return the detections of a result file, in its order. Raises DataError, naming file and entry, for invalid ones.
+    """Read the detections from a result file, in the order of the file.
 
-    `segmentation`: run lengths (packed or a list) or polygons. `image_id`: `Frame.index`, as a number or as the image's
-    file name ("color/000012.png"). `category_id` is used only without `category_name`.
+    `segmentation`: run lengths (packed or a list) or polygons. `image_id`: `Frame.index`, as a number or as the file
+    name of the image ("color/000012.png"). `category_id` is used only without `category_name`. Raises DataError that
+    names file and entry for an invalid entry.
     """
     entries = read_json(path)
     if not isinstance(entries, list):
-        raise DataError(f"{path}: expected a list of results in COCO's format, got an object")
+        raise DataError(f"{path}: expected a list of results in COCO's format, got {entries!r:.100}")
     index = {name: k for k, name in enumerate(labels)}
     names: dict[int, str] | None = None
     found: list[StoredDetection] = []
@@ -77,8 +78,8 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
                 image, frame = PurePosixPath(entry["image_id"]), found[-1].frame
                 if (other := folders.setdefault(frame, image.parent)) != image.parent:
                     raise DataError(
-                        f"{image}: expected one image for each frame, got another one of frame {frame} in {other}/; "
-                        "split by sequence"
+                        f"{image}: expected one image of frame {frame}, got another image in {other}/; "
+                        "split the file by sequence"
                     )
     return found
 
@@ -110,9 +111,9 @@ def _read_image_id(found: Any) -> int:
     if type(found) is int and found >= 0:
         return found
     name = PurePosixPath(found if isinstance(found, str) else "")
-    stem = "" if name.suffix[1:].isdigit() else name.stem  # 12.5 is no file name
+    stem = "" if name.suffix[1:].isdigit() else name.stem  # 12.5 is not a file name
     if not (stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS):
-        raise DataError(f"image_id: expected the number of the frame, or a file name that is one, got {found!r}")
+        raise DataError(f"image_id: expected a frame number, or a file name such as 000012.png, got {found!r}")
     return int(stem)
 
 
@@ -132,7 +133,7 @@ def _read_segmentation(found: Any) -> Segmentation:
     size = found.get("size") if isinstance(found, Mapping) else None
     if not isinstance(size, list) or len(size) != 2 or not all(type(side) is int and side > 0 for side in size):
         raise DataError(
-            "segmentation: expected run lengths with size [height, width], or a list of polygons, got other values"
+            f"segmentation: expected run lengths with size [height, width], or a list of polygons, got {found!r:.200}"
         )
     shape = (size[0], size[1])
     if shape[0] * shape[1] > MOST_PIXELS:
@@ -141,7 +142,7 @@ def _read_segmentation(found: Any) -> Segmentation:
     if isinstance(counts, list):
         return RunLengths(pack(counts, shape), shape)
     if not isinstance(counts, str) or not counts.isascii():
-        raise DataError("segmentation.counts: expected a packed string or a list of run lengths, got another type")
+        raise DataError(f"segmentation.counts: expected a packed string or a list of run lengths, got {counts!r:.100}")
     check(counts.encode(), shape)
     return RunLengths(counts.encode(), shape)
 
@@ -149,9 +150,9 @@ def _read_segmentation(found: Any) -> Segmentation:
 def _read_polygons(found: Sequence[Any]) -> Polygons:
     for outline in found:
         if not isinstance(outline, list) or len(outline) < 6 or len(outline) % 2:
-            raise DataError("polygon: expected a list x1, y1, x2, y2, ... of three points or more, got other values")
+            raise DataError(f"polygon: expected a list x1, y1, x2, y2, ... for at least 3 points, got {outline!r:.100}")
         if not all(isinstance(x, int | float) and np.isfinite(x) for x in outline):
-            raise DataError("polygon: expected coordinates in px, got other values")
+            raise DataError(f"polygon: expected coordinates in px, got {outline!r:.100}")
     if not found:
         raise DataError("segmentation: expected a polygon, got none")
     return Polygons(tuple(tuple(float(x) for x in outline) for outline in found))
@@ -164,14 +165,14 @@ class ResultWriter:
         self._file = file
         self._classes = classes
         self._ids = (CategoryIds.COCO_91 if classes == COCO else CategoryIds.FROM_ONE).of(classes)
-        self.count = 0  # entries written
+        self.count = 0  # number of written entries
         self.frames = 0
 
     def write(self, frame: int, detections: Detections) -> None:
-        """Write the detections of frame number `frame`."""
+        """Write the detections of the frame with index `frame`."""
         height, width = detections.masks.shape[1:]
         best = detections.class_probabilities.argmax(axis=1).tolist()
-        boxes = detections.boxes.astype(np.float64)  # so that x + width is exactly x2
+        boxes = detections.boxes.astype(np.float64)  # float64 makes x + width exactly x2
         for k, counts in enumerate(encode(detections.masks)):
             x1, y1, x2, y2 = boxes[k].tolist()
             entry = {
@@ -191,7 +192,7 @@ class ResultWriter:
 
 @contextmanager
 def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]:
-    """Write a result file of a detector with these classes, atomically when the block ends."""
+    """Open a result file for a detector with these classes; the file appears atomically at the end of the block."""
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write("[\n")
         yield ResultWriter(file, classes)
@@ -199,5 +200,5 @@ def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]
 
 
 def _shortest(values: Float32) -> list[float]:
-    """Return the numbers with the fewest digits that identify a float32, which halves the file."""
+    """Round float32 values to the fewest digits that identify them, which halves the file size."""
     return [float(text) for text in values.astype(str)]

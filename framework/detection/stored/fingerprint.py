@@ -1,4 +1,4 @@
-"""Fingerprint of a detector: one hash of everything besides the frame that its detections depend on."""
+"""Fingerprint of a detector: a hash of all inputs of its detections except the frame."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from framework.files.hashing import path_hash
 from framework.files.search_paths import candidates
 
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transformers")
-"""Libraries whose version may change the last digits."""
+"""Libraries whose versions may change the last digits of the results."""
 
-SHARED_SOURCES = ("detection/**/*.py", "vocabulary/label_spaces.*")  # in framework/: the code that detectors share
-NOT_GIVEN = Path()  # value of `path: ""` in a config
+SHARED_SOURCES = ("detection/**/*.py", "vocabulary/label_spaces.*")  # code shared by detectors, in framework/
+NOT_GIVEN = Path()  # value of an empty path in a config
 
 
 def fingerprint(detector: object) -> str:
-    """Return the SHA-256 (hex) of a dataclass instance's class, code and parameters.
+    """Compute the SHA-256 (hex) of the class, code and parameters of a dataclass instance.
 
-    Code is the modules of its class and base classes, framework.detection, and the versions of numerical libraries. A
-    Path, or a str that names an existing file or folder, is identified by its content, with all files below a folder;
-    relative paths are searched in the working, then in the project folder. `device: auto` is identified by the device
-    that is used. The number of threads is not included.
+    The code comprises the modules of the class and its base classes, framework.detection, and the versions of numerical
+    libraries. A path, or a str that names an existing file or folder, is identified by its content. A folder includes
+    all files below it. Relative paths are searched in the working folder, then in the project folder. `device: auto` is
+    identified by the selected device. The number of threads is not included.
 
-    Raises ConfigError for a missing path, and for code without a file (a notebook's): such a class needs its own method
-    `fingerprint`.
+    Raises ConfigError for a missing path and for code without a source file, such as a class in a notebook. Such a
+    class must define a method `fingerprint`.
     """
     kind = type(detector)
     digest = hashlib.sha256()
@@ -45,7 +45,7 @@ def _code(kind: type) -> Iterator[str]:
         source = getattr(sys.modules.get(module), "__file__", None)
         if source is None:
             raise ConfigError(
-                f"{kind.__qualname__}: expected a source file to identify it by, got none; implement fingerprint()"
+                f"{kind.__qualname__}: expected a class in a source file, got none; implement fingerprint()"
             )
         yield path_hash(Path(source))
     framework = Path(__file__).resolve().parents[2]
@@ -61,7 +61,7 @@ def _code(kind: type) -> Iterator[str]:
 def _parameters(detector: object) -> Iterator[str]:
     if not dataclasses.is_dataclass(detector):
         raise ConfigError(
-            f"{type(detector).__qualname__}: expected a dataclass, got another class; implement fingerprint()"
+            f"{type(detector).__qualname__}: expected a dataclass, got a class without fields; implement fingerprint()"
         )
     for field in dataclasses.fields(detector):
         value = getattr(detector, field.name)
@@ -80,7 +80,7 @@ def _parameters(detector: object) -> Iterator[str]:
 
 
 def _is_path(value: str) -> bool:
-    """Return whether a str parameter names an existing path, and is not a name such as `auto`."""
+    """Return True if a str parameter is an existing path, not a name such as `auto`."""
     try:
         return value not in ("", ".") and any(candidate.exists() for candidate in candidates(Path(value)))
     except (OSError, ValueError):  # too long for a file name
@@ -88,11 +88,11 @@ def _is_path(value: str) -> bool:
 
 
 def content_hash(path: Path) -> str:
-    """Return `path_hash` of the file or folder that a path leads to; "" for an empty path."""
+    """Compute the `path_hash` of the file or folder at a path; "" for an empty path."""
     if path == NOT_GIVEN:
         return ""
     found = next((candidate for candidate in candidates(path) if candidate.exists()), None)
     if found is None:
         looked = " and ".join(str(candidate) for candidate in candidates(path))
-        raise ConfigError(f"{looked}: expected a file to identify the detector by, got none; implement fingerprint()")
+        raise ConfigError(f"{looked}: expected an existing file, got none; set another path or implement fingerprint()")
     return path_hash(found)

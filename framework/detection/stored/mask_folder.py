@@ -1,4 +1,4 @@
-"""A folder of masks: for each frame NNNNNN.png with instance ids and NNNNNN.json with their classes and scores."""
+"""Mask folders. Each frame has an image NNNNNN.png of instance ids and a file NNNNNN.json of classes and scores."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from framework.errors import DataError, errors_of
 from framework.files.image_files import read_uint16
 from framework.files.json_file import read_json
 
-_read_ids = lru_cache(maxsize=1)(read_uint16)  # the detections of a frame share its image
+_read_ids = lru_cache(maxsize=1)(read_uint16)  # the detections of a frame share an image
 
 LARGEST_ID = np.iinfo(np.uint16).max
 
 
 @dataclass(frozen=True)
 class InstanceOfImage(Segmentation):
-    """The pixels of an image with an id."""
+    """The pixels with an id in an image."""
 
     path: Path
     id: int
@@ -43,17 +43,18 @@ class InstanceOfImage(Segmentation):
 
 
 def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetection]:
-    """Return the detections of a folder of masks. Raises DataError, naming file and entry, for invalid ones.
+    """Read the detections from a mask folder.
 
-    NNNNNN is `Frame.index`; the PNG has one channel of 16 bits; the JSON is a list of {"id", "class", "score"} and
-    optionally "class_probabilities". Ids that are not listed are no detections. Masks cannot overlap.
+    NNNNNN is `Frame.index`. The PNG has one channel of 16 bits. The JSON is a list of {"id", "class", "score"} and
+    optionally "class_probabilities". Unlisted ids are not detections. Masks cannot overlap. Raises DataError that names
+    file and entry for an invalid entry.
     """
     index = {name: k for k, name in enumerate(labels)}
     found: list[StoredDetection] = []
     images: dict[int, Path] = {}
     for path in sorted(folder.glob("*.png")):
         if not (path.stem.isascii() and path.stem.isdigit()):
-            raise DataError(f"{path}: expected the number of the frame as the name, such as 000012.png")
+            raise DataError(f"{path}: expected a file name such as 000012.png (the frame number)")
         frame = int(path.stem)
         if images.setdefault(frame, path) != path:
             raise DataError(
@@ -63,7 +64,7 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
         ids: set[int] = set()
         entries = read_json(description)
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise DataError(f"{description}: expected a list of objects with id, class and score, got other values")
+            raise DataError(f"{description}: expected a list of objects with id, class and score, got {entries!r:.100}")
         for k, entry in enumerate(entries):
             where = f"{description}, entry {k}"
             with errors_of(where):

@@ -1,4 +1,4 @@
-"""Stored detections of any program, validated when they are read."""
+"""Stored detections from other programs, validated on reading."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from framework.data import PROBABILITY_TOLERANCE, Bool, Float32
 from framework.detection.masks.run_length import decode
 from framework.errors import DataError
 
-ROUNDED_SUM = 0.05  # largest |sum - 1| of probabilities that were rounded when printed
-LARGEST = 1e6  # probability that is accepted before the sum is checked
+ROUNDED_SUM = 0.05  # largest |sum - 1| of probabilities with rounded digits
+LARGEST = 1e6  # largest accepted probability before the check of the sum
 
 
 class Segmentation(ABC):
@@ -44,7 +44,7 @@ class RunLengths(Segmentation):
 
 @dataclass(frozen=True)
 class Polygons(Segmentation):
-    """The outlines of an object's parts, each x1 y1 x2 y2 ... px; as in COCO, the image's corner is (0, 0)."""
+    """Outlines of an object's parts, each x1 y1 x2 y2 ... px; as in COCO, the corner of the image is (0, 0)."""
 
     outlines: tuple[tuple[float, ...], ...]
 
@@ -55,7 +55,7 @@ class Polygons(Segmentation):
         )
         if outside > 1:  # px; outlines from annotation tools slightly exceed the image
             raise DataError(
-                f"polygon: expected points in the image of {width}x{height} px, got {outside:g} px outside of it"
+                f"polygon: expected points in the image of {width}x{height} px, got a point {outside:g} px outside"
             )
         runs = coco.merge(coco.frPyObjects([list(outline) for outline in self.outlines], height, width))
         return np.asarray(decode([runs["counts"]], shape)[0], np.bool_)
@@ -63,39 +63,40 @@ class Polygons(Segmentation):
 
 @dataclass(frozen=True)
 class StoredDetection:
-    """One object of one image."""
+    """One object in one image."""
 
     where: str  # file and entry, for errors
     frame: int  # Frame.index
     label: str  # of the file's label space
     score: float  # in [0, 1]
     segmentation: Segmentation
-    probabilities: Float32 | None = None  # (C,) a distribution over the file's label space; None = only the label
-    box: Float32 | None = None  # (4,) x1 y1 x2 y2 px; None = the mask's tight one
+    probabilities: Float32 | None = None  # (C,) distribution over the file's label space; None = label only
+    box: Float32 | None = None  # (4,) x1 y1 x2 y2 px; None = tight box of the mask
     exact: bool = False  # as in Detections
 
 
 def read_score(found: Any) -> float:
-    """Return a score in [0, 1]. Raises DataError for other values."""
+    """Validate a score in [0, 1]. Raises DataError for other values."""
     if isinstance(found, bool) or not isinstance(found, int | float) or not 0 <= found <= 1:
         raise DataError(f"score: expected a number in [0, 1], got {found!r}")
     return float(found)
 
 
 def read_label(found: Any, index: Mapping[str, int]) -> str:
-    """Return a name of the label space. Raises DataError for other values."""
+    """Validate a name in the label space. Raises DataError for other values."""
     if not isinstance(found, str) or found not in index:
         raise DataError(
             f"label: expected one of the {len(index)} names in detector.label_space, got {found!r}; set "
-            "detector.label_space to that of the file"
+            "detector.label_space to the label space of the file"
         )
     return found
 
 
 def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
-    """Return a distribution (C,) over the label space from a list, or a mapping from names (others have 0).
+    """Read a distribution (C,) over the label space from a list or a mapping; None = not given.
 
-    Rounded distributions are normalized, others are unchanged. None = not given. Raises DataError for other values.
+    A mapping has class names as keys; missing names have the probability 0. Only rounded distributions are normalized.
+    Raises DataError for other values.
     """
     if found is None:
         return None
@@ -114,7 +115,7 @@ def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
     if len(given) != len(index):
         raise DataError(f"class_probabilities: expected {len(index)} values, one for each label, got {len(given)}")
     if not all(isinstance(p, int | float) and 0 <= p <= LARGEST for p in given):  # rejects NaN
-        raise DataError("class_probabilities: expected numbers of at least 0 with a sum of 1, got other values")
+        raise DataError(f"class_probabilities: expected numbers of at least 0 with a sum of 1, got {given!r:.200}")
     row = np.array(given, np.float32)
     total = float(row.sum(dtype=np.float64))
     if abs(total - 1) > ROUNDED_SUM:

@@ -10,7 +10,7 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import Solid, cushion, cylinder, lathe, leg, panel, rounded_box, tube
 from framework.synthetic.paints import Material, Texture
 
-WEAVE = 0.04  # m, between the vertices of cloth, fine enough for creases
+WEAVE = 0.04  # m, vertex spacing of cloth, fine enough for creases
 LAMP_GLOW = 2.2  # emission of a lampshade
 
 
@@ -34,7 +34,7 @@ def cupboard(rng: Rng) -> Furniture:
 
 
 def low_board(rng: Rng) -> Furniture:
-    """Return a board for a television."""
+    """Return a random TV board."""
     size = rng.uniform(1.35, 1.6), rng.uniform(0.40, 0.45), rng.uniform(0.46, 0.56)
     return _drawers("low board", rng, *size, 3)
 
@@ -199,7 +199,7 @@ def bowl(rng: Rng) -> Furniture:
 
 
 def painting(rng: Rng) -> Furniture:
-    """Return a framed picture with its back at y = 0."""
+    """Return a framed painting with its back at y = 0."""
     piece = Furniture("picture")
     width, height = rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.65)
     frame = paints.wood(rng)
@@ -308,7 +308,7 @@ def clothes(rng: Rng) -> Furniture:
 
 
 def _crumpled(sheet: Solid, rng: Rng, height: float, fringe: float) -> Solid:
-    """Return the sheet with creases up to `height` m and an uneven border of up to `fringe` m."""
+    """Add creases up to `height` m and an uneven border of up to `fringe` m to a sheet."""
     a, b, c, d = rng.uniform(0, 2 * np.pi, 4)
 
     def crumple(p: Float64) -> Float64:

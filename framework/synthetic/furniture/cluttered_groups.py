@@ -1,4 +1,4 @@
-"""Hard cases as groups: objects on beds, couches and tables, rows of equal objects, and neighbors that touch."""
+"""Difficult furniture groups: objects on beds, couches and tables, rows of identical objects, touching neighbors."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import SPACING
 from framework.synthetic.paints import Texture
 
-PILLOWS = 0.68  # m, from the wall to the free part of a bed
-BACKREST = 0.50  # m, from the wall to the free part of a couch
+PILLOWS = 0.68  # m, distance from the wall to the free part of a bed
+BACKREST = 0.50  # m, distance from the wall to the free part of a couch
 BORDER = 0.06  # m, empty border of a bed or couch
 ARM = 0.24  # m, maximum width of a couch arm
-SINK = 0.012  # m, depth by which objects sink into soft surfaces
+SINK = 0.012  # m, penetration depth of objects in soft surfaces
 PLACES = 60  # candidate positions of each scattered object
-TOUCHING = (0.001, 0.005)  # m, gap between neighbors, below sensor resolution
+TOUCHING = (0.001, 0.005)  # m, gap between touching neighbors, below sensor resolution
 LADEN_CHAIRS = 0.5  # fraction of the chairs along a wall with an object on them
-SEAT = 0.19  # m, from the front of a chair to the middle of its seat
+SEAT = 0.19  # m, distance from the front of a chair to the middle of its seat
 LEATHER_COUCHES = 0.3  # fraction of black leather couches
 RIM = 0.02  # m, empty border of a table
-APRON = 0.13  # m, height of the space below a table's top that a chair cannot enter
+APRON = 0.13  # m, height of the blocked space below a table top
 
 
 def cluttered_bed_group(rng: Rng) -> Group:
-    """Return a cluttered bed: a blanket, clothes, cushions, a bag, books."""
+    """Return a bed with a blanket, clothes, cushions, a bag and books."""
     group = bed_group(rng)
     bed, stand = group.pieces[:2]
     side = 1 if stand.bounds()[0][0] > 0 else -1
@@ -48,7 +48,7 @@ def cluttered_bed_group(rng: Rng) -> Group:
 
 
 def cluttered_couch_group(rng: Rng) -> Group:
-    """Return a couch with cushions, a blanket, a bag and books, and a full coffee table that touches it."""
+    """Return a couch with cushions, a blanket, a bag and books, and a touching, cluttered coffee table."""
     group = cluttered_couch(rng)
     front = float(group.pieces[0].bounds()[1][1])
     table = tabletops.coffee_table(rng)
@@ -60,7 +60,7 @@ def cluttered_couch_group(rng: Rng) -> Group:
 
 
 def cluttered_couch(rng: Rng) -> Group:
-    """Return the couch without a table."""
+    """Return a cluttered couch without a table."""
     group = Group("couch")
     couch = seating.bare_couch(rng)
     if rng.uniform() < LEATHER_COUCHES:
@@ -71,7 +71,7 @@ def cluttered_couch(rng: Rng) -> Group:
 
 
 def _in_leather(couch: Furniture, rng: Rng) -> Furniture:
-    """Return the couch with black leather."""
+    """Replace the fabric of a couch with black leather."""
     hide = paints.leather(rng)
     parts = [(solid, hide if material.texture is Texture.FABRIC else material) for solid, material in couch.parts]
     return Furniture(couch.kind, couch.class_name, parts)
@@ -100,9 +100,9 @@ def _clutter_couch(group: Group, rng: Rng) -> None:
 def _scatter(
     group: Group, lying: list[Furniture], low: Float64, high: Float64, rng: Rng, things: list[Furniture]
 ) -> None:
-    """Place things on the first piece of `lying`, between the corners `low` and `high` (2,), m.
+    """Place `things` on the first object of `lying`, between the corners `low` and `high` (2,), m.
 
-    They do not overlap other pieces or each other, except blankets. Things without a free position are omitted.
+    The objects do not overlap, except blankets. Objects without a free position are omitted.
     """
     lying = [*lying]
     in_the_way = [np.stack(piece.bounds()) for piece in lying[1:]]
@@ -120,7 +120,7 @@ def _scatter(
 
 
 def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
-    """Place `thing` lengthwise or across, randomly between the corners, or centered if it is too large."""
+    """Place `thing` lengthwise or across at a random position between the corners; center a large object."""
     turned = thing.placed(0.0, 0.0, 0.0, np.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.3, 0.3))
     turned_low, turned_high = turned.bounds()
     middle = (turned_low + turned_high)[:2] / 2
@@ -142,7 +142,7 @@ def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
 
 
 def chair_row(rng: Rng, count: int) -> Group:
-    """Return a row of equal, touching chairs along the wall, some with objects on them."""
+    """Return a row of identical, touching chairs along the wall, some with objects on them."""
     group = Group("chair row")
     chair = seating.chair(rng)
     pitch = size(chair)[0] + _touch(rng)
@@ -166,7 +166,7 @@ def _lay_on_seat(group: Group, chair: Furniture, thing: Furniture) -> None:
 
 
 def desk_row(rng: Rng, count: int) -> Group:
-    """Return equal, touching desks, each with an identical office chair under it and different objects on it."""
+    """Return identical, touching desks with identical office chairs and different objects."""
     group = Group("desk row")
     desk, chair = tabletops.desk(rng), seating.office_chair(rng)
     pitch = size(desk)[0] + _touch(rng)
@@ -179,7 +179,7 @@ def desk_row(rng: Rng, count: int) -> Group:
 
 
 def laid_table_group(rng: Rng) -> Group:
-    """Return a long table with many things, two equal adjacent chairs pushed under it, one or two at its ends."""
+    """Return a long table with many objects, two identical adjacent chairs, and one or two chairs at its ends."""
     group = Group("dining")
     table = tabletops.long_table(rng)
     table = group.add(table, y=against_wall(table))
@@ -197,7 +197,10 @@ def laid_table_group(rng: Rng) -> Group:
 
 
 def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Furniture:
-    """Return a chair pushed under a table that faces +y, `x` m from its middle, until back or arms touch."""
+    """Push a chair under a table until its back or arms touch.
+
+    The table faces +y, and the chair is `x` m from its middle.
+    """
     low, high = table.bounds()
     turned = chair.placed(0, 0, 0, np.pi)
     stopped = _between(turned, float(high[2]) - APRON, float(high[2]))
@@ -206,7 +209,7 @@ def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Fu
 
 
 def _between(piece: Furniture, bottom: float, top: float) -> Float64:
-    """Return the points (N, 3) of a piece's parts that reach into the heights from `bottom` to `top`, m."""
+    """Return the vertices (N, 3) of an object near the heights from `bottom` to `top`, m."""
     solids = [solid.vertices for solid, _ in piece.parts]
     reaching = [v for v in solids if v[:, 2].max() > bottom and v[:, 2].min() < top]
     sections = [v[(v[:, 2] > bottom - SPACING) & (v[:, 2] < top + SPACING)] for v in reaching]
@@ -214,7 +217,7 @@ def _between(piece: Furniture, bottom: float, top: float) -> Float64:
 
 
 def strew_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
-    """Place things at free positions on a flat top, possibly touching. Things without a free position are omitted."""
+    """Place `things` at free positions on a flat top, possibly touching; omit objects without a free position."""
     low, high = table.bounds()
     there: list[Float64] = []
     for thing in things:
@@ -234,7 +237,7 @@ def _touch(rng: Rng) -> float:
 
 
 def board_group(rng: Rng) -> Group:
-    """Return a low board with books in piles and rows and a bag against it."""
+    """Return a low board with piles and rows of books, and a bag next to the board."""
     group = Group("board")
     board = clutter.low_board(rng)
     board = group.add(board, y=against_wall(board))
@@ -247,7 +250,7 @@ def board_group(rng: Rng) -> Group:
 
 
 def laden(name: str, support: Furniture, rng: Rng) -> Group:
-    """Return a cupboard or another tall piece with things on top."""
+    """Return a cupboard or another tall support with objects on top."""
     group = single(name, support)
     strew_on(group, group.pieces[0], rng, small_things.some(rng, small_things.ON_TOPS, 2))
     return group

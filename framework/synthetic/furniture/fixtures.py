@@ -1,4 +1,4 @@
-"""Refrigerators, televisions, toilets, and backpacks."""
+"""Refrigerators, televisions, toilets and backpacks."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _ring(a: float, b: float, inner_a: float, inner_b: float, height: float, fro
     """Return a toilet seat: an egg-shaped ring about y = 0.03, from z = 0 to `height`."""
     n, m = 40, 8
     around, across = np.meshgrid(np.linspace(0, 2 * np.pi, n + 1), np.linspace(0, 2 * np.pi, m + 1), indexing="ij")
-    blend = 0.5 + 0.5 * np.cos(across)  # 1 at the outer edge, 0 at the inner one
+    blend = 0.5 + 0.5 * np.cos(across)  # 1 at the outer edge, 0 at the inner edge
     stretch = np.where(np.sin(around) > 0, blend * front + (1 - blend) * inner_front, 1.0)
     x = (blend * a + (1 - blend) * inner_a) * np.cos(around)
     y = 0.03 + (blend * b + (1 - blend) * inner_b) * np.sin(around) * stretch

@@ -1,6 +1,6 @@
-"""Furniture groups: a bed with its nightstand, a table with chairs and objects on it.
+"""Furniture groups, such as a bed with a nightstand or a table with chairs and objects.
 
-A group is at the origin, with its back at y = 0, facing +y.
+The back of a group is at y = 0. The group is at the origin and faces +y.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 
 Place = tuple[float, float, float]  # x, y (m) and angle (rad, counter-clockwise from above)
 
-WALL_GAP = 0.015  # m, between a wall and furniture against it
+WALL_GAP = 0.015  # m, between a wall and adjacent furniture
 
 
 @dataclass
 class Group:
-    """Pieces in a common frame."""
+    """Objects in a common frame."""
 
     name: str
     pieces: list[Furniture] = field(default_factory=list)
-    opposite: str = ""  # name of the group that it should face
+    opposite: str = ""  # name of the preferred group on the opposite wall
 
     def add(self, piece: Furniture, x: float = 0.0, y: float = 0.0, z: float = 0.0, angle: float = 0.0) -> Furniture:
         placed = piece.placed(x, y, z, angle)
@@ -36,33 +36,33 @@ class Group:
 
     @property
     def boxes(self) -> Float64:
-        """Axis-aligned boxes (N, 2, 3) of the pieces, m."""
+        """Axis-aligned boxes (N, 2, 3) of the objects, m."""
         return np.array([piece.bounds() for piece in self.pieces])
 
     @property
     def solid(self) -> Bool:
-        """Mask (N,) of the solid pieces: all but rugs."""
+        """Mask (N,) of the solid objects, which excludes rugs."""
         return np.array([piece.kind != "rug" for piece in self.pieces])
 
 
 def against_wall(piece: Furniture) -> float:
-    """Return the y at which the piece's back touches the plane y = 0."""
+    """Return the y offset of an object with its back at the wall, the plane y = 0."""
     return WALL_GAP - float(piece.bounds()[0][1])
 
 
 def on_top(piece: Furniture) -> float:
-    """Return the height of the piece's uppermost point, m."""
+    """Return the height of the object's uppermost point, m."""
     return float(piece.bounds()[1][2]) + 0.001
 
 
 def size(piece: Furniture) -> Float64:
-    """Return the size (3,) of a piece in m."""
+    """Return the size (3,) of an object, m."""
     low, high = piece.bounds()
     return high - low
 
 
 def beside(piece: Furniture, other: Furniture, side: int, gap: float) -> float:
-    """Return the x at which `piece` stands `gap` m to the right (side 1) or left (side -1) of `other`."""
+    """Return the x offset of `piece`, `gap` m to the right (side 1) or left (side -1) of `other`."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(other_high[0] + gap - low[0] if side > 0 else other_low[0] - gap - high[0])
 
@@ -98,7 +98,7 @@ def with_low_table(couch: Furniture, rng: Rng) -> Group:
 
 
 def put_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
-    """Put things on a table, side by side along its length."""
+    """Place `things` on a table, side by side along its length."""
     low, high = table.bounds()
     slots = np.linspace(low[0], high[0], len(things) + 1)
     for thing, left, right in zip(things, slots[:-1], slots[1:], strict=True):
@@ -122,14 +122,14 @@ def tv_group(rng: Rng) -> Group:
 
 
 def dining_group(rng: Rng) -> Group:
-    """Return a table with chairs on two or three sides, two of them side by side and nearly touching."""
+    """Return a table with chairs on up to three sides; two chairs are side by side and nearly touch."""
     group = Group("dining")
     table = tabletops.dining_table(rng)
     group.add(table, y=against_wall(table) + 0.03)
     table = group.pieces[0]
     low, high = table.bounds()
     make = int(rng.integers(2**31))
-    chairs = [seating.chair(np.random.default_rng(make)) for _ in range(4)]  # a set of equal chairs
+    chairs = [seating.chair(np.random.default_rng(make)) for _ in range(4)]  # a set of identical chairs
     width = size(chairs[0])[0]
     gap = rng.uniform(0.012, 0.05)
     is_round = table.kind == "round table"
@@ -140,7 +140,7 @@ def dining_group(rng: Rng) -> Group:
         group.add(chair, side * (width + gap) / 2, y)
     for side, piece in zip((-1, 1), chairs[2:], strict=True):
         if rng.uniform() < 0.75:
-            chair = piece.placed(0, 0, 0, side * np.pi / 2)  # +y turned to -x (side 1) or +x
+            chair = piece.placed(0, 0, 0, side * np.pi / 2)  # +y is rotated to -x (side 1) or +x (side -1)
             x = (
                 high[0] - chair.bounds()[0][0] + rng.uniform(0.02, 0.10)
                 if side > 0
@@ -190,7 +190,7 @@ def desk_group(rng: Rng) -> Group:
 
 
 def single(name: str, piece: Furniture, z: float = 0.0, hung: bool = False) -> Group:
-    """Return a group of one piece."""
+    """Return a group with one object."""
     group = Group(name)
     group.add(piece, y=0.002 if hung else against_wall(piece), z=z)
     return group

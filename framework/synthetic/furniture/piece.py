@@ -1,4 +1,4 @@
-"""Furniture in a local frame: at the origin on z = 0, facing +y."""
+"""Furniture in a local frame: at the origin, standing on z = 0 and facing +y."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ Rng = np.random.Generator
 
 @dataclass
 class Furniture:
-    """One object: its parts, each a solid of one material."""
+    """One object, composed of solid parts with one material each."""
 
-    kind: str  # readable name: "office chair"
-    class_name: str | None = None  # COCO's name; None = not evaluated
+    kind: str  # readable name, such as "office chair"
+    class_name: str | None = None  # COCO name; None = not evaluated
     parts: list[tuple[Solid, Material]] = field(default_factory=list)
 
     def add(self, solid: Solid, material: Material, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> None:
-        """Add a part, moved by x, y, z m."""
+        """Add a part at the offset x, y, z m."""
         self.parts.append((solid.moved(x, y, z), material))
 
     def add_pair(self, solid: Solid, material: Material, x: float, y: float = 0.0, z: float = 0.0) -> None:
-        """Add the same part at -x and at x."""
+        """Add a part twice, at -x and x."""
         for side in (-1, 1):
             self.add(solid, material, side * x, y, z)
 
     def add_legs(self, solid: Solid, material: Material, x: float, y: float) -> None:
-        """Add the same part at the four corners (±x, ±y)."""
+        """Add a part four times, at the corners (±x, ±y)."""
         for corner in ((-x, -y), (x, -y), (x, y), (-x, y)):
             self.add(solid, material, *corner)
 
@@ -42,12 +42,12 @@ class Furniture:
         return lows.min(axis=0), highs.max(axis=0)
 
     def placed(self, x: float, y: float, z: float = 0.0, angle: float = 0.0) -> Furniture:
-        """Return the piece turned by `angle` (rad, counter-clockwise from above), then moved."""
+        """Rotate the object by `angle` (rad, counter-clockwise from above), then translate it."""
         parts = [(solid.turned("z", angle).moved(x, y, z), material) for solid, material in self.parts]
         return Furniture(self.kind, self.class_name, parts)
 
     def tilted(self, angle: float) -> Furniture:
-        """Return the piece turned by `angle` rad about x, its front upwards, standing on z = 0 again."""
+        """Rotate the object by `angle` rad about x, with its front upwards, and place it on z = 0."""
         parts = [(solid.turned("x", angle), material) for solid, material in self.parts]
         tilted = Furniture(self.kind, self.class_name, parts)
         return tilted.placed(0.0, 0.0, -float(tilted.bounds()[0][2]))

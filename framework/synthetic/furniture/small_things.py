@@ -1,4 +1,4 @@
-"""Small objects, and shelves with small objects. Only books have a class."""
+"""Small objects and shelves with small objects; only books have a class."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MakeThing = Callable[[Rng], Furniture]
 
 
 def papers(rng: Rng) -> Furniture:
-    """Return an untidy stack of sheets."""
+    """Return an untidy stack of paper."""
     piece = Furniture("papers")
     z = 0.0
     for _ in range(int(rng.integers(2, 5))):
@@ -40,7 +40,7 @@ def bottle(rng: Rng) -> Furniture:
 
 
 def waste_bin(rng: Rng) -> Furniture:
-    """Return a full paper bin."""
+    """Return a full waste bin."""
     piece = Furniture("bin")
     r, height = rng.uniform(0.11, 0.14), rng.uniform(0.27, 0.34)
     color = paints.pick(rng, ((0.12, 0.12, 0.13), (0.62, 0.63, 0.64), (0.75, 0.30, 0.22)))
@@ -90,7 +90,7 @@ def carton_stack(rng: Rng) -> Furniture:
 
 
 def book_row(rng: Rng) -> Furniture:
-    """Return a row of upright books: one instance, like a pile."""
+    """Return a row of upright books, labeled as one instance like a pile of books."""
     row = Furniture("row of books", "book")
     end = 0.0
     for _ in range(int(rng.integers(5, 9))):
@@ -98,14 +98,15 @@ def book_row(rng: Rng) -> Furniture:
         low, high = book.bounds()
         end += float(high[2] - low[2]) + 0.0005
         for solid, material in book.parts:
-            # A flat book has its back at -x and its cover up: turn the back to the front and the cover to the side.
+            # A flat book has its spine at -x and its cover up. After the rotation, the spine faces the front and the
+            # cover faces the side.
             standing = solid.turned("z", -np.pi / 2).turned("y", -np.pi / 2)
             row.add(standing, material, end, 0.0, float(high[1] - low[1]) / 2)
     return row.placed(-end / 2, 0.0)
 
 
 def shelf(rng: Rng) -> Furniture:
-    """Return an open shelf with its contents: one object without a class."""
+    """Return an open shelf and its contents as one object without a class."""
     piece = Furniture("shelf")
     wood = paints.wood(rng)
     width, depth, height = rng.uniform(0.75, 1.0), 0.30, rng.uniform(1.5, 1.9)
@@ -122,7 +123,7 @@ def shelf(rng: Rng) -> Furniture:
 
 
 def _fill(piece: Furniture, rng: Rng, start: float, end: float, z: float, height: float) -> None:
-    """Place binders, boxes and gaps side by side on one board."""
+    """Place binders, boxes and gaps side by side on one shelf board."""
     x = start
     while True:
         wide = rng.uniform() < 0.2
@@ -143,5 +144,5 @@ ON_TOPS: tuple[MakeThing, ...] = (clutter.carton, clutter.throw_cushion, basket,
 
 
 def some(rng: Rng, makers: tuple[MakeThing, ...], count: int) -> list[Furniture]:
-    """Return `count` things, each by a random maker."""
+    """Return `count` objects, each from a random maker."""
     return [makers[int(rng.integers(len(makers)))](rng) for _ in range(count)]

@@ -1,7 +1,7 @@
 """Shapes of furniture: rounded boxes, lofts and tubes, as triangles with smooth normals.
 
-A shape is centered on the origin, z up. Its texture coordinates are its initial 3D coordinates in meters, so that a
-solid texture moves with it. Faces are subdivided, because light is baked into the vertices.
+A shape is centered on the origin, with z up. Its texture coordinates are its initial 3D coordinates in meters, so that
+a solid texture moves with the shape. Faces are subdivided, because light is baked into the vertices.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 
 from framework.data import Float64, Int32
 
-SPACING = 0.07  # m, between vertices on flat faces: the resolution of baked shadows
-WELD = 1e-6  # m, vertices closer than this are merged
+SPACING = 0.07  # m, vertex spacing on flat faces, the resolution of baked shadows
+WELD = 1e-6  # m, maximum distance of merged vertices
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A triangle mesh. Triangles turn counter-clockwise seen from outside."""
+    """A triangle mesh; triangles are counter-clockwise as seen from outside."""
 
     vertices: Float64  # (V, 3) m
     normals: Float64  # (V, 3) unit
@@ -31,17 +31,17 @@ class Solid:
         return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
     def turned(self, axis: str, angle: float) -> Solid:
-        """Return the solid rotated by `angle` rad about the axis x, y or z through the origin."""
+        """Rotate the solid by `angle` rad about the axis x, y or z through the origin."""
         R = axis_rotation(axis, angle)
         return replace(self, vertices=_turn(R, self.vertices), normals=_turn(R, self.normals))
 
     def deformed(self, shape: Callable[[Float64], Float64]) -> Solid:
-        """Return the solid with `shape` applied to the (V, 3) vertices, and matching normals."""
+        """Apply `shape` to the vertices (V, 3), and recompute the normals."""
         vertices = shape(self.vertices.copy())
         return replace(self, vertices=vertices, normals=smooth_normals(vertices, self.triangles))
 
     def flat(self, along: int, up: int) -> Solid:
-        """Return the solid with texture coordinates (s, t, 0) in meters from the corner, for pictures.
+        """Replace the texture coordinates with (s, t, 0) in meters from the corner, for image textures.
 
         s and t run along the coordinate axes `along` and `up` of the vertices.
         """
@@ -51,7 +51,7 @@ class Solid:
 
 
 def axis_rotation(axis: str, angle: float) -> Float64:
-    """Return the (3, 3) rotation by `angle` rad about the axis x, y or z."""
+    """Return the rotation (3, 3) by `angle` rad about the axis x, y or z."""
     c, s = np.cos(angle), np.sin(angle)
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -61,12 +61,12 @@ def axis_rotation(axis: str, angle: float) -> Float64:
 
 
 def _turn(R: Float64, vectors: Float64) -> Float64:
-    """Rotate vectors (V, 3) without BLAS, whose rounding may depend on the number of threads."""
+    """Rotate vectors (V, 3) without BLAS, because its rounding may depend on the number of threads."""
     return np.asarray(np.einsum("ck,vk->vc", R, vectors))
 
 
 def smooth_normals(vertices: Float64, triangles: Int32) -> Float64:
-    """Return area-weighted (V, 3) vertex normals; vertices at the same position share one."""
+    """Return the area-weighted normals (V, 3) of vertices; vertices at equal positions share a normal."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     faces = np.cross(b - a, c - a)
     _, point = np.unique(np.round(vertices / WELD).astype(np.int64), axis=0, return_inverse=True)
@@ -81,7 +81,7 @@ def smooth_normals(vertices: Float64, triangles: Int32) -> Float64:
 def rounded_box(
     x: float, y: float, z: float, radius: float = 0.004, segments: int = 1, spacing: float = SPACING
 ) -> Solid:
-    """Return a box of these side lengths (m), with edges rounded by `radius` m."""
+    """Return a box with side lengths x, y, z m and edges rounded by `radius` m."""
     half = np.array([x, y, z]) / 2
     radius = min(radius, float(half.min()) * 0.999)
     inner = half - radius
@@ -109,12 +109,12 @@ def rounded_box(
 
 
 def _grain_first(vertices: Float64, size: Float64) -> Float64:
-    """Return texture coordinates with the longest side first: the grain of wood runs along a board."""
+    """Return texture coordinates with the longest side first, so that wood grain runs along a board."""
     return vertices[:, np.argsort(-size, kind="stable")]
 
 
 def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
-    """Return a pillow: thick in the middle, thin at the seam."""
+    """Return a pillow that is thick in the middle and thin at the seam."""
     box = rounded_box(x, y, z, radius=0.45 * z, segments=4, spacing=min(x, y) / 9)
 
     def swell(p: Float64) -> Float64:
@@ -137,11 +137,11 @@ class Section:
     x: float = 0.0
     y: float = 0.0
     n: float = 2.0  # 2 = ellipse, larger = closer to a rectangle
-    front: float = 1.0  # stretches the half with positive y: egg shapes
+    front: float = 1.0  # scale of the half with positive y, for egg shapes
 
 
 def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACING) -> Solid:
-    """Return the body through these sections, from bottom to top, closed by flat ends."""
+    """Return the solid through `sections`, from bottom to top, with flat ends."""
     cuts = [sections[0]]
     for below, above in pairwise(sections):
         length = np.hypot(above.z - below.z, max(abs(above.a - below.a), abs(above.b - below.b)))
@@ -180,7 +180,7 @@ def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACI
 
 
 def lathe(profile: Sequence[tuple[float, float]], segments: int = 24, spacing: float = SPACING) -> Solid:
-    """Return the body of revolution about z through these (height, radius) pairs, m."""
+    """Return the solid of revolution about z through (height, radius) pairs, m."""
     return loft([Section(z, r, r) for z, r in profile], segments, spacing)
 
 
@@ -197,11 +197,11 @@ def leg(thickness: float, height: float, taper: float = 0.7) -> Solid:
 
 
 def tube(points: Sequence[tuple[float, float, float]] | Float64, radius: float, segments: int = 10) -> Solid:
-    """Return a round rod along a polyline (N, 3), smoothed by a Catmull-Rom spline where it bends."""
+    """Return a round rod along a polyline (N, 3), smoothed by a Catmull-Rom spline at bends."""
     path = _spline(np.asarray(points, np.float64))
     tangents = np.gradient(path, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    # the coordinate axis least parallel to all tangents: the rod does not twist
+    # the coordinate axis least parallel to all tangents prevents twists of the rod
     aside = np.cross(tangents, np.eye(3)[np.abs(tangents).max(axis=0).argmin()])
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     other = np.cross(tangents, aside)

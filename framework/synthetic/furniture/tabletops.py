@@ -35,7 +35,7 @@ def desk(rng: Rng) -> Furniture:
 
 
 def coffee_table(rng: Rng) -> Furniture:
-    """Return a low table, which COCO's annotators also call a dining table."""
+    """Return a low table. Its class is dining table, as in COCO's annotations."""
     size = rng.uniform(0.85, 1.1), rng.uniform(0.48, 0.58), rng.uniform(0.38, 0.44)
     return _table("coffee table", *size, paints.wood(rng), 0.05)
 
@@ -54,14 +54,14 @@ def _table(kind: str, width: float, depth: float, height: float, material: Mater
 
 
 def book(rng: Rng) -> Furniture:
-    """Return a closed book that lies flat."""
+    """Return a flat, closed book."""
     piece = Furniture("book", "book")
     _add_book(piece, rng, rng.uniform(0.17, 0.25), rng.uniform(0.24, 0.32), rng.uniform(0.025, 0.05))
     return piece
 
 
 def book_pile(rng: Rng) -> Furniture:
-    """Return a pile of three or four books: one instance, as SceneNN's annotators label "books"."""
+    """Return a pile of three or four books, labeled as one instance like "books" in SceneNN."""
     piece = Furniture("pile of books", "book")
     z = 0.0
     for k in range(int(rng.integers(3, 5))):

@@ -114,7 +114,7 @@ def test_detect_layout_inverted_corners_raise():
     boxes = cells()[50:53]
     with pytest.raises(
         DataError,
-        match=r"detector\.box_format: expected corners with x1 <= x2 and y1 <= y2, got others in a confident detection",
+        match=r"detector\.box_format: expected corners with x1 <= x2 and y1 <= y2 in confident detections, got \[",
     ):
         seen(detections(boxes, 0.9, 1))
     _, output = seen(detections(boxes, 0.9, 1), boxes=BoxKind.CENTER)
@@ -167,8 +167,8 @@ MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells()
         (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression .*another detector\.label_space"),
         (detections(as_corners(cells()), 0.9, 3), {}, r"label_space: expected labels 0 to 2 .*, got 3 to 3"),
         (detections(as_corners(cells()), 1.5, 1), {}, r"detector\.layout: expected scores in \[0, 1\], got 0 to 1\.5"),
-        (np.zeros((1, 11, 11)), {}, "expected different numbers of candidates and columns, got 11 of both"),
-        (dense(cells()), {"maps": np.zeros((1, 4, 16, 16))}, r"64x96, got .*16, 16\) with other proportions"),
+        (np.zeros((1, 11, 11)), {}, "expected different numbers of candidates and columns, got 11 for both"),
+        (dense(cells()), {"maps": np.zeros((1, 4, 16, 16))}, r"64x96, got .*16, 16\) with another aspect ratio"),
         (dense(cells())[0], {}, r"expected two outputs, .*, got output0 \(11, 126\)"),
     ],
 )  # fmt: skip

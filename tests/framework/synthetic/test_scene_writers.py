@@ -102,7 +102,7 @@ def test_write_scenes_foreign_folder_raises(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="expected a new or empty folder"):
         write_scenes(tmp_path / "011.ply", SPECS, RECORDING, jobs=1)
     (tmp_path / "synthesize.json").write_text("{")
-    with pytest.raises(DataError, match=r"synthesize\.json: damaged"):
+    with pytest.raises(DataError, match=r"synthesize\.json: expected valid JSON, got a damaged file"):
         write_scenes(tmp_path, SPECS, RECORDING, jobs=1)
 
 
@@ -112,7 +112,7 @@ def killed(status: int, rng: object) -> None:
 
 def test_write_scenes_killed_process_raises_one_line_error(tmp_path: Path) -> None:
     deadly = SceneSpec("trap", (partial(killed, 9),), {})
-    with pytest.raises(DataError, match=r"rooms/666: a writing process was terminated.*run the same command again"):
+    with pytest.raises(DataError, match=r"rooms/666: expected a running writer process.*run the same command again"):
         write_scenes(tmp_path / "rooms", {"666": deadly}, RECORDING, jobs=1)
 
 

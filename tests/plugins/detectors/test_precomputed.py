@@ -248,10 +248,10 @@ def test_mask_image_with_wrong_size_or_type_raises(tmp_path: Path, ids: np.ndarr
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"image_id": "left.png"}, "image_id: expected the number of the frame, or a file name that is one"),
+        ({"image_id": "left.png"}, "image_id: expected a frame number, or a file name such as 000012.png, got"),
         ({"image_id": -1}, "image_id"),
         ({"image_id": True}, "image_id"),
-        ({"image_id": "0.5"}, "image_id: expected the number of the frame, or a file name that is one"),
+        ({"image_id": "0.5"}, "image_id: expected a frame number, or a file name such as 000012.png, got"),
         ({"category_name": "chiar"}, "label: expected one of the 80 names in detector.label_space, got"),
         ({"category_name": None, "category_id": 12}, "category_id: expected the id of a label, got 12"),
         ({"category_name": None}, "category_id: expected the id of a label, got None"),
@@ -259,14 +259,14 @@ def test_mask_image_with_wrong_size_or_type_raises(tmp_path: Path, ids: np.ndarr
         ({"score": None}, "score"),
         (
             {"segmentation": None},
-            "segmentation: expected run lengths with size [height, width], or a list of polygons, got other values",
+            "segmentation: expected run lengths with size [height, width], or a list of polygons, got None",
         ),
         ({"segmentation": {"size": [6, 8], "counts": "\u00e9"}}, "packed string"),
         ({"segmentation": {"size": [6, 8], "counts": PACKED[:-1]}}, "run lengths: expected 8x6 = 48 px, got 40 px"),
         ({"segmentation": {"size": [6, 9], "counts": PACKED}}, "run lengths: expected 9x6 = 54 px, got 48 px"),
         ({"segmentation": {"size": [6], "counts": PACKED}}, "size"),
         ({"segmentation": {"size": [6, 8], "counts": [3, 4]}}, "run lengths: expected"),
-        ({"segmentation": [[1, 2, 3, 4]]}, "three points"),
+        ({"segmentation": [[1, 2, 3, 4]]}, "at least 3 points, got [1, 2, 3, 4]"),
         ({"segmentation": []}, "segmentation: expected a polygon, got none"),
         ({"bbox": [1, 2, 3]}, "bbox: expected [x, y, width, height] px, at most"),
         ({"class_probabilities": [0.5, 0.5]}, "class_probabilities: expected 80 values, one for each label, got 2"),
@@ -304,7 +304,7 @@ def test_result_file_with_two_sequences_raises(tmp_path: Path) -> None:
     path = write(tmp_path, entry(image_id="kitchen/000002.png"), entry(image_id="hall/000002.png"))
     with pytest.raises(
         DataError,
-        match=r"entry 1: hall/000002\.png: expected one image for each frame, got another one of frame .* in kitchen/",
+        match=r"entry 1: hall/000002\.png: expected one image of frame 2, got another image in kitchen/",
     ):
         Precomputed(path)
 
@@ -315,7 +315,7 @@ def test_mask_with_wrong_frame_size_raises(tmp_path: Path) -> None:
         detector.detect(frame(camera=CAMERA.scaled(2)))
     detector = Precomputed(write(tmp_path, entry(segmentation=[[0, 0, 12, 0, 12, 6]])))
     with pytest.raises(
-        DataError, match="entry 0: frame 0: polygon: expected points in the image of 8x6 px, got 4 px outside of it"
+        DataError, match="entry 0: frame 0: polygon: expected points in the image of 8x6 px, got a point 4 px outside"
     ):
         detector.detect(frame())
 

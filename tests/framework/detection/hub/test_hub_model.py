@@ -144,7 +144,7 @@ def test_hub_tokenizer_in_one_or_two_files_is_found(hub):
 
 def test_hub_model_with_wrong_hash_is_discarded(hub):
     hub.served["model.safetensors"] = bytes(len(WEIGHTS))
-    assert "for model.safetensors, got another one" in fault()
+    assert "for model.safetensors, got " in fault()
     hub.served.clear()
     assert (find_model("somebody/something", "main") / "model.safetensors").read_bytes() == WEIGHTS
 

@@ -46,7 +46,7 @@ def test_onnx_network_dynamic_input_requires_size(tmp_path):
     assert network.shape == (32, 32)
     assert network(np.ones((32, 32, 3), np.float32))["doubled"].shape == (1, 3, 32, 32)
     with pytest.raises(
-        ConfigError, match=r"detector\.input_size: expected a size in px, got 0 for .*, whose input has any size "
+        ConfigError, match=r"detector\.input_size: expected a size in px, got 0 for .* with dynamic input size "
     ):
         OnnxNetwork(path, "", "cpu", 0)
     fixed = doubling_network(tmp_path / "f.onnx", (1, 3, 8, 8))
@@ -113,7 +113,7 @@ def test_onnx_file_missing_or_invalid_raises(tmp_path):
     sha256 = OnnxNetwork(path, "", "cpu", 0).sha256
     assert OnnxNetwork(path, sha256.upper(), "cpu", 0).sha256 == sha256
     path.write_bytes(b"no network")
-    with pytest.raises(DataError, match=r"n\.onnx: expected an ONNX file that onnxruntime can load, got an error:"):
+    with pytest.raises(DataError, match=r"n\.onnx: expected an ONNX file for onnxruntime, got "):
         OnnxNetwork(path, "", "cpu", 0)
 
 
@@ -129,9 +129,7 @@ def test_onnx_network_rejected_by_onnxruntime_names_file(tmp_path):
             graph, opset_imports=[helper.make_opsetid("", 13), helper.make_opsetid("nobody", 1)]
         ).SerializeToString()
     )
-    with pytest.raises(
-        DataError, match=r"n\.onnx: expected an ONNX file that onnxruntime can load, got an error:"
-    ) as refused:
+    with pytest.raises(DataError, match=r"n\.onnx: expected an ONNX file for onnxruntime, got ") as refused:
         OnnxNetwork(path, "", "cpu", 0)(np.zeros((8, 8, 3), np.float32))
     assert "\n" not in str(refused.value)
 
@@ -175,7 +173,7 @@ def test_onnx_network_damaged_file_error_is_one_line(tmp_path):
         try:
             OnnxNetwork(path, "", "cpu", 0)
         except DataError as error:
-            assert str(error).startswith(f"{path}: expected an ONNX file that onnxruntime can load, got an error:")
+            assert str(error).startswith(f"{path}: expected an ONNX file for onnxruntime, got ")
             assert "\n" not in str(error)
             refused += 1
     assert refused > 0.9 * len(damaged)

@@ -349,7 +349,7 @@ def test_cache_full_disk_stops_storing_but_not_run(
         detector.detect(frame)
     assert detector.misses == 6
     assert len(caplog.records) == 1
-    assert "No space left on device; storing nothing more in this run" in caplog.text
+    assert "No space left on device; storing no more detections in this run" in caplog.text
 
 
 def test_cache_unusable_folder_raises(tmp_path: Path) -> None:

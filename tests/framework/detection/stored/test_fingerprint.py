@@ -75,7 +75,7 @@ def test_content_hash_resolves_path_in_working_folder(tmp_path: Path, monkeypatc
 
 
 def test_fingerprint_missing_path_raises(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="absent: expected a file to identify the detector by, got none"):
+    with pytest.raises(ConfigError, match="absent: expected an existing file, got none"):
         fingerprint(Network(tmp_path / "absent"))
 
 
@@ -107,7 +107,7 @@ def test_fingerprint_covers_all_detection_modules(monkeypatch: pytest.MonkeyPatc
 
 def test_fingerprint_without_source_file_raises() -> None:
     notebook = type("Mine", (), {"__module__": "a_notebook"})
-    with pytest.raises(ConfigError, match="Mine: expected a source file to identify it by, got none"):
+    with pytest.raises(ConfigError, match="Mine: expected a class in a source file, got none"):
         fingerprint(dataclass(notebook)())
 
 
