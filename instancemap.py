@@ -13,21 +13,21 @@
         print(instance.id, mapper.name(instance), instance.obb.center, "m", instance.confidence)
     mapper.save("map.npz")
 
-`Mapper("resume_from=outputs/demo")` resumes the map of a run. Stored maps answer queries:
+`Mapper("resume_from=outputs/demo")` resumes the map of a run. Query a stored map:
 
     scene = load_map("outputs/demo/map.npz")
     chairs = scene.instances("chair")
     it = scene.nearest((1.0, 0.0, 2.0))
-    mesh = scene.mesh()  # vertices, triangles, color, instance and class of each vertex; scene.mesh(it) of one object
-    view = scene.view(camera, T_world_camera)  # depth, normals, color and instances, as the camera would see them
+    mesh = scene.mesh()  # vertices, triangles, color, instance and class of each vertex; scene.mesh(it) for one object
+    view = scene.view(camera, T_world_camera)  # rendered depth, normals, color and instances
 
 `export("outputs/demo", "glb", "usd")` writes files for other programs. `query("outputs/demo", "a red chair").objects`
-are the objects that match the text, best first.
+lists the matching objects, best first.
 
 A Mapper is thread-safe; queries wait until the current frame is mapped.
 
 Meters, seconds, radians; camera axes x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a;
-pixel centers at integers; instance 0 = none. User errors are InstanceMapErrors with a one-line message.
+pixel centers at integers; instance 0 = no instance. User errors are InstanceMapErrors with a one-line message.
 
 Your own stages are dataclasses that implement Detector, PoseTracker, ClusterRefiner or MapFuser. Combine them with
 `Pipeline(detector, tracker, refiner, fuser).run(sequence)`, or register them with a YAML file (CONTRIBUTING.md).
@@ -43,8 +43,8 @@ _own = Path(__file__).resolve().with_name("framework")
 _found = find_spec("framework")
 if _found is None or _own not in [Path(path).resolve() for path in _found.submodule_search_locations or ()]:
     raise ImportError(
-        f"the package 'framework' at {_found and _found.origin} stands in the way of InstanceMap's own at {_own}: "
-        "rename it, or start Python elsewhere"
+        f"framework: expected InstanceMap's package at {_own}, got {_found and _found.origin}; rename it or start "
+        "Python in another folder"
     )
 
 from framework import __version__
@@ -80,7 +80,7 @@ _SHARED_WITH_PLUGINS = {
     "transform": "framework.geometry",
     "vote_for_best": "framework.mapping.labels.label_rule",
 }
-"""Modules of the names that plugins use, in addition to those of framework.api."""
+"""Modules of the names for plugins that framework.api does not export."""
 
 if TYPE_CHECKING:
     from framework.api import *
@@ -100,7 +100,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Import the libraries with the first name that needs them, so that `configure_process` can run before."""
+    """Import the libraries on first use, so that `configure_process` can run before them."""
     if name in _SHARED_WITH_PLUGINS:
         return getattr(import_module(_SHARED_WITH_PLUGINS[name]), name)
     if name == "__all__" or not name.startswith("_"):

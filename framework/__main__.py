@@ -1,4 +1,4 @@
-"""`instancemap [COMMAND] ...`, the same as `python -m framework [COMMAND] ...`; without a command, a run or a sweep."""
+"""Entry point of `instancemap [COMMAND] ...` and `python -m framework [COMMAND] ...`; the default is a run or sweep."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ COMMANDS = {
     "tables": "write the tables of an experiment: Markdown, LaTeX, CSV",
     "figures": "draw the figures of an experiment",
     "raycast": "draw the ray-cast view of a map: depth, normals, vertices, RGB, object indices",
-    "report": "write an HTML report of a run, or a comparison of several",
-    "import": "convert a recording of a phone or sensor to a folder for dataset=rgbd_folder",
+    "report": "write HTML reports of runs and compare them",
+    "import": "convert a phone or sensor recording to a folder for dataset=rgbd_folder",
     "check": "validate a recording and suggest parameter fixes",
     "diff": "list objects that appeared, vanished or moved between two runs",
     "export": "export a run as GLB, USD, PLY, OBJ, floor plan, ROS map or scene graph",
@@ -29,9 +29,9 @@ COMMANDS = {
     "doctor": "check the installation and print the fix for each problem",
     "plugins": "list the plugins of each stage and their parameters",
     "new-plugin": "create a repository with a plugin: package, option, tests, CI",
-    "synthesize": "render a benchmark of synthetic rooms in SceneNN's format",
-    "train-detector": "train Mask R-CNN on rendered rooms",
-    "convert-weights": "convert a Mask R-CNN of torchvision or detectron2",
+    "synthesize": "render a benchmark of synthetic scenes in SceneNN format",
+    "train-detector": "train Mask R-CNN on rendered synthetic scenes",
+    "convert-weights": "convert Mask R-CNN weights of torchvision or detectron2",
     "convert-oni": "convert an OpenNI recording to images for dataset=scenenn",
 }
 """Summary of each command."""
@@ -42,27 +42,28 @@ FOLDERS = {
     "recordings": ("import", "check", "synthesize", "convert-oni"),
     "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "convert-weights"),
 }
-"""The folder of framework.commands that contains the module of each command."""
+"""Commands by the folder of framework.commands that contains their modules."""
 
 PRINTING = (*FOLDERS["results"], "plugins", "doctor")  # a closed pipe (`| head`) ends them silently
 
 HELP = """\
 {program} [COMMAND] ...    instance-oriented semantic 3D mapping from RGB-D video
 
-Without a command, KEY=VALUE ... start a run; with -m, or with an experiment, a sweep of runs:
+Without a command, KEY=VALUE ... starts a run. With -m or an experiment, it starts a sweep of runs:
   {program} dataset=rgbd_folder dataset.root=DIR
   {program} -m refiner=identity,kmeans,gmm_em seed=0,1,2
 
 Commands (COMMAND --help lists the arguments):
 {commands}
 
-Exit status: 0 = success; 1 = error; 3 = an error ended a run early, and its partial outputs are written;
-128 + N = ended by signal N (130 = Ctrl-C, 143 = SIGTERM), and the partial outputs of a run are written.
+Exit status: 0 = success; 1 = error; 3 = a run ended early after an error and wrote its partial outputs;
+128 + N = ended by signal N (130 = Ctrl-C, 143 = SIGTERM); a run writes its partial outputs.
 
-debug=true adds the traceback to errors of any command. --cfg job lists the keys of a run, --hydra-help Hydra's options.
+debug=true adds the traceback to errors of any command. --cfg job lists the config keys of a run. --hydra-help lists
+Hydra's options.
 """
 
-RERUN = "--experimental-rerun"  # of Hydra: reads a pickle, which may contain code
+RERUN = "--experimental-rerun"  # Hydra option that reads a pickle, which may contain code
 
 
 def module_of(command: str) -> str:
@@ -73,33 +74,33 @@ def module_of(command: str) -> str:
 
 
 def leave_working_folder(arguments: list[str]) -> None:
-    """Remove the working folder from the module search path: it may be a run directory from someone else.
+    """Remove the working folder from the module search path. It may be a run directory from an untrusted source.
 
-    With --config-dir, which registers plugins of the user's own, append it. `python -P` keeps it out in any case.
+    With --config-dir, which registers plugins of the user, append it instead. `python -P` always excludes it.
     """
     try:
         here = str(Path.cwd())
     except FileNotFoundError:
-        sys.exit("error: working folder: expected an existing folder, got a removed one; change to another one")
+        sys.exit("error: working folder: expected an existing folder, got a deleted folder; change to another folder")
     if sys.flags.safe_path or Path(here) == Path(__file__).resolve().parents[1]:
         return
-    if sys.path[0] in ("", here):  # of `python -m`
+    if sys.path[0] in ("", here):  # added by `python -m`
         del sys.path[0]
     if any(word.startswith(("--config-d", "-cd")) for word in arguments):
         sys.path.append(here)
 
 
 def open_standard_streams() -> None:
-    """Open /dev/null for closed streams (`2>&-`).
+    """Open /dev/null for closed standard streams (`2>&-`).
 
-    Otherwise an output file of the run gets the number of one, and receives the output of libraries.
+    Otherwise an output file of the run reuses the file descriptor of a closed stream, and receives library output.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
             mode = "r" if number == 0 else "w"
-            # opening takes the lowest free number, which is this one
+            # opening a file uses the lowest free descriptor, which is `number`
             stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115  (open until the process ends)
             setattr(sys, name, stream)
             setattr(sys, f"__{name}__", stream)
@@ -111,11 +112,11 @@ def main() -> None:
     leave_working_folder(sys.argv[1:])
     if any(word.startswith("--e") and RERUN.startswith(word.partition("=")[0]) for word in sys.argv[1:]):
         sys.exit(
-            f"error: {RERUN}: expected no option that reads a pickle, which can run code; pass the overrides "
-            "of the run instead"
+            f"error: {RERUN}: expected overrides, got an option that reads a pickle, which can run code; pass the "
+            "overrides of the run"
         )
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # file names may not be valid text
+        if isinstance(stream, TextIOWrapper):  # file names may be invalid Unicode
             stream.reconfigure(errors="backslashreplace")
     program = "python -m framework" if Path(sys.argv[0]).name == "__main__.py" else Path(sys.argv[0]).name
     word = sys.argv[1] if len(sys.argv) > 1 else ""
@@ -135,7 +136,7 @@ def main() -> None:
         sys.exit(f"error: {word!r}: unknown command; {suggestion}")
     else:
         word = "run"
-    if word in PRINTING and hasattr(signal, "SIGPIPE"):  # Windows has none
+    if word in PRINTING and hasattr(signal, "SIGPIPE"):  # not on Windows
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     try:
         import_module(module_of(word)).main()
@@ -150,7 +151,7 @@ def flush_output(rest: str = "") -> None:
         sys.stdout.write(rest)
         sys.stdout.flush()
     except OSError as error:
-        # redirect the rest of the buffer to nowhere: Python flushes it again at exit, and would report that
+        # discard the rest of the buffer: Python flushes it again at exit, and would report a second error
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not reported:
             sys.exit(f"error: {error}")

@@ -1,4 +1,4 @@
-"""The Python API: the same stages, names and defaults as on the command line."""
+"""Python API with the stages, names and defaults of the command line."""
 
 from __future__ import annotations
 
@@ -95,10 +95,10 @@ __all__ = [
 
 
 def begin(config: DictConfig) -> Pipeline:
-    """Build the stages of a config, resume or localize in the map that it names, and compile the kernels.
+    """Build the stages of a config, load a map to resume or localize in, and compile the kernels.
 
-    With `resume_from`, the tracker reports lost poses until it relocalizes in the stored map. Raises ConfigError if the
-    stages do not fit that map, DataError if it cannot be read.
+    With a stored map, the tracker reports lost poses until it relocalizes. Raises ConfigError if the stages do not fit
+    the stored map, and DataError if the map cannot be read.
     """
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
@@ -106,7 +106,7 @@ def begin(config: DictConfig) -> Pipeline:
     detector = with_cache(build(Detector, config.get("detector")), config)  # last: loading a network takes long
     chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
     if len(chosen) > 1:
-        raise ConfigError("resume_from and localize_in: expected at most one of them, got both")
+        raise ConfigError("resume_from and localize_in: expected at most one of these keys, got both; remove one")
     for key, value in chosen.items():
         run = checked_path(key, value)
         scene = scene_of(key, run)
@@ -118,32 +118,32 @@ def begin(config: DictConfig) -> Pipeline:
 
 
 def scene_of(key: str, run: Path) -> SceneMap:
-    """Read the map of a stored run. Raises DataError, which begins with `key`."""
+    """Read the map of a stored run. Raises DataError that names `key`."""
     if not (run / MAP).is_file():
-        raise DataError(f"{key}: expected the directory of a run, got {run} without {MAP}")
+        raise DataError(f"{key}: expected a run directory, got {run} without {MAP}")
     return load_scene(run / MAP)
 
 
 @dataclass(frozen=True)
 class FrameResult(Pose):
-    """The pose of a frame, or that it is lost, and the changes of the objects."""
+    """The pose of a frame, its tracking state, and the new and removed objects."""
 
-    new: tuple[int, ...] = ()  # ids of objects since this frame
-    removed: tuple[int, ...] = ()  # ids of merged or outvoted objects
+    new: tuple[int, ...] = ()  # ids of objects added by this frame
+    removed: tuple[int, ...] = ()  # ids of objects that were merged or outvoted
 
 
 class Mapper(Map):
     """Incremental mapping, frame by frame: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`.
 
-    Takes the overrides of a run on the command line, as text or by name, with its defaults for recordings. `dataset` is
-    not allowed; `prefetch` and `skip_completed` have no effect. `resume_from=DIR` resumes the map of a run.
-    `viewer="rerun"` shows the map until the mapper is deleted.
+    Takes the overrides of a run on the command line, as text or by name. The defaults are the same as for recordings.
+    `dataset` is not allowed. `prefetch` and `skip_completed` have no effect. `resume_from=DIR` resumes the map of a
+    run. `viewer="rerun"` shows the map until the mapper is deleted.
 
     All methods are thread-safe. To read `scene` itself while another thread may call `add`, hold the lock:
     `with mapper.lock: mesh = mapper.scene.mesh()`.
 
     Raises:
-        ConfigError: An unknown name or an invalid value.
+        ConfigError: A name is unknown, or a value is invalid.
     """
 
     def __init__(self, *overrides: str, **named: object) -> None:
@@ -153,7 +153,7 @@ class Mapper(Map):
                 raise ConfigError(f"Mapper: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
             if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
                 raise ConfigError(
-                    f"Mapper: expected overrides of a mapper, got {override}; it is for the command line only"
+                    f"Mapper: expected overrides of a mapper, got {override}; use it only on the command line"
                 )
         config = composed("~dataset", *words)
         self._threads = Settings.of(config).threads
@@ -164,8 +164,8 @@ class Mapper(Map):
         viewer = self.pipeline.viewer
         viewer.begin(self.scene, "frames from Python", Path())
         finalize(self, viewer.end)  # when the mapper is deleted, or at exit
-        self._camera: Camera | None = None  # of the last frame
-        self._T_world_camera: Float64 | None = None  # of the last frame with a pose
+        self._camera: Camera | None = None  # camera of the last frame
+        self._T_world_camera: Float64 | None = None  # pose of the last frame that is not lost
         self._frames = 0  # number of calls of `add`
 
     def add(
@@ -183,12 +183,15 @@ class Mapper(Map):
             color: (H, W, 3) uint8 RGB, or a Frame instead of all arguments.
             depth: (H, W) float32, m along z; 0 = no reading.
             pose: (4, 4) T_world_camera; None = unknown.
-            camera: None = that of the last frame.
-            timestamp: s; None = 30 frames per second.
-            up: (3,) unit vector against gravity in the camera frame; None = unknown.
+            camera: The camera; None = the camera of the last frame.
+            timestamp: Time of the frame, s; None = 30 frames per second.
+            up: (3,) unit vector opposite to gravity in the camera frame; None = unknown.
+
+        Returns:
+            The pose of the frame, and the new and removed objects.
 
         Raises:
-            FrameError: The frame is unusable, such as one without a required pose; the map is unchanged.
+            FrameError: The frame is unusable, for example because a required pose is missing. The map is unchanged.
             DataError: The arrays do not form a frame.
             MapFullError: The map has reached `fuser.max_blocks`.
         """
@@ -210,7 +213,7 @@ class Mapper(Map):
                 frame = Frame(self._frames, time, color, depth, camera, pose, up=up)
             self._camera = frame.camera
             self._frames += 1
-            self._journal.timings.clear()  # unused, and a camera may run for days
+            self._journal.timings.clear()  # unused here; would grow without limit for a live camera
             self._journal.tracked.clear()
             before = self.scene.instance_ids()
             found = self._map(frame)
@@ -236,9 +239,19 @@ class Mapper(Map):
     def at_pixel(
         self, u: int, v: int, camera: Camera | None = None, T_world_camera: Float64 | None = None
     ) -> Instance | None:
-        """Return the object at pixel (u, v) of the last frame with a pose, or of another view; None = no object.
+        """Return the object at a pixel of the last frame with a pose, or of another view.
 
-        Raises DataError for a pixel outside of the image, or before the first frame.
+        Args:
+            u: The column of the pixel.
+            v: The row of the pixel.
+            camera: The camera; None = the camera of the last frame.
+            T_world_camera: The pose (4, 4); None = the pose of the last frame that is not lost.
+
+        Returns:
+            The object; None = no object.
+
+        Raises:
+            DataError: The pixel is outside of the image, or no frame is mapped yet.
         """
         camera = camera or self._camera
         T_world_camera = self._T_world_camera if T_world_camera is None else T_world_camera
@@ -258,15 +271,33 @@ def _override(name: str, value: object) -> str:
 def open_dataset(name: str, **parameters: object) -> RGBDSequence:
     """Open a recording: `open_dataset("rgbd_folder", root="DIR", stride=2)`.
 
-    Takes the options and parameters of `dataset=` on the command line. Raises ConfigError for unknown ones, DataError
-    for an unreadable recording.
+    Args:
+        name: An option of `dataset=` on the command line.
+        parameters: The parameters of the option.
+
+    Returns:
+        The sequence.
+
+    Raises:
+        ConfigError: The option or a parameter is unknown.
+        DataError: The recording is unreadable.
     """
     words = [_override("dataset", name), *(_override(f"dataset.{key}", value) for key, value in parameters.items())]
     return build(RGBDSequence, composed(*words).dataset)
 
 
 def load_map(path: Path | str) -> Map:
-    """Read map.npz of a run, or a map that `save` wrote, of any fuser. Raises DataError."""
+    """Read a map that a run or `Map.save` has written, from any fuser.
+
+    Args:
+        path: The file, such as map.npz of a run.
+
+    Returns:
+        The map.
+
+    Raises:
+        DataError: The file is missing, damaged or not a map.
+    """
     return Map(load_scene(path))
 
 
@@ -279,23 +310,23 @@ def export(
     floor: float | None = None,
     **choices: object,
 ) -> list[Path]:
-    """Export a run, as in `export("outputs/demo", "glb", objects=["chair", 7])`.
+    """Export a run: `export("outputs/demo", "glb", objects=["chair", 7])`.
 
     Args:
         run: The run directory.
         formats: "glb", "ply", "usd", "obj", "floorplan" or "graph".
         out: The output folder; None = `export` in the run directory.
-        objects: Classes or ids; () = the whole room.
-        up: (3,) the up direction, if the run has none.
+        objects: Classes or ids of the exported objects; () = the whole scene.
+        up: The up direction (3,), if the run has none.
         floor: The floor height along `up`, m, if the run has none.
         choices: min_confidence, triangles, coloring, collision, resolution, robot_height; see
             `instancemap export --help`.
 
     Returns:
-        The files.
+        The paths of the files.
 
     Raises:
-        ConfigError: An unknown name or value.
+        ConfigError: A name is unknown, or a value is invalid.
         DataError: The run cannot be exported.
     """
     from framework.exporting import exports
@@ -312,11 +343,15 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
         run: The run directory, or a map.
         words: The text query.
         by: "embeddings" of images, "names" of classes and colors, or None = embeddings if available.
-        model: Folder, file or id on huggingface.co of the embedding model; None = that of the run's detector.
+        model: Folder, file or id on huggingface.co of the embedding model; None = the model of
+            the run's detector.
+
+    Returns:
+        The matching objects, best first, and the ranking that was used.
 
     Raises:
-        ConfigError: An invalid query.
-        DataError: A run without a map, unknown words, or missing embeddings.
+        ConfigError: The query is invalid.
+        DataError: The run has no map, the words are unknown, or embeddings are missing.
     """
     question = TextQuery(words, by, None if model is None else str(model))
     if isinstance(run, Map):
@@ -325,7 +360,7 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
 
 
 def load_scene(path: Path | str) -> SceneMap:
-    """Read a map like `load_map`, without the query interface."""
+    """Read a map without the query interface of `load_map`."""
     from framework.baselines import object_map, open3d_map, semantic_map
     from framework.mapping import instance_map
     from framework.mapping.storage.map_file import read_format

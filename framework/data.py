@@ -7,13 +7,13 @@ Conventions, used everywhere:
   [-0.5, width - 0.5] x [-0.5, height - 0.5];
 - `T_a_b` maps coordinates in b to coordinates in a, so that adjacent names cancel:
   `p_world = T_world_camera @ p_camera`;
-- depth is float32 meters along z, not along the ray, 0 = no reading;
+- depth is float32 meters along z, not along the ray; 0 = no reading;
 - color is uint8 RGB;
 - instance 0 = no instance; class index -1 = no class; cluster -1 = the point belongs to no cluster;
 - `None` in place of a pose or of ground truth = unknown.
 
-Every dataclass here is frozen and validates shapes, dtypes and finiteness. Data enter the pipeline through these types,
-and the code behind them trusts them.
+Every dataclass here is frozen and validates shapes, dtypes and finiteness. Data enter the pipeline through these types.
+Later stages do not check them again.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ UInt8 = npt.NDArray[np.uint8]
 UInt16 = npt.NDArray[np.uint16]
 Bool = npt.NDArray[np.bool_]
 
-ROTATION_TOLERANCE = 1e-3  # largest entry of |R R^T - I| of a rigid transform: published poses have 4 digits
-MOST_PIXELS = 2**25  # of an image: 8K video
-WIDEST = 10.0  # most m sideways per m of depth: a field of view of 168 degrees
+ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; published poses have 4 digits
+MOST_PIXELS = 2**25  # px of an image, such as 8K video
+WIDEST = 10.0  # maximum lateral distance per depth, m/m: a field of view of 168 degrees
 LONGEST_FOCAL_LENGTH = 1e6  # px
-UNIT_TOLERANCE = 1e-3  # largest | |v| - 1 | of a unit vector
+UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
 LONGEST_EMBEDDING = 65_536  # dimensions; published networks have 500 to 4,000
-LONGEST_SPACE = 300  # characters of the name of an embedding space
-SAME_TIME = 1e-5  # s, between two readings of one frame's time: trajectory.txt has 1e-9, a double of a Unix time 1e-6
-PROBABILITY_TOLERANCE = 1e-3  # a row of probabilities sums to 1 within this: softmax in half precision
+LONGEST_SPACE = 300  # characters of an embedding space name
+SAME_TIME = 1e-5  # s, maximum difference of equal timestamps; resolution: 1e-9 in trajectory.txt, 1e-6 of a Unix time
+PROBABILITY_TOLERANCE = 1e-3  # maximum error of a sum of probabilities, due to softmax in half precision
 
 
 @dataclass(frozen=True)
@@ -78,25 +78,24 @@ class Camera:
             raise DataError(
                 f"Camera: expected fx, fy of at most {LONGEST_FOCAL_LENGTH:g} px, got fx, fy, cx, cy = {numbers}"
             )
-        horizontal = max(
-            self.cx, self.width - 1 - self.cx, -self.cx
-        )  # px, of the outermost pixels from the principal point
+        # px, distances of the outermost pixels from the principal point
+        horizontal = max(self.cx, self.width - 1 - self.cx, -self.cx)
         vertical = max(self.cy, self.height - 1 - self.cy, -self.cy)
         if horizontal > WIDEST * self.fx or vertical > WIDEST * self.fy:
             raise DataError(
-                f"Camera: expected a field of view of at most {WIDEST:g} m sideways per m of depth, got "
-                f"{self.width}x{self.height} px with fx, fy, cx, cy = {numbers}; give them in px, not as "
+                f"Camera: expected a field of view of at most {WIDEST:g} m laterally per m of depth, got "
+                f"{self.width}x{self.height} px with fx, fy, cx, cy = {numbers}; set them in px, not as "
                 "fractions of width and height"
             )
 
     @property
     def K(self) -> Float64:
-        """The (3, 3) intrinsic matrix."""
+        """The intrinsic matrix (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(height, width), the shape of this camera's images."""
+        """Image shape (height, width), px."""
         return self.height, self.width
 
     def scaled(self, factor: float) -> Camera:
@@ -108,10 +107,10 @@ class Camera:
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """The true instances visible in a frame, for ground-truth detectors and evaluation only."""
+    """The ground-truth instances visible in a frame, for simulated detectors and evaluation only."""
 
     instance_ids: Int32 = field(repr=False)  # (H, W)
-    class_names: Mapping[int, str | None]  # by instance id; None = the class is unknown, do not evaluate
+    class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
 
     def __post_init__(self) -> None:
         check_array("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
@@ -123,9 +122,9 @@ class FrameTruth:
 
 
 class DeferredTruth(FrameTruth):
-    """A FrameTruth that renders its ids on first access: once, from any thread.
+    """Ground truth of a frame with ids rendered on first access, once for all threads.
 
-    Each access raises the errors of `render`, and DataError if it does not return (H, W) int32 of `shape`.
+    Each access raises the errors of `render`. It raises DataError if `render` does not return int32 of `shape`.
     """
 
     def __init__(
@@ -133,14 +132,14 @@ class DeferredTruth(FrameTruth):
         render: Callable[[], Int32],
         shape: tuple[int, int],  # (height, width) of the ids
         class_names: Mapping[int, str | None],
-        origin: str,  # a hash of all that the ids depend on, which identifies them before they are rendered
+        origin: str,  # hash of all inputs of the ids, which identifies them before they are rendered
     ) -> None:
         self._render = render
         self._shape = shape
         self._ids: Int32 | None = None
         self._lock = threading.Lock()
         self.origin = origin
-        object.__setattr__(self, "class_names", class_names)  # a field of the frozen base
+        object.__setattr__(self, "class_names", class_names)  # a field of the frozen base class
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -158,19 +157,19 @@ class DeferredTruth(FrameTruth):
 
 @dataclass(frozen=True)
 class Frame:
-    """One RGB-D image, color and depth registered to each other."""
+    """One RGB-D image with registered color and depth."""
 
-    index: int  # in the sequence, before start, stop and stride select frames
+    index: int  # position in the full sequence, before start, stop and stride select frames
     timestamp: float  # s
     color: UInt8  # (H, W, 3) RGB
     depth: Float32  # (H, W) m along z, 0 = no reading
     camera: Camera
     T_world_camera: Float64 | None = None  # (4, 4) ground truth
     truth: FrameTruth | None = None
-    up: Float64 | None = None  # (3,) unit vector against gravity by a sensor, in the camera; None = no sensor
+    up: Float64 | None = None  # (3,) unit vector opposite to measured gravity, camera frame; None = no sensor
 
     def __post_init__(self) -> None:
-        index, camera = cast(object, self.index), cast(object, self.camera)  # of any type
+        index, camera = cast(object, self.index), cast(object, self.camera)  # the caller may pass any type
         if isinstance(index, bool) or not isinstance(index, int | np.integer) or index < 0:
             raise DataError(f"Frame.index: expected an integer of at least 0, got {index!r}")
         where = f"frame {self.index}: "
@@ -188,7 +187,7 @@ class Frame:
             check_array(where + "up", self.up, (3,), np.float64)
             if abs(np.linalg.norm(self.up) - 1) > UNIT_TOLERANCE:
                 raise DataError(f"{where}up: expected a unit vector, got length {np.linalg.norm(self.up):.4g}")
-        # the kernels are compiled for these; views such as bgr[..., ::-1] and read-only arrays are copied
+        # kernels require contiguous writable arrays; views such as bgr[..., ::-1] and read-only arrays are copied
         object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
         object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))
         if self.truth is not None and not isinstance(cast(object, self.truth), FrameTruth):
@@ -201,9 +200,9 @@ class Frame:
 class Pose:
     """The camera pose estimated by a tracker. Frames with a lost pose are never integrated."""
 
-    T_world_camera: Float64  # (4, 4); for a lost pose the last reliable one
+    T_world_camera: Float64  # (4, 4); if lost, the last reliable pose
     lost: bool = False
-    reason: str = ""  # why it is lost, for the log
+    reason: str = ""  # reason of the loss, for the log
 
     def __post_init__(self) -> None:
         check_rigid("Pose.T_world_camera", self.T_world_camera)
@@ -218,9 +217,9 @@ class Detections:
     scores: Float32  # (N,) in [0, 1]
     class_probabilities: Float32  # (N, C), each row a distribution over `classes`
     classes: tuple[str, ...]  # names of the C columns
-    exact: bool = False  # the masks are ground truth, which refiners do not change
-    embeddings: Float32 | None = None  # (N, D) unit vectors, 0 = not computed; None = none were computed
-    embedding_space: str = ""  # "MODEL@REVISION"; only embeddings of one space are comparable; "" = none
+    exact: bool = False  # True = ground-truth masks, which refiners do not change
+    embeddings: Float32 | None = None  # (N, D) unit vectors; a zero row = not computed; None = no embeddings
+    embedding_space: str = ""  # "MODEL@REVISION"; embeddings of different spaces are not comparable; "" = none
     detected: bool = True  # False = the detector did not run, so a missing object is no evidence of absence
 
     def __post_init__(self) -> None:
@@ -234,7 +233,7 @@ class Detections:
 
     @classmethod
     def none(cls, shape: tuple[int, int], classes: tuple[str, ...], detected: bool = True) -> Detections:
-        """Return no detections in an image of `shape` (height, width)."""
+        """Return empty detections for an image of `shape` (height, width)."""
         return cls(
             masks=np.zeros((0, *shape), np.bool_),
             boxes=np.zeros((0, 4), np.float32),
@@ -283,18 +282,18 @@ class PointClusters:
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """The surface of a map as seen by a camera, for tracking."""
+    """The surface of a map from a camera pose, for tracking."""
 
     camera: Camera
     T_world_camera: Float64  # (4, 4)
-    depth: Float32  # (H, W) m along z, 0 = nothing mapped there
+    depth: Float32  # (H, W) m along z, 0 = no surface
     normals_world: Float32  # (H, W, 3) unit length, towards the camera; 0 where depth is 0
     color: UInt8  # (H, W, 3) RGB
 
 
 @dataclass(frozen=True)
 class View(SurfaceView):
-    """A map as seen by a camera, with labels."""
+    """The surface of a map from a camera pose, with labels."""
 
     instance_ids: Int32  # (H, W), 0 = no instance
     class_ids: Int32  # (H, W) index into the map's classes, -1 = no class
@@ -302,7 +301,7 @@ class View(SurfaceView):
 
 @dataclass(frozen=True)
 class Box:
-    """An oriented box. The columns of `rotation` are its axes in the world; the identity for an axis-aligned box."""
+    """An oriented box. The columns of `rotation` are its axes in the world frame (the identity if axis-aligned)."""
 
     center: Float64  # (3,) m
     extent: Float64  # (3,) m, full side lengths
@@ -317,12 +316,12 @@ class Instance:
     class_probabilities: Float32  # (C,) a distribution over the map's classes
     confidence: float  # in [0, 1], ranks instances in the evaluation
     observations: int  # frames in which it was detected
-    first_frame: int  # `Frame.index` of the first and the last of them
-    last_frame: int
+    first_frame: int  # `Frame.index` of the first detection
+    last_frame: int  # `Frame.index` of the last detection
     vertices: Int32  # (M,) indices of its vertices in the map's InstanceMesh
     aabb: Box
     obb: Box
-    embedding: Float32 | None = None  # (D,) unit vector in the map's `embedding_space`; None = none
+    embedding: Float32 | None = None  # (D,) unit vector in the map's `embedding_space`; None = no embedding
     embedding_spread: float | None = None  # in [0, 1], 1 - |mean of the unit vectors|: 0 = all equal
 
 
@@ -330,7 +329,7 @@ class Instance:
 class InstanceMesh:
     """The surface of a map."""
 
-    vertices: Float32  # (V, 3) m, world
+    vertices: Float32  # (V, 3) m, world frame
     triangles: Int32  # (F, 3)
     colors: UInt8  # (V, 3) RGB
     instance_ids: Int32  # (V,), 0 = no instance
@@ -362,11 +361,11 @@ class InstanceMesh:
 
 @dataclass(frozen=True)
 class ReferenceTrajectory:
-    """The camera poses in the world of a ground truth. Maps in another world are aligned to them."""
+    """The camera poses in the world frame of the ground truth. Maps in other world frames are aligned to them."""
 
     timestamps: Float64  # (F,) s, increasing
     T_world_camera: Float64  # (F, 4, 4)
-    given: bool  # the poses given to the run: a map that begins with one of them is in their world already
+    given: bool  # True = the run uses these poses; a map that starts at one of them is not aligned
 
     def __post_init__(self) -> None:
         f = len(self.timestamps)
@@ -374,7 +373,7 @@ class ReferenceTrajectory:
         check_array("ReferenceTrajectory.T_world_camera", self.T_world_camera, (f, 4, 4), np.float64)
 
     def at(self, timestamps: Float64) -> Int64:
-        """Return the index (N,) of the pose at each time (N,), -1 = none."""
+        """Return the indices (N,) of the poses at the times (N,), -1 = no pose."""
         if not len(self.timestamps):
             return np.full(len(timestamps), -1)
         last = len(self.timestamps) - 1
@@ -384,13 +383,13 @@ class ReferenceTrajectory:
 
 @dataclass(frozen=True)
 class SceneTruth:
-    """The true instances of a sequence as labeled surface points, for evaluation."""
+    """The ground-truth instances of a sequence as labeled surface points, for evaluation."""
 
     points_world: Float32  # (V, 3) m, on the visible surface
     instance_ids: Int32  # (V,), 0 = no instance
     class_names: Mapping[int, str | None] = field(default_factory=dict)  # as in FrameTruth; None = not evaluated
     classes: tuple[str, ...] | None = None  # all annotated classes; None = unknown
-    trajectory: ReferenceTrajectory | None = None  # None = all maps are in the world of the points
+    trajectory: ReferenceTrajectory | None = None  # None = all maps share the world frame of the points
 
     def __post_init__(self) -> None:
         v = len(self.points_world)
@@ -399,7 +398,7 @@ class SceneTruth:
 
 
 def check_rigid(name: str, T: Float64) -> None:
-    """Raise DataError, naming `name`, unless `T` is a finite (4, 4) float64 rigid transform."""
+    """Raise DataError that names `name` unless `T` is a finite float64 rigid transform (4, 4)."""
     check_array(name, T, (4, 4), np.float64)
     R = T[:3, :3]
     error = float(np.abs(R @ R.T - np.eye(3)).max())
@@ -434,7 +433,7 @@ def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: n
 
 
 def _check_objects(found: Detections | PointClusters, n: int, c: int) -> None:
-    """Raise DataError unless scores, class probabilities and embeddings are those of n objects and c classes."""
+    """Raise DataError unless scores, class probabilities and embeddings are valid for n objects and c classes."""
     name, scores = type(found).__name__, found.scores
     check_array(f"{name}.scores", scores, (n,), np.float32)
     if n and (scores.min() < 0 or scores.max() > 1):
@@ -451,7 +450,7 @@ def _check_embeddings(name: str, rows: Float32 | None, space: str, n: int) -> No
             raise DataError(f"{name}: expected embeddings for embedding_space {space!r}, got none")
         return
     if not space:
-        raise DataError(f"{name}: expected a name in embedding_space, got an empty one")
+        raise DataError(f"{name}: expected a name in embedding_space, got an empty string")
     check_array(name, rows, (n, None), np.float32)
     if not 1 <= rows.shape[1] <= LONGEST_EMBEDDING:
         raise DataError(f"{name}: expected 1 to {LONGEST_EMBEDDING} columns, got {rows.shape[1]}")

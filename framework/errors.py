@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-LONGEST_WORD = 200  # characters of an input, such as a name, that a message repeats
+LONGEST_WORD = 200  # characters of an input, such as a name, in a message
 LONGEST_MESSAGE = 1000  # characters; a list of all options or labels has about 500
 
 _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
@@ -17,7 +17,7 @@ _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 class InstanceMapError(Exception):
     """Base of every known error. The command line prints it as one line; `debug=true` adds the traceback.
 
-    The message is printable and of limited length, whatever input it repeats.
+    The message is printable and of limited length for any input.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -29,23 +29,23 @@ class ConfigError(InstanceMapError):
 
 
 class DataError(InstanceMapError):
-    """Unusable input: a missing, corrupt or inconsistent file, or an array of the wrong form."""
+    """Unusable input: a missing, corrupt or inconsistent file, or an array of the wrong shape or type."""
 
 
 class FrameError(DataError):
-    """One unusable frame of a usable sequence: the pipeline counts it in `frames_skipped`."""
+    """One unusable frame of a usable sequence. The pipeline counts it in `frames_skipped`."""
 
 
 class NoPoseError(FrameError):
-    """A frame without a pose, as in gaps of motion capture: skipped, and reported at the end."""
+    """A frame without a required pose, such as in a gap of motion capture. The pipeline skips it."""
 
 
 class MapFullError(InstanceMapError):
-    """The map has reached its block budget; what was mapped so far is kept."""
+    """The map has reached its block budget. The map up to this frame is kept."""
 
 
 class PartialRunError(InstanceMapError):
-    """A run that ended early and has written its outputs. `__cause__` is the reason."""
+    """An early end of a run with partial outputs. `__cause__` is the reason."""
 
 
 def printable(message: object) -> str:
@@ -61,18 +61,18 @@ def _shortened(text: str, most: int) -> str:
 
 
 def in_one_line(message: object) -> str:
-    """Return the message of another library's error on one line; the error's class if it is empty."""
+    """Return an error message of another library on one line, or the error class if the message is empty."""
     return " ".join(str(message).split()) or type(message).__name__
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an error message."""
+    """Return the first line of an error message, or the error class if the line is empty."""
     return str(error).partition("\n")[0] or type(error).__name__
 
 
 @contextmanager
 def errors_of(where: object) -> Iterator[None]:
-    """Prepend the file, or the position in it, to the message of a DataError."""
+    """Prepend a file, or a position in a file, to the message of a DataError."""
     try:
         yield
     except DataError as error:
@@ -80,11 +80,11 @@ def errors_of(where: object) -> Iterator[None]:
 
 
 def import_optional(module: str, purpose: str, extra: str) -> Any:
-    """Import a module of an optional package. Raises ConfigError, naming the extra to install, without it."""
+    """Import a module of an optional package. Raises ConfigError that names the extra to install."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
         name = module.partition(".")[0]
         raise ConfigError(
-            f"{name}, which {purpose}: expected an installed package, got none; run pip install instancemap[{extra}]"
+            f"{name}: expected an installed package (it {purpose}), got none; run pip install instancemap[{extra}]"
         ) from error

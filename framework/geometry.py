@@ -11,12 +11,19 @@ from scipy.spatial.transform import Rotation
 from framework.data import Camera, Float32, Float64, Int32, PointClusters
 from framework.errors import DataError
 
-RIGID_WITHIN = 1e-2  # largest entry of |R R^T - I| due to rounding: published poses have six digits, lost ones R = 0
-EXACT_WITHIN = 1e-12  # such a rotation has the precision of float64, and is not changed
+RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| due to rounding; published poses have six digits, lost poses R = 0
+EXACT_WITHIN = 1e-12  # maximum entry of |R R^T - I| of a float64 rotation, which is not changed
 
 
 def inverse(T_a_b: Float64) -> Float64:
-    """Return T_b_a (4, 4) of a rigid transform."""
+    """Return the inverse of a rigid transform.
+
+    Args:
+        T_a_b: The transform (4, 4).
+
+    Returns:
+        The transform T_b_a (4, 4).
+    """
     T_b_a = np.eye(4)
     T_b_a[:3, :3] = T_a_b[:3, :3].T
     T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
@@ -24,25 +31,40 @@ def inverse(T_a_b: Float64) -> Float64:
 
 
 def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Return the points (..., 3) of frame b in frame a, with their dtype."""
+    """Transform points from frame b to frame a.
+
+    Args:
+        T_a_b: The rigid transform (4, 4).
+        points_b: The points (..., 3) in frame b.
+
+    Returns:
+        The points (..., 3) in frame a, with the same dtype.
+    """
     moved = points_b @ T_a_b[:3, :3].T.astype(points_b.dtype) + T_a_b[:3, 3].astype(points_b.dtype)
     return np.asarray(moved, points_b.dtype)
 
 
 def skew(v: Float64) -> Float64:
-    """Return the skew-symmetric (3, 3) matrix S of v, with S @ w = v x w."""
+    """Return the skew-symmetric matrix S (3, 3) of v, with S @ w = v x w."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def exp_se3(xi: Float64) -> Float64:
-    """Return the rigid motion exp(xi^) of a twist xi (6,) = (translation, rotation), m and rad."""
+    """Return the exponential map of SE(3).
+
+    Args:
+        xi: The twist (6,): translation, m, and rotation, rad.
+
+    Returns:
+        The rigid motion exp(xi^) (4, 4).
+    """
     rho, phi = np.asarray(xi[:3], np.float64), np.asarray(xi[3:], np.float64)
     theta = math.sqrt(phi @ phi)
     W = skew(phi)
     WW = W @ W
     A = _sinc(theta)
-    B = _sinc(theta / 2) ** 2 / 2  # (1 - cos(theta)) / theta^2, which would cancel
-    # (theta - sin(theta)) / theta^3; a series, with an error of theta^6, where the difference would cancel
+    B = _sinc(theta / 2) ** 2 / 2  # (1 - cos(theta)) / theta^2 without cancellation
+    # (theta - sin(theta)) / theta^3; for small angles a series (error theta^6), which avoids cancellation
     C = (theta - math.sin(theta)) / theta**3 if theta > 1e-2 else 1 / 6 - theta**2 / 120 + theta**4 / 5040
     T = np.eye(4)
     T[:3, :3] += A * W + B * WW
@@ -55,19 +77,19 @@ def _sinc(x: float) -> float:
 
 
 def rotation_angle(R: Float64) -> float:
-    """Return the angle of a (3, 3) rotation, rad, also accurate for small angles."""
+    """Return the angle of a rotation (3, 3) in rad, accurate for small angles."""
     sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
     return float(np.arctan2(sine, (np.trace(R) - 1) / 2))
 
 
 def nearest_rotation(R: Float64) -> Float64:
-    """Return the rotation nearest to a (3, 3) matrix in the Frobenius norm (orthogonal Procrustes)."""
+    """Return the rotation nearest to a matrix (3, 3) in the Frobenius norm (orthogonal Procrustes)."""
     U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """Remove the rounding errors of the rotation of a (4, 4) pose. Raises DataError if it is not rigid."""
+    """Remove the rounding errors of the rotation of a pose (4, 4). Raises DataError if it is not rigid."""
     if not np.isfinite(matrix).all():
         raise DataError("pose: expected finite values, got NaN or infinity")
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
@@ -93,20 +115,37 @@ def interpolate(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Floa
 
 
 def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Return the pixel coordinates (..., 2) (u, v) of points (..., 3) in front of the camera."""
+    """Project points in front of a camera to the image.
+
+    Args:
+        camera: The camera.
+        points_camera: The points (..., 3) in the camera frame, m.
+
+    Returns:
+        The pixel coordinates (u, v) (..., 2).
+    """
     x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
 
 
 def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Float32:
-    """Return the points (P, 3) m, in the camera, of pixels (P, 2) (u, v) with depths (P,) m along z."""
+    """Back-project pixels with depth.
+
+    Args:
+        camera: The camera.
+        pixels: The pixel coordinates (u, v) (P, 2).
+        depth: The depths (P,) along z, m.
+
+    Returns:
+        The points (P, 3) in the camera frame, m.
+    """
     x = (pixels[:, 0] - np.float32(camera.cx)) * (depth / np.float32(camera.fx))
     y = (pixels[:, 1] - np.float32(camera.cy)) * (depth / np.float32(camera.fy))
     return np.stack([x, y, depth], axis=1).astype(np.float32, copy=False)
 
 
 def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raise DataError if a pixel of a cluster is outside the (height, width) image; kernels do not check bounds."""
+    """Raise DataError if a cluster has a pixel outside of the image (height, width). Kernels do not check bounds."""
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
         raise DataError(

@@ -43,11 +43,18 @@ FrameReader = Callable[[], Frame]
 FusionStage = Literal["association", "update", "integration"]
 
 StageTimer = Callable[[FusionStage], AbstractContextManager[None]]
-"""Measures a stage of a fuser, as in `with timer("association"): ...`. The times of one stage in a frame are added."""
+"""Timer of a fuser stage: `with timer("association"): ...`. Times of the same stage in a frame are added."""
 
 
 def untimed(stage: FusionStage) -> AbstractContextManager[None]:
-    """Measure nothing."""
+    """Return a timer that measures nothing.
+
+    Args:
+        stage: The stage; ignored.
+
+    Returns:
+        An empty context manager.
+    """
     return nullcontext()
 
 
@@ -56,14 +63,14 @@ class RGBDVideo(ABC):
 
     name: str  # of the scene, for tables
     annotation: str = ""  # release of the ground truth, for tables; "" = a single release
-    domain: str = ""  # of the images, compared with that of a detector: "rendered rooms"; "" = photographs, or unknown
+    domain: str = ""  # image domain, compared with the detector: "rendered rooms"; "" = photographs or unknown
 
     def has_poses(self) -> bool:
-        """Return whether frames may have true poses. Called before any frame is read; some frames may lack one."""
+        """Return True if frames may have ground-truth poses. Called before any frame is read."""
         return True
 
     def scene_truth(self) -> SceneTruth | None:
-        """Return the true instances visible in the selected frames, or None if there is no annotation."""
+        """Return the ground-truth instances visible in the selected frames; None = no annotation."""
         return None
 
 
@@ -81,14 +88,14 @@ class RGBDSequence(RGBDVideo):
 
     @abstractmethod
     def __getitem__(self, k: int) -> Frame:
-        """Return selected frame k, 0 <= k < len; called in order, from any thread. Raises FrameError if unusable."""
+        """Return selected frame k, 0 <= k < len. Called in order, from any thread. Raises FrameError if unusable."""
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
 
 
 class LiveVideo(RGBDVideo):
-    """A camera stream that is mapped while it runs. If mapping falls behind, frames are dropped."""
+    """A running camera stream. If mapping falls behind, frames are dropped."""
 
     @abstractmethod
     def frames(self) -> Generator[FrameReader | None]:
@@ -99,7 +106,7 @@ class LiveVideo(RGBDVideo):
         and closed with the generator, which may happen at any yield.
 
         Raises:
-            DataError: the device cannot be opened, or fails.
+            DataError: The device cannot be opened, or fails.
         """
 
     def has_poses(self) -> bool:
@@ -110,8 +117,8 @@ class Detector(ABC):
     """Detector of object instances in one image."""
 
     classes: tuple[str, ...]  # names of the columns of class_probabilities; set by the constructor
-    concurrent: bool = False  # true: threads may call `detect` at the same time; each call uses about one core
-    domain: str = ""  # the only `RGBDVideo.domain` that the detector is for; "" = any
+    concurrent: bool = False  # True = threads may call `detect` at the same time; each call uses about one core
+    domain: str = ""  # the only supported `RGBDVideo.domain`; "" = any
 
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:
@@ -125,32 +132,32 @@ class PoseTracker(ABC):
 
     @abstractmethod
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """Return the pose of `frame`; called once per frame, in order. `scene` is read only.
+        """Return the pose of `frame`. Called once per frame, in order. `scene` is read-only.
 
         Set `Pose.lost` if the pose cannot be estimated; the frame is then not integrated. The first frame defines the
-        world frame: its true pose if known, otherwise the identity.
+        world frame: its ground-truth pose if known, otherwise the identity.
 
         Raises:
-            NoPoseError: the tracker returns given poses, and this frame has none. The frame is skipped.
+            NoPoseError: The tracker requires the poses of the sequence, and this frame has no pose. It is skipped.
         """
 
     def keyframes(self) -> Mapping[str, Array]:
-        """Return the arrays of the keyframes, for `load_keyframes`; empty if the tracker keeps none."""
+        """Return the arrays of the keyframes, for `load_keyframes`; empty if the tracker has no keyframes."""
         return {}
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
-        """Resume from stored keyframes; poses are lost until relocalization in `scene` succeeds.
+        """Resume from stored keyframes. Poses are lost until relocalization in `scene` succeeds.
 
         Args:
-            keyframes: The arrays that `keyframes` returned; empty if there were none.
+            keyframes: The arrays returned by `keyframes`; may be empty.
             scene: The map in which these keyframes were recorded.
 
         Raises:
-            ConfigError: the tracker cannot relocalize with these keyframes.
-            DataError: the arrays are not keyframes.
+            ConfigError: The tracker cannot relocalize with these keyframes.
+            DataError: The arrays are not keyframes.
         """
         raise ConfigError(
-            f"tracker: expected a tracker that relocalizes in a stored map, got {type(self).__name__}; "
+            f"tracker: expected a tracker with relocalization in a stored map, got {type(self).__name__}; "
             "choose another tracker"
         )
 
@@ -160,7 +167,7 @@ class ClusterRefiner(ABC):
 
     @abstractmethod
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        """Return the refined clusters; their number may change. `pixels` are the pixels of `frame` of each point.
+        """Return the refined clusters; their number may change. `pixels` contains the pixel of each point in `frame`.
 
         `framework.refinement.refine` bypasses this method for clusters that are `exact`.
         """
@@ -175,22 +182,22 @@ class MapFuser(ABC):
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         """Integrate `frame`, taken at `pose`, and the evidence of its `clusters`.
 
-        If `clusters.detected` is false, there are none, and instances in view do not lose confidence.
+        If `clusters.detected` is false, `clusters` is empty and instances in view do not lose confidence.
         `timer` measures data association, the update of labels and instances, and the integration of depth and color.
         A fuser that does not use it reports their total time as `fusion`.
 
         Raises:
-            MapFullError: the block budget of the map is reached.
+            MapFullError: The block budget of the map is reached.
         """
 
     def resume(self, scene: SceneMap) -> None:
-        """Continue a stored map instead of the empty one.
+        """Resume a stored map instead of starting with an empty map.
 
         Raises:
-            ConfigError: the fuser cannot write this map.
+            ConfigError: The fuser cannot resume this map.
         """
         raise ConfigError(
-            f"fuser: expected a fuser that resumes a stored map, got {type(self).__name__}; choose another fuser"
+            f"fuser: expected a fuser with support for stored maps, got {type(self).__name__}; choose another fuser"
         )
 
 
@@ -200,21 +207,22 @@ class MapStatistics:
 
     voxels: int  # allocated
     bytes: int  # of the arrays
-    evictions: int = 0  # label slots of voxels that were given to another label
+    evictions: int = 0  # label slots reassigned to another label
 
 
 @dataclass(frozen=True)
 class Gravity:
     """The direction of gravity in the world frame of a map."""
 
-    up: Float64 | None = None  # (3,) unit vector against gravity; None = unknown
+    up: Float64 | None = None  # (3,) unit vector opposite to gravity; None = unknown
     source: str = ""  # "sensor" or "surfaces"; "" = unknown
 
 
 class SceneMap(ABC):
-    """The map that a fuser builds.
+    """The map of a fuser.
 
-    Implement `classes` and the six abstract members. Override the other six if the map knows more, or has a faster way.
+    Implement `classes` and the six abstract members. Override the other six members to provide more data or a faster
+    implementation.
     """
 
     classes: tuple[str, ...]  # the label space; empty until the first frame is fused
@@ -226,7 +234,7 @@ class SceneMap(ABC):
 
     @property
     def depth_range(self) -> tuple[float, float]:
-        """(nearest, farthest) depth, m, that is integrated."""
+        """Nearest and farthest integrated depth, m."""
         return 0.0, float("inf")
 
     @property
@@ -255,9 +263,10 @@ class SceneMap(ABC):
         """Return the view of the map from a camera. Raises DataError if T_world_camera is not a pose."""
 
     def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        """Return the surface near the measured `depth` (H, W) m, which a tracker compares with the frame.
+        """Return the surface near the measured `depth` (H, W) m, for tracking.
 
-        A map may start the search at the readings, and omit pixels without a reading and surfaces far behind it.
+        A map may start its search at the depth measurements. It may omit pixels without a measurement, and surfaces far
+        behind a measurement.
         """
         return self.render(camera, T_world_camera)
 
@@ -276,7 +285,7 @@ class SceneMap(ABC):
     @classmethod
     @abstractmethod
     def load(cls, path: Path | str) -> SceneMap:
-        """Return the map in a file of `save`. Raises DataError if the file is damaged or of another kind."""
+        """Read a map written by `save`. Raises DataError if the file is damaged or has another format."""
 
 
 class Viewer:
@@ -287,13 +296,13 @@ class Viewer:
     """
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
-        """Start a video; write files to `directory`. Raises ConfigError if it cannot be shown."""
+        """Start a video and write files to `directory`. Raises ConfigError if the viewer cannot start."""
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
-        """Show a frame that was integrated, or whose pose is lost. `stage_ms` is the time of each stage, by name."""
+        """Show an integrated frame, or a frame with a lost pose. `stage_ms` contains the stage times by name, ms."""
 
     def skip(self, reason: str) -> None:
         """Report an unusable frame."""
 
     def end(self) -> None:
-        """Finish, however the run ended; called once after `begin`."""
+        """Finish the video. Called once after `begin`, also after an error of the run."""

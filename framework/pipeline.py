@@ -1,4 +1,4 @@
-"""The loop: detection, tracking, lifting, refinement, fusion."""
+"""The mapping loop: detection, tracking, lifting, refinement, fusion."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from framework.runtime.signals import Interruption, signals_deferred
 
 log = logging.getLogger(__name__)
 
-WITHOUT_POSES = "add the poses of the sequence, or set tracker=voxel_hashing_icp, which needs none"
+WITHOUT_POSES = "add the poses of the sequence, or estimate them with tracker=voxel_hashing_icp"
 WITHOUT_THREADS = (
     "numba's threading layer is not thread-safe; detection runs in the calling thread; call "
     "instancemap.configure_process() before numba is imported"
@@ -53,7 +53,7 @@ class Pipeline:
     fuser: MapFuser
     prefetch: int = 2  # frames prefetched by other threads (live video: at most 1); 0 = none
     viewer: Viewer = field(default_factory=Viewer)
-    detection_interval: int = 1  # frames from one detection to the next; the frames between are tracked and mapped
+    detection_interval: int = 1  # detect on every n-th frame; all frames are tracked and mapped
 
     def __post_init__(self) -> None:
         if self.detection_interval < 1:
@@ -61,17 +61,26 @@ class Pipeline:
                 f"Pipeline.detection_interval: expected at least 1 frame, got {self.detection_interval}; set it to 1"
             )
         if self.prefetch < 0:
-            raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}")
+            raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
         self.viewer = GuardedViewer(self.viewer)
 
     def run(self, video: RGBDVideo) -> RunResult:
         """Map `video` frame by frame.
 
-        Frames that raise FrameError are skipped, and lost frames are not fused; both are counted. Ctrl-C (after the
-        current frame) and a full map end the loop early, with the reason in `stopped_by`. Ctrl-C is the normal end of a
-        live video, whose frames are dropped and counted when mapping falls behind.
+        Frames that raise FrameError are skipped, and lost frames are not fused. Both are counted. Ctrl-C (after the
+        current frame) and a full map end the loop early.
 
-        Raises DataError if nothing was mapped, and other errors of stages.
+        Ctrl-C is the normal end of a live video. Its frames are dropped and counted if mapping falls behind. Other
+        errors of stages are raised.
+
+        Args:
+            video: The sequence or live video.
+
+        Returns:
+            The map and the statistics of the run. `stopped_by` is the reason of an early end.
+
+        Raises:
+            DataError: No frame was mapped.
         """
         result = self.run_to_any_end(video)
         if result.stopped_by is None or isinstance(result.stopped_by, KeyboardInterrupt | MapFullError):
@@ -79,16 +88,16 @@ class Pipeline:
         raise result.stopped_by
 
     def run_to_any_end(self, video: RGBDVideo, directory: Path = Path()) -> RunResult:
-        """Map `video`, and return errors of stages in `stopped_by` once something is mapped.
+        """Map `video`, and return errors of stages in `stopped_by` after the first mapped frame.
 
-        `directory` is the folder of a viewer's files.
+        `directory` is the output folder of the viewer.
         """
         frames_expected = len(video) if isinstance(video, RGBDSequence) else None
         if frames_expected == 0:
             raise DataError(f"{video.name}: expected at least 1 frame, got 0; change start, stop or stride")
         if self.tracker.pose_source == "ground_truth" and not video.has_poses():
             frames = "its frames" if frames_expected is None else f"the {frames_expected} frames"
-            raise DataError(f"{video.name}: expected true poses, got none for {frames}; {WITHOUT_POSES}")
+            raise DataError(f"{video.name}: expected ground-truth poses, got none for {frames}; {WITHOUT_POSES}")
         warn_outside_domain(self.detector, video)
         journal = Journal(self.fuser.scene, frames_expected, self.tracker.pose_source)
         with (
@@ -106,13 +115,13 @@ class Pipeline:
             if journal.frames_in_map == 0:
                 raise journal.stopped_by
             if isinstance(video, LiveVideo) and journal.stopped_by is interruption.asked:
-                journal.stopped_by = None  # normal end; a second signal is another Interrupted
+                journal.stopped_by = None  # the normal end; a second signal raises another Interrupted
         elif journal.frames_in_map == 0 or self.fuser.scene.statistics.voxels == 0:
             raise DataError(f"{video.name}: {self.empty_map_reason(journal)}")
         return replace(journal.result(), keyframes=keyframes)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
-        """Return the tracker's keyframes. An error of the last frame, which is raised only now, ends the run."""
+        """Return the keyframes of the tracker. An error of the last frame is raised only now, and ends the run."""
         try:
             return self.tracker.keyframes()
         except Exception as error:
@@ -120,7 +129,7 @@ class Pipeline:
             return self.tracker.keyframes()
 
     def empty_map_reason(self, journal: Journal) -> str:
-        """Return why the map of a run is empty."""
+        """Return the reason of an empty map."""
         result = journal.result()
         if result.frames == 0:
             return "expected at least one frame, got none"
@@ -172,8 +181,8 @@ class Pipeline:
     ) -> Generator[tuple[Frame, Detections]]:
         """Yield the usable frames with their detections, in order.
 
-        Up to `prefetch` frames are read and detected while another one is mapped, in parallel if the detector supports
-        it; the results of a recording do not depend on it.
+        Up to `prefetch` frames are read and detected while another frame is mapped, in parallel if the detector
+        supports it. The results of a recording do not depend on `prefetch`.
         """
         stream = stream_of(video, lambda: interruption.asked is not None)
         prefetch = prefetch if stream.most_ahead is None else min(prefetch, stream.most_ahead)
@@ -202,9 +211,9 @@ class Pipeline:
     def read_and_detect(
         self, stream: FrameStream, turn: AbstractContextManager[None], number: int
     ) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
-        """Read the next frame, the `number`-th, in its `turn` and detect.
+        """Read frame `number` of the video in its `turn`, and detect its objects.
 
-        Returns its stage times, too, or its error; None at the end.
+        Returns the frame, its detections and its stage times, or the error of the frame. None = end of the video.
         """
         try:
             with turn:
@@ -220,7 +229,7 @@ class Pipeline:
         return frame, detections, [reading, *times]
 
     def detect(self, frame: Frame, number: int) -> tuple[Detections, list[StageTime]]:
-        """Return the detections of the `number`-th frame of a video (from 0), and their time if detection ran."""
+        """Return the detections of frame `number` of the video (from 0), and the detection time if the detector ran."""
         if number % self.detection_interval:
             return Detections.none(frame.depth.shape, self.detector.classes, detected=False), []
         began = time.perf_counter()
@@ -249,7 +258,7 @@ class Pipeline:
 
 @contextmanager
 def watched(viewer: Viewer, scene: SceneMap, video: str, directory: Path) -> Iterator[None]:
-    """Begin the viewer, and end it after the body or an error."""
+    """Start the viewer, and end it after the body, also after an error."""
     viewer.begin(scene, video, directory)
     try:
         yield

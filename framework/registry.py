@@ -1,4 +1,4 @@
-"""Construction of plugins from config nodes; no other module runs code named in a config."""
+"""Construction of plugins from config nodes. No other module runs code named in a config."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ STAGES: Mapping[str, type[Any]] = {
     "refiner": ClusterRefiner,
     "fuser": MapFuser,
 }
-"""Config groups that results depend on, and the interface that their options implement."""
+"""Interfaces of the options, by config group. These groups affect results."""
 
 GROUPS: Mapping[str, type[Any]] = {**STAGES, "viewer": Viewer}
-"""All config groups whose options are plugins."""
+"""Interfaces of the options, by config group of plugins."""
 
 REGISTER = "; register your class with a YAML {stage}/NAME.yaml in a folder given by --config-dir"
 
@@ -53,12 +53,12 @@ def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
     unregistered code. Interpolations in the node are resolved against the config that contains it.
 
     Args:
-        interface: The class that the plugin implements. Not `type[Plugin]`, which excludes abstract classes.
+        interface: The interface of the plugin. Its type is not `type[Plugin]`, which excludes abstract classes.
         node: The config of the plugin.
 
     Raises:
-        ConfigError: The class or a parameter is wrong; names the stage and the plugin.
-        InstanceMapError: Raised by the plugin itself; the stage and the plugin are prepended.
+        ConfigError: The class or a parameter is invalid. The message names the stage and the plugin.
+        InstanceMapError: The plugin raises it. The stage and the plugin are prepended to the message.
     """
     stage = stage_of(interface)
     if not isinstance(node, DictConfig) or OmegaConf.is_missing(node, "_target_") or not node.get("_target_"):
@@ -91,7 +91,15 @@ def _errors_at(where: str) -> Iterator[None]:
 
 
 def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
-    """Return the plugin with these parameters, which include those of its parts."""
+    """Build a plugin from its parameters, including the parameters of its parts.
+
+    Args:
+        plugin_class: The class of the plugin.
+        values: The parameters by name.
+
+    Returns:
+        The plugin.
+    """
     parts = {
         name: assemble(part, **{key: values.pop(key) for key in parameter_fields(part) if key in values})
         for name, (_, part) in _fields(plugin_class).items()
@@ -103,7 +111,7 @@ def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
 def parameter_fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
     """Return the field and type of each parameter of a plugin by name.
 
-    A part (a field whose type is a dataclass) is replaced by its own parameters. Raises ConfigError for a duplicate
+    A part (a field with a dataclass as type) is replaced by its own parameters. Raises ConfigError for a duplicate
     name.
     """
     found: dict[str, tuple[dataclasses.Field[Any], Any]] = {}
@@ -127,14 +135,14 @@ def _fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]
 
 
 def stage_of(interface: Callable[..., object]) -> str:
-    """Return the config group whose options implement `interface`, or a base class of it."""
+    """Return the config group of the plugins that implement `interface` or a base class of it."""
     assert isinstance(interface, type)
     return next(stage for stage, of in GROUPS.items() if issubclass(interface, of))
 
 
 @contextmanager
 def _options_loader() -> Iterator[Any]:
-    """Yield the loader of the running Hydra if our configs are on its search path, else a new one."""
+    """Yield the loader of the running Hydra if our configs are on its search path, otherwise a new loader."""
     if (running := running_loader()) is not None:
         yield running
         return
@@ -143,7 +151,7 @@ def _options_loader() -> Iterator[Any]:
 
 
 def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
-    """Yield the classes that the stage's options name, first of the options whose name is part of `sought`."""
+    """Yield the class names in the options of a stage. Options with a name contained in `sought` come first."""
     inheriting = []
     files: Any = CachingConfigRepository(loader.repository)
     for name in sorted(loader.get_group_options(stage), key=lambda name: name not in sought):
@@ -153,20 +161,20 @@ def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
         else:
             inheriting.append(name)
     for name in inheriting:
-        with suppress(HydraException):  # of a broken option
+        with suppress(HydraException):  # broken option
             for path, package in composition(files, stage, name).items():
                 if package == stage:
                     yield str(files.load_config(path).config.get("_target_"))
 
 
 def composition(files: Any, stage: str, name: str) -> dict[str, str]:
-    """Return the packages of the configs that an option of a stage consists of, by path, in order.
+    """Return the packages of the configs in an option of a stage, by path, in order.
 
-    They are composed as in a run, because an option may override the choice of another stage. `files` is the caching
+    The option is composed as in a run, because it may override the choice of another stage. `files` is the caching
     repository of a loader. Raises HydraException for a broken option.
     """
     own = files.load_config(f"{stage}/{name}")
-    if not own.defaults_list and own.header.get("package") is None:  # a single file: skip Hydra's 10 ms
+    if not own.defaults_list and own.header.get("package") is None:  # a single file: skip the composition (10 ms)
         return {f"{stage}/{name}": stage}
     chosen = OverridesParser.create().parse_overrides([f"{stage}={name}"])
     entries: Any = create_defaults_list(files, "config", chosen, prepend_hydra=False, skip_missing=False).defaults
@@ -174,7 +182,7 @@ def composition(files: Any, stage: str, name: str) -> dict[str, str]:
 
 
 def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
-    """Import the class that `target` ("package.module.Class") names.
+    """Import the class `target` ("package.module.Class").
 
     Raises ConfigError unless it is a concrete dataclass that implements `interface`.
     """
@@ -193,7 +201,7 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
             f"{class_name}{_did_you_mean(class_name, fitting)}"
         )
     if not _implements(found, interface):
-        kind = "another class" if isinstance(found, type) else f"a {type(found).__name__}"
+        kind = f"the class {class_name}" if isinstance(found, type) else f"a {type(found).__name__}"
         if _implements(found, GROUPS[stage]):
             what = (inspect.getdoc(interface) or "").partition("\n")[0].removesuffix(".")
             raise ConfigError(f"{where}: expected a subclass of {interface.__name__} ({what}), got {class_name}")
@@ -212,8 +220,8 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
 def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, Any]:
     """Return the keyword arguments for `plugin_class` from `node`, each with the type of its dataclass field.
 
-    Raises ConfigError, starting with `where`, for an unknown parameter, a wrong type or a missing value. The metadata
-    `where` of a field is a hint on how to obtain its value.
+    Raises ConfigError that names `where` for an unknown parameter, a wrong type or a missing value. The metadata
+    `where` of a field is a hint for obtaining its value.
     """
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
@@ -234,7 +242,7 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
 def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
     """Raise ConfigError if an option has an unknown parameter or a value of a wrong type.
 
-    Skips values that depend on other configs or that the user has to set.
+    Skips values that depend on other configs, and values that the user must set.
     """
     plugins = plugin_fields(plugin_class)
     settled = [key for key in map(str, node) if key not in plugins and not OmegaConf.is_interpolation(node, key)]
@@ -242,7 +250,7 @@ def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
 
 
 def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
-    """Return the values of a plugin's parameters (with defaults), and the plugins that it contains."""
+    """Return the parameters of a plugin (with defaults), and its nested plugins."""
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
     typed = [
@@ -275,7 +283,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
 
 
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
-    """Return the interfaces of the fields that hold a plugin, or several by name (Mapping[str, interface])."""
+    """Return the interfaces of the fields with a plugin, or with plugins by name (Mapping[str, interface])."""
     found = {}
     for name, hint in get_type_hints(plugin_class).items():
         of = get_args(hint)
@@ -287,12 +295,12 @@ def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
 
 
 def holds_one(plugin_class: type, name: str) -> bool:
-    """Return true if a field that holds plugins holds one, and not several by name."""
+    """Return True if a plugin field contains a single plugin, not a mapping of plugins."""
     return get_type_hints(plugin_class)[name] in STAGES.values()
 
 
 def _inner(where: str, interface: type[Any], node: Any, one: bool) -> Any:
-    """Build the plugin in another one's config, or the mapping of plugins by name, without those that are null."""
+    """Build a nested plugin, or a mapping of nested plugins without null entries."""
     if one:
         with _errors_at(where):
             return build(interface, node)
@@ -313,7 +321,7 @@ def _import(where: str, module_name: str) -> ModuleType:
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"{where}: {module_name} requires the package {error.name!r}, which is not installed; install it"
+            f"{where}: {module_name}: expected an installed package {error.name!r}, got none; install it"
         ) from error
     except Exception as error:  # third-party code
         kind = type(error).__name__
@@ -326,7 +334,7 @@ def _check_module(where: str, module_name: str) -> None:
     name = package
     try:
         spec = importlib.util.find_spec(package)
-    except ValueError:  # not a name, or the name of something else
+    except ValueError:  # not a module name
         spec = None
     if package == "plugins" and spec is not None:
         _check_plugins_package(spec)
@@ -345,12 +353,12 @@ def _check_module(where: str, module_name: str) -> None:
 
 
 def _check_plugins_package(plugins: ModuleSpec) -> None:
-    """Raise InstanceMapError if Python finds another package `plugins` before ours."""
+    """Raise InstanceMapError if another package `plugins` precedes ours on the module search path."""
     found = Path([*(plugins.submodule_search_locations or []), str(plugins.origin)][0]).resolve()
     if found != PROJECT_ROOT / "plugins":
         raise InstanceMapError(
-            f"plugins: expected InstanceMap's package at {PROJECT_ROOT / 'plugins'}, got another one at "
-            f"{found}; rename it or start in another folder"
+            f"plugins: expected InstanceMap's package at {PROJECT_ROOT / 'plugins'}, got {found}; rename "
+            "it or start Python in another folder"
         )
 
 

@@ -1,4 +1,4 @@
-"""Commands of `instancemap`, one per file; `command_line`, `experiment` and `sweep` are shared."""
+"""Commands of `instancemap`, one module each. Modules such as `command_line` are shared."""
 
 from framework.runtime.process_settings import set_environment
 

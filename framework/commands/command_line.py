@@ -38,7 +38,7 @@ EXIT_SIGNAL = 128  # plus the signal's number, as in shells: 130 after Ctrl-C, 1
 
 
 def directory_name(overrides: str) -> str:
-    """Return overrides as the name of one directory: no separators, and short enough for every file system."""
+    """Return a directory name for overrides, without separators and short enough for every file system."""
     name = overrides.replace(os.sep, "_") or "defaults"
     return name if len(name) <= 200 else f"{name[:180]}_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
 
@@ -49,7 +49,7 @@ OmegaConf.register_new_resolver("directory_name", directory_name, replace=True)
 
 @contextmanager
 def one_line_errors() -> Iterator[None]:
-    """Exit with one line on stderr and a status after a known error or Ctrl-C in the body."""
+    """Exit with a status and one line on stderr after a known error or Ctrl-C in the body."""
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises its errors instead of printing them
     try:
         yield
@@ -69,11 +69,11 @@ def print_error(error: BaseException, prefix: str = "error: ") -> None:
 
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Parse the command line. All commands also take `debug=true` and --config-dir, which registers more options."""
+    """Parse the command line. All commands also accept `debug=true` and --config-dir."""
     for word in sys.argv[1:]:
         if word.startswith("debug=") and word not in ("debug=true", "debug=false"):
             parser.error(f"debug: expected true or false, got {word.partition('=')[2][:60]!r}")
-    parser.add_argument("--config-dir", metavar="FOLDER", type=Path, help="folder with more options, as in a run")
+    parser.add_argument("--config-dir", metavar="FOLDER", type=Path, help="folder with additional config options")
     parsed = parser.parse_intermixed_args([word for word in sys.argv[1:] if not word.startswith("debug=")])
     if parsed.config_dir is not None:
         try:
@@ -84,7 +84,7 @@ def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
 
 
 def print_for_directories(description: str, directory_help: str, write: Callable[[Path], str]) -> None:
-    """Run a command with arguments DIR...: print what `write` returns for each directory.
+    """Run a command with arguments DIR..., and print the result of `write` for each directory.
 
     An error in one directory does not stop the others.
     """
@@ -109,7 +109,7 @@ class Jobs:
     status: int = 0
 
     def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
-        """Return `job` with its errors logged: one line for a known error, else (or with `debug`) a traceback."""
+        """Return `job` with logged errors: one line for a known error, otherwise (or with `debug`) a traceback."""
 
         @wraps(job)
         def reported_job(config: DictConfig) -> None:
@@ -128,10 +128,10 @@ class Jobs:
         return reported_job
 
     def run(self, command: Callable[[], None]) -> None:
-        """Run Hydra's command for a reported job, and exit with a status if one has failed."""
+        """Run Hydra's command for a reported job, and exit with an error status if a job has failed."""
         with one_line_errors():
-            for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra reports a missing one
-                add_config_dir(folder)  # for the work after Hydra's part, such as the figure of a sweep
+            for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra reports a missing folder
+                add_config_dir(folder)  # for steps after Hydra, such as the figure of a sweep
             Plugins.instance().register(InstalledConfigs)
             command()
         if self.status:
@@ -146,7 +146,7 @@ def check_switches(config: DictConfig) -> None:
 
 
 def is_of_sweep(hydra_config: HydraConf) -> bool:
-    """Return true for a job of a sweep."""
+    """Return True for a job of a sweep."""
     return not OmegaConf.is_missing(hydra_config.job, "num")
 
 
@@ -161,13 +161,13 @@ def _config_dirs(words: list[str]) -> list[Path]:
 
 
 def _in_worker() -> bool:
-    """Return true in a job that another launcher than Hydra's own runs in a separate process."""
+    """Return True in a job of a launcher other than Hydra's basic launcher, which uses separate processes."""
     hydra_config = HydraConfig.get()
     return is_of_sweep(hydra_config) and not str(hydra_config.launcher._target_).endswith(".BasicLauncher")
 
 
 def _log_error(message: str, error: BaseException | None) -> None:
-    """Log an error, which also writes it to the job's log file; print it if logging is not configured."""
+    """Log an error to the console and the job's log file, or print it if logging is not configured."""
     if logging.getLogger().handlers and not log.disabled:
         log.error("%s", message, exc_info=error)
         return

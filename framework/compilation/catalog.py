@@ -1,4 +1,4 @@
-"""Compiles kernels before the runs that need them, in parallel processes and with a progress bar.
+"""Compilation of kernels in advance, in parallel processes and with a progress bar.
 
 numba compiles a kernel at its first call with new argument types, and stores it in its cache. kernels.txt lists these
 calls.
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 LIST = Path(__file__).with_name("kernels.txt")
 CHECKOUT = Path(__file__).resolve().parents[2]
-DEFAULT, OTHERS = "# a run with the default stages", "# what other stages add"
+DEFAULT, OTHERS = "# a run with the default stages", "# additional kernels of other stages"
 MOST_WORKERS = 4  # each takes 0.5 GB and compiles shared functions again
 SECONDS_EACH = 0.65  # of a core (AMD EPYC, Zen 5), for an estimate of the time
 
@@ -51,7 +51,7 @@ class Kernel:
 
     @property
     def dispatcher(self) -> Any:
-        """Raises DataError if the list is older than the code."""
+        """The numba dispatcher. Raises DataError if kernels.txt is older than the code."""
         found = getattr(import_module(self.module), self.name, None)
         if not isinstance(found, Dispatcher):
             raise DataError(
@@ -65,7 +65,7 @@ class Kernel:
         return tuple(map(_type_of, ast.parse(f"f({self.types})", mode="eval").body.args))  # type: ignore[attr-defined]
 
     def is_compiled(self) -> bool:
-        """Return true if numba's cache contains it, newer than all kernels that it calls."""
+        """Return True if numba's cache contains the kernel and is newer than all called kernels."""
         cache = self.dispatcher._cache
         index = Path(cache._cache_file._index_path) if cache._enabled else None
         if index is None or not index.exists():
@@ -106,9 +106,9 @@ def line_of(dispatcher: Any, signature: Iterable[Any]) -> str:
 
 
 def compile_for_run() -> None:
-    """Compile the listed kernels of all imported modules. Logs a warning for those that fail.
+    """Compile the listed kernels of all imported modules. Logs a warning if a kernel fails.
 
-    A run calls it after it has built its stages, and after its video.
+    A run calls this function after building its stages, and again after building its video.
     """
     loaded = [kernel for kernel in listed(DEFAULT, OTHERS) if kernel.module in sys.modules]
     missing = [kernel for kernel in loaded if not kernel.is_compiled()]
@@ -129,8 +129,8 @@ def compile_for_run() -> None:
 def compile_all(kernels: list[Kernel]) -> None:
     """Compile kernels in parallel processes, with a progress bar.
 
-    One process compiles all kernels of a module, which share functions. Raises DataError for the first error, after
-    the other kernels are done.
+    One process compiles all kernels of a module, which share functions. Raises DataError for the first error after all
+    other kernels are compiled.
     """
     in_order = sorted(kernels, key=attrgetter("module"))
     by_module = {module: list(group) for module, group in groupby(in_order, attrgetter("module"))}
@@ -173,7 +173,7 @@ def _worker() -> subprocess.Popen[str]:
 def _feed(
     process: subprocess.Popen[str], waiting: queue.SimpleQueue[list[Kernel]], events: queue.SimpleQueue[tuple[str, str]]
 ) -> None:
-    """Send a worker the kernels of one module after the other; report `begun` and `done` with an error or ""."""
+    """Send kernels to a worker, module by module. Report `begun`, and `done` with an error or ""."""
     assert process.stdin is not None
     assert process.stdout is not None
     with suppress(queue.Empty):
@@ -195,7 +195,7 @@ def _feed(
 
 
 def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueue[tuple[str, str]]) -> list[str]:
-    """Show the number of remaining kernels until all are done, as a bar or as log lines, and return the errors."""
+    """Show the number of remaining kernels as a bar or as log lines until all are done, and return the errors."""
     left = count
     errors: list[str] = []
     with Progress(count, " kernels") as bar:
@@ -205,7 +205,7 @@ def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueu
             except queue.Empty:
                 event, text = "", ""
                 if not any(thread.is_alive() for thread in threads):
-                    raise DataError("kernels: expected running processes, got none; all have ended") from None
+                    raise DataError("kernels: expected running processes, got none; run the command again") from None
             if event == "done":
                 left -= 1
                 bar.update()
@@ -220,7 +220,7 @@ def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueu
 
 @contextmanager
 def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
-    """Serialize compilation: the jobs of a sweep start at the same time."""
+    """Serialize compilation across processes: the jobs of a sweep start at the same time."""
     folder = Path(kernels[0].dispatcher._cache.cache_path)
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / "compiling.lock")
@@ -230,7 +230,7 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
         except Timeout:
             log.info("another process is compiling kernels; waiting for it")
             lock.acquire()
-    except OSError as error:  # no locks: several processes may compile the same kernels
+    except OSError as error:  # without locks, several processes may compile the same kernels
         log.warning("%s: expected a file system with locks (%s); compiling without a lock", folder, error.strerror)
     try:
         yield
@@ -239,7 +239,7 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
 
 
 def called_by(dispatcher: Any) -> set[Any]:
-    """Return a kernel and all kernels that it calls, directly or not."""
+    """Return a kernel and all kernels that it calls directly or indirectly."""
     found: set[Any] = set()
     waiting = [dispatcher]
     while waiting:
@@ -259,7 +259,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _text_of(kind: Any) -> str:
-    """Return a numba type as a Python expression, which _type_of() parses."""
+    """Return a numba type as a Python expression for _type_of()."""
     if isinstance(kind, types.Array):
         axes = [":"] * kind.ndim
         if kind.layout == "C":
@@ -277,12 +277,12 @@ def _text_of(kind: Any) -> str:
         return f"omitted({kind.value!r})"
     text = "boolean" if kind == types.boolean else str(kind)
     if getattr(types, text, None) != kind:
-        raise TypeError(f"{kind}: expected a type of numba.types, got another one")
+        raise TypeError(f"{kind}: expected a type of numba.types, got {type(kind).__name__}")
     return text
 
 
 def _type_of(node: ast.expr) -> Any:
-    """Return the numba type of an expression of _text_of()."""
+    """Return the numba type of an expression from _text_of()."""
     if isinstance(node, ast.Name):
         return getattr(types, node.id)
     if isinstance(node, ast.Tuple):

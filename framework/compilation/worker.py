@@ -1,11 +1,11 @@
-"""Worker process that compiles kernels without running them.
+"""Worker process for compiling kernels without running them.
 
 numba generates machine code and Python and C wrappers for each function that a kernel calls, although the kernel
-contains a copy. Skipping that saves a third of the time and gives the same cache.
+contains a copy. Skipping this step saves a third of the time and results in the same cache.
 
 numba also optimizes each function separately, and again as part of each caller. Here, most functions are optimized
-only as part of a kernel, which saves another fifth; the kernels are no slower. Functions with forced inlining are
-optimized first, because loops over a batch or a row are vectorized only in a separate function.
+only as part of a kernel, which saves another fifth of the time. The kernels are equally fast. Functions with forced
+inlining are optimized first, because loops over a batch or a row are vectorized only in a separate function.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numba.core.caching import NullCache
 from framework.compilation.catalog import DEFAULT, OTHERS, Kernel, called_by, listed
 
 TESTED = ("0.68.1",)
-"""Versions of numba whose internals this process replaces. Other versions compile 1.4 times slower."""
+"""Supported versions of the numba internals that this process replaces. Others compile 1.4 times slower."""
 
 
 def work() -> None:
@@ -56,7 +56,7 @@ def work() -> None:
 
 
 def make_code_only_for(names: set[str]) -> None:
-    """Make numba generate machine code only for functions with these names, which contain the others."""
+    """Make numba generate machine code only for functions with these names. They contain all other functions."""
     from numba.core.codegen import CPUCodeLibrary, JITCPUCodegen
     from numba.core.registry import cpu_target
 
@@ -80,7 +80,7 @@ def make_code_only_for(names: set[str]) -> None:
 
 
 def optimize_fully(names: set[str]) -> None:
-    """Make numba optimize only functions with these names; others only lose reference counts before inlining."""
+    """Make numba optimize only functions with these names; for others only remove reference counts."""
     from numba.core.codegen import CPUCodeLibrary
 
     optimize = CPUCodeLibrary._optimize_final_module

@@ -1,4 +1,4 @@
-"""Composition of configs as on the command line, with errors in one line."""
+"""Composition of configs as on the command line, with one-line errors."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def add_config_dir(folder: Path) -> None:
 
 @cache
 def installed_config_dirs() -> dict[Path, str]:
-    """Return the config folders of the entry points `instancemap.configs`, each with the name of its package.
+    """Return the config folders of the entry points `instancemap.configs`, with the names of their packages.
 
     The value of an entry point is the dotted path of a folder. Nothing is imported.
     """
@@ -68,7 +68,9 @@ def installed_config_dirs() -> dict[Path, str]:
         folder = next(filter(Path.is_dir, places), None)
         name = entry.dist.name if entry.dist else entry.name
         if folder is None:
-            log.warning("%s: expected the folder %s of its entry point instancemap.configs", name, entry.value)
+            log.warning(
+                "%s: expected the folder %s of its entry point instancemap.configs, got none", name, entry.value
+            )
         else:
             folders[folder.resolve()] = name
     return folders
@@ -95,20 +97,21 @@ class FileConfigSource(hydra_api.FileConfigSource):
         config: Any = found.config
         if not isinstance(config, DictConfig):
             raise DataError(f"{path}: expected keys and values, got a list")
+        # Hydra does not check some types of defaults
         if "defaults" in config and not isinstance(config.get("defaults"), ListConfig):
-            raise DataError(f"{path}: expected a list as defaults")  # Hydra does not check some other types
+            raise DataError(f"{path}: defaults: expected a list, got {config.get('defaults')!r:.40}")
         return found
 
 
 class HydraNodes(hydra_api.StructuredConfigSource):
-    """Hydra's structured nodes, without those stored by the host.
+    """Hydra's structured nodes, without nodes of the host application.
 
     Hydra adds the basic launcher and sweeper only when it scans its plugins, which changes the host's store.
     """
 
     def __init__(self, provider: str, path: str) -> None:
         super().__init__(provider, path)
-        self.store = object.__new__(ConfigStore)  # the class itself returns the host's
+        self.store = object.__new__(ConfigStore)  # the class itself returns the store of the host
         self.store.repo = {"hydra": deepcopy(ConfigStore.instance().repo["hydra"])}
         for part in ("launcher", "sweeper"):
             if "basic.yaml" not in self.store.repo["hydra"].get(part, {}):
@@ -131,7 +134,7 @@ class Repository(hydra_api.ConfigRepository):
 
 
 class ConfigLoader(hydra_api.ConfigLoaderImpl):
-    """Loader of our configs and those of the added folders, without Hydra's process-wide state."""
+    """Loader of our configs and of added folders, without Hydra's process-wide state."""
 
     def __init__(self) -> None:
         path = hydra_api.ConfigSearchPathImpl()
@@ -157,7 +160,7 @@ class ConfigLoader(hydra_api.ConfigLoaderImpl):
 
 @contextmanager
 def config_loader() -> Iterator[ConfigLoader]:
-    """Return the loader of our configs; Hydra uses their version base inside the context."""
+    """Yield the loader of our configs. Hydra uses their version base inside the context."""
     with hydra_api.version_base("1.3"):
         yield ConfigLoader()
 
@@ -172,7 +175,7 @@ def running_loader() -> Any | None:
 
 
 def one_line(error: BaseException) -> str:
-    """Return the error in one line, with the fix."""
+    """Return an error message on one line, with the fix."""
     return printable(_said(error))
 
 
@@ -185,7 +188,7 @@ def _said(error: BaseException) -> str:
         return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         return _joined(f"{error} {error.__cause__}")
-    if isinstance(error, InterpolationResolutionError):  # the message of a resolver is between its kind and the key
+    if isinstance(error, InterpolationResolutionError):  # the message of the resolver is between its type and the key
         return _joined(
             str(error).partition("\n")[0].partition(" raised while resolving interpolation: ")[2] or str(error)
         )
@@ -212,7 +215,7 @@ def _no_such_option(error: MissingConfigException) -> str:
 
 
 def _known_keys(error: OmegaConfBaseException) -> str:
-    """Return the existing keys at the position of an unknown key."""
+    """Return an error message with the existing keys at the position of an unknown key."""
     keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
     close = get_close_matches(str(error.key), keys, n=1)
     path = str(error.full_key or error.key)

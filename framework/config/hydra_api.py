@@ -1,4 +1,4 @@
-"""The private parts of Hydra that this project uses. All other modules import them from here.
+"""Private Hydra APIs in use. All other modules import them from here.
 
 Tested with the versions in TESTED; `hydra-core>=1.3.8,<1.4` in pyproject.toml has to match them.
 """
@@ -42,7 +42,7 @@ _composing = RLock()
 
 @contextmanager
 def version_base(version: str) -> Iterator[None]:
-    """Give Hydra this version base while the body runs; the host's is restored."""
+    """Set Hydra's version base in the body, and restore the value of the host application."""
     with _composing:
         before = Singleton._instances.pop(VersionBase, None)
         setbase(version)
@@ -55,7 +55,7 @@ def version_base(version: str) -> Iterator[None]:
 
 
 def running() -> Any | None:
-    """Return the Hydra application of this process; unlike GlobalHydra.instance(), this creates nothing."""
+    """Return the Hydra application of this process, without creating one as GlobalHydra.instance() does."""
     return getattr(Singleton._instances.get(GlobalHydra), "hydra", None)
 
 
@@ -66,6 +66,6 @@ def search_path_plugins() -> list[Any]:
 
 
 def replace_file_source(source: type[FileConfigSource]) -> None:
-    """Make this process's Hydra read YAML files with `source`. Only for a process of the command line."""
+    """Make Hydra read YAML files with `source` in this process. Only for processes of the command line."""
     Plugins.instance()  # registers Hydra's own sources
     SourcesRegistry.instance().types[source.scheme()] = source

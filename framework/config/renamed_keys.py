@@ -1,4 +1,4 @@
-"""Config keys that were renamed before 0.1.0, for errors that name the new key."""
+"""Config keys renamed before 0.1.0, for error messages with the new key."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ RENAMED = {
 
 
 def new_name(key: str) -> str | None:
-    """Return the new name of a dotted key, None if it was not renamed."""
+    """Return the new name of a dotted key; None = not renamed."""
     parts = key.split(".")
     return RENAMED.get(key) or (RENAMED.get(f"{parts[0]}.{parts[-1]}") if len(parts) > 2 else None)
 
 
 def rename_hint(key: str) -> str:
-    """Return the end of an error for an unknown key: its new name, or an empty string."""
+    """Return the fix for an unknown key: its new name; "" = not renamed."""
     found = new_name(key)
     return f"{key} was renamed; set {found}" if found else ""

@@ -17,14 +17,22 @@ LONGEST_SIDE = 2**13  # px, of the input image of a network
 
 
 def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
-    """Raise ConfigError unless each named parameter is in its closed interval (low, high); NaN is in no interval."""
+    """Check that parameters are in closed intervals. NaN is in no interval.
+
+    Args:
+        plugin: The plugin.
+        bounds: The interval (low, high) of each parameter by name.
+
+    Raises:
+        ConfigError: A parameter is outside of its interval.
+    """
     for name, (low, high) in bounds.items():
         value = getattr(plugin, name)
         require(low <= value <= high, f"{type(plugin).__name__}.{name}", value, f"a value in [{low:g}, {high:g}]")
 
 
 def check_intervals(stage: str, plugin: object, **intervals: str) -> None:
-    """Raise ConfigError unless each named parameter lies in its interval, such as "(0, 1]". NaN is in no interval."""
+    """Raise ConfigError unless each parameter is in its interval, such as "(0, 1]". NaN is in no interval."""
     for name, interval in intervals.items():
         low, high = map(float, interval[1:-1].split(","))
         value = getattr(plugin, name)
@@ -48,14 +56,14 @@ def checked_file(name: str, value: object, suffix: str = "") -> Path:
     """Return the absolute path of an output file in a config key. Raises ConfigError if it cannot be written."""
     path = checked_path(name, value)
     if suffix and path.suffix.lower() != suffix:
-        raise ConfigError(f"{name}: expected a name that ends in {suffix}, got {path.name}")
+        raise ConfigError(f"{name}: expected a name with the suffix {suffix}, got {path.name}")
     if not path.parent.is_dir():
         raise ConfigError(f"{name}: expected a file in an existing folder, got {path}; create {path.parent}")
     return path
 
 
 def check_count(name: str, value: int, most: int) -> None:
-    """Raise ConfigError unless a count is in [1, `most`], the limit of memory."""
+    """Raise ConfigError unless a count is in [1, `most`]. The limit bounds memory."""
     require(1 <= value <= most, name, value, f"a value in [1, {most}]")
 
 
@@ -66,14 +74,14 @@ def checked_rows(node: Any) -> dict[str, list[str]]:
     """
     if node is not None and not isinstance(node, Mapping):
         raise ConfigError(
-            f"rows: expected names with overrides, got {node!r}; write them like mine: [refiner=identity]"
+            f"rows: expected names with overrides, got {node!r}; write for example mine: [refiner=identity]"
         )
     rows = {str(name): overrides for name, overrides in (node or {}).items()}
     for name, overrides in rows.items():
         listed = isinstance(overrides, Sequence) and not isinstance(overrides, str)
         if not listed or not all(isinstance(one, str) for one in overrides):
             raise ConfigError(
-                f"rows.{name}: expected a list of overrides, got {overrides!r}; write it like [refiner=identity]"
+                f"rows.{name}: expected a list of overrides, got {overrides!r}; write for example [refiner=identity]"
             )
     return {name: list(overrides) for name, overrides in rows.items()}
 

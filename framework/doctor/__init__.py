@@ -1,1 +1,1 @@
-"""Checks of the installation, as printed by `instancemap doctor`. Nothing here needs a working installation."""
+"""Checks of the installation for `instancemap doctor`. They run even if the installation is broken."""

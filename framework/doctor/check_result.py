@@ -1,4 +1,4 @@
-"""The result of one check, and a runner that survives a failing one."""
+"""Results of checks, and a runner that continues after a failing check."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 class Status(Enum):
-    """The result of a check; the value is the mark in front of it."""
+    """The status of a check. The value is its mark in the output."""
 
     OK = "ok"
     MISSING = "--"  # optional
@@ -19,12 +19,12 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class Check:
-    """One result."""
+    """The result of one check."""
 
     name: str
     status: Status
     detail: str
-    fix: str = ""  # the command that fixes it; "" = none is needed or known
+    fix: str = ""  # command that fixes the problem; "" = not needed or unknown
 
     @classmethod
     def of(cls, name: str, passed: bool, detail: str, fix: str = "", required: bool = False) -> Check:
@@ -35,7 +35,7 @@ class Check:
 
 
 def run_checks(*checks: Callable[[], Iterable[Check]]) -> list[Check]:
-    """Return all results; a check that raises becomes an error of its own."""
+    """Return the results of all checks. An exception becomes a result with status ERROR."""
     results: list[Check] = []
     for check in checks:
         try:
@@ -51,7 +51,7 @@ def one_line(error: BaseException) -> str:
 
 
 def anonymous(text: str | Path) -> str:
-    """Return the text without the user's home and name, so that it can be pasted into an issue."""
+    """Return the text without the home folder and name of the user, for pasting into an issue."""
     home, text = str(Path.home()), str(text)
     if home != "/":
         text = text.replace(home, "~")

@@ -17,11 +17,11 @@ TIMEOUT_S = 120.0
 ROOT = Path(__file__).resolve().parents[2]
 ACCELERATION, KERNELS = (f"from {__name__} import {name}; {name}()" for name in ("acceleration", "kernels"))
 
-Outcomes = Mapping[str, tuple[str, str]]  # by code: the last line that it prints, and why it fails ("" = it does not)
+Outcomes = Mapping[str, tuple[str, str]]  # by code: last printed line and error ("" = success)
 
 
 def run_all(codes: Iterable[str]) -> Outcomes:
-    """Run pieces of Python code, each in a process of its own."""
+    """Run pieces of Python code in separate processes."""
     codes = [*codes]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return dict(zip(codes, pool.map(_run, codes), strict=True))
@@ -44,7 +44,7 @@ def _run(code: str) -> tuple[str, str]:
 
 
 def acceleration() -> None:
-    """Print the GPUs, and whether 8-bit integers are supported, as JSON."""
+    """Print the GPUs and the support of 8-bit integers as JSON."""
     import torch
 
     from framework.detection.runtimes.caffe2_network import has_int8_kernels
@@ -55,7 +55,7 @@ def acceleration() -> None:
 
 
 def kernels() -> None:
-    """Print the cache folder, and how many kernels are compiled and exist for the default and other stages, as JSON."""
+    """Print the cache folder and the counts of compiled and listed kernels, of default and other stages, as JSON."""
     from framework.compilation.catalog import DEFAULT, OTHERS, listed
 
     sections = [listed(DEFAULT), listed(OTHERS)]

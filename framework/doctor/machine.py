@@ -1,4 +1,4 @@
-"""The machine: memory, disk, system libraries, and environment variables that change the behavior."""
+"""Checks of the machine: memory, disk, system libraries and environment variables."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 
 from framework.doctor.check_result import Check, Status, anonymous
 
-MIN_DISK_GB = 2.0  # a run writes 20 to 200 MB, a synthetic benchmark gigabytes
-MIN_MEMORY_GIB = 2.0  # the demo takes 1.2
+MIN_DISK_GB = 2.0  # a run writes 20 to 200 MB, a synthetic benchmark several GB
+MIN_MEMORY_GIB = 2.0  # the demo requires 1.2
 SYSTEM_LIBRARIES = {
     "libGL.so.1": ("libgl1", "Open3D"),
     "libEGL.so.1": ("libegl1", "Open3D"),
@@ -27,7 +27,7 @@ PREFIXES = ("HF_", "INSTANCEMAP_", "NUMBA_", "OMP_", "TRANSFORMERS_", "CUDA_VISI
 
 
 def hardware() -> Iterator[Check]:
-    """Check the GPU and the CPU."""
+    """Check the processor and the memory."""
     from framework.runs.provenance import processor
     from framework.runtime.process_settings import available_cores
 
@@ -55,13 +55,13 @@ def disk() -> Iterator[Check]:
 
 
 def writable_parent(folder: Path) -> tuple[Path, bool]:
-    """Return the folder or its nearest existing parent, and true if it is writable."""
+    """Return the folder or its nearest existing parent, and True if it is writable."""
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     return existing, os.access(existing, os.W_OK)
 
 
 def system_libraries() -> Iterator[Check]:
-    """Check the shared libraries of the system."""
+    """Check the system libraries of Linux."""
     for file, (package, user) in SYSTEM_LIBRARIES.items() if platform.system() == "Linux" else ():
         try:
             found = bool(ctypes.CDLL(file))
@@ -72,6 +72,6 @@ def system_libraries() -> Iterator[Check]:
 
 
 def environment() -> Iterator[Check]:
-    """Check the Python environment."""
+    """List the environment variables that change the behavior."""
     for name in sorted(name for name in os.environ if name.startswith(PREFIXES)):
         yield Check(name, Status.OK, anonymous(os.environ[name]) or '""')

@@ -1,4 +1,4 @@
-"""Weights that the detectors' options name: included in the project, or downloaded on first use."""
+"""Checks of detector weights: included in the project, or downloaded on first use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODEL_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # on huggingface.co
 
 
 def included_and_hub() -> Iterator[Check]:
-    """Check the weights that come with the project, and the cache of huggingface_hub for the model ids of options."""
+    """Check the weights included in the project, and the cache of huggingface_hub for the model ids of options."""
     from framework.detection.hub.hub_model import forbidden_by
 
     choices = _content(CONF / "config.yaml")["defaults"]
@@ -40,7 +40,7 @@ def included_and_hub() -> Iterator[Check]:
 
 
 def published() -> Iterator[Check]:
-    """Check the networks of the options."""
+    """Check the published networks."""
     from framework.detection.mask_rcnn.published_weights import OFFLINE, PUBLISHED
 
     offline = f", but {OFFLINE} is set" if os.environ.get(OFFLINE) else ""
@@ -54,7 +54,7 @@ def published() -> Iterator[Check]:
 
 
 def _named() -> Iterator[tuple[str, str]]:
-    """Yield the weight paths and model ids of every option, by option, or by option.parameter if it has several."""
+    """Yield the weight paths and model ids of all options, by option, or by option.parameter if there are several."""
     for path in sorted((CONF / "detector").glob("*.yaml")):
         content = _content(path).items()
         values = {key: value for key, value in content if isinstance(value, str) and MODEL_ID.match(value)}
@@ -75,13 +75,13 @@ def _hub_cache() -> Path:
 
 
 def _complete_size(snapshot: Path) -> int:
-    """Return the bytes of a complete download, 0 if its config or weights are missing."""
+    """Return the size of a complete download in bytes; 0 if its config or weights are missing."""
     names = {file.name for file in snapshot.iterdir() if file.exists()}
     complete = "config.json" in names and any(name.endswith((".safetensors", ".bin")) for name in names)
     return _size(snapshot) if complete else 0
 
 
 def _size(path: Path) -> int:
-    """Return the bytes of a file or of a folder's files, 0 if it is missing."""
+    """Return the size of a file or folder in bytes; 0 if it is missing."""
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files if file.is_file())

@@ -1,4 +1,4 @@
-"""Python packages: the required ones and the extras, as declared in the project's own metadata."""
+"""Checks of the required Python packages and of the extras, as declared in the project metadata."""
 
 from __future__ import annotations
 
@@ -22,12 +22,15 @@ MODULES = {
     "pyyaml": "yaml",
     "scikit-learn": "sklearn",
 }
-"""Import names of the packages whose import name differs."""
+"""Import names that differ from the package names."""
 
 
 @cache
 def declared() -> tuple[str, list[Requirement], dict[str, list[Requirement]]]:
-    """Return the Python range, the required packages and those of each extra: of the checkout, else as installed."""
+    """Return the Python version range, the required packages, and the packages of each extra.
+
+    Reads pyproject.toml of a checkout, otherwise the metadata of the installed package.
+    """
     if PYPROJECT.is_file():
         project: dict[str, Any] = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]
         extras = {name: [*map(Requirement, lines)] for name, lines in project["optional-dependencies"].items()}
@@ -60,7 +63,7 @@ def libraries(outcomes: Outcomes) -> Iterator[Check]:
 
 
 def extras() -> Iterator[Check]:
-    """Check every extra that users can install."""
+    """Check the packages of every extra."""
     for name, lines in declared()[2].items():
         found = {line.name: _installed(line) for line in lines}
         detail = ", ".join(f"{package} {detail}" for package, (_, detail) in found.items())

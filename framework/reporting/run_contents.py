@@ -51,7 +51,7 @@ class RunContents:
         elif is_there(directory / PARTIAL_METRICS):
             record, partial = read_partial(directory)
         else:
-            raise DataError(f"{directory}: expected the directory of a run, got no {METRICS} or {PARTIAL_METRICS}")
+            raise DataError(f"{directory}: expected a run directory, got no {METRICS} or {PARTIAL_METRICS}")
         mesh, objects = _map_of(record)
         timestamps, poses = np.zeros(0), np.zeros((0, 4, 4))
         if is_there(directory / TRAJECTORY):

@@ -1,4 +1,4 @@
-"""A hash of the files that a run reads: weights, recording and others."""
+"""Hash of the input files of a run: weights, recording and others."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from framework.files.search_paths import folder_of
 from framework.runs.provenance import leaves, relevant
 
 INPUTS = "inputs_sha256"  # the key of metrics.json
-MOST_FILES = 200_000  # of a recording (3 s); the longest sequences of known datasets have 20,000
+MOST_FILES = 200_000  # of a recording (hashed in 3 s); the longest sequences of known datasets have 20,000
 OUTPUTS = {"outputs", "multirun"}  # Hydra's output folders
 
 
 def inputs_sha256(config: Mapping[str, Any]) -> str:
-    """Return the SHA-256 (hex) of the files that a resolved config names.
+    """Return the SHA-256 (hex) of the files in a resolved config.
 
-    Files and folders are hashed by content; a recording by names, sizes and modification times of the files in
-    dataset.root and below dataset.scene, which is faster.
+    Files and folders are hashed by content. A recording is hashed by the names, sizes and modification times of the
+    files in dataset.root and below dataset.scene, which is faster.
     """
     digest = hashlib.sha256()
     for key, value in leaves(relevant(config)):
@@ -41,7 +41,7 @@ def inputs_sha256(config: Mapping[str, Any]) -> str:
 
 
 def _truth_files(value: str) -> list[str]:
-    """Return the files of a named ground truth; none if one is missing, which is an error of the run."""
+    """Return the files of a named ground truth; empty if a file is missing, which the run reports."""
     try:
         return [str(path) for path in truth_files(Path(value))]
     except (ConfigError, DataError):
@@ -49,7 +49,7 @@ def _truth_files(value: str) -> list[str]:
 
 
 def _content(value: str) -> str:
-    """Hash a file or folder; "" if there is none."""
+    """Hash a file or folder; "" if it does not exist."""
     try:
         return content_hash(Path(value))
     except (ConfigError, DataError, OSError, ValueError):
@@ -62,7 +62,7 @@ def _listed(root: Path, scene: str) -> Iterator[tuple[str, str, int, int]]:
     walks = [[(str(folder), [], [LABEL_TABLE, FIRST_LABEL_TABLE]) for folder in above]]
     if scene:
         walks.append(islice(os.walk(root), 1))  # files that scenes share, such as Replica's cam_params.json
-    walks.append(os.walk(root / scene, followlinks=True))  # MOST_FILES ends cyclic links
+    walks.append(os.walk(root / scene, followlinks=True))  # MOST_FILES limits cyclic links
     for folder, folders, files in chain.from_iterable(walks):
         folders[:] = sorted(set(folders) - OUTPUTS)
         for name in sorted(files):

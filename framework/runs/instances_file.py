@@ -15,13 +15,13 @@ from framework.files.json_file import read_json, write_json
 from framework.runs.metrics import class_name
 
 LARGEST_ID = 2**31 - 1
-FARTHEST = 1e6  # m, limit of coordinates and sizes; float32 resolves 6 cm there
+FARTHEST = 1e6  # m, limit of coordinates and sizes; resolution of float32: 6 cm
 NO_CLASS = "object"  # class name in a map without classes
 
 
 @dataclass(frozen=True)
 class StoredInstance:
-    """One object of instances.json; lengths in m, in the world."""
+    """One object of instances.json; lengths in m, in the world frame."""
 
     id: int  # 1 to LARGEST_ID
     class_name: str  # NO_CLASS in a map without classes
@@ -51,7 +51,7 @@ def write_instances(
                 "id": instance.id,
                 "class": class_name(instance, classes),
                 "confidence": float(instance.confidence),
-                # the shortest digits that give each float32 back: 0.9, not 0.8999999761581421
+                # the shortest decimals of each float32: 0.9, not 0.8999999761581421
                 "class_probabilities": {
                     name: float(str(value)) for name, value in zip(classes, instance.class_probabilities, strict=True)
                 },
@@ -79,16 +79,18 @@ def read_instances(path: Path) -> list[StoredInstance]:
     found = [_stored(f"{path}, entry {number}", entry) for number, entry in enumerate(entries, start=1)]
     ids = {instance.id for instance in found}
     if len(ids) < len(found):
-        raise DataError(f"{path}: expected unique ids, got {len(ids)} different ones for {len(found)} instances")
+        raise DataError(f"{path}: expected unique ids, got {len(ids)} ids for {len(found)} instances")
     return found
 
 
 def _stored(where: str, entry: Any) -> StoredInstance:
     if not isinstance(entry, dict):
-        raise DataError(f"{where}: expected an object with id, class, confidence and so on, got {entry!r:.40}")
+        raise DataError(f"{where}: expected an object with id, class, confidence and other keys, got {entry!r:.40}")
     box, probabilities = entry.get("obb"), entry.get("class_probabilities")
     if not isinstance(box, dict) or not isinstance(probabilities, dict):
-        raise DataError(f"{where}: expected keys and values in obb and class_probabilities, got other values")
+        raise DataError(
+            f"{where}: expected mappings in obb and class_probabilities, got {box!r:.40} and {probabilities!r:.40}"
+        )
     return StoredInstance(
         id=_integer(where, entry, "id", 1),
         class_name=_class(where, entry),
@@ -110,7 +112,7 @@ def _stored(where: str, entry: Any) -> StoredInstance:
 
 
 def _integer(where: str, entry: Mapping[str, Any], key: str, lowest: int | None = None) -> int:
-    """Return an integer of any size, or from `lowest` to LARGEST_ID."""
+    """Return an integer from `lowest` to LARGEST_ID; None = of any size."""
     value = entry.get(key)
     if isinstance(value, int) and not isinstance(value, bool) and (lowest is None or lowest <= value <= LARGEST_ID):
         return value
@@ -127,7 +129,7 @@ def _class(where: str, entry: Mapping[str, Any]) -> str:
 
 def _fraction(where: str, entry: Mapping[str, Any], key: str) -> float:
     value = entry.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:  # NaN is neither
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:  # rejects NaN
         raise DataError(f"{where}: {key:.40}: expected a number in [0, 1], got {value!r:.40}")
     return float(value)
 
@@ -137,7 +139,7 @@ def _array(where: str, entry: Mapping[str, Any], key: str, shape: tuple[int, ...
         values = np.array(entry.get(key), np.float64)
     except (TypeError, ValueError):
         values = np.zeros(0)
-    if values.shape != shape or not (np.abs(values) <= FARTHEST).all():  # NaN is not
+    if values.shape != shape or not (np.abs(values) <= FARTHEST).all():  # rejects NaN
         raise DataError(
             f"{where}: {key}: expected numbers of shape {shape}, at most {FARTHEST:g}, got {entry.get(key)!r:.60}"
         )

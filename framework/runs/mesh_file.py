@@ -40,13 +40,12 @@ def read_mesh(path: Path) -> InstanceMesh:
     for name, kind in TYPES.items():
         if name not in ply.properties or ply.properties[name].dtype != kind:
             raise DataError(
-                f"{path}: expected the vertex property {name!r} of {np.dtype(kind)}, got none; it is not the "
-                "mesh of a run"
+                f"{path}: expected the vertex property {name!r} of {np.dtype(kind)}, got none; use mesh.ply of a run"
             )
     class_lines = [comment for comment in ply.comments if f"{comment} ".startswith(CLASSES)]
     if len(class_lines) != 1:
         raise DataError(
-            f"{path}: expected one line 'comment {CLASSES}...', got {len(class_lines)}; it is not the mesh of a run"
+            f"{path}: expected one line 'comment {CLASSES}...', got {len(class_lines)}; use mesh.ply of a run"
         )
     names = class_lines[0][len(CLASSES) :]
     return InstanceMesh(

@@ -23,12 +23,18 @@ log = logging.getLogger(__name__)
 
 Metrics = dict[str, float | int | str | bool | None]
 
-MAIN_FIGURES = ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou")  # of `instances.`, for both label transfers
+MAIN_FIGURES = (
+    "ap50",
+    "ap25",
+    "ap",
+    "ap50_agnostic",
+    "mean_iou",
+)  # below `instances.`, for both label transfers
 TRUTH = "truth_sha256"  # key of the hash of the ground truth
 
 
 def run_metrics(result: RunResult) -> Metrics:
-    """Return counts, speed, stage times and map size; for a live video also dropped frames and latency."""
+    """Return counts, speed, stage times and map size. For live video, add dropped frames and latency."""
     metrics: Metrics = {
         "frames": result.frames,
         "frames_lost": result.frames_lost,
@@ -51,8 +57,8 @@ def run_metrics(result: RunResult) -> Metrics:
 
 
 def trajectory_metrics(result: RunResult) -> Metrics:
-    """Return the error of the poses that are not lost; empty without true poses."""
-    reference: list[Float64 | None] = [None] * result.frames  # keeps skipped frames, which interrupt relative poses
+    """Return the errors of the poses that are not lost; empty without ground-truth poses."""
+    reference: list[Float64 | None] = [None] * result.frames  # includes skipped frames, which interrupt relative poses
     estimated = [Pose(np.eye(4), lost=True)] * result.frames
     for frame in result.tracked:
         reference[frame.position], estimated[frame.position] = frame.T_world_camera_truth, frame.pose
@@ -77,9 +83,9 @@ def instance_metrics(
     classes: tuple[str, ...],
     trajectory: tuple[Float64, Float64],
 ) -> Metrics:
-    """Return the number of instances and, with ground truth in a known world, their metrics.
+    """Return the number of instances, and their metrics if the ground truth can be aligned to the map.
 
-    `trajectory` has the times (F,) s and poses (F, 4, 4) of the map.
+    `trajectory` contains the times (F,) in s and poses (F, 4, 4) of the map.
     """
     count: Metrics = {"instances.count": len(found)}
     truth = video.scene_truth()
@@ -96,10 +102,10 @@ def instance_metrics(
 def evaluation_metrics(
     predictions: PredictedInstances, truth: SceneTruth, aligned: SceneTruth, annotation: str
 ) -> Metrics:
-    """Return `InstanceEvaluation.metrics`, and the main ones of the other label transfer as `instances.to_map.`...
+    """Return `InstanceEvaluation.metrics`, and the main metrics of the other label transfer as `instances.to_map.*`.
 
-    `aligned` is the ground truth in the world of the map. `annotation_release` is the release of the ground truth, None
-    = only one exists; `truth_sha256` its hash.
+    `aligned` is the ground truth in the world frame of the map. `annotation_release` is the release of the ground
+    truth, None = a single release. `truth_sha256` is its hash.
     """
     figures = instances.evaluate(predictions, aligned).metrics()
     to_map = instances.evaluate(predictions, aligned, transfer=Transfer.TO_MAP).metrics()
@@ -116,7 +122,7 @@ def truth_sha256(truth: SceneTruth) -> str:
 
 
 def is_evaluation(key: str) -> bool:
-    """Return true for a key of `evaluation_metrics`."""
+    """Return True for a key of `evaluation_metrics`."""
     return key in ("annotation_release", TRUTH) or (key.startswith("instances.") and key != "instances.count")
 
 

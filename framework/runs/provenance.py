@@ -33,7 +33,7 @@ def config_hash(resolved: Mapping[str, Any]) -> str:
 
 
 def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys that results depend on."""
+    """Return the config without keys that do not change results."""
     return {key: value for key, value in config.items() if key not in WITHOUT_EFFECT}
 
 
@@ -47,7 +47,7 @@ def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def shows_speed(config: Mapping[str, Any]) -> bool:
-    """Return true if the table of a config's experiment has the column `fps`."""
+    """Return True if the table of a config's experiment has the column `fps`."""
     return "fps" in (config.get("table") or {}).get("columns", ())
 
 
@@ -57,10 +57,10 @@ def speed_settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dic
 
 
 def code_version() -> dict[str, str | bool]:
-    """Return the commit of the checkout, and true if files differ from it; "unknown" outside of a checkout."""
+    """Return the commit of the checkout, and True if files are modified; "unknown" outside of a checkout."""
     checkout = Path(framework.__file__).resolve().parent.parent
     top = _git(checkout, "rev-parse", "--show-toplevel")
-    if top is None or Path(top).resolve() != checkout:  # installed from a wheel, perhaps inside another repository
+    if top is None or Path(top).resolve() != checkout:  # installed from a wheel, possibly inside another repository
         return {"git_commit": UNKNOWN, "git_dirty": UNKNOWN}
     return {
         "git_commit": _git(checkout, "rev-parse", "HEAD") or UNKNOWN,

@@ -1,4 +1,4 @@
-"""Re-evaluates stored runs with the current code, from their meshes and instances."""
+"""Re-evaluation of stored runs with the current code, from their meshes and instances."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Truth:
 
     scene: SceneTruth | None  # None = not labeled
     annotation: str  # RGBDVideo.annotation
-    named: str | None = None  # dataset.ground_truth, None = the dataset's own
+    named: str | None = None  # dataset.ground_truth; None = the ground truth of the dataset
 
     @classmethod
     def of(cls, dataset: Mapping[str, Any]) -> Truth:
@@ -43,7 +43,7 @@ class Truth:
         return cls(video.scene_truth(), video.annotation, None if named is None else str(named))
 
     def in_world_of(self, record: Record) -> SceneTruth | None:
-        """Return the ground truth in the world of a run's map. Raises DataError."""
+        """Return the ground truth in the world frame of a run. Raises DataError."""
         return self.scene and in_map_world(self.scene, *read_tum(record.directory / TRAJECTORY))
 
 
@@ -56,10 +56,10 @@ class Reevaluation:
 
     @classmethod
     def of(cls, record: Record, truth: Truth, other_truth: bool = False) -> Reevaluation:
-        """Evaluate the instances again, and keep all other metrics.
+        """Re-evaluate the instances, and keep all other metrics.
 
-        Raises DataError if the files are inconsistent, the ground truth is missing, or it has changed since the run
-        (unless `other_truth`).
+        Raises DataError if the files are inconsistent or the ground truth is missing. Unless `other_truth` is set, also
+        raises DataError if the ground truth has changed since the run.
         """
         if truth.scene is None:
             if any(map(is_evaluation, record.metrics)):
@@ -72,9 +72,9 @@ class Reevaluation:
         found = evaluation_metrics(read_predictions(record), truth.scene, aligned, truth.annotation)
         if not other_truth and record.metrics.get(TRUTH) not in (None, found[TRUTH]):
             raise DataError(
-                f"{record.directory}: expected the ground truth used in the run, got other instances of "
-                f"{record.dataset['_target_']}; check the dataset and a relative dataset.root, or set "
-                "--other-truth to compare anyway"
+                f"{record.directory}: expected the ground truth of the run ({TRUTH} {record.metrics[TRUTH]!s:.8}), got "
+                f"{found[TRUTH]!s:.8} from {record.dataset['_target_']}; check the dataset and a relative "
+                "dataset.root, or set --other-truth to compare anyway"
             )
         metrics: dict[str, Any] = {}
         for key, value in record.metrics.items():
@@ -100,9 +100,9 @@ class Reevaluation:
         return [key for key in self.metrics if is_evaluation(key) and key not in self.record.metrics]
 
     def write(self) -> None:
-        """Replace metrics.json but keep its time, by which tables choose the latest of several runs.
+        """Replace metrics.json but keep its modification time, by which tables select the latest of several runs.
 
-        Raises DataError if the run has started again meanwhile.
+        Raises DataError if the run has been restarted.
         """
         path = self.record.directory / METRICS
         with locked(self.record.directory):  # a new run waits
@@ -112,14 +112,14 @@ class Reevaluation:
                 before = None
             if before is None or before.st_mtime != self.record.written:
                 raise DataError(
-                    f"{path}: expected an unchanged file, got a new one; the run has started again, evaluate it later"
+                    f"{path}: expected an unchanged file, got a modified file; the run was restarted, evaluate it later"
                 )
             write_json(path, self.metrics)
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
 def read_predictions(record: Record) -> PredictedInstances:
-    """Return the predictions of a run as they were evaluated at its end. Raises DataError."""
+    """Return the predictions that a run evaluated at its end. Raises DataError."""
     mesh, instances = read_objects(record)
     return PredictedInstances.on_mesh(
         mesh,
@@ -130,5 +130,5 @@ def read_predictions(record: Record) -> PredictedInstances:
 
 
 def dataset_of(record: Record, ground_truth: str | None = None) -> dict[str, Any]:
-    """Return the dataset's config of a run, with another ground truth; "" = the dataset's own, None = unchanged."""
+    """Return the dataset config of a run with a ground truth: "" = ground truth of the dataset, None = unchanged."""
     return record.dataset | ({} if ground_truth is None else {"ground_truth": ground_truth or None})

@@ -1,4 +1,4 @@
-"""Writes the run directory: every file atomically, small ones first, metrics.json last."""
+"""Writing of the run directory: every file atomically, small files first, metrics.json last."""
 
 from __future__ import annotations
 
@@ -92,12 +92,12 @@ class RunRecord:
             counts: Additional metrics.
 
         Returns:
-            Why the run is partial: `result.stopped_by`, or the first error of writing, which does not stop the other
-            files; None = the run is complete.
+            The reason of a partial run: `result.stopped_by`, or the first write error. Other files are still written.
+            None = the run is complete.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         scene, attempt = result.scene, _Attempts(result.stopped_by)
-        for name in (*MAPPED, KEYFRAMES):  # of an earlier run
+        for name in (*MAPPED, KEYFRAMES):  # from an earlier run
             attempt((self.directory / name).unlink, missing_ok=True)
         if not (self.directory / CONFIG).exists():  # the directory was removed
             attempt(_write_config, self.directory / CONFIG, self.config)
@@ -118,7 +118,9 @@ class RunRecord:
         if result.keyframes:
             attempt(write_keyframes, self.directory / KEYFRAMES, result.keyframes)
         if found is not None:
-            stored = attempt(read_tum, self.directory / TRAJECTORY)  # as written: a re-evaluation gets the same metrics
+            stored = attempt(
+                read_tum, self.directory / TRAJECTORY
+            )  # as written, so that a re-evaluation returns the same metrics
             figures |= (stored and attempt(instance_metrics, video, *found, scene.classes, stored)) or {}
         figures |= attempt(trajectory_metrics, result) or {}
         title = headline({"sequence": video.name, **figures})
@@ -148,7 +150,7 @@ class RunRecord:
         }
 
     def _write_partial(self, video: RGBDVideo, figures: Metrics, error: BaseException | None) -> None:
-        """Write the metrics of a partial run with the reason; no error = it is still being written."""
+        """Write the metrics of a partial run with the reason; no error = the outputs are still being written."""
         why = "the outputs were not completed" if error is None else reason(error)
         write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
 
@@ -162,7 +164,7 @@ class RunRecord:
         rest = f"; {unlikely} with a confidence below {LIKELY} only in the files" if unlikely else ""
         log.info("objects: %s%s", counted, rest)
         written = [name for name in ("overview.png", "mesh.ply", "instances.json") if (self.directory / name).exists()]
-        if written:  # one line: a job of a sweep has a long name
+        if written:  # one line: directories of sweep jobs have long names
             beside = f", {', '.join(written[1:])}" if written[1:] else ""
             log.info("%s%s", _from_here(self.directory / written[0]), beside)
         if error is not None:
@@ -171,9 +173,9 @@ class RunRecord:
 
 @dataclass
 class _Attempts:
-    """Calls of functions with logged errors: a failing one does not stop the others."""
+    """Function calls with logged errors. A failing call does not stop later calls."""
 
-    error: BaseException | None  # the first
+    error: BaseException | None  # the first error
 
     def __call__(
         self, function: Callable[Arguments, Made], *arguments: Arguments.args, **named: Arguments.kwargs
@@ -193,13 +195,13 @@ def _write_config(path: Path, config: Mapping[str, Any]) -> None:
 
 
 def _from_here(path: Path) -> Path:
-    """Return the path relative to the working folder, if it is in it."""
+    """Return the path relative to the working folder if it is inside."""
     here, place = Path.cwd(), path.absolute()
     return place.relative_to(here) if place.is_relative_to(here) else place
 
 
 def _labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict[int, tuple[str, float]]:
-    """Return class name and confidence of the likely instances by id."""
+    """Return the class name and confidence of the likely instances by id."""
     return {
         key: (class_name(instance, classes) or "object", instance.confidence)
         for key, instance in instances.items()
@@ -245,7 +247,7 @@ def write_timings(path: Path, result: RunResult) -> None:
 
 
 def peak_memory() -> int | None:
-    """Return the peak resident memory of this process, bytes; on Linux since the start of the run.
+    """Return the peak resident memory of this process in bytes; on Linux since the start of the run.
 
     None on Windows, which has no `resource`.
     """
@@ -258,6 +260,6 @@ def peak_memory() -> int | None:
 
 
 def _reset_peak_memory() -> None:
-    """Reset the peak memory of earlier jobs of a sweep."""
+    """Reset the peak memory of earlier sweep jobs."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")

@@ -15,14 +15,14 @@ from framework.runs.stored_runs import Record, is_number
 CHOICE = "choice."  # prefix of the chosen options in metrics.json
 DATA = "dataset.root"  # config key of the recording's folder
 CONFIDENCE = 0.95
-PRESET_STAGES = ("tracker", "refiner", "fuser")  # what preset=NAME chooses
+PRESET_STAGES = ("tracker", "refiner", "fuser")  # stages set by preset=NAME
 
-Run = tuple[str, ...]  # values of the keys that are averaged over: ("3",) is seed 3
+Run = tuple[str, ...]  # values of the averaged keys: ("3",) is seed 3
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over runs; NaN = undefined: the mean of no run, the deviation of one."""
+    """A mean over runs. NaN = undefined: the mean of no run, the deviation of a single run."""
 
     value: float
     deviation: float  # sample standard deviation, with n - 1
@@ -42,7 +42,7 @@ class Mean:
 
     @property
     def is_not_zero(self) -> bool:
-        """Return true if 0 is outside of the confidence interval of the mean, by Student's t.
+        """Return True if 0 is outside of the confidence interval of the mean, by Student's t.
 
         Equal values, such as counts, have no confidence interval.
         """
@@ -55,7 +55,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class RunRow:
-    """Runs with equal keys except those averaged over."""
+    """Runs with equal keys, except for the averaged keys."""
 
     name: str
     records: Mapping[Run, Record]
@@ -68,7 +68,7 @@ class RunRow:
 
     @property
     def poses(self) -> str:
-        """Return the pose source as text, with the tracker if there is one."""
+        """Return the pose source as text, including the tracker of tracked poses."""
         tracked = {"tracked": f"tracked ({self._distinct(f'{CHOICE}tracker')})"}
         return tracked.get(self.pose_source, self.pose_source.replace("_", " "))
 
@@ -81,7 +81,7 @@ class RunRow:
         return "/".join(sorted({str(record.metrics.get(key)) for record in self.records.values()}))
 
     def values(self, column: str) -> dict[Run, float]:
-        """Return the metric of each run, without undefined ones."""
+        """Return the metric of each run, without undefined values."""
         found = {run: record.metrics.get(column) for run, record in self.records.items()}
         return {run: float(value) for run, value in found.items() if is_number(value)}
 
@@ -89,7 +89,7 @@ class RunRow:
         return Mean.of(self.values(column).values())
 
     def differences(self, base: RunRow, column: str) -> dict[Run, float]:
-        """Return the metric minus that of the baseline, for the runs in both rows.
+        """Return the difference of the metric from the baseline, for the runs in both rows.
 
         Runs with the same seed have the same scene and detections, so most of the variation cancels.
         """
@@ -100,12 +100,14 @@ class RunRow:
 def rows_of(
     records: Sequence[Record], over: Sequence[str], overrides: Mapping[str, Sequence[str]] | None = None
 ) -> list[RunRow]:
-    """Group `records` into rows: those named in `overrides` first, then the others by name.
+    """Group `records` into rows: rows in `overrides` first, then other rows by name.
 
-    A row is a `row` of an experiment, else the options and parameters in which the records differ, except for the keys
-    `over` and those that follow them, as dataset.seed follows seed. A row of an experiment is split by differences
-    within it, by differences between rows that no override of a row causes (tracked or given poses, number of frames),
-    and by data folder and annotation. Of two records of the same run, the later one counts.
+    A row is a `row` of an experiment. Other records are grouped by their differing options and parameters, except for
+    the keys `over` and keys that follow them, as dataset.seed follows seed.
+
+    A row of an experiment is split by differences within it, by data folder and by annotation. It is also split by
+    differences between rows that no override causes, such as the pose source or the number of frames. The later of two
+    records of the same run is used.
     """
     overrides = overrides or {}
     variants = [_Variant.of(record, over) for record in sorted(records, key=lambda record: record.written)]
@@ -126,7 +128,7 @@ def rows_of(
         variant += [f"{key}={one.parameters[key]}" for key in parameters if key in one.parameters and key not in own]
         rows.setdefault((one.row, tuple(variant)), {})[one.run] = one.record
     place = {name: k for k, name in enumerate(overrides)}
-    # the parts of a split row replace it
+    # the parts of a split row take its position
     order = sorted(rows, key=lambda key: (place.get(key[0], len(place)), key))
     return [_row(system, variant, rows[system, variant]) for system, variant in order]
 
@@ -137,13 +139,13 @@ def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record]) -
 
 
 def _changed(override: str) -> tuple[str, ...]:
-    """Return the keys that an override changes: refiner.links.x for refiner@refiner.links.x=y."""
+    """Return the keys changed by an override: refiner.links.x for refiner@refiner.links.x=y."""
     group, _, package = override.lstrip("+~").partition("=")[0].partition("@")
     return PRESET_STAGES if group == "preset" else (package or group.replace("/", "."),)
 
 
 def _kept(one: _Variant, changed: Collection[str]) -> Iterator[tuple[Any, Mapping[str, Any]]]:
-    """Yield the parameters that no row changes, by stage and option."""
+    """Yield the parameters unchanged by all rows, by stage and option."""
     for key, value in one.parameters.items():
         if not _is_below(key, changed):
             stage = key.partition(".")[0]
@@ -151,7 +153,7 @@ def _kept(one: _Variant, changed: Collection[str]) -> Iterator[tuple[Any, Mappin
 
 
 def _is_below(key: str, others: Collection[str]) -> bool:
-    """Return true if a dotted key is in `others` or below one of them."""
+    """Return True if a dotted key is in `others` or below one of them."""
     parts = key.split(".")
     return any(".".join(parts[:k]) in others for k in range(1, len(parts) + 1))
 
@@ -177,7 +179,7 @@ class _Variant:
 
 
 def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
-    """Return the keys with the value of one of `over` in every record but another name, perhaps by chance."""
+    """Return the keys that equal a key of `over` in every record, possibly by chance, but have another name."""
     variants = [_Variant.of(record, over) for record in records]
     names = {key.rpartition(".")[2] for key in over}
     differing = set(_differing([("", one.parameters) for one in variants]))
@@ -185,7 +187,7 @@ def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
 
 
 def _following(variants: Sequence[_Variant], over: Sequence[str]) -> set[str]:
-    """Return the keys `over`, and those with the value of one of them in every record."""
+    """Return the keys `over`, and the keys that equal one of them in every record."""
     found = set(over)
     for key in {key for one in variants for key in one.parameters}:
         for k in range(len(over)):

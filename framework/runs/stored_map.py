@@ -22,7 +22,7 @@ class StoredMap:
     """A map of F frames with V vertices."""
 
     mesh: InstanceMesh
-    ids: Int32  # (V,) 0 = no counted instance
+    ids: Int32  # (V,) 0 = no stored instance
     class_names: Mapping[int, str]  # by instance
     poses: Float64  # (F, 4, 4) T_world_camera of the mapped frames
     record: Record
@@ -33,13 +33,13 @@ class StoredMap:
         mesh, instances = read_objects(record)
         _, poses = read_tum(record.directory / TRAJECTORY)
         if not len(mesh.triangles) or not len(poses):
-            raise DataError(f"{record.directory}: expected a map, got an empty one")
+            raise DataError(f"{record.directory}: expected a map, got an empty map")
         names = {instance.id: instance.class_name for instance in instances}
         ids = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
         return cls(mesh, ids, names, poses, record)
 
     def true_ids(self, truth: SceneTruth) -> Int32:
-        """Return (V,) the nearest true instance of each vertex, 0 = none within the distance of the evaluation."""
+        """Return the nearest ground-truth instance (V,) of each vertex; 0 = none within MAX_DISTANCE."""
         return transfer_labels(truth.points_world, truth.instance_ids, self.mesh.vertices, MAX_DISTANCE)
 
 
@@ -49,7 +49,7 @@ def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
     if len(instances) != record.metrics.get("instances.count"):
         raise DataError(
             f"{record.directory / INSTANCES}: expected {record.metrics.get('instances.count')} instances (as "
-            f"in {METRICS}), got {len(instances)}; the files are of different runs, run it again"
+            f"in {METRICS}), got {len(instances)}; the files are from different runs, repeat the run"
         )
     return mesh, instances
 
@@ -64,6 +64,6 @@ def read_labeled_mesh(directory: Path) -> tuple[InstanceMesh, list[StoredInstanc
         if vertices.get(instance.id, 0) != instance.vertices:
             raise DataError(
                 f"{instances_path}: expected {vertices.get(instance.id, 0)} vertices of instance {instance.id} "
-                f"(as in {mesh_path}), got {instance.vertices}; the files are of different runs, run it again"
+                f"(as in {mesh_path}), got {instance.vertices}; the files are from different runs, repeat the run"
             )
     return mesh, instances

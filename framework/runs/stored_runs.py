@@ -1,4 +1,4 @@
-"""Stored runs: the completed ones, and the reasons why others are incomplete."""
+"""Stored runs: completed runs, and the reasons of incomplete runs."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ TRAJECTORY = "trajectory.txt"
 REPORT = "report.html"  # written by `instancemap report`
 KEYFRAMES = "keyframes.npz"  # of the tracker, to resume the map; optional
 MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
-"""Files of a map in the order of writing, small ones first in case the disk is full."""
+"""Files of a map in the order of writing, small files first in case the disk is full."""
 
 EVALUATION = "evaluation."  # prefix of the code version of a re-evaluation
-GROUND_TRUTH = EVALUATION + "ground_truth"  # key of the dataset.ground_truth of a re-evaluation, if it had one
+GROUND_TRUTH = EVALUATION + "ground_truth"  # key of dataset.ground_truth in the last re-evaluation, if it was set
 
 FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # prefixes of numeric metrics
 
@@ -60,7 +60,7 @@ class Record:
 
     @property
     def code(self) -> str:
-        """Return the commit of the run, and of its re-evaluation if that differs."""
+        """Return the commit of the run, and the commit of its re-evaluation if they differ."""
         prefix = len(EVALUATION)
         later = {key[prefix:]: value for key, value in self.metrics.items() if key.startswith(EVALUATION)}
         evaluator = commit_of(later) if later else self.commit
@@ -80,7 +80,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Incomplete:
-    """A run without usable outputs, and the reason."""
+    """A run without complete outputs, and the reason."""
 
     directory: Path
     reason: str
@@ -101,7 +101,7 @@ def read_record(directory: Path) -> Record:
 
 
 def read_partial(directory: Path) -> tuple[Record, str]:
-    """Read the partial run in `directory`, and why it ended early. Raises DataError."""
+    """Read the partial run in `directory`, and the reason of its early end. Raises DataError."""
     record = _read(directory, PARTIAL_METRICS)
     return record, str(record.metrics.get("partial"))
 
@@ -110,16 +110,19 @@ def _read(directory: Path, name: str) -> Record:
     path = directory / name
     metrics, config = _read_flat(path), read_yaml(directory / CONFIG)
     if metrics.get("config_hash") != config_hash(config):
-        raise DataError(f"{path}: expected the config_hash of the config next to it, got another one; run it again")
+        raise DataError(
+            f"{path}: expected the config_hash of {CONFIG}, {config_hash(config)[:8]}, got "
+            f"{metrics.get('config_hash')!s:.8}; repeat the run"
+        )
     try:
         written = path.stat().st_mtime
-    except OSError as error:  # the run has started again
+    except OSError as error:  # the run has been restarted
         raise DataError(f"{path}: expected a readable file, got {error.strerror}") from error
     return Record(directory, metrics, config, written)
 
 
 def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
-    """Return the completed and the other runs at and below `root`, by path."""
+    """Return the completed and the incomplete runs in `root` and its subfolders, by path."""
     records: list[Record] = []
     others: list[Incomplete] = []
     for directory in _run_directories(root):
@@ -134,9 +137,9 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
 
 
 def is_recorded(directory: Path, config: DictConfig) -> bool:
-    """Return true if `directory` contains a completed run of this config and inputs, and log the reason.
+    """Return True if `directory` contains a completed run of this config and inputs, and log the reason.
 
-    If the experiment's table shows the speed, settings that change times must match, too. The commit may differ: most
+    If the experiment's table shows the speed, settings that change times must also match. The commit may differ: most
     commits do not change results, and tables list the commits of their runs.
     """
     if not (directory / METRICS).exists():
@@ -144,33 +147,35 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
     try:
         record = read_record(directory)
     except DataError as error:
-        log.warning("run again: %s", error)
+        log.warning("repeating the run: %s", error)
         return False
     resolved = OmegaConf.to_container(config, resolve=True)
     assert isinstance(resolved, dict)
     asked = {str(key): value for key, value in resolved.items()}
     if record.metrics["config_hash"] != config_hash(asked):
-        log.info("run again: the config of the run in %s differs", directory)
+        log.info("repeating the run: the config in %s differs", directory)
         return False
     if record.metrics.get(INPUTS) not in (None, inputs_sha256(asked)):  # None: an older run
-        log.info("run again: weights or data changed since the run in %s", directory)
+        log.info("repeating the run: weights or data changed since the run in %s", directory)
         return False
     settings = speed_settings(record.config, record.metrics)
     if shows_speed(asked) and settings != speed_settings(asked, environment()):
         shown = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in settings.items())
         log.info(
-            "run again: the times in %s were measured with other settings or on another machine: %s", directory, shown
+            "repeating the run: the times in %s were measured with other settings or on another machine: %s",
+            directory,
+            shown,
         )
         return False
     if lost := [name for name in MAPPED if not (directory / name).exists()]:
-        log.warning("%s: expected %s, got none; set skip_completed=false to run it again", directory, ", ".join(lost))
+        log.warning("%s: expected %s, got none; set skip_completed=false to repeat the run", directory, ", ".join(lost))
     now = commit_of(code_version())
     if record.commit == now and not now.endswith(WITH_CHANGES):  # modified trees may differ
         log.info("skipped: the completed run in %s", directory)
     else:
         message = (
             "skipped: the completed run in %s, of commit %s; the current commit is %s; set "
-            "skip_completed=false to run it again"
+            "skip_completed=false to repeat the run"
         )
         log.warning(message, directory, record.commit, now)
     return True
@@ -201,7 +206,7 @@ def read_figures(directory: Path) -> dict[str, Any]:
     for name in (METRICS, PARTIAL_METRICS):
         if is_there(directory / name):
             return _read_flat(directory / name)
-    raise DataError(f"{directory}: expected the directory of a run, got no {METRICS} or {PARTIAL_METRICS}")
+    raise DataError(f"{directory}: expected a run directory, got no {METRICS} or {PARTIAL_METRICS}")
 
 
 def _read_flat(path: Path) -> dict[str, Any]:
@@ -209,7 +214,7 @@ def _read_flat(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected an object, got {type(content).__name__}")
     if nested := [key for key, value in content.items() if isinstance(value, dict | list)]:
-        raise DataError(f"{path}: expected flat values, got nested ones below {nested[0]!r}")
+        raise DataError(f"{path}: expected flat values, got nested values below {nested[0]!r}")
     for key, value in content.items():
         if key.startswith(FIGURES) and value is not None and not is_number(value):
             raise DataError(f"{path}: {key}: expected a number or null, got {value!r}")
@@ -217,7 +222,7 @@ def _read_flat(path: Path) -> dict[str, Any]:
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """Return true for a finite number that is not a boolean."""
+    """Return True for a finite number that is not a boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -229,7 +234,7 @@ def _run_directories(root: Path) -> Iterator[Path]:
 
 
 def _why_incomplete(directory: Path) -> str:
-    """Return the reason. The error of a job is the last message of its log."""
+    """Return the reason of an incomplete run. The error of a job is the last message of its log."""
     if (directory / PARTIAL_METRICS).exists():
         try:
             return f"partial: {_read_flat(directory / PARTIAL_METRICS).get('partial')}"

@@ -16,11 +16,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.validation import checked_rows
 
-_OF_ITSELF = re.compile(r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}")  # references to its own keys, as in our experiments
+_OF_ITSELF = re.compile(
+    r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}"
+)  # references to its own keys, as in the included experiments
 
 SWEEP = "multirun.yaml"  # written by Hydra's sweeper
-MOST_VALUES = 1000  # of a key; a range may have any number
-MOST_RUNS = 100_000  # of all keys
+MOST_VALUES = 1000  # of a key; a range may have any number of values
+MOST_RUNS = 100_000  # combinations of the values of all keys
 
 
 def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:
@@ -30,7 +32,7 @@ def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str,
         return []
     try:
         values = [_values(asked[key]) for key in keys]
-    except HydraException:  # glob(*), which depends on the config groups
+    except HydraException:  # glob(*) depends on the config groups
         return []
     plain = not any("${" in value for column in values for value in column)
     return list(itertools.islice(itertools.product(*values), MOST_RUNS)) if plain else []
@@ -47,10 +49,10 @@ def sweep_rows(sweep: Mapping[str, Any]) -> dict[str, list[str]]:
 
 
 def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
-    """Return the overrides of the experiment's config, then those of the command line, which take precedence."""
+    """Return the overrides of the experiment, then the overrides of the command line, which take precedence."""
     found = []
     for text in [*_params(sweep), *_below(sweep, "overrides", "task", list)]:
-        with suppress(HydraException):  # ${all_of:${rows}}, which is not a value
+        with suppress(HydraException):  # ${all_of:${rows}} is not a value
             found.append(OverridesParser.create().parse_override(str(text)))
     return found
 
@@ -70,7 +72,7 @@ def _without_hydra(sweep: Mapping[str, Any]) -> DictConfig:
 
 
 def _of_itself(node: Any) -> Any:
-    """Replace other references, such as ${oc.env:...}, which depends on this machine, by "???"."""
+    """Replace other references, such as the machine-dependent ${oc.env:...}, with "???"."""
     if isinstance(node, Mapping):
         return {key: _of_itself(value) for key, value in node.items()}
     if isinstance(node, list):

@@ -22,8 +22,8 @@ OLD_STAGES = {
     "refine": "refinement",
     "fuse": "fusion",
 }
-"""Names of the stages before 0.1.0, which stored runs and sweeps may have."""
-LARGEST = 2**53  # limit of frame numbers, which are exact in float64
+"""Current stage names by their names before 0.1.0, which stored runs and sweeps may contain."""
+LARGEST = 2**53  # limit of frame numbers: exact in float64
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Execution of the loop in threads."""
+"""Runtime of the mapping loop: threads, signals, logging and process settings."""

@@ -1,8 +1,8 @@
-"""CPU budget: numba threads for reading and detection ahead, and for mapping.
+"""CPU budget: division of the numba threads between prefetching (reading, detection) and mapping.
 
 A parallel loop waits for its slowest thread, so two loops that share all cores slow each other down. Each side gets its
 own cores instead, in proportion to its recent work. Kernel results do not depend on the number of threads. Threads of
-networks are neither limited nor counted. Work that no frame waits for has low priority.
+networks are neither limited nor counted. Background work has low priority.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ def lower_priority() -> None:
 
 
 def parallel_kernels_are_thread_safe() -> bool:
-    """Return whether two threads may run parallel kernels at the same time.
+    """Return True if two threads may run parallel kernels at the same time.
 
-    numba's workqueue layer ends the process when they do. numba picks a layer when it starts its threads, as here.
+    numba's workqueue layer ends the process in that case. numba selects a layer when it starts its threads, which this
+    function triggers.
     """
     numba.get_num_threads()
     return str(numba.threading_layer()) in ("omp", "tbb")
@@ -67,18 +68,18 @@ def limited_threads(threads: int) -> Iterator[None]:
 
 
 class CoreSharing:
-    """Division of the kernel threads between both sides, by their work on recent frames."""
+    """Division of the kernel threads between prefetching and mapping, by their work on recent frames."""
 
     def __init__(self, with_a_thread_ahead: bool = True) -> None:
         self.cores = int(numba.get_num_threads())
         self._alone = not with_a_thread_ahead
-        self._ahead: deque[float] = deque(maxlen=RECENT)  # CPU time per frame of the thread itself, s
-        self._mapping: deque[float] = deque(maxlen=RECENT)  # CPU time per frame times threads, s: mostly parallel loops
+        self._ahead: deque[float] = deque(maxlen=RECENT)  # CPU time per frame of one thread, s
+        self._mapping: deque[float] = deque(maxlen=RECENT)  # CPU time per frame times threads, s; mostly parallel loops
         self._lock = threading.Lock()
 
     @contextmanager
     def ahead(self, workers: int = 1) -> Iterator[None]:
-        """Run the work on one frame ahead, by one of `workers` threads."""
+        """Run the prefetching of one frame in one of `workers` threads."""
         with kernel_threads(self.cores if self._alone else max(self.cores_ahead() // workers, 1)):
             began = time.thread_time()
             yield
@@ -94,7 +95,7 @@ class CoreSharing:
             self._record(self._mapping, threads * (time.thread_time() - began))
 
     def cores_ahead(self) -> int:
-        """Return the number of cores for work ahead, rounded: 0 or all cores if one side has almost no work."""
+        """Return the rounded number of cores for prefetching: 0 or all cores if one side has almost no work."""
         with self._lock:
             if not (self._ahead and self._mapping):
                 return self.cores // 2

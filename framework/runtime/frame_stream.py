@@ -1,4 +1,4 @@
-"""Frames of a video in order (all of a recording, the newest of a live video), processed ahead by other threads."""
+"""Frame streams of recordings (all frames) and live videos (the newest frame), and prefetching by threads."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Outcome = TypeVar("Outcome")
 
 
 class FrameStream(AbstractContextManager["FrameStream"]):
-    """Readers of a video's frames in order. Any thread may take them."""
+    """Stream of frame readers in order. Any thread may take them."""
 
     most_ahead: int | None = None  # maximum number of prefetched frames; None = no limit
     dropped: int = 0  # number of frames that were not taken
@@ -34,7 +34,7 @@ class FrameStream(AbstractContextManager["FrameStream"]):
 
 
 def stream_of(video: RGBDVideo, ended: Callable[[], bool]) -> FrameStream:
-    """Return the stream of a video; a live one also ends when `ended` returns true."""
+    """Return the stream of a video. A live stream also ends when `ended` returns true."""
     if isinstance(video, LiveVideo):
         return LiveFrames(video, ended)
     if isinstance(video, RGBDSequence):
@@ -43,7 +43,7 @@ def stream_of(video: RGBDVideo, ended: Callable[[], bool]) -> FrameStream:
 
 
 class RecordedFrames(FrameStream):
-    """Every frame of a recording, in order."""
+    """Stream of all frames of a recording, in order."""
 
     def __init__(self, sequence: RGBDSequence) -> None:
         self._readers = (partial(sequence.__getitem__, k) for k in range(len(sequence)))
@@ -56,7 +56,7 @@ class RecordedFrames(FrameStream):
 
 
 class LiveFrames(FrameStream):
-    """The newest frame of a live video at each call of `take`; older ones are dropped.
+    """Stream of a live video. `take` returns the newest frame; older frames are dropped.
 
     A thread receives the frames, so that no queue builds up in the video. Only one frame is prefetched.
     """
@@ -80,7 +80,7 @@ class LiveFrames(FrameStream):
         self._listener.join()
 
     def take(self) -> FrameReader | None:
-        """Wait for a frame. Raises the video's error once the last frame before it is taken."""
+        """Wait for a frame. Raises the error of the video after all earlier frames."""
         with self._changed:
             while self._newest is None and not self._over and not self._ended():
                 self._changed.wait(POLL_INTERVAL_S)
@@ -127,7 +127,7 @@ def map_ahead(
     if ahead == 0:
         yield from map(function, items)
         return
-    # numba's thread count is per thread: the workers get the consumer's
+    # numba's thread count is per thread: the workers get the count of the consumer
     pool = ThreadPoolExecutor(workers, "detect-ahead", numba.set_num_threads, (numba.get_num_threads(),))
     pending: deque[Future[Outcome]] = deque()
     try:
@@ -142,7 +142,7 @@ def map_ahead(
 
 
 class Turns:
-    """Serialization of a part of the work of several threads, in the order of their numbers from 0."""
+    """Serialization of a critical section, in the order of turn numbers from 0."""
 
     def __init__(self) -> None:
         self._next = 0
@@ -150,7 +150,7 @@ class Turns:
 
     @contextmanager
     def turn(self, number: int) -> Iterator[None]:
-        """Wait until all smaller numbers are done."""
+        """Wait for the end of all turns with smaller numbers."""
         with self._changed:
             self._changed.wait_for(lambda: self._next == number)
         try:

@@ -1,7 +1,7 @@
-"""Keeps freed memory in the process.
+"""Retention of freed memory in the process.
 
-The C library returns large freed blocks to the system. The next image of that size then needs new pages, which takes
-0.1 ms for a huge page (2 MiB), in a virtual machine up to 5 ms.
+The C library returns large freed blocks to the system. The next image of that size then needs new pages. A huge page
+(2 MiB) takes 0.1 ms, and up to 5 ms in a virtual machine.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MOST_SHARED = 2**25  # bytes of an array that reuses freed memory; the maximum o
 def keep_freed_memory() -> None:
     """Keep about MOST_KEPT freed bytes in the process, if its C library is glibc.
 
-    Settings of the environment take precedence.
+    Environment variables of malloc take precedence.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     configured = {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES"} & os.environ.keys()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 BOUNDS = {
-    "seed": (0, 2**63 - 1),  # that of torch
+    "seed": (0, 2**63 - 1),  # the range of torch
     "threads": (0, 4096),  # no machine has more cores
     "prefetch": (0, 1000),
     "detection_interval": (1, 10**6),
@@ -35,12 +35,12 @@ ENVIRONMENT = {
     # The detection threads and the mapping thread launch parallel kernels at the same time. Of numba's threading layers
     # only OpenMP and TBB support that. OpenMP is always installed, because torch requires it.
     "NUMBA_THREADING_LAYER": "omp",
-    # Idle OpenMP threads spin by default and take the cores from other threads. A few microseconds of spinning pay off
+    # Idle OpenMP threads spin by default and block cores for other threads. A few microseconds of spinning save time
     # between the kernels of one stage.
     "OMP_WAIT_POLICY": "passive",
     "GOMP_SPINCOUNT": "10000",
-    # Threads of OpenBLAS (numpy, scipy and OpenCV each bring a copy) spin for 2^26 cycles by default. Those of OpenCV
-    # took a core for 30 ms after each keyframe. The value is the exponent.
+    # Threads of OpenBLAS (numpy, scipy and OpenCV each contain a copy) spin for 2^26 cycles by default. The copy in
+    # OpenCV occupied a core for 30 ms after each keyframe. The value is the exponent.
     "OPENBLAS_THREAD_TIMEOUT": "14",
 }
 """Environment variables that libraries read when they are loaded; values that the user has set are kept."""
@@ -49,8 +49,8 @@ ENVIRONMENT = {
 def set_environment() -> None:
     """Set ENVIRONMENT in this process. It takes effect only before numpy and numba are imported.
 
-    numba stores compiled kernels next to the code or in the user's cache, and fails where it can write to neither, such
-    as in a read-only container. There, this process gets a temporary cache with an unpredictable name.
+    numba stores compiled kernels next to the code or in the user's cache, and fails if both are read-only, such as in a
+    container. In that case, this process uses a temporary cache with an unpredictable name.
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
@@ -61,7 +61,7 @@ def set_environment() -> None:
 
 
 def _is_writable(folder: Path) -> bool:
-    """Return whether the folder, or its nearest existing parent, can be written."""
+    """Return True if the folder, or its nearest existing parent, is writable."""
     existing = next((path for path in (folder, *folder.parents) if path.exists()), Path())
     return os.access(existing, os.W_OK)
 
@@ -69,8 +69,9 @@ def _is_writable(folder: Path) -> bool:
 def configure_process(threads: int = 0, seed: int | None = None) -> None:
     """Apply the process-wide settings of the command line to this process.
 
-    `import instancemap`, `Mapper` and `Pipeline` change nothing process-wide. Call this function at the start of a
-    program that may do so: detection then runs in parallel with mapping on every platform, and frames take less time.
+    `import instancemap`, `Mapper` and `Pipeline` change no process-wide settings. Call this function at the start of
+    your program if it may change them. Detection then runs in parallel with mapping on every platform, and frames take
+    less time.
 
         import instancemap
 
@@ -80,7 +81,7 @@ def configure_process(threads: int = 0, seed: int | None = None) -> None:
     It sets environment variables (`NUMBA_THREADING_LAYER`, `OMP_WAIT_POLICY`, `GOMP_SPINCOUNT`,
     `OPENBLAS_THREAD_TIMEOUT`, `OMP_NUM_THREADS`), the thread counts of numba, OpenCV, torch, OpenMP and BLAS, and the
     malloc thresholds of glibc. Libraries read the environment when they are loaded, so call it before you import numpy
-    or numba; otherwise a warning lists the variables without effect.
+    or numba. Otherwise a warning lists the variables without effect.
 
     Args:
         threads: Threads of each library; 0 = all cores of this process.
@@ -110,7 +111,7 @@ def available_cores() -> int:
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of the config that all stages share."""
+    """Config settings shared by all stages."""
 
     seed: int  # 0 or more
     device: str  # one of DEVICES; the stages that run networks read it
@@ -134,14 +135,17 @@ class Settings:
     def apply(self) -> None:
         """Limit the threads of the libraries and seed their global generators, in a process of the command line.
 
-        The project's own code draws from generators seeded with `seed`; the global ones are for third-party plugins.
-        Call it again when the stages are built: torch is only configured if it is loaded, which takes seconds.
+        The project's own code uses separate generators seeded with `seed`. Third-party plugins may use the global
+        generators. Call this method again after the stages are built: torch is configured only if it is loaded already.
         """
         self.limit_threads()
         self.seed_generators()
 
     def limit_threads(self) -> None:
-        """Open3D's own (TBB) threads have no switch: only the affinity of the process limits them."""
+        """Limit the threads of all libraries.
+
+        The TBB threads of Open3D have no setting. Only the affinity of the process limits them.
+        """
         import cv2
         import numba
         from threadpoolctl import threadpool_limits
@@ -152,8 +156,8 @@ class Settings:
         threads = self.threads or available_cores()
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
         cv2.setNumThreads(threads)
-        threadpool_limits(threads)  # OpenMP and BLAS, as far as they are loaded
-        os.environ["OMP_NUM_THREADS"] = str(threads)  # libraries that are loaded later, such as torch, read it
+        threadpool_limits(threads)  # loaded OpenMP and BLAS libraries
+        os.environ["OMP_NUM_THREADS"] = str(threads)  # for libraries that are loaded later, such as torch
         if torch := sys.modules.get("torch"):
             torch.set_num_threads(threads)
 
@@ -169,9 +173,9 @@ class Settings:
 
 @contextmanager
 def frozen_garbage_collector() -> Iterator[None]:
-    """Exclude all objects that exist now from garbage collection while the body runs, unless some already are.
+    """Exclude all existing objects from garbage collection in the body. Does nothing if objects are already frozen.
 
-    The 300,000 objects of the imported libraries take the collector 40 ms, longer than a frame.
+    The collector takes 40 ms for the 300,000 objects of the imported libraries, longer than a frame.
     """
     if gc.get_freeze_count():
         yield

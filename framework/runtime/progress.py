@@ -1,4 +1,4 @@
-"""Progress of long operations: a bar in a terminal, else a log line from time to time."""
+"""Progress of long operations: a bar in a terminal, otherwise periodic log lines."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Any
 
 from tqdm import tqdm
 
-SIGN_OF_LIFE, LONGEST = 3.0, 60.0  # s, the least and the most from one line to the next
+SIGN_OF_LIFE, LONGEST = 3.0, 60.0  # s, minimum and maximum interval of log lines
 
 
 class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
-    """tqdm's bar of `total` items (None = unknown), and the interval of log lines without a bar."""
+    """Progress bar of `total` items (None = unknown), and timer of log lines without a bar."""
 
     def __init__(self, total: int | None, unit: str, **options: Any) -> None:
-        # tqdm itself does not look where `disable` is given; a program without a console has no stderr
+        # tqdm ignores TQDM_DISABLE if `disable` is given; a program without a console has no stderr
         self.quiet = os.environ.get("TQDM_DISABLE") == "1" or sys.stderr is None
         wide = self.quiet or not sys.stderr.isatty() or _columns() > 0
         super().__init__(total=total, unit=unit, disable=self.quiet or None, dynamic_ncols=wide, **options)
         self._begun = self._spoken = time.monotonic()
 
     def line_is_due(self) -> bool:
-        """Return whether a log line is due without a bar: every few seconds, less often in long runs."""
+        """Return True if no bar is shown and a log line is due: every few seconds, less often in long runs."""
         now = time.monotonic()
         interval = min(max(SIGN_OF_LIFE, 0.1 * (now - self._begun)), LONGEST)
         if not self.disable or self.quiet or now - self._spoken < interval:
@@ -33,7 +33,7 @@ class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
 
 
 def _columns() -> int:
-    """Return the width of the terminal at standard error; 0 = unknown, and tqdm would show nothing."""
+    """Return the width of the terminal at standard error; 0 = unknown, for which tqdm shows nothing."""
     try:
         return os.get_terminal_size(sys.stderr.fileno()).columns
     except (OSError, ValueError):

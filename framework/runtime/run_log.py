@@ -21,7 +21,7 @@ from framework.runtime.progress import Progress
 
 log = logging.getLogger(__name__)
 
-SKIPS_LOGGED = 10  # later unusable frames are only counted, so that a broken disk does not flood the log
+SKIPS_LOGGED = 10  # further unusable frames are only counted, so that a broken disk does not flood the log
 FUSION_STAGES: tuple[str, ...] = get_args(FusionStage)
 STAGES = ("reading", "detection", "tracking", "lifting", "refinement", *FUSION_STAGES)
 FUSION = "fusion"  # the total of FUSION_STAGES, if the fuser does not time them
@@ -30,7 +30,7 @@ COUNT_INTERVAL_S = 1.0  # s, interval of the number of instances in the progress
 
 @dataclass(frozen=True)
 class StageTime:
-    """How long one stage took for one frame."""
+    """The time of one stage for one frame."""
 
     frame: int  # Frame.index
     stage: str  # one of STAGES, or FUSION
@@ -39,7 +39,7 @@ class StageTime:
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """The estimated and the true pose of a frame."""
+    """The estimated and the ground-truth pose of a frame."""
 
     index: int  # Frame.index
     position: int  # in the sequence, including skipped frames
@@ -52,8 +52,8 @@ class TrackedFrame:
 class LiveFigures:
     """Statistics of a live video."""
 
-    frames_dropped: int  # replaced by a newer one before they were mapped
-    latencies: tuple[float, ...]  # of each fused frame, from capture to map, s
+    frames_dropped: int  # frames replaced by a newer frame before they were mapped
+    latencies: tuple[float, ...]  # s, from capture to map, of each fused frame
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,12 @@ class RunResult:
 
     @property
     def fps(self) -> float:
-        """Return frames per second of wall clock, including reading and detection."""
+        """Return the frames per second of wall clock, including reading and detection."""
         return self.frames / self.seconds
 
     @property
     def fps_median(self) -> float:
-        """Return frames per second by the median frame, without outliers such as kernel compilation."""
+        """Return the frames per second of the median frame, without outliers such as kernel compilation."""
         return 1 / float(np.median(self.intervals)) if self.intervals else self.fps
 
 
@@ -98,7 +98,7 @@ class Journal:
     frames: int = 0
     frames_skipped: int = 0
     without_pose: int = 0  # skipped frames without a pose
-    first_without_pose: str = ""  # message of the first one
+    first_without_pose: str = ""  # message of the first frame without a pose
     tracked: list[TrackedFrame] = field(default_factory=list)
     timings: list[StageTime] = field(default_factory=list)
     frames_in_map: int = 0  # at least partly fused
@@ -151,7 +151,7 @@ class Journal:
         self.timings += [StageTime(frame, stage, 1e3 * spent) for stage, spent in of_stages.items()]
 
     def stage_ms(self, frame: int) -> dict[str, float]:
-        """Return the time of each stage, ms, of the last frame, whose index is `frame`."""
+        """Return the stage times of the last frame, ms; `frame` is its index."""
         of_last = takewhile(lambda time: time.frame == frame, reversed(self.timings))
         return {time.stage: time.milliseconds for time in of_last}
 
@@ -193,7 +193,7 @@ class Journal:
         self.tracked.append(TrackedFrame(frame.index, self.frames - 1, frame.timestamp, pose, frame.T_world_camera))
         if pose.lost:
             if not self.lost_for:
-                log.warning("frame %d: lost: %s", frame.index, pose.reason or "the tracker gave no reason")
+                log.warning("frame %d: lost: %s", frame.index, pose.reason or "no reason given by the tracker")
             self.lost_for += 1
         elif self.lost_for:
             log.warning("frame %d: tracked again after %d lost frames", frame.index, self.lost_for)

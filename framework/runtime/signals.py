@@ -1,4 +1,4 @@
-"""Signals that end a run: the first one after the current step, the second one immediately."""
+"""Handling of signals: the first signal ends a run after the current step, the second signal immediately."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal ended the run. Code that handles Ctrl-C also handles the other signals."""
+    """End of a run by a signal. Code that handles Ctrl-C also handles the other signals."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -34,7 +34,7 @@ def _raise_interrupted(number: int, _frame: FrameType | None) -> None:
 
 
 OURS_TO_HANDLE = (signal.SIG_DFL, signal.default_int_handler, _raise_interrupted)
-"""Handlers that may be replaced; a signal that is ignored or handled otherwise is left alone."""
+"""Handlers that may be replaced. Ignored signals, and signals with other handlers, are not changed."""
 
 
 def raise_on_signals() -> None:
@@ -46,7 +46,7 @@ def raise_on_signals() -> None:
 
 @dataclass
 class Interruption:
-    """The signals that were received while they were deferred."""
+    """Record of the signals received while signals are deferred."""
 
     asked: Interrupted | None = None
     quiet: bool = False  # true if another process prints messages
@@ -60,9 +60,9 @@ class Interruption:
 
     @contextmanager
     def second_ends_at_once(self, when: str) -> Iterator[None]:
-        """Let the second signal raise in the body; the message of the first one announces the end `when`.
+        """Let the second signal raise in the body. The message of the first signal announces the end `when`.
 
-        Between such bodies no signal raises, so that the result of one reaches the next.
+        Between such bodies no signal raises, so that the result of one body reaches the next body.
         """
         self._when, self._at_once = when, True
         try:
@@ -80,7 +80,7 @@ class Interruption:
 
 
 def _print(text: str) -> None:
-    """Write to stderr without its buffer and the log, which the signal may have interrupted."""
+    """Write to stderr directly. The signal may have interrupted its buffer or the log."""
     if sys.__stderr__ is not None:
         with suppress(OSError, ValueError):
             os.write(sys.__stderr__.fileno(), text.encode())
@@ -94,8 +94,8 @@ _in_worker = ExitStack()  # never closed
 def signals_deferred(*numbers: int) -> Iterator[Interruption]:
     """Record the first of these signals in the yielded Interruption instead of raising in the body.
 
-    An exception within a frame would leave it partly integrated. A nested call yields the outer Interruption. Nothing
-    changes outside the main thread, and for signals that are ignored or handled otherwise.
+    An exception within a frame would leave it partly integrated. A nested call yields the outer Interruption. Other
+    threads, ignored signals and signals with other handlers are not affected.
     """
     global _deferring
     if threading.current_thread() is not threading.main_thread():
@@ -104,7 +104,7 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
     if _deferring is not None:
         for number in numbers:
             if signal.getsignal(number) == _deferring.receive:
-                signal.signal(number, _deferring.receive)  # restores it: libraries such as glog replace it
+                signal.signal(number, _deferring.receive)  # restore the handler: libraries such as glog replace it
         yield _deferring
         return
     interruption = _deferring = Interruption()
@@ -121,9 +121,9 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
 
 
 def received_from_sweep() -> Interruption:
-    """Return the Interruption of a sweep's worker process: a SIGTERM of the sweep since the worker's first job.
+    """Return the Interruption of a worker process: a SIGTERM from the sweep since the first job of the worker.
 
-    Other signals, which a terminal sends to all its processes, are left to the sweep.
+    A terminal sends other signals to all its processes. Only the sweep handles them.
     """
     for number in set(ENDING) - {signal.SIGTERM}:
         signal.signal(number, signal.SIG_IGN)
@@ -135,7 +135,7 @@ def received_from_sweep() -> Interruption:
 
 @contextmanager
 def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterator[None]:
-    """Forward the first signal in the body to the worker processes `at_work`, and raise once none is busy.
+    """Forward the first signal in the body to the worker processes `at_work`, and raise after they have finished.
 
     Idle workers get no signal: they may have no handler yet, and joblib kills all workers when one ends. The second
     signal raises immediately.

@@ -1,1 +1,1 @@
-"""Contract tests that every plugin inherits. Other packages import them from `instancemap.testing`."""
+"""Contract tests for all plugins. Other packages import them from `instancemap.testing`."""

@@ -1,4 +1,4 @@
-"""Contract tests of each stage's plugins and of their options. Viewers are in viewer.py."""
+"""Contract tests of plugins and their options, by stage. viewer.py contains the tests of viewers."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from framework.testing.corner_room import (
 
 
 class OptionContract:
-    """Builds the plugin from its option, as a run does. The first base of a test class."""
+    """Tests of an option, which builds the plugin as in a run. Use as the first base of a test class."""
 
-    stage: str  # of the stage's contract
+    stage: str  # set by the contract of the stage
     option: str
-    overrides: tuple[str, ...] = ()  # values that only users know: ("detector.weights=FILE",)
+    overrides: tuple[str, ...] = ()  # values that the user must set: ("detector.weights=FILE",)
 
     def plugin(self) -> Any:
         return build(GROUPS[self.stage], self.node())
@@ -51,12 +51,12 @@ class OptionContract:
 
     def test_option_lists_every_parameter_with_comment(self) -> None:
         [listed] = registered(self.stage, only=self.option)
-        assert listed.documentation, "the class has no docstring"
+        assert listed.documentation, "the class requires a docstring"
         assert not listed.documentation.startswith("unusable"), listed.documentation
         named = {parameter.name for parameter in listed.parameters}
-        assert named == set(map(str, self.node())) - {"_target_"}, "the YAML needs every parameter"
+        assert named == set(map(str, self.node())) - {"_target_"}, "the YAML file must list every parameter"
         bare = [parameter.name for parameter in listed.parameters if not parameter.comment]
-        assert not bare, f"the YAML needs comments of {bare}"
+        assert not bare, f"the YAML file must have comments for {bare}"
 
     def test_option_values_are_class_defaults(self) -> None:
         node = self.node()
@@ -73,14 +73,14 @@ class SequenceContract:
     stage = "dataset"
 
     def plugin(self) -> RGBDSequence:
-        raise NotImplementedError("the recording that is tested")
+        raise NotImplementedError("expected plugin() to return the recording under test")
 
     def test_dataset_returns_frames_of_its_camera(self) -> None:
         sequence = self.plugin()
         assert sequence.name
         assert len(sequence) > 0
         frame = sequence[0]
-        assert frame.T_world_camera is not None, "the tests' recordings have poses"
+        assert frame.T_world_camera is not None, "the tested recording must have poses"
         assert frame.camera == sequence.camera
         assert (frame.depth > 0).any()
         assert same(frame, sequence[0])
@@ -97,7 +97,7 @@ class DetectorContract:
     stage = "detector"
 
     def plugin(self) -> Detector:
-        raise NotImplementedError("the detector that is tested")
+        raise NotImplementedError("expected plugin() to return the detector under test")
 
     def test_detector_returns_valid_detections(self) -> None:
         detector = self.plugin()
@@ -137,18 +137,18 @@ class DetectorContract:
 
 
 def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
-    """Assert that detections fulfill the detector contract."""
+    """Check that detections fulfill the detector contract."""
     assert found.classes == detector.classes
     assert found.masks.shape == (len(found), *frame.camera.shape)
     assert found.class_probabilities.shape == (len(found), len(detector.classes))
     np.testing.assert_allclose(found.class_probabilities.sum(axis=1), 1, atol=1e-4)
-    assert (np.diff(found.scores) <= 0).all(), "best first"
+    assert (np.diff(found.scores) <= 0).all(), "the best detection must come first"
     for mask, (x1, y1, x2, y2) in zip(found.masks, found.boxes, strict=True):
         assert -1 <= x1 <= x2 <= frame.camera.width + 1
         assert -1 <= y1 <= y2 <= frame.camera.height + 1
         v, u = np.nonzero(mask)
         if len(u):
-            slack = 2  # px: boxes are regressed, masks are resampled
+            slack = 2  # px, because boxes are regressed and masks are resampled
             assert u.min() >= x1 - slack
             assert u.max() <= x2 + slack
             assert v.min() >= y1 - slack
@@ -161,14 +161,14 @@ class TrackerContract:
     stage = "tracker"
 
     def plugin(self) -> PoseTracker:
-        raise NotImplementedError("the tracker that is tested")
+        raise NotImplementedError("expected plugin() to return the tracker under test")
 
     def test_tracker_returns_pose_and_keeps_map(self) -> None:
         tracker = self.plugin()
         scene = RoomMap()
         for k in range(6):
             pose = tracker.track(frame_at(k), scene)
-            assert isinstance(pose, Pose)  # rigid, as every Pose
+            assert isinstance(pose, Pose)  # which is always rigid
             assert not pose.lost or pose.reason
 
     def test_tracker_starts_at_first_true_pose(self) -> None:
@@ -199,7 +199,7 @@ class RefinerContract:
     stage = "refiner"
 
     def plugin(self) -> ClusterRefiner:
-        raise NotImplementedError("the refiner that is tested")
+        raise NotImplementedError("expected plugin() to return the refiner under test")
 
     def test_refiner_invents_no_points(self) -> None:
         frame = frame_at(1)
@@ -209,10 +209,10 @@ class RefinerContract:
         u, v = refined.pixels.T
         np.testing.assert_allclose(refined.points_world, readings(frame)[v, u], atol=1e-4)
         of_one = np.c_[refined.pixels, refined.cluster]
-        assert len(np.unique(of_one, axis=0)) == len(of_one), "a pixel twice in one cluster"
+        assert len(np.unique(of_one, axis=0)) == len(of_one), "duplicate pixel in a cluster"
         assert refined.classes == clusters.classes
         assert all(np.array_equal(before[name], value) for name, value in vars(clusters).items()), "input was changed"
-        assert (refined.cluster >= 0).any(), "nothing is left of two whole spheres"
+        assert (refined.cluster >= 0).any(), "all points of two complete spheres were removed"
 
     def test_refiner_is_repeatable(self) -> None:
         refiner = self.plugin()
@@ -251,7 +251,7 @@ class RefinerContract:
 
 
 def readings(frame: Frame) -> Float64:
-    """Return (H, W, 3) each pixel's point in the world, NaN without depth."""
+    """Return the points (H, W, 3) of the pixels in the world frame, NaN without depth."""
     whole = replace(spheres_in(frame), masks=np.ones((2, *CAMERA.shape), np.bool_))
     lifted = lift(whole, frame, Pose(pose_at(frame.index)))
     points = np.full((*CAMERA.shape, 3), np.nan)
@@ -265,7 +265,7 @@ class FuserContract:
     stage = "fuser"
 
     def plugin(self) -> MapFuser:
-        raise NotImplementedError("the fuser that is tested")
+        raise NotImplementedError("expected plugin() to return the fuser under test")
 
     def test_fuser_starts_with_an_empty_map(self) -> None:
         scene = self.plugin().scene
@@ -295,7 +295,7 @@ class FuserContract:
         mesh, instances = scene.mesh(), scene.instances()
         assert scene.instance_ids() == set(instances)
         assert mesh.triangles.max(initial=-1) < len(mesh.vertices)
-        assert instances, "two spheres, each seen whole in five frames"
+        assert instances, "expected instances of two spheres, fully visible in five frames"
         for key, instance in instances.items():
             assert key == instance.id > 0
             assert (mesh.instance_ids[instance.vertices] == key).all()
@@ -386,7 +386,7 @@ class FuserContract:
 
 
 def fused(fuser: MapFuser, frames: int = 5) -> MapFuser:
-    """Return the fuser after it has fused `frames` frames of the room."""
+    """Fuse `frames` frames of the room, and return the fuser."""
     for k in range(frames):
         frame = frame_at(k)
         fuser.fuse(frame, Pose(pose_at(k)), exact_clusters(frame))
@@ -399,7 +399,7 @@ def nothing_in(frame: Frame, pose: Pose) -> PointClusters:
 
 
 def same(a: object, b: object) -> bool:
-    """Return true if two of the pipeline's data contain the same arrays."""
+    """Return True if two data objects of the pipeline contain equal arrays."""
     return all(
         same(x, y) if is_dataclass(x) else np.array_equal(x, y)
         for x, y in zip(vars(a).values(), vars(b).values(), strict=True)
@@ -407,11 +407,11 @@ def same(a: object, b: object) -> bool:
 
 
 def assert_data_error(call: Callable[[], object], words: str) -> None:
-    """Assert that the call raises a DataError of one line with these words."""
+    """Check that the call raises a one-line DataError that contains `words`."""
     try:
         call()
     except DataError as error:
-        assert words in str(error), f"{str(error)!r} does not say {words!r}"
+        assert words in str(error), f"{str(error)!r} does not contain {words!r}"
         assert "\n" not in str(error)
     else:
-        raise AssertionError(f"nothing was raised; expected a DataError with {words!r}")
+        raise AssertionError(f"expected a DataError with {words!r}, got no error")

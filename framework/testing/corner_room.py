@@ -1,7 +1,7 @@
-"""A synthetic scene with exactly known pixels, for the contract tests.
+"""A synthetic scene with exact ground truth, for the contract tests.
 
-The textured corner of a room (two walls and a floor) with a chair and a couch, both spheres. World: x right, y down,
-z forward, as the first camera.
+The scene is a textured corner of a room (two walls and a floor) with a chair and a couch, both spheres. The world frame
+is the frame of the first camera: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def pose_at(k: int) -> Float64:
 
 
 def frame_at(k: int, truth: bool = True) -> Frame:
-    """Return frame k of a moving camera, with or without its true pose and instances."""
+    """Return frame k of a moving camera, with or without its ground-truth pose and instances."""
     depth, _, color, ids = look(CAMERA, pose_at(k))
     if not truth:
         return Frame(k, k / RATE, color, depth, CAMERA)
@@ -81,9 +81,9 @@ def frame_at(k: int, truth: bool = True) -> Frame:
 
 
 def spheres_in(frame: Frame) -> Detections:
-    """Return the true masks of both spheres. Raises DataError for a frame without true instances."""
+    """Return the ground-truth masks of both spheres. Raises DataError for a frame without ground-truth instances."""
     if frame.truth is None:
-        raise DataError(f"frame {frame.index} has no true instances: choose a detector that needs none")
+        raise DataError(f"frame {frame.index}: expected ground-truth instances, got none; choose another detector")
     masks = frame.truth.instance_ids == np.array([1, 2], np.int32)[:, None, None]
     boxes = [
         [u.min(), v.min(), u.max() + 1, v.max() + 1] if len(u) else [0, 0, 0, 0] for v, u in map(np.nonzero, masks)
@@ -93,12 +93,12 @@ def spheres_in(frame: Frame) -> Detections:
 
 
 def exact_clusters(frame: Frame) -> PointClusters:
-    """Lift both spheres from their true masks and pose."""
+    """Lift both spheres with ground-truth masks and pose."""
     return lift(spheres_in(frame), frame, Pose(pose_at(frame.index)))
 
 
 def bleeding_clusters(frame: Frame) -> PointClusters:
-    """Lift both spheres with masks that include some of the wall."""
+    """Lift both spheres with masks that extend onto the wall."""
     exact = spheres_in(frame)
     masks = exact.masks | np.roll(exact.masks, 3, axis=2)
     return lift(replace(exact, masks=masks), frame, Pose(pose_at(frame.index)))
@@ -106,7 +106,7 @@ def bleeding_clusters(frame: Frame) -> PointClusters:
 
 @dataclass(frozen=True)
 class RoomMap(SceneMap):
-    """The room as a read-only map with exact views."""
+    """Read-only map of the room with exact views."""
 
     classes: tuple[str, ...] = CLASSES
 
@@ -132,8 +132,8 @@ class RoomMap(SceneMap):
         return {}
 
     def save(self, path: Path | str) -> None:
-        raise DataError("the room is not to be saved")
+        raise DataError("RoomMap.save: unsupported")
 
     @classmethod
     def load(cls, path: Path | str) -> RoomMap:
-        raise DataError("the room is not to be loaded")
+        raise DataError("RoomMap.load: unsupported")

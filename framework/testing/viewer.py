@@ -32,7 +32,7 @@ STAGE_MS = {
 
 @dataclass(frozen=True)
 class WatchedMap(RoomMap):
-    """A map of one chair (a triangle) that records reads outside of a viewer's calls."""
+    """A map of one chair (a triangle). Records read accesses outside of viewer calls."""
 
     within_a_call: threading.Event = field(default_factory=threading.Event)
     asked_outside: list[str] = field(default_factory=list)
@@ -76,7 +76,7 @@ class ViewerContract:
     stage = "viewer"
 
     def plugin(self) -> Viewer:
-        raise NotImplementedError("the viewer that is tested")
+        raise NotImplementedError("expected plugin() to return the viewer under test")
 
     def test_viewer_accepts_all_frames_and_keeps_them(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         scene, frames = WatchedMap(), [frame_with_found(k) for k in range(FRAMES)]
@@ -89,7 +89,7 @@ class ViewerContract:
     def test_viewer_reads_map_only_in_calls(self, tmp_path: Path) -> None:
         scene = WatchedMap()
         show_run(self.plugin(), scene, [frame_with_found(k) for k in range(FRAMES)], tmp_path)
-        assert not scene.asked_outside, "the fuser may be writing it then"
+        assert not scene.asked_outside, "the fuser may write the map outside of viewer calls"
 
     def test_viewer_accepts_run_without_frames(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         scene, viewer = WatchedMap(), self.plugin()
@@ -115,7 +115,7 @@ class ViewerContract:
 
 
 def frame_with_found(k: int) -> tuple[Frame, Detections]:
-    """Return frame k and its detections; one frame has none, one is black and without depth."""
+    """Return frame k and its detections. One frame has no detections; one frame is black and has no depth."""
     frame = frame_at(k)
     found = spheres_in(frame)
     if k == NOTHING_FOUND:
@@ -127,7 +127,7 @@ def frame_with_found(k: int) -> tuple[Frame, Detections]:
 
 
 def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detections]], directory: Path) -> None:
-    """Show these frames as a run does. One of them is lost, one is skipped."""
+    """Show the frames as a run does. One frame is lost, and one frame is skipped."""
     with scene.call():
         viewer.begin(scene, "a room", directory)
     for k, (frame, found) in enumerate(frames):
@@ -146,5 +146,5 @@ def show_run(viewer: Viewer, scene: WatchedMap, frames: list[tuple[Frame, Detect
 
 
 def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """Return logged warnings, such as those of a viewer that fails in its own thread."""
+    """Return the logged warnings, including failures in the thread of a viewer."""
     return [record.message for record in caplog.records if record.levelno >= logging.WARNING]

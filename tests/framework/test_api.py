@@ -150,8 +150,8 @@ def test_mapper_add_none_raises() -> None:
         ("detection_cache=bogus", "detection_cache: expected one of"),
         ("seed=-1", r"seed: expected an integer in \["),
         ("~refiner", "refiner: expected a plugin's config .*; choose refiner=NAME"),
-        ("dataset=desk", "got dataset=desk; it is for the command line only"),
-        ("hydra.run.dir=x", "got hydra.run.dir=x; it is for the command line only"),
+        ("dataset=desk", "got dataset=desk; use it only on the command line"),
+        ("hydra.run.dir=x", "got hydra.run.dir=x; use it only on the command line"),
         (None, "Mapper: expected overrides such as 'fuser.voxel_size=0.02', got None"),
     ],
 )
@@ -232,4 +232,4 @@ def test_import_names_conflicting_framework_package(tmp_path: Path) -> None:
     (tmp_path / "framework" / "__init__.py").touch()
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import instancemap"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert f"the package 'framework' at {tmp_path}/framework/__init__.py stands in the way" in done.stderr
+    assert f"got {tmp_path}/framework/__init__.py; rename it" in done.stderr

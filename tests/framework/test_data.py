@@ -241,19 +241,19 @@ def test_camera_out_of_range_value_raises(wrong: dict[str, float]) -> None:
         ),
         (
             {"fx": 1e-300},
-            "Camera: expected a field of view of at most 10 m sideways per m of depth",
+            "Camera: expected a field of view of at most 10 m laterally per m of depth",
         ),
         (
             {"fy": 1e-5},
-            "Camera: expected a field of view of at most 10 m sideways per m of depth",
+            "Camera: expected a field of view of at most 10 m laterally per m of depth",
         ),
         (
             {"cx": 1e9},
-            "Camera: expected a field of view of at most 10 m sideways per m of depth",
+            "Camera: expected a field of view of at most 10 m laterally per m of depth",
         ),
         (
             {"cy": -1e9},
-            "Camera: expected a field of view of at most 10 m sideways per m of depth",
+            "Camera: expected a field of view of at most 10 m laterally per m of depth",
         ),
         ({"fx": 1e300}, "at most 1e\\+06 px"),
         ({"width": 10**9, "height": 10**9}, "at most 33554432 px, got 1000000000x1000000000"),

@@ -62,8 +62,14 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
         ("threads=1000000", ["ERROR", "threads: expected an integer in [0, 4096], got 1000000"]),
         (f"detector={'x' * 100_000}", ["File name too long", "characters)"]),
         (f"seed={'x' * 100_000}", ["seed: expected an integer in [", "characters)"]),
-        ("--experimental-rerun=config.pickle", ["--experimental-rerun: expected no option that reads a pickle"]),
-        ("--experimental-r=config.pickle", ["--experimental-rerun: expected no option that reads a pickle"]),
+        (
+            "--experimental-rerun=config.pickle",
+            ["--experimental-rerun: expected overrides, got an option that reads a pickle"],
+        ),
+        (
+            "--experimental-r=config.pickle",
+            ["--experimental-rerun: expected overrides, got an option that reads a pickle"],
+        ),
     ],
 )
 def test_run_invalid_override_exits_with_one_line_error(tmp_path: Path, override: str, message: list[str]) -> None:
@@ -102,7 +108,7 @@ def test_removed_working_folder_exits_with_one_line(tmp_path: Path, monkeypatch:
     (tmp_path / "gone").rmdir()
     with pytest.raises(
         SystemExit,
-        match=r"^error: working folder: expected an existing folder, got a removed one; change to another one$",
+        match=r"^error: working folder: expected an existing folder, got a deleted folder; change to another folder$",
     ):
         leave_working_folder([])
 

@@ -176,7 +176,7 @@ def test_build_flattens_parameters_of_parts() -> None:
         ({"_target_": f"{HERE}.Ambiguous"}, ["Ambiguous: expected unique parameters, got two nms"]),
         ({"_target_": f"{HERE}.Prob"}, ["got Prob", "did you mean 'Probe'?"]),
         ({"_target_": f"{HERE}.some_function"}, ["implements Detector", "got a function"]),
-        ({"_target_": f"{HERE}.Path"}, ["implements Detector", "got another class"]),
+        ({"_target_": f"{HERE}.Path"}, ["implements Detector", "got the class Path"]),
         ({"_target_": "os.system"}, ["implements Detector"]),
         ({"_target_": "framework.interfaces.Detector"}, ["implements Detector"]),
         (
@@ -212,7 +212,7 @@ def test_find_class_import_failure_raises_one_line_error(tmp_path: Path, monkeyp
     (tmp_path / "needs_more.py").write_text(f"import surely_not_installed\n{tracker}")
     failing = "raise RuntimeError('operator torchvision::nms does not exist\\nmore')\n"
     (tmp_path / "raises.py").write_text(failing + tracker)
-    with pytest.raises(ConfigError, match=r".* requires the package 'surely_not_installed', which is not installed"):
+    with pytest.raises(ConfigError, match=r".* expected an installed package 'surely_not_installed', got none"):
         find_class(PoseTracker, "needs_more.Tracker")
     with pytest.raises(ConfigError, match=r"raises: import failed: RuntimeError: operator .* does not exist$"):
         find_class(PoseTracker, "raises.Tracker")
@@ -266,8 +266,8 @@ def test_conflicting_plugins_package_is_reported(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{CHECKOUT}"}
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
-    output = f"plugins: expected InstanceMap's package at {CHECKOUT}/plugins, got another one at {tmp_path}/plugins"
-    assert f"{output}; rename it or start in another folder" in done.stderr
+    output = f"plugins: expected InstanceMap's package at {CHECKOUT}/plugins, got {tmp_path}/plugins"
+    assert f"{output}; rename it or start Python in another folder" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert "imported" not in done.stdout
 

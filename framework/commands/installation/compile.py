@@ -15,11 +15,11 @@ from framework.errors import ConfigError
 def main() -> None:
     """Run the command `instancemap compile`."""
     parser = argparse.ArgumentParser(
-        description="Compiles the kernels of a run with the default stages, which numba stores for later runs of this "
+        description="Compile the kernels of a run with the default stages. numba stores them for later runs of this "
         "installation. Compiled kernels are skipped."
     )
-    parser.add_argument("words", metavar="WORD", nargs="*", help="only kernels whose names contain one of these")
-    parser.add_argument("--all", action="store_true", help="also the kernels of other stages")
+    parser.add_argument("words", metavar="WORD", nargs="*", help="part of a kernel name; default: all kernels")
+    parser.add_argument("--all", action="store_true", help="also compile the kernels of other stages")
     parsed = arguments(parser)
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     with one_line_errors():
@@ -27,9 +27,9 @@ def main() -> None:
 
 
 def compile_named(kernels: list[Kernel], words: list[str]) -> str:
-    """Compile the missing kernels whose names contain one of the words (none = all), and return a summary.
+    """Compile the missing kernels with one of the words in their names ([] = all), and return a summary.
 
-    Raises ConfigError if no kernel matches, DataError if one cannot be compiled.
+    Raises ConfigError if no kernel matches, DataError if a kernel cannot be compiled.
     """
     if words:
         kernels = [kernel for kernel in kernels if any(word in f"{kernel.module}.{kernel.name}" for word in words)]

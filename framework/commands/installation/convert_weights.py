@@ -1,6 +1,6 @@
-"""`instancemap convert-weights IN OUT`: convert a Mask R-CNN of torchvision or detectron2 for `detector=mask_rcnn`.
+"""`instancemap convert-weights IN OUT`: convert torchvision or detectron2 weights for `detector=mask_rcnn`.
 
-The metadata of OUT describe the network, so it needs only `detector.weights=OUT`. Code in IN is never executed.
+The metadata of OUT describe the network, so `detector.weights=OUT` is sufficient. Code in IN is never executed.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from framework.errors import ConfigError
 def main() -> None:
     """Run the command `instancemap convert-weights`."""
     parser = argparse.ArgumentParser(
-        description="Converts a Mask R-CNN of torchvision or detectron2 for detector=mask_rcnn."
+        description="Convert Mask R-CNN weights of torchvision or detectron2 for detector=mask_rcnn."
     )
-    parser.add_argument("source", metavar="IN", type=Path, help="name of a published network, or a .pth or .pkl file")
-    parser.add_argument("target", metavar="OUT", type=Path, help="the .safetensors file to write")
-    parser.add_argument("--kind", choices=["torchvision", "detectron2"], help="format of IN, default: detected")
-    parser.add_argument("--classes", help="comma-separated, in the network's order, if not COCO's")
-    epsilon = "of batch normalization, torchvision only; default: 0, as in its COCO checkpoint"
+    parser.add_argument("source", metavar="IN", type=Path, help="name of a published network, or .pth or .pkl file")
+    parser.add_argument("target", metavar="OUT", type=Path, help="output .safetensors file")
+    parser.add_argument("--kind", choices=["torchvision", "detectron2"], help="format of IN; default: detected")
+    parser.add_argument("--classes", help="comma-separated class names in network order, if other than COCO")
+    epsilon = "epsilon of batch normalization, torchvision only; default: 0, as in its COCO checkpoint"
     parser.add_argument("--norm-eps", type=float, default=0.0, help=epsilon)
-    parser.add_argument("--half", action="store_true", help="store float16: half the size")
+    parser.add_argument("--half", action="store_true", help="store float16 weights: half the size")
     parsed = arguments(parser)
     with one_line_errors():
         convert(parsed.source, parsed.target, parsed.kind, parsed.classes, parsed.norm_eps, parsed.half)
@@ -32,7 +32,7 @@ def main() -> None:
 def convert(source: Path, target: Path, kind: str | None, classes: str | None, norm_eps: float, half: bool) -> None:
     """Convert a checkpoint to safetensors."""
     if target.suffix != ".safetensors":
-        raise ConfigError(f"{target}: expected a file name that ends in .safetensors")
+        raise ConfigError(f"{target}: expected the suffix .safetensors, got {target.suffix or 'none'}")
     from framework.detection.mask_rcnn.checkpoint import CheckpointKind, read_network
     from framework.detection.mask_rcnn.network_file import save_network
     from framework.detection.mask_rcnn.published_weights import find_network

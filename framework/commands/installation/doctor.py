@@ -24,8 +24,8 @@ LEGEND = "ok: available   --: missing, optional   !!: missing or broken, require
 def main() -> None:
     """Run the command `instancemap doctor`."""
     parser = argparse.ArgumentParser(
-        description="Checks the installation and prints the fix for each problem. Paste the output into an issue: it"
-        " does not contain your user name or home folder. Exits with 1 if a run with the default stages cannot work."
+        description="Check the installation and print the fix for each problem. The output contains no user name or "
+        "home folder, so you can paste it into an issue. Exit status 1: a run with the default stages cannot work."
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args([word for word in sys.argv[1:] if not word.startswith("debug=")])

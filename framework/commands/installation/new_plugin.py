@@ -1,4 +1,4 @@
-"""`instancemap new-plugin STAGE NAME` creates a package with a working plugin.
+"""`instancemap new-plugin STAGE NAME`: create a package with a working plugin.
 
 framework/templates has a folder for each stage, one for viewers and one for common files.
 """
@@ -25,7 +25,7 @@ from framework.errors import ConfigError, DataError
 from framework.registry import GROUPS
 
 TEMPLATES = Path(framework.__file__).with_name("templates")
-PLACES = {  # path of each template in the new package; those of the stage come first
+PLACES = {  # path of each template in the new package; templates of the stage take precedence
     "plugin.py": "$package/$name.py",
     "option.yaml": "$package/conf/$stage/$name.yaml",
     "test.py": "tests/test_$name.py",
@@ -36,11 +36,11 @@ PLACES = {  # path of each template in the new package; those of the stage come 
     "gitignore": ".gitignore",
     "test.yml": ".github/workflows/test.yml",
 }
-LONGEST_NAME = 30  # characters; lines of the templates stay within 120
+LONGEST_NAME = 30  # characters; keeps lines of the templates within 120
 FOLDERS = ("conf", "tests")  # names that a module of the package must not have
 SMALL = "dataset=synthetic dataset.frames=30 dataset.width=320 dataset.height=240"
 FIRST = "hydra.sweep.dir=outputs/first_sweep"
-TRIES = {  # by stage: command that compares a new plugin with ours; a viewer is only inspected
+TRIES = {  # by stage: command that compares a new plugin with an existing plugin; viewers are only run
     "detector": f"instancemap -m detector=mask_rcnn_rooms,$name {SMALL} {FIRST}",
     "tracker": f"instancemap -m tracker=voxel_hashing_icp,$name detector=simulated {SMALL} {FIRST}",
     "refiner": f"instancemap -m refiner=gmm_em,$name detector=simulated {SMALL} {FIRST}",
@@ -75,12 +75,17 @@ VARIANTS = {  # by stage: parameter of a variant
 def main() -> None:
     """Run the command `instancemap new-plugin`."""
     parser = argparse.ArgumentParser(
-        description="Writes a repository with a plugin of your own, which works at once: package, option, tests, CI."
+        description="Create a repository with a working plugin: package, option, tests, CI."
     )
     parser.add_argument("stage", metavar="STAGE", choices=GROUPS, help=", ".join(GROUPS))
-    parser.add_argument("name", metavar="NAME", help="of the option, such as my_refiner: refiner=my_refiner")
+    parser.add_argument("name", metavar="NAME", help="option name, such as my_refiner for refiner=my_refiner")
     parser.add_argument(
-        "--in", dest="folder", metavar="DIR", type=Path, default=Path(), help="where to write it; else here"
+        "--in",
+        dest="folder",
+        metavar="DIR",
+        type=Path,
+        default=Path(),
+        help="parent folder; default: working folder",
     )
     asked = arguments(parser)
     with one_line_errors():
@@ -94,7 +99,7 @@ def main() -> None:
 def write_repository(stage: str, name: str, folder: Path) -> Path:
     """Create the new folder in `folder` atomically and return it.
 
-    Raises ConfigError for a name that cannot be one or is taken, DataError where the folder cannot be written.
+    Raises ConfigError for an invalid or existing name, and DataError if the folder cannot be written.
     """
     check_name(stage, name)
     if not folder.is_dir():
@@ -102,7 +107,7 @@ def write_repository(stage: str, name: str, folder: Path) -> Path:
     place = folder / names_of(stage, name)["distribution"]
     if os.path.lexists(place):
         raise ConfigError(
-            f"{place}: expected a new folder, got an existing one; choose another name, or another folder with --in"
+            f"{place}: expected a new folder, got an existing folder; choose another name, or another folder with --in"
         )
     try:
         with tempfile.TemporaryDirectory(prefix=".new-plugin-", dir=folder) as temporary:
@@ -125,12 +130,13 @@ def check_name(stage: str, name: str) -> None:
         )
     if is_value(name):
         raise ConfigError(
-            f"NAME: expected a name, got the value {name} of the command line and YAML; choose another such "
+            f"NAME: expected a name, got the value {name} of the command line and YAML; choose another name such "
             f"as my_{name}"
         )
     if keyword.iskeyword(name) or name in FOLDERS:
         raise ConfigError(
-            f"NAME: expected a name without a meaning in Python packages, got {name}; choose another such as my_{name}"
+            f"NAME: expected a name without a meaning in Python packages, got {name}; choose another name such as "
+            f"my_{name}"
         )
     if name in options_of(stage):
         raise ConfigError(
@@ -143,7 +149,7 @@ def check_name(stage: str, name: str) -> None:
 
 
 def is_value(name: str) -> bool:
-    """Return whether Hydra or YAML parses the word as null, a boolean or a number."""
+    """Return True if Hydra or YAML parses the word as null, a boolean or a number."""
     on_a_line = OverridesParser.create().parse_override(f"option={name}").value()
     return not (isinstance(on_a_line, str) and isinstance(OmegaConf.create(f"option: {name}").option, str))
 

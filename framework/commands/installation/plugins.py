@@ -1,6 +1,6 @@
 """`instancemap plugins [STAGE [NAME]]`: the plugins of each stage, with documentation and parameters.
 
-Options of installed packages (entry point `instancemap.configs`) and of --config-dir are listed, too.
+The list includes options of installed packages (entry point `instancemap.configs`) and of --config-dir.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Option:
-    """One choosable option of a stage: a YAML file that registers a class."""
+    """One option of a stage: a YAML file that registers a class."""
 
     stage: str
     name: str
     target: str
     provider: str  # provider in Hydra's search path: main, or the third-party package
-    documentation: str  # first line of the class, and the change of a derived option; the error of an unusable option
+    documentation: str  # summary of the class and change of a derived option, or error of an unusable option
     parameters: tuple[Parameter, ...]
 
 
 def registered(*stages: str, only: str | None = None) -> list[Option]:
-    """Return the options of these config groups by stage and name, or only those with the requested name."""
+    """Return the options of these config groups by stage and name, or only the options named `only`."""
     with config_loader() as loader:
-        files = CachingConfigRepository(loader.repository)  # of all options, because they share most configs
+        files = CachingConfigRepository(loader.repository)  # shared, because the options have most configs in common
         return [
             _option(files, stage, name)
             for stage in stages
@@ -77,7 +77,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
     try:
         own: Any = files.load_config(f"{stage}/{name}")
         target = str(own.config.get("_target_"))
-        made_of = composition(files, stage, name)  # the option's own file, and those that it includes
+        made_of = composition(files, stage, name)  # the file of the option, and included files
         texts, configs = [], []
         for path in (path for path, package in made_of.items() if package == stage):
             part: Any = files.load_config(path)
@@ -109,10 +109,10 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
 
 
 def _nested(made_of: Mapping[str, str], place: str, plugin_class: type) -> str:
-    """Return the options in the field at `place` (detector.detector): one, or several by name."""
+    """Return the options in the field at `place` (detector.detector): one option, or several by name."""
     if holds_one(plugin_class, place.rpartition(".")[2]):
         own = [path for path, package in made_of.items() if package == place]
-        return own[-1].rpartition("/")[2] if own else ""  # after those that it inherits from
+        return own[-1].rpartition("/")[2] if own else ""  # after the inherited options
     packages = (package for package in made_of.values() if f"{place}." in package)
     return ", ".join(dict.fromkeys(package.rpartition(".")[2] for package in packages))
 
@@ -124,7 +124,7 @@ def _default(field: dataclasses.Field[Any]) -> object:
 
 
 def _text(source: str, name: str) -> str:
-    """Return the text of the YAML file; Hydra's configs have no comments."""
+    """Return the text of a YAML file; "" for Hydra's own configs, which have no comments."""
     scheme, _, root = source.partition("://")
     return Path(root, name).read_text() if scheme == "file" else ""
 
@@ -145,14 +145,15 @@ def describe(option: Option) -> str:
 
 def main() -> None:
     """Run the command `instancemap plugins`."""
-    parser = argparse.ArgumentParser(description="Lists the registered plugins.")
-    parser.add_argument("stage", nargs="?", choices=GROUPS, help="only this stage")
-    parser.add_argument("name", nargs="?", help="only this option")
+    parser = argparse.ArgumentParser(description="List the plugins of each stage and their parameters.")
+    parser.add_argument("stage", nargs="?", choices=GROUPS, help="stage to list; default: all")
+    parser.add_argument("name", nargs="?", help="option to list; default: all")
     asked = arguments(parser)
     with one_line_errors():
         stages = [asked.stage] if asked.stage else list(GROUPS)
-        atexit.register(gc.freeze)  # going through all that torch leaves in memory takes a fifth of the time ...
-        gc.disable()  # ... and as much again before the process ends
+        # garbage collection of torch's objects takes a fifth of the time here, and again at exit
+        atexit.register(gc.freeze)
+        gc.disable()
         options = registered(*stages, only=asked.name)
         gc.enable()
         if asked.name and not options:

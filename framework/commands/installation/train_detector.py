@@ -1,4 +1,4 @@
-"""`instancemap train-detector`: train Mask R-CNN on rendered rooms."""
+"""`instancemap train-detector`: train Mask R-CNN on rendered synthetic scenes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from framework.files.search_paths import CONF
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train_detector")
 def job(config: DictConfig) -> None:
     """Train the detector of a composed config."""
-    from framework.training.train import train  # slow: after Hydra has checked the keys
+    from framework.training.train import train  # slow import: after Hydra has checked the keys
 
     train(config, Path(HydraConfig.get().runtime.output_dir))
 

@@ -24,7 +24,7 @@ jobs = Jobs()
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="check")
 @jobs.reported
 def job(config: DictConfig) -> None:
-    """Check the dataset of the config, print the findings and draw them."""
+    """Check the dataset of the config, and print and draw the findings."""
     out = checked_file("out", config.out, ".png") if config.out is not None else Path("outputs", "check.png").absolute()
 
     from framework.checking.recording_check import check
@@ -41,9 +41,7 @@ def job(config: DictConfig) -> None:
     log.info("%s", out)
     if found.faults:
         settings = " ".join(dict.fromkeys(finding.setting for finding in found.faults if finding.setting))
-        raise DataError(
-            f"dataset: expected a recording that can be mapped, got errors{f'; try {settings}' if settings else ''}"
-        )
+        raise DataError(f"dataset: expected a usable recording, got errors{f'; try {settings}' if settings else ''}")
 
 
 def main() -> None:

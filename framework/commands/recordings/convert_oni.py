@@ -1,4 +1,4 @@
-"""`instancemap convert-oni FILE.oni OUT`: convert SceneNN's raw recordings to the images that `dataset=scenenn` reads.
+"""`instancemap convert-oni FILE.oni OUT`: convert a raw SceneNN recording to images for `dataset=scenenn`.
 
 OpenNI 2 plays the recording. OUT is the scene's folder, DIR/NNN, and gets image/, depth/ and timestamp.txt with the
 file names of SceneNN's own converter.
@@ -21,16 +21,16 @@ from framework.datasets.scenenn.scene_files import MICROSECONDS, write_timestamp
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
 
-PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # a higher level takes longer than playing
+PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # higher levels take longer than playback
 
 
 def main() -> None:
     """Run the command `instancemap convert-oni`."""
     parser = argparse.ArgumentParser(
-        description="Converts an OpenNI recording to SceneNN's images. Needs OpenNI 2: apt-get install libopenni2-0."
+        description="Convert an OpenNI recording to SceneNN images. Requires OpenNI 2: apt-get install libopenni2-0."
     )
-    parser.add_argument("source", metavar="FILE.oni", type=Path, help="the recording, oni/NNN.oni")
-    parser.add_argument("target", metavar="OUT", type=Path, help="the scene's folder, DIR/NNN; without images")
+    parser.add_argument("source", metavar="FILE.oni", type=Path, help="recording: oni/NNN.oni")
+    parser.add_argument("target", metavar="OUT", type=Path, help="scene folder without images: DIR/NNN")
     parsed = arguments(parser)
     with one_line_errors():
         convert(parsed.source, parsed.target)
@@ -45,7 +45,9 @@ def convert(source: Path, target: Path) -> None:
     image, depth, timestamp = target / "image", target / "depth", target / "timestamp.txt"
     for path in (image, depth, timestamp):
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-            raise DataError(f"{path}: expected an empty or missing folder; remove it, or choose another folder")
+            raise DataError(
+                f"{path}: expected an empty or missing folder, got existing files; remove them or choose another OUT"
+            )
     image.mkdir(parents=True, exist_ok=True)
     depth.mkdir(exist_ok=True)
     color_times: dict[int, float] = {}
@@ -72,13 +74,13 @@ def convert(source: Path, target: Path) -> None:
     )
     if contents.cut_off:
         raise DataError(
-            f"{contents.path}: expected a complete file, got one truncated or damaged at byte "
+            f"{contents.path}: expected a complete file, got a truncated or damaged file at byte "
             f"{contents.end}; kept the frames up to image{number:05d}.png; download it again for the rest"
         )
 
 
 def _write_png(path: Path, image: Array) -> None:
-    """Write (H, W) uint16 or (H, W, 3) uint8 BGR."""
+    """Write an image: depth (H, W) uint16 or BGR (H, W, 3) uint8."""
     _, data = cv2.imencode(".png", image, PNG)
     with written_whole(path) as temporary:
         temporary.write_bytes(data.tobytes())

@@ -1,4 +1,4 @@
-"""`instancemap import SOURCE DIR`: convert a recording of a phone or sensor to a folder for `dataset=rgbd_folder`."""
+"""`instancemap import SOURCE DIR`: convert a phone or sensor recording to a folder for `dataset=rgbd_folder`."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ def main() -> None:
     default = Writing()
     listed = "\n".join(f"  {kind.name:<15} {kind.needs}" for kind in FORMATS)
     parser = argparse.ArgumentParser(
-        description="Converts a recording of a phone or sensor to an RGB-D folder for dataset=rgbd_folder.\n"
-        f"SOURCE is one of these; its format is detected:\n{listed}",
+        description="Convert a phone or sensor recording to an RGB-D folder for dataset=rgbd_folder.\n"
+        f"The format of SOURCE is detected. Supported formats:\n{listed}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("source", metavar="SOURCE", type=Path, help="folder or file that the app exported")
+    add("source", metavar="SOURCE", type=Path, help="folder or file exported by the app")
     add("directory", metavar="DIR", type=Path, help="new or empty folder")
-    width = f"image width, px; default: {LONGER_SIDE} for the longer side"
+    width = f"image width, px; default: {LONGER_SIDE} px for the longer side"
     add("--width", type=int, default=default.width, help=width)
-    add("--stride", type=int, default=default.stride, help="import every n-th frame, default: 1")
-    confidence = "minimum depth confidence of a phone, 0 low, 1 medium, 2 high; default: 1"
+    add("--stride", type=int, default=default.stride, help="frame step: import every n-th frame; default: 1")
+    confidence = "minimum depth confidence of phone recordings: 0 (low), 1 (medium), 2 (high); default: 1"
     add("--confidence", type=int, default=default.confidence, help=confidence)
-    add("--turn", type=int, default=default.turn, help="clockwise rotation of the images: 90, 180 or 270 degrees")
+    add("--turn", type=int, default=default.turn, help="clockwise image rotation, degrees: 90, 180 or 270")
     add = parser.add_argument_group("topics of a ROS bag, if types and names are ambiguous").add_argument
     add("--color", metavar="TOPIC", default="", help="color images")
     add("--depth", metavar="TOPIC", default="", help="depth images")
     add("--camera-info", metavar="TOPIC", default="", help="intrinsics of the color camera")
-    add("--poses", metavar="TOPIC", default="", help="nav_msgs/Odometry or geometry_msgs/PoseStamped")
+    add("--poses", metavar="TOPIC", default="", help="camera poses: nav_msgs/Odometry or geometry_msgs/PoseStamped")
     parsed = arguments(parser)
     with one_line_errors():
         writing = Writing(parsed.width, parsed.stride, parsed.confidence, parsed.turn)

@@ -1,4 +1,4 @@
-"""`instancemap synthesize DIR`: render a benchmark of synthetic rooms in SceneNN's format."""
+"""`instancemap synthesize DIR`: render a benchmark of synthetic scenes in SceneNN format."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ def main() -> None:
     """Run the command `instancemap synthesize`."""
     default = BenchmarkSettings()
     parser = argparse.ArgumentParser(
-        description="Writes synthetic rooms to DIR in SceneNN's format: images, depth, trajectory, labeled mesh. The "
-        "the same parameters give byte-identical files. Existing rooms are kept."
+        description="Write synthetic scenes to DIR in SceneNN format: images, depth, trajectory, labeled mesh. "
+        "Equal parameters give byte-identical files. Existing scenes are kept."
     )
     add = parser.add_argument
-    add("directory", metavar="DIR", type=Path, help="new folder, or one that this command began")
-    add("--scenes", default=",".join(SCENES), help="comma-separated rooms, default: %(default)s")
-    add("--seed", type=int, default=default.seed, help="another seed gives other rooms")
-    add("--frames", type=int, default=default.frames, help="number of frames per room, default: 120")
-    add("--rate", type=float, default=default.rate, help="frame rate, Hz, default: 10")
-    add("--width", type=int, default=default.width, help="image width, px, default: 640")
-    add("--haste", type=float, default=default.haste, help="speed of the camera, default: 2; 1 = slow")
-    add("--jobs", type=int, default=available_cores(), help="number of processes, default: all cores")
+    add("directory", metavar="DIR", type=Path, help="new folder, or a partly written folder to complete")
+    add("--scenes", default=",".join(SCENES), help="comma-separated scenes; default: %(default)s")
+    add("--seed", type=int, default=default.seed, help="random seed of the scenes; default: 0")
+    add("--frames", type=int, default=default.frames, help="number of frames per scene; default: 120")
+    add("--rate", type=float, default=default.rate, help="frame rate, Hz; default: 10")
+    add("--width", type=int, default=default.width, help="image width, px; default: 640")
+    add("--haste", type=float, default=default.haste, help="speed factor of the camera: 1 = slow; default: 2")
+    add("--jobs", type=int, default=available_cores(), help="number of processes; default: all cores")
     parsed = arguments(parser)
     with one_line_errors():
         names = parsed.scenes.split(",")

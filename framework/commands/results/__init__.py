@@ -1,1 +1,1 @@
-"""Commands that read finished runs."""
+"""Commands for stored runs."""

@@ -1,4 +1,4 @@
-"""`instancemap diff RUN RUN`: list the changes between two runs in the same world."""
+"""`instancemap diff RUN RUN`: list the changes between two runs with the same world frame."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ UNCHANGED = (Kind.STAYED, Kind.NOT_SEEN)
 def main() -> None:
     """Run the command `instancemap diff`."""
     parser = argparse.ArgumentParser(
-        description="Lists the objects that appeared, vanished or moved between two runs, with probabilities. Both "
+        description="List the objects that appeared, vanished or moved between two runs, with probabilities. Both runs "
         "need the same world frame: run the second with localize_in=FIRST, or both with given poses."
     )
     parser.add_argument("before", metavar="FIRST", type=Path, help="run directory of the first visit")
     parser.add_argument("after", metavar="SECOND", type=Path, help="run directory of the second visit")
     parser.add_argument("--all", action="store_true", help="also list objects that stayed or were not seen")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="also write all changes to this JSON file")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="JSON file for all changes")
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
@@ -48,13 +48,13 @@ def main() -> None:
 
 def visit_of(run: Path) -> Visit:
     """Read the map and trajectory of a stored run. Raises DataError."""
-    from framework.api import scene_of  # slow: after the arguments are checked
+    from framework.api import scene_of  # slow import: after the arguments are checked
 
     return Visit(scene_of("diff", run), read_tum(run / TRAJECTORY)[1])
 
 
 def in_world(run: Path, world: Path) -> bool:
-    """Return true if the outputs of two runs show that they have the same world frame."""
+    """Return True if the configs or metrics of two runs imply the same world frame."""
     config = load_yaml(run / CONFIG) if is_there(run / CONFIG) else None
     worlds = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
     if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):
@@ -64,7 +64,7 @@ def in_world(run: Path, world: Path) -> bool:
 
 
 def line(change: Change) -> str:
-    """Return one line of text about a change."""
+    """Format a change as one line of text."""
     x, y, z = change.place
     where = f"at ({x:.2f}, {y:.2f}, {z:.2f}) m"
     if change.kind is Kind.MOVED:
@@ -74,7 +74,7 @@ def line(change: Change) -> str:
 
 
 def entry(change: Change) -> dict[str, object]:
-    """Return a change for JSON."""
+    """Return the JSON entry of a change."""
     return {
         "kind": change.kind.value,
         "class": change.name,

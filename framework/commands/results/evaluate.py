@@ -25,10 +25,10 @@ REFUSED = "refused: "  # prefix of an error
 def main() -> None:
     """Run the command `instancemap evaluate`."""
     parser = argparse.ArgumentParser(
-        description="Re-evaluates the instances of stored runs from mesh.ply and instances.json, updates these metrics "
-        "in metrics.json and prints the changes. Other metrics, such as those of the trajectory, are not changed."
+        description="Re-evaluate the instances of stored runs from mesh.ply and instances.json, update their metrics "
+        "in metrics.json and print the changes. Other metrics, such as trajectory errors, are not changed."
     )
-    parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory, or a folder of them")
+    parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory, or folder of run directories")
     parser.add_argument(
         "--transfer",
         choices=[transfer.value for transfer in Transfer],
@@ -38,10 +38,10 @@ def main() -> None:
     parser.add_argument(
         "--ground-truth",
         metavar="PATH",
-        help="labeled mesh or run directory to compare with, as dataset.ground_truth; '' = the dataset's own",
+        help="ground truth, as in dataset.ground_truth: labeled mesh or run directory; '' = dataset ground truth",
     )
     parser.add_argument("--other-truth", action="store_true", help="accept a changed ground truth")
-    parser.add_argument("--dry-run", action="store_true", help="print only, write nothing")
+    parser.add_argument("--dry-run", action="store_true", help="print the changes without writing them")
     parsed = arguments(parser)
     with one_line_errors():
         transfer, write = Transfer(parsed.transfer), not parsed.dry_run
@@ -57,7 +57,7 @@ def evaluate_runs(
     other_truth: bool = False,
     ground_truth: str | None = None,
 ) -> int:
-    """Evaluate all runs at and below `roots`, print a line for each, and return the number of failures.
+    """Evaluate all runs in `roots` and their subfolders, print a line per run, and return the number of failures.
 
     `ground_truth` is as in `dataset_of`.
     """
@@ -88,7 +88,7 @@ def evaluate_runs(
 
 
 def summary(found: Reevaluation, transfer: Transfer) -> str:
-    """Describe the changes: the main metrics of one transfer, and the number of others."""
+    """Summarize the changes: the main metrics of one transfer, and the number of other changes."""
     changed, added = found.changed, found.added
     prefix = "instances." if transfer is Transfer.TO_TRUTH else f"instances.{transfer.value}."
     shown = [key for key in (*(prefix + name for name in MAIN_FIGURES), "annotation_release") if key in changed]
@@ -106,7 +106,7 @@ def _step(old: Any, new: Any) -> str:
 
 
 def _find(roots: Sequence[Path]) -> tuple[list[Record], list[DataError]]:
-    """Return the completed runs, each once, and an error for each of the others."""
+    """Return the completed runs without duplicates, and an error for each incomplete run."""
     records: dict[Path, Record] = {}
     failures: dict[Path, DataError] = {}
     for root in roots:

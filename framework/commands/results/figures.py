@@ -1,4 +1,4 @@
-"""`instancemap figures DIR...`: draw the figures of an experiment, also during a sweep."""
+"""`instancemap figures DIR...`: draw the figures of an experiment. Works during a sweep."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from framework.figures.experiment_figure import write_figure
 def main() -> None:
     """Run the command `instancemap figures`."""
     print_for_directories(
-        "Writes figure.png and figure.pdf of the experiment in DIR.",
+        "Write figure.png and figure.pdf of the experiment in DIR.",
         "folder of an experiment",
         lambda directory: "\n".join(map(str, write_figure(directory))),
     )

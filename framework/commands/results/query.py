@@ -14,20 +14,20 @@ from framework.queries.text_search import BY, WITH_EMBEDDINGS, Match, QueryResul
 def main() -> None:
     """Run the command `instancemap query`."""
     parser = argparse.ArgumentParser(
-        description="Ranks the objects of a stored run by a text query: by image embeddings if the run has any "
-        f"({WITH_EMBEDDINGS}), else by class names and surface colors."
+        description="Rank the objects of a stored run by a text query. Uses image embeddings if the run used "
+        f"{WITH_EMBEDDINGS}, otherwise class names and surface colors."
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
     parser.add_argument("text", metavar="WORDS", help='text query: "a red chair"')
     parser.add_argument("--top", metavar="N", type=int, default=5, help="number of objects (default: 5)")
-    parser.add_argument("--by", choices=BY, help="ranking (default: embeddings if available)")
-    parser.add_argument("--model", help="model that embeds the query (default: that of the run's detector)")
+    parser.add_argument("--by", choices=BY, help="ranking method (default: embeddings if available)")
+    parser.add_argument("--model", help="embedding model of the query (default: model of the run's detector)")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parsed = arguments(parser)
     if parsed.top < 1:
         parser.error(f"--top: expected at least 1, got {parsed.top}")
     with one_line_errors():
-        from framework.api import query  # slow: after the arguments are checked
+        from framework.api import query  # slow import: after the arguments are checked
 
         answer = query(parsed.run, parsed.text, parsed.by, parsed.model)
         shown = answer.objects[: parsed.top]
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def heading(answer: QueryResult, wanted: str | None) -> str:
-    """Describe the ranking, and the reason for names if they were not requested."""
+    """Describe the ranking method, and its reason if embeddings are unavailable."""
     if answer.by == "embeddings":
         return f"by embeddings of {answer.space}"
     unavailable = wanted is None and not answer.space

@@ -23,15 +23,14 @@ PICTURE = "raycast.png"
 def main() -> None:
     """Run the command `instancemap raycast`."""
     parser = argparse.ArgumentParser(
-        description="Draws the ray-cast view of a run's map in five panels: depth, normals, vertices, RGB and object "
-        "indices."
+        description="Draw the ray-cast view of a map in five panels: depth, normals, vertices, RGB and object indices."
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
     view = parser.add_mutually_exclusive_group()
-    view.add_argument("--frame", metavar="N", type=int, help="number of a mapped frame, default: the middle one")
+    view.add_argument("--frame", metavar="N", type=int, help="number of a mapped frame; default: middle frame")
     pose = ("TX", "TY", "TZ", "QX", "QY", "QZ", "QW")
-    view.add_argument("--pose", metavar=pose, nargs=7, type=float, help="another pose, T_world_camera, in m as in TUM")
-    parser.add_argument("--out", metavar="FILE", type=Path, help=f"PNG file, default: {PICTURE} in the run directory")
+    view.add_argument("--pose", metavar=pose, nargs=7, type=float, help="camera pose T_world_camera, m, in TUM order")
+    parser.add_argument("--out", metavar="FILE", type=Path, help=f"PNG file; default: {PICTURE} in the run directory")
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
@@ -41,8 +40,8 @@ def main() -> None:
 
 
 def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> None:
-    """Write the picture of a run's map from a pose, by default that of a frame. Raises DataError."""
-    from framework.api import scene_of  # slow: after the arguments are checked
+    """Write the ray-cast image of a run from `pose`, or from the pose of `frame`. Raises DataError."""
+    from framework.api import scene_of  # slow import: after the arguments are checked
     from framework.figures.raycast_figure import write_raycast
     from framework.reporting.run_contents import RunContents
     from framework.reporting.run_source import RunSource
@@ -63,14 +62,14 @@ def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> N
     names = {key: scene.classes[int(one.class_probabilities.argmax())] for key, one in objects.items()}
     view = scene.render(source.camera or NOT_CAMERA, T_world_camera)
     if not (view.depth > 0).any():
-        raise DataError(f"raycast: expected a pose that sees the map, got {place}")
+        raise DataError(f"raycast: expected a pose with the map in view, got {place}")
     centers = {key: one.aabb.center for key, one in objects.items()}
     note = f"{contents.name}, {place}, ray-cast from the final map. Commit {contents.record.commit}."
     write_raycast(out, view, names, centers, note)
 
 
 def pose_of_frame(contents: RunContents, frame: int | None) -> int:
-    """Return the index of a frame's pose in the trajectory, None = the middle one. Raises DataError without a pose."""
+    """Return the index of a frame's pose in the trajectory; None = middle pose. Raises DataError without a pose."""
     numbers, lost = contents.frame_numbers, contents.lost_frames
     if not numbers:
         raise DataError(f"{contents.record.directory}: expected mapped frames, got none")
@@ -83,4 +82,4 @@ def pose_of_frame(contents: RunContents, frame: int | None) -> int:
         raise DataError(f"--frame: expected {min(known)} to {max(known)}, got {frame}")
     nearest = min(numbers, key=lambda number: abs(number - frame))
     what = "a lost frame" if frame in lost else "a frame that was not mapped"
-    raise DataError(f"--frame: expected a mapped frame, got {frame} ({what}); the nearest is {nearest}")
+    raise DataError(f"--frame: expected a mapped frame, got {frame} ({what}); the nearest mapped frame is {nearest}")

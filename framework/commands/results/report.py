@@ -1,4 +1,4 @@
-"""`instancemap report RUN...`: write an HTML report of a run, or a comparison of several."""
+"""`instancemap report RUN...`: write HTML reports of runs and compare them."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ COMPARISON = "comparison.html"
 def main() -> None:
     """Run the command `instancemap report`."""
     parser = argparse.ArgumentParser(
-        description="Writes an interactive HTML report of a run: map, objects, trajectory, times, and errors if ground "
-        "truth is known. For several runs, it writes a report of each and a comparison. A report is a single file."
+        description="Write an interactive HTML report of a run: map, objects, trajectory, times, and errors if ground "
+        "truth is available. For several runs, also writes a comparison. Each report is a single file."
     )
     parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory")
     default = f"default: {REPORT} in the run directory, or {COMPARISON} in the common folder of the runs"
-    parser.add_argument("--out", metavar="FILE", type=Path, help=f"file of the report or comparison; {default}")
+    parser.add_argument("--out", metavar="FILE", type=Path, help=f"output file of the report or comparison; {default}")
     parsed = arguments(parser)
     with one_line_errors():
         for path in write_reports(parsed.run, parsed.out):
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[Path]:
-    """Write the reports and return their paths; the last one is the comparison, or the only report.
+    """Write the reports and return their paths. The last path is the comparison, or the only report.
 
     Raises DataError before any file is written if a run cannot be read.
     """
@@ -44,10 +44,10 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
 
     places = [directory.resolve() for directory in directories]
     if again := [place for k, place in enumerate(places) if place in places[:k]]:
-        raise DataError(f"{again[0]}: expected each run once, got it twice")
+        raise DataError(f"{again[0]}: expected each run once, got it twice; remove the duplicate")
     if out is not None:
         if not out.parent.is_dir():
-            raise DataError(f"{out}: expected a file in an existing folder; create {out.parent}")
+            raise DataError(f"{out}: expected a file in an existing folder, got no folder {out.parent}; create it")
         if out.exists():
             check_regular(out)
     runs = [RunContents.read(directory) for directory in directories]
@@ -66,4 +66,4 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
 
 def _write(path: Path, page: str) -> None:
     with written_whole(path) as temporary:
-        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may not be valid text
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may be invalid Unicode

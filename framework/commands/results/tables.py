@@ -1,4 +1,4 @@
-"""`instancemap tables DIR...`: write the tables of the runs below a directory, also during a sweep."""
+"""`instancemap tables DIR...`: write the tables of the runs in a directory. Works during a sweep."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from framework.tables.experiment_tables import write_tables
 def main() -> None:
     """Run the command `instancemap tables`."""
     print_for_directories(
-        "Writes table.md, table.tex and table.csv of the runs below DIR.",
-        "folder of a sweep or of several runs",
+        "Write table.md, table.tex and table.csv of the runs in DIR and its subfolders.",
+        "folder of a sweep, or of several runs",
         write_tables,
     )

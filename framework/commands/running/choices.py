@@ -1,7 +1,7 @@
-"""Choices of the command line: swept keys and an experiment's rows, checked before the first run.
+"""Choices on the command line: swept keys and rows of an experiment, checked before the first run.
 
 Hydra's sweeper varies one key at a time. An experiment therefore sweeps over the key `row`, and a job adds the
-overrides that `rows` lists for its row.
+overrides of its row in `rows`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from framework.config.composition import config_loader
 from framework.config.validation import checked_rows
 from framework.errors import ConfigError
 
-MANY = 1_000_000  # number of values of a glob(), which depends on the file system
+MANY = 1_000_000  # upper bound on the values of a glob(), which depend on the file system
 COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)
 
 Choices = Mapping[str, str | None]
@@ -60,7 +60,7 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
 
     Raises ConfigError for an empty sweep, and for a row that is not in `rows` of the experiment.
     """
-    runs: dict[str, int] = {}  # by key; the last override counts
+    runs: dict[str, int] = {}  # by key; the last override takes precedence
     for override in _parsed(overrides):
         values = _values(override)
         runs[override.get_key_element()] = len(values) or MANY
@@ -72,13 +72,13 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
 
 
 def swept_keys(overrides: Sequence[str]) -> set[str]:
-    """Return the keys and groups with several values; the last override of a key counts."""
+    """Return the keys and groups with several values. The last override of a key takes precedence."""
     last = {override.key_or_group: override for override in _parsed(overrides)}
     return {key for key, override in last.items() if override.is_sweep_override()}
 
 
 def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
-    """Raise ConfigError for the first chosen row that the experiment does not have."""
+    """Raise ConfigError for the first chosen row that is missing in the experiment."""
     for row in chosen:
         if row not in rows:
             close = get_close_matches(row, rows, n=1)
@@ -116,7 +116,7 @@ def _parsed(overrides: Sequence[str]) -> list[Override]:
 
 
 def _values(override: Override) -> list[str]:
-    """Return the values of an override in order; none if they depend on the file system."""
+    """Return the values of an override in order; empty if they depend on the file system."""
     try:
         return [*override.sweep_string_iterator()] if override.is_sweep_override() else [str(override.value())]
     except HydraException:

@@ -51,7 +51,7 @@ def job(config: DictConfig) -> None:
     settings.apply()
     sequence = build(RGBDSequence, config.dataset)
     detector = with_cache(build(Detector, config.detector), config)
-    settings.apply()  # to torch, if the detector has loaded it
+    settings.apply()  # apply to torch, if the detector has loaded it
     write_detections(out, detector, sequence)
     how = f"detector=precomputed detector.path={out}"
     if detector.classes != COCO:
@@ -76,7 +76,7 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
     log.info("%s: %d detections in %d frames of %s", path, results.count, results.frames, sequence.name)
     if precision.objects:
         log.info(
-            "mask AP50 %.2f, AP %.2f: mean of %d classes, %d true objects of at least %d px",
+            "mask AP50 %.2f, AP %.2f: mean of %d classes, %d ground-truth objects of at least %d px",
             precision.ap50,
             precision.ap,
             sum(not math.isnan(ap) for ap in precision.ap50_by_class.values()),

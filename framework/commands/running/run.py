@@ -1,4 +1,4 @@
-"""A run from its config, or with -m or an experiment a sweep of runs: `instancemap` without a command."""
+"""`instancemap` without a command: a run, or with -m or an experiment a sweep of runs."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def job(config: DictConfig) -> None:
         if config.skip_completed and is_recorded(directory, config):
             return
         interruption = run(config, directory, choices)
-    if is_of_sweep(hydra_config):  # it continues after this run
+    if is_of_sweep(hydra_config):  # a sweep would continue after this run
         interruption.check()
 
 
@@ -51,15 +51,15 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
     `choices` are the chosen options by config group. A run ends in one of three ways:
 
-    - completed: the outputs are complete. The returned Interruption contains a signal that arrived while they were
-      written, or that ended a live video.
+    - completed: the outputs are complete. The returned Interruption contains a signal that arrived during writing, or
+      that ended a live video.
     - partial: a signal, a stage or the disk ended the run after something was mapped. The outputs are written as far
       as possible, and marked as partial. Raises Interrupted, or PartialRunError from the cause.
     - nothing was mapped: raises the cause.
 
-    The first signal takes effect after the current frame or output, the second one immediately.
+    The first signal takes effect after the current frame or output, the second signal immediately.
     """
-    from framework.api import begin  # after Hydra has checked the names
+    from framework.api import begin  # local: after Hydra has checked the names
     from framework.compilation.catalog import compile_for_run
     from framework.datasets.frames.sequence_reader import Recording
     from framework.detection.stored.cache import cache_metrics
@@ -71,15 +71,15 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     settings = Settings.of(config)
     settings.apply()
     pipeline = begin(config)
-    settings.apply()  # to torch, if a stage has loaded it
-    gc.collect()  # otherwise it delays one of the first hundreds of frames
+    settings.apply()  # apply to torch, if a stage has loaded it
+    gc.collect()  # otherwise a collection delays one of the first few hundred frames
     video = build(RGBDVideo, config.get("dataset"))  # after the stages: a synthetic scene takes longest
-    compile_for_run()  # its renderer
+    compile_for_run()  # kernels of its renderer
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     length = f"{len(video)} frames" if isinstance(video, RGBDSequence) else "live until Ctrl-C"
     log.info("mapping %s: %s, %s", video.name, length, chosen)
-    if isinstance(video, Recording):  # may be the user's own
+    if isinstance(video, Recording):  # third-party datasets may have another class
         from framework.checking.recording_check import warn_of_poses
 
         warn_of_poses(video)

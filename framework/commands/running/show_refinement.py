@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # heavy imports are local
 log = logging.getLogger(__name__)
 jobs = Jobs()
 
-TRIED = 6  # evenly spaced frames, candidates of the default frame
+TRIED = 6  # number of candidates of the default frame, evenly spaced
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="show_refinement")
@@ -46,7 +46,7 @@ def job(config: DictConfig) -> None:
     settings.apply()
     sequence = build(RGBDSequence, config.dataset)
     detector = with_cache(build(Detector, config.detector), config)
-    settings.apply()  # to torch, if the detector has loaded it
+    settings.apply()  # apply to torch, if the detector has loaded it
     refiner = build(ClusterRefiner, config.refiner)
     position, frame, detections = detected(sequence, detector, config.frame)
     if len(detections) == 0:
@@ -60,7 +60,7 @@ def job(config: DictConfig) -> None:
 
 
 def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tuple[int, Frame, Detections]:
-    """Return the frame at `position`, its detections and position; None = the frame with the most detections of a few.
+    """Return a position, its frame and its detections; None = the candidate with the most detections.
 
     Raises ConfigError for an invalid position, FrameError for an unusable frame, DataError if no candidate is usable.
     """

@@ -1,4 +1,4 @@
-"""Directories, signals and tables of runs and sweeps, with any launcher."""
+"""Directories, signals and tables of runs and sweeps, for all launchers."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ ending = ExitStack()
 
 
 def cores_of(threads: int) -> int:
-    """Return the cores that a job with so many threads uses; 0 = all."""
+    """Return the number of cores of a job with `threads` threads; 0 = all cores."""
     return threads or available_cores()
 
 
 def jobs_at_once(threads: int) -> int:
-    """Return the number of such jobs that fit on this machine."""
+    """Return the number of concurrent jobs with `threads` threads each."""
     return max(1, available_cores() // cores_of(threads))
 
 
@@ -76,7 +76,7 @@ class PlaceCallback(Callback):
 
 
 def place_of(key: str, chosen: str) -> Path:
-    """Return the chosen directory. Raises ConfigError for an empty name, which would be the working folder."""
+    """Return the chosen directory. Raises ConfigError for an empty name, which would select the working folder."""
     if not chosen.strip():
         raise ConfigError(f"{key}: expected a folder, got an empty name; set {key}=. for the working folder")
     return Path(chosen)
@@ -92,9 +92,10 @@ def run_in(directory: Path, wait: bool) -> Iterator[None]:
 
 
 def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[None]:
-    """Return the directory of a sweep that has runs. Raises InstanceMapError.
+    """Return the context of a sweep with at least one run. Raises InstanceMapError.
 
-    joblib starts at most one worker per run: a terminal's signal would end an idle worker and then all others.
+    joblib is limited to one worker per run. A signal of the terminal would end an idle worker, and joblib would then
+    end all workers.
     """
     own = config.hydra
     swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
@@ -139,8 +140,8 @@ def joblib_workers(asked: int | None) -> int:
 def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool = False) -> Iterator[None]:
     """Lock `directory` inside the context, and print the table of its runs at the end, also after errors.
 
-    The figure is drawn, too, except after Ctrl-C. Raises InstanceMapError if a launcher fails because a worker was
-    killed. With `workers`, signals are forwarded to them: their runs store partial results before the sweep ends.
+    The figure is also drawn, except after Ctrl-C. Raises InstanceMapError if a launcher fails because a worker was
+    killed. With `workers`, signals are forwarded to the workers, which store partial results before the sweep ends.
     """
     # joblib stops its workers, and Python's resource tracker warns about it
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker")))
@@ -150,7 +151,7 @@ def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool
             with signals_passed_on(lambda: at_work_in(directory)) if workers else nullcontext():
                 yield
         except BaseException as error:
-            with suppress(InstanceMapError):  # the first error matters more than a missing table
+            with suppress(InstanceMapError):  # report the first error, not the missing table
                 _report(directory, with_table, with_figure and isinstance(error, Exception))
             if _is_of_a_launcher(error):
                 reason = textwrap.shorten(one_line(error), 300)
@@ -181,5 +182,5 @@ def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
 
 
 def _is_of_a_launcher(error: BaseException) -> bool:
-    """Return True for errors of a launcher: RuntimeErrors of joblib and submitit, and those of Ray."""
+    """Return True for errors of a launcher: RuntimeErrors of joblib and submitit, and errors of Ray."""
     return isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] == "ray"

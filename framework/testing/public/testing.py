@@ -5,12 +5,12 @@
     class TestMyRefiner(OptionContract, RefinerContract):
         option = "my_refiner"
 
-pytest finds the tests in the class. They run on short videos of a small room in which every pixel is known.
+pytest finds the tests in the class. They run on short synthetic videos with exact ground truth.
 """
 
 import pytest
 
-pytest.register_assert_rewrite("framework.testing")  # failed assertions show their values
+pytest.register_assert_rewrite("framework.testing")  # shows the values of failed assertions
 
 from framework.testing.contracts import (
     DetectorContract,

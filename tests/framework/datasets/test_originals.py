@@ -135,7 +135,7 @@ def test_openni_1_recording_is_converted_and_mapped(
     assert [sequence[k].timestamp for k in range(3)] == pytest.approx([0.01168, 0.045049, 0.078419], abs=2e-6)
     assert (result.frames, result.frames_skipped, result.frames_lost) == (3, 0, 0)
     check_map_shows_its_frames(sequence, result)
-    with pytest.raises(DataError, match="expected true poses, got none for the 3 frames; add the poses"):
+    with pytest.raises(DataError, match="expected ground-truth poses, got none for the 3 frames; add the poses"):
         run(*overrides, "tracker=ground_truth")
 
 
@@ -315,7 +315,7 @@ def test_run_inside_motion_capture_gap_raises_one_line(originals: Path, tmp_path
     first = [recorded.timestamp for recorded in sequence.contents.frames].index(GAP[0])
     alone = TumRgbd(sequence.folder, start=first, stop=first + 1)
     for tracker, message in (
-        (GroundTruth(), "expected true poses, got none for the 1 frames;"),
+        (GroundTruth(), "expected ground-truth poses, got none for the 1 frames;"),
         (TrajectoryFile(sequence.folder / "groundtruth.txt"), "expected poses, got none for the 1 frames"),
     ):
         with pytest.raises(DataError, match=f"{FREIBURG1_RPY}: {message}") as caught:

@@ -407,7 +407,7 @@ def test_export_partial_run_without_objects_writes_scene(tmp_path: Path) -> None
 
 
 def test_export_invalid_selection_raises(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="expected the directory of a run"):
+    with pytest.raises(DataError, match="expected a run directory"):
         export(tmp_path, [ExportFormat.GLB])
     with pytest.raises(DataError, match="object: expected an id or class of this run, got 'cub'; did you mean 'cube'"):
         export(run, [ExportFormat.GLB], tmp_path, Chosen(("cub",)))

@@ -157,7 +157,7 @@ def test_query_command_with_embeddings_requires_model(
     assert out.splitlines()[0] == "by class names and colors"
     status, _, err = asked(monkeypatch, capsys, "nowhere", "a bed")
     assert status == 1
-    assert "expected the directory of a run" in err
+    assert "expected a run directory" in err
     assert asked(monkeypatch, capsys, str(run), "a bed", "--top", "0")[0] == 2
 
 
@@ -226,7 +226,7 @@ def test_query_invalid_arguments_raise_before_reading(question: dict[str, Any], 
 
 
 def test_query_unanswerable_request_raises(embedded: Map, run_without: Path) -> None:
-    with pytest.raises(DataError, match=r"query: expected the directory of a run, got .* without"):
+    with pytest.raises(DataError, match=r"query: expected a run directory, got .* without"):
         query("nowhere", "bed")
     with pytest.raises(
         DataError, match="expected embeddings of its objects, got none; run with detector=with_embeddings"

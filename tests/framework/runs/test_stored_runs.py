@@ -56,7 +56,7 @@ def test_read_record_returns_config_and_metrics(directory: Path) -> None:
         ("metrics.json", "[" * 100_000, "metrics.json: expected"),
         ("metrics.json", "\xff", "metrics.json: expected"),
         ("metrics.json", "[1, 2]", r"metrics\.json: expected an object, got list"),
-        ("metrics.json", '{"fps": [1]}', r"metrics\.json: expected flat values, got nested ones below 'fps'"),
+        ("metrics.json", '{"fps": [1]}', r"metrics\.json: expected flat values, got nested values below 'fps'"),
         ("metrics.json", '{"instances.ap50": "best"}', r"instances\.ap50: expected a number or null, got 'best'"),
         (
             "metrics.json",
@@ -65,16 +65,16 @@ def test_read_record_returns_config_and_metrics(directory: Path) -> None:
         ),
         ("metrics.json", '{"fps": 1e999}', "fps: expected a number or null, got inf"),
         ("metrics.json", '{"frames": true}', "frames: expected a number or null, got True"),
-        ("metrics.json", "{}", "expected the config_hash of the config next to it, got another one"),
-        ("config.yaml", "seed: 4", "expected the config_hash of the config next to it, got another one"),
-        ("config.yaml", "", "expected the config_hash of the config next to it, got another one"),
+        ("metrics.json", "{}", "expected the config_hash of config.yaml, "),
+        ("config.yaml", "seed: 4", "expected the config_hash of config.yaml, "),
+        ("config.yaml", "", "expected the config_hash of config.yaml, "),
         ("config.yaml", "seed: [", "config.yaml: cannot be read"),
-        ("config.yaml", "word", "expected the config_hash of the config next to it, got another one"),
+        ("config.yaml", "word", "expected the config_hash of config.yaml, "),
         ("config.yaml", "- 1", r"config\.yaml: expected keys and values, got a list"),
         (
             "config.yaml",
             "fuser: {true: 1, voxel_size: 2}",
-            "expected the config_hash of the config next to it, got another one",
+            "expected the config_hash of config.yaml, ",
         ),
     ],
 )
@@ -143,7 +143,7 @@ def test_is_recorded_logs_missing_map_files(directory: Path, caplog: pytest.LogC
     (directory / "mesh.ply").unlink()
     assert is_recorded(directory, OmegaConf.create(CONFIG))
     assert (
-        f"{directory}: expected mesh.ply, map.npz, got none; set skip_completed=false to run it again"
+        f"{directory}: expected mesh.ply, map.npz, got none; set skip_completed=false to repeat the run"
         in caplog.messages
     )
 
@@ -151,7 +151,7 @@ def test_is_recorded_logs_missing_map_files(directory: Path, caplog: pytest.LogC
 def test_is_recorded_other_config_is_false(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     assert not is_recorded(directory, OmegaConf.create(CONFIG | {"seed": 4}))
-    assert caplog.messages == [f"run again: the config of the run in {directory} differs"]
+    assert caplog.messages == [f"repeating the run: the config in {directory} differs"]
 
 
 @pytest.mark.parametrize("theirs", [{"git_commit": "1234567890"}, {"git_dirty": True}])
@@ -191,7 +191,7 @@ def test_is_recorded_speed_experiment_needs_same_settings(
     caplog.clear()
     assert not is_recorded(directory, OmegaConf.create(config | changed | about_speed))
     assert caplog.messages == [
-        f"run again: the times in {directory} were measured with other settings or on another machine: "
+        f"repeating the run: the times in {directory} were measured with other settings or on another machine: "
         "threads=4, prefetch=2, detection_cache=off, processor=a, cpus=4"
     ]
 
@@ -226,7 +226,7 @@ def test_is_recorded_changed_weights_or_data_is_false(
         change()
         caplog.clear()
         assert not is_recorded(directory, OmegaConf.create(config))
-        assert caplog.messages == [f"run again: weights or data changed since the run in {directory}"]
+        assert caplog.messages == [f"repeating the run: weights or data changed since the run in {directory}"]
     record_of(directory, config, monkeypatch)
     (tmp_path / "data" / "another room").mkdir()
     (tmp_path / "data" / "another room" / "0.png").write_bytes(b"depth")

@@ -234,7 +234,7 @@ def test_live_video_without_usable_frame_raises() -> None:
         pipeline().run(LiveRoom(frames_sent=0))
     with pytest.raises(DataError, match="expected usable frames, got none of 1"):
         pipeline().run(LiveRoom(frames_sent=1, unreadable=0))
-    with pytest.raises(DataError, match="expected true poses, got none for its frames;"):
+    with pytest.raises(DataError, match="expected ground-truth poses, got none for its frames;"):
         pipeline(tracker=GivenPose()).run(Handed())
 
 

@@ -107,7 +107,7 @@ def test_run_without_poses_raises_one_line(
         pipeline(tracker(tmp_path)).run(room)
     assert str(caught.value) == (
         f"corner_room: expected poses, got none for the 1 frames; the first: {first}; "
-        "add the poses of the sequence, or set tracker=voxel_hashing_icp, which needs none"
+        "add the poses of the sequence, or estimate them with tracker=voxel_hashing_icp"
     )
     assert not caplog.records
 
@@ -120,5 +120,7 @@ def test_sequence_without_poses_raises_before_reading() -> None:
         def __getitem__(self, k: int) -> Frame:
             raise AssertionError("it was read")
 
-    with pytest.raises(DataError, match="corner_room: expected true poses, got none for the 6 frames; add the poses"):
+    with pytest.raises(
+        DataError, match="corner_room: expected ground-truth poses, got none for the 6 frames; add the poses"
+    ):
         pipeline(GroundTruth()).run(Unposed())

@@ -34,8 +34,7 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
     assert "WRONG  poses: stored as T_camera_world" in done.stdout
     assert "; set dataset.pose_kind=T_CAMERA_WORLD" in done.stdout
     assert (
-        "ERROR   dataset: expected a recording that can be mapped, got errors; try dataset.pose_kind=T_CAMERA_WORLD"
-        in done.stderr
+        "ERROR   dataset: expected a usable recording, got errors; try dataset.pose_kind=T_CAMERA_WORLD" in done.stderr
     )
     assert "Traceback" not in done.stderr
     picture = cv2.imread(str(tmp_path / "outputs" / "check.png"))
@@ -50,7 +49,7 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
     ("arguments", "message"),
     [
         (("out=2024",), "out: expected a path"),
-        (("out=check.jpg",), "out: expected a name that ends in"),
+        (("out=check.jpg",), "out: expected a name with the suffix"),
         (("out=nowhere/check.png",), "out: expected a file in an existing folder, got"),
         (("dataset=rgbd_folder", "dataset.root=nowhere"), "dataset.root: expected an existing folder, got nowhere"),
         (("dataset=rgbd_folder", "dataset.root=.", "dataset.camera_axes=UNITY"), "camera_axes"),

@@ -97,7 +97,9 @@ def test_convert_oni_existing_output_is_not_overwritten(tmp_path, monkeypatch, s
     (tmp_path / "011" / file).parent.mkdir(parents=True)
     (tmp_path / "011" / file).write_bytes(b"mine")
     deliver(monkeypatch, 4)
-    with pytest.raises(DataError, match="expected an empty or missing folder; remove it, or choose another folder"):
+    with pytest.raises(
+        DataError, match="expected an empty or missing folder, got existing files; remove them or choose another OUT"
+    ):
         convert_oni.convert(source, tmp_path / "011")
     assert names(tmp_path / "011") == [file]
 
@@ -127,7 +129,7 @@ def test_convert_oni_truncated_recording_names_last_image(tmp_path, monkeypatch,
         command(monkeypatch, source, tmp_path / "011")
     assert names(tmp_path / "011") == written(3)
     fault = capsys.readouterr().err.splitlines()[-1]
-    assert fault.startswith(f"error: {source}: expected a complete file, got one truncated or damaged at byte")
+    assert fault.startswith(f"error: {source}: expected a complete file, got a truncated or damaged file at byte")
     assert "up to image00003.png; download it again" in fault
 
 

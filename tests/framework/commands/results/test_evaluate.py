@@ -122,10 +122,8 @@ def test_evaluate_other_truth_requires_option(stored: Path, command) -> None:
     write_metrics(stored, true | {"truth_sha256": "0" * 64})
     status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert (
-        "expected the ground truth used in the run, got other instances of tests.support.scenes.corner_room.CornerRoom"
-        in err
-    )
+    assert "expected the ground truth of the run (truth_sha256 00000000), got " in err
+    assert " from tests.support.scenes.corner_room.CornerRoom; check the dataset" in err
     assert metrics_of(stored)["truth_sha256"] == "0" * 64
     assert command(stored, "--other-truth")[:2] == (0, f"{stored}: 1 other\n")
     assert metrics_of(stored) == true | CODE
@@ -186,7 +184,7 @@ def _truncated_mesh(directory: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (_another_config, "expected the config_hash of the config next to it, got another one"),
+        (_another_config, "expected the config_hash of config.yaml, "),
         (_interrupted, "partial: interrupted by Ctrl-C"),
         (_one_instance_less, "instances (as in metrics.json), got 1"),
         (_another_id, "vertices of instance"),
@@ -244,7 +242,7 @@ def test_evaluate_run_restarted_meanwhile_is_unchanged(stored: Path, command, mo
     monkeypatch.setattr(CornerRoom, "scene_truth", begins_again)
     status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert "expected an unchanged file, got a new one" in err
+    assert "expected an unchanged file, got a modified file" in err
     assert not (stored / "metrics.json").exists()
 
 

@@ -117,7 +117,7 @@ def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
         (("fuser.voxel_size=0.05",), r"fuser.voxel_size: expected 0.04 \(as in the stored map\), got 0.05"),
         (("fuser.max_depth=4",), "fuser.max_depth"),
         (("fuser=label_count",), "label rule of the fuser: expected"),
-        (("fuser=object_volumes",), "expected a fuser that resumes a stored map, got ObjectVolumes"),
+        (("fuser=object_volumes",), "expected a fuser with support for stored maps, got ObjectVolumes"),
         (
             ("tracker=voxel_hashing_icp",),
             "resume_from or localize_in: expected a run with stored keyframes, got one without",
@@ -135,7 +135,7 @@ def test_resume_with_incompatible_config_raises(
 
 
 def test_resume_from_missing_map_raises(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"resume_from: expected the directory of a run, got .* without"):
+    with pytest.raises(DataError, match=r"resume_from: expected a run directory, got .* without"):
         Mapper(*GIVEN, f"resume_from={tmp_path}")
     with pytest.raises(ConfigError, match="resume_from: expected a path"):
         Mapper(*GIVEN, "resume_from=7")

@@ -113,7 +113,7 @@ def test_missing_package_raises_one_line(brand: Brand, monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, brand.library, None)
     with pytest.raises(
         ConfigError,
-        match=rf"^{brand.library}, .*: expected an installed package, .* pip install instancemap\[{brand.name}\]$",
+        match=rf"^{brand.library}: expected an installed package .*, .* pip install instancemap\[{brand.name}\]$",
     ):
         next(brand.video().frames())
 

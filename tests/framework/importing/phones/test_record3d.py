@@ -194,7 +194,7 @@ def test_missing_package_error_names_extra(
 ) -> None:
     path = request.getfixturevalue(source)
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ConfigError, match=r"which .*: expected an installed package, got none"):
+    with pytest.raises(ConfigError, match=r"expected an installed package \(it .*\), got none"):
         open_source(path)
 
 

@@ -60,7 +60,7 @@ def test_merged_instances_combine_embeddings() -> None:
 @pytest.mark.parametrize(
     ("embeddings", "space", "fault"),
     [
-        (np.eye(2, 3, dtype=np.float32), "", "expected a name in embedding_space, got an empty one"),
+        (np.eye(2, 3, dtype=np.float32), "", "expected a name in embedding_space, got an empty string"),
         (None, "words@1", "expected embeddings for embedding_space 'words@1', got none"),
         (np.eye(3, dtype=np.float32), "words@1", r": expected shape \(2, any\), got \(3, 3\)"),
         (np.eye(2, 3), "words@1", "expected an array"),
