@@ -1,4 +1,4 @@
-"""How sphinx builds these pages: `make docs`, or `sphinx-build docs DIR`."""
+"""Sphinx configuration of the documentation. Build it with `make docs` or `sphinx-build docs DIR`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS), str(DOCS.parent)]  # its extensions; the package of this checkout
+sys.path[:0] = [str(DOCS), str(DOCS.parent)]  # Sphinx extensions in docs/, and the package of this checkout
 
 from framework import __version__  # noqa: E402
 
@@ -35,8 +35,8 @@ html_math_renderer = "mathml"
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 
-smartquotes = False  # "" is an empty word, here
-default_role = "literal"  # a name between single backticks in a docstring
+smartquotes = False  # "" means an empty string in these pages
+default_role = "literal"  # for names in single backticks in docstrings
 toc_object_entries_show_parents = "hide"
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
@@ -46,6 +46,6 @@ autodoc_type_aliases = {
 
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(?!(framework|plugins|instancemap)\.).*"),  # other libraries: nothing is fetched
-    ("py:class", r"framework\.(mapping\..*|registry\.Plugin)"),  # types that plugins only pass on
+    ("py:.*", r"(?!(framework|plugins|instancemap)\.).*"),  # names of other libraries: no inventories are downloaded
+    ("py:class", r"framework\.(mapping\..*|registry\.Plugin)"),  # types without a page
 ]

@@ -1,6 +1,6 @@
-"""Write an animation of a growing map, which begins with the complete map.
+"""Write an animation of a growing map. The animation begins with the complete map.
 
-`python docs/growing_map.py OUT.webp [key=value ...]` takes the overrides of a run.
+Usage: `python docs/growing_map.py OUT.webp [key=value ...]`, with the overrides of a run.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from framework.runs.run_directory import LIKELY
 from framework.runtime.process_settings import Settings
 from framework.runtime.run_log import Journal
 
-FRAME_INTERVAL = 2  # frames from one picture to the next
-WIDTH, HEIGHT = 600, 500  # px of each of the two views
-MILLISECONDS, LAST = 100, 2500  # display time of a picture and of the complete map
+FRAME_INTERVAL = 2  # frames between two images
+WIDTH, HEIGHT = 600, 500  # px, size of each of the two views
+MILLISECONDS, LAST = 100, 2500  # ms, display times of an image and of the complete map
 
 
 def only(instance_ids: Int32, shown: list[int]) -> Int32:
-    """Return the instance IDs, 0 for those that are not shown."""
+    """Return the instance ids; ids not in `shown` become 0."""
     return np.where(np.isin(instance_ids, shown), instance_ids, 0).astype(np.int32)
 
 
@@ -54,13 +54,13 @@ def main() -> None:
             maps.append((scene.mesh(), likely))
 
     if not poses:
-        sys.exit("no frame was tracked")
+        sys.exit("dataset: expected at least one tracked frame, got none; choose another sequence or tracker")
     path = np.array(poses)
     last, likely = maps[-1]
     surface = Surface.seen_from(last.vertices, last.triangles, path)
     camera, T_world_camera = best_view(surface, only(last.instance_ids, likely), path, WIDTH, HEIGHT)
     centroids = {}
-    for mesh, likely in maps:  # color by the last position of an instance
+    for mesh, likely in maps:  # colors depend on the last position of each instance
         for key in likely:
             centroids[key] = mesh.vertices[mesh.instance_ids == key].mean(axis=0)
     colors = dict(

@@ -3,7 +3,7 @@ r"""ROS 2 node that maps the images of a depth camera and publishes the objects 
     python examples/ros2_node.py --ros-args -r color:=/camera/color/image_raw \
         -r depth:=/camera/aligned_depth_to_color/image_raw -r camera_info:=/camera/color/camera_info
 
-Depth must be registered to color. Each marker is the box around one object in the map's world; its text is the class.
+Depth must be registered to color. Each marker is the box of one object in the world frame; its text is the class.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class InstanceMapNode(Node):
         topics = (("color", Image), ("depth", Image), ("camera_info", CameraInfo))
         subscribers = [message_filters.Subscriber(self, kind, name) for name, kind in topics]
         synchronizer = message_filters.ApproximateTimeSynchronizer(subscribers, queue_size=2, slop=0.02)
-        synchronizer.registerCallback(self.map)  # while a frame is mapped, the queue keeps the two newest
+        synchronizer.registerCallback(self.map)  # during mapping, the queue keeps the two newest frames
 
     def map(self, color: Image, depth: Image, info: CameraInfo) -> None:
         camera = Camera(info.width, info.height, info.k[0], info.k[4], info.k[2], info.k[5])
@@ -57,14 +57,14 @@ class InstanceMapNode(Node):
 
 
 def rgb(image: Image) -> np.ndarray:
-    """Return the RGB image (H, W, 3) uint8 of a message."""
+    """Convert a message to an RGB image (H, W, 3), uint8."""
     pixels = np.frombuffer(bytes(image.data), np.uint8).reshape(image.height, image.step)[:, : 3 * image.width]
     pixels = pixels.reshape(image.height, image.width, 3)
     return pixels[..., ::-1] if image.encoding == "bgr8" else pixels
 
 
 def meters(image: Image) -> np.ndarray:
-    """Return the depth (H, W) float32 in m of a message, 0 = no reading."""
+    """Convert a message to depth (H, W), float32, m; 0 = no reading."""
     kind, unit = (np.float32, 1.0) if image.encoding == "32FC1" else (np.uint16, 0.001)
     values = np.frombuffer(bytes(image.data), kind).reshape(image.height, -1)[:, : image.width] * np.float32(unit)
     return np.nan_to_num(values, nan=0.0, posinf=0.0).astype(np.float32)

@@ -1,1 +1,1 @@
-"""What these pages need beside sphinx's own: pages that are made from the code, and formulas without a network."""
+"""Sphinx extensions: reference pages generated from the code, and formulas without network access."""

@@ -1,6 +1,6 @@
-"""Fields of dataclasses in the API reference, with the comments beside them: shapes, units, bounds.
+"""Fields of dataclasses in the API reference, with their comments: shapes, units, bounds.
 
-The code states them as plain comments, which autodoc does not read. Arrays have the names that the code gives them.
+The code documents fields by plain comments, which autodoc does not read. Array types keep their names from the code.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def add_fields(app: Sphinx, what: str, name: str, of: Any, options: Any, lines: 
     if not isinstance(of, type) or not dataclasses.is_dataclass(of):
         return
     said: dict[str, str] = {}
-    for base in reversed(of.__mro__):  # a field stands where it was last declared
+    for base in reversed(of.__mro__):  # the last declaration of a field applies
         if dataclasses.is_dataclass(base):
             said |= comments(textwrap.dedent(inspect.getsource(base)))
     fields = [field for field in dataclasses.fields(of) if not field.name.startswith("_")]
@@ -53,7 +53,7 @@ def add_fields(app: Sphinx, what: str, name: str, of: Any, options: Any, lines: 
 def name_arrays(
     app: Sphinx, what: str, name: str, of: Any, options: Any, signature: str | None, returned: str | None
 ) -> tuple[str | None, str | None]:
-    """Sphinx knows the names of `autodoc_type_aliases`, but writes them so where an array may be None."""
+    """Replace Sphinx's `TypeAliasForwardRef('Float32')` of optional arrays by `Float32`."""
     plain = [text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in (signature, returned)]
     return plain[0], plain[1]
 

@@ -1,6 +1,6 @@
-"""Formulas as MathML, which browsers show by themselves: MathJax, sphinx's choice, comes from the network.
+"""Formulas as MathML, which browsers render natively. MathJax, the default of Sphinx, requires network access.
 
-docutils brings the translation from LaTeX, and says what it does not know.
+docutils translates from LaTeX and reports unknown commands.
 """
 
 from __future__ import annotations
@@ -31,7 +31,13 @@ def _translated(node: nodes.math | nodes.math_block, as_block: bool = False) -> 
     try:
         return str(tex2mathml(node.astext(), as_block=as_block))
     except MathError as error:
-        log.warning("the formula %s: %s", node.astext(), error, location=node, type="mathml")
+        log.warning(
+            "formula: expected LaTeX supported by docutils, got %s: %s",
+            node.astext(),
+            error,
+            location=node,
+            type="mathml",
+        )
         return ""
 
 

@@ -1,7 +1,6 @@
-"""The configuration reference, made of what is registered: `{options} detector`, `{settings} config`, `{commands}`.
+"""Configuration reference from the registry: directives `{options} detector`, `{settings} config` and `{commands}`.
 
-Nothing of it is written down here: names, types, defaults and comments are those that `python -m framework plugins`
-prints, which come from the dataclasses and the YAML files.
+Names, types, defaults and comments come from the dataclasses and the YAML files, as in `instancemap plugins`.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ class Row(NamedTuple):
 
 
 class Options(SphinxDirective):
-    """All options of a stage: a section each, with its documentation and a table of its parameters."""
+    """Directive for the options of a stage: one section per option, with documentation and parameters."""
 
     required_arguments = 1  # the stage
 
@@ -49,7 +48,7 @@ class Options(SphinxDirective):
 
 
 class Settings(SphinxDirective):
-    """The settings at the top of a main config, such as `seed`, with the comments of its YAML."""
+    """Directive for the top-level settings of a main config, such as `seed`, with the comments of its YAML."""
 
     required_arguments = 1  # the config's name
 
@@ -62,7 +61,7 @@ class Settings(SphinxDirective):
 
 
 class Files(SphinxDirective):
-    """The choices of a config group that registers no plugins, each with the first line of its YAML."""
+    """Directive for the choices of a config group without plugins, each with the first comment of its YAML."""
 
     required_arguments = 1  # the group
 
@@ -74,14 +73,14 @@ class Files(SphinxDirective):
 
 
 class Commands(SphinxDirective):
-    """The commands of `python -m framework`, each with what it does."""
+    """Directive for the commands of `instancemap` with their descriptions."""
 
     def run(self) -> list[nodes.Node]:
         return [definitions(COMMANDS.items())]
 
 
 def _head(text: str) -> str:
-    """Return the comment at the top of a YAML; `# @package` is Hydra's."""
+    """Return the comment at the top of a YAML file, without Hydra's `# @package`."""
     lines = [line for line in text.splitlines() if not line.startswith("# @")]
     head = []
     for line in lines:
@@ -96,7 +95,7 @@ def _type(value: object) -> str:
 
 
 def yaml_value(value: object) -> str:
-    """As it is written on the command line."""
+    """Return a value in command-line syntax."""
     return str(yaml.safe_dump(value, default_flow_style=True)).partition("\n")[0]
 
 
@@ -106,7 +105,7 @@ def paragraph(text: str) -> nodes.paragraph:
 
 
 def inline(text: str) -> Iterator[nodes.Node]:
-    """Text in which `words` and ``words`` between backticks are code."""
+    """Yield the nodes of a text; words in single or double backticks are code."""
     for k, part in enumerate(re.split(r"`+", text)):
         if part:
             yield nodes.literal("", part) if k % 2 else nodes.Text(part)
@@ -123,7 +122,7 @@ def definitions(items: Iterable[tuple[str, str]]) -> nodes.definition_list:
 
 
 def table(rows: Iterable[Row]) -> nodes.table:
-    """Return a row for each parameter: name, type and default on the left, description on the right."""
+    """Return a table with one row per parameter: name, type and default on the left, description on the right."""
     group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in (45, 55)), cols=2)
     head = nodes.row("", *(nodes.entry("", paragraph(word)) for word in ("Parameter", "Meaning")))
     group += nodes.thead("", head)

@@ -1,7 +1,7 @@
-"""Links out of these pages: relative, as on any code host, and right in the built pages, too.
+"""Relative links in the documentation, valid on code hosts and in the built pages.
 
-Some files of the project are pages here as well; in `docs/` each has a page of one line that links to it. A folder is
-no page: of a link to one, its words are left.
+Some project files are also documentation pages: a page of one line in `docs/` links to each file. Folders have no
+pages: a link to a folder is replaced by its text.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ PAGES = {
     "plugins/detectors/mask_rcnn_rooms.md": "guides/mask_rcnn_rooms.md",
     "plugins/detectors/maskrcnn2go.md": "guides/maskrcnn2go.md",
 }
-"""The pages that show files of the project."""
+"""Pages of project files, by file."""
 
 _FOLDER = re.compile(r"\[(?P<words>[^\]]*)\]\((?!\w+:|#)(?P<path>[^)#\s]+)\)")
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)(?P<path>[^)#\s]+)(?P<anchor>#[^)\s]*)?(?=\))")
 
 
 def show(app: Sphinx, name: str, source: list[str]) -> None:
-    """Return the text of a page or of the file that it shows, with links relative to the page."""
+    """Replace the source by the text of the page or of its project file, with links relative to the page."""
     page = DOCS / f"{name}.md"
     shown = {DOCS / place: PROJECT / path for path, place in PAGES.items()}.get(page, page)
     text = source[0] if shown == page else shown.read_text()

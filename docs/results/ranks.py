@@ -1,6 +1,6 @@
-"""Compare how the rows of an experiment rank on several datasets: means, ranks and Spearman's rho.
+"""Compare the ranks of an experiment's rows on several datasets: means, ranks and Spearman's rho.
 
-Run it with the folders of the experiment's runs: `python docs/results/ranks.py DIR DIR... --metric instances.ap50`.
+Usage: `python docs/results/ranks.py DIR DIR... --metric instances.ap50`, with one folder of runs per dataset.
 """
 
 from __future__ import annotations
@@ -28,45 +28,45 @@ from framework.tables.grid import TextTable, decimals, figure, markdown_grid
 from framework.tables.layouts import NOTHING, head
 from framework.tables.table_notes import counted, digest
 
-FEWEST = 3  # rows: two are in the same order or in the other one, by chance as likely as not
-SAMPLES = 2000  # of a bootstrap
-SEED = 0  # of its random numbers, anew for each pair of places
-DIGITS = 9  # decimals in which means must agree to share a rank
+FEWEST = 3  # minimum rows; two rows have the same order by chance with probability 0.5
+SAMPLES = 2000  # number of bootstrap samples
+SEED = 0  # random seed, reset for each pair of folders
+DIGITS = 9  # decimals of means for equal ranks
 OTHERS = "mean of the others"
 
 
 @dataclass(frozen=True)
 class Place:
-    """An experiment folder, with the rows that all places have."""
+    """An experiment folder with the common rows of all folders."""
 
-    name: str  # of the folder
+    name: str  # name of the folder
     comparison: ComparisonTable
-    values: Float64  # (R, S) a figure of each row in each sequence, or with each seed; all rows have the same
-    runs: int  # of each row, of which S sequences are the means
-    left_out: int  # runs that not every row has
+    values: Float64  # (R, S) metric by row and by sequence or seed
+    runs: int  # number of runs per row, averaged by sequence
+    left_out: int  # number of omitted runs without results in all rows
 
     @property
     def means(self) -> Float64:
-        """(R,) of each row; every sequence counts as one."""
+        """Mean (R,) of each row with equal weights of the sequences."""
         return np.asarray(self.values.mean(axis=1), np.float64)
 
     def drawn_means(self, rng: np.random.Generator) -> Float64:
-        """Return (SAMPLES, R) means of bootstrap samples of the sequences, the same samples for all rows."""
+        """Return the means (SAMPLES, R) of bootstrap samples of the sequences, with common samples for all rows."""
         drawn = rng.integers(self.values.shape[1], size=(SAMPLES, self.values.shape[1]))
         return np.asarray(self.values[:, drawn].mean(axis=2).T, np.float64)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Spearman's rank correlation of the rows in two places; NaN = not defined, as where all rows are equal."""
+    """Spearman's rank correlation of the rows in two folders; NaN = undefined, as for equal rows."""
 
     rho: float
-    over_rows: tuple[float, float]  # 95 % of the bootstrap over rows: were they others of this kind
-    over_runs: tuple[float, float]  # and over the runs of each place: were they others; NaN where a place has but one
+    over_rows: tuple[float, float]  # 95% bootstrap interval over rows
+    over_runs: tuple[float, float]  # 95% bootstrap interval over the runs of each folder; NaN for a single run
 
     @classmethod
     def of(cls, first: Place, others: Sequence[Place]) -> Agreement:
-        """Of a place and the mean of others; of two places where there is one other."""
+        """Return the agreement of a folder with the mean of one or more other folders."""
         ours, theirs = first.means, _mean([place.means for place in others])
         rng = np.random.default_rng(SEED)
         drawn = rng.integers(len(ours), size=(SAMPLES, len(ours)))
@@ -79,16 +79,19 @@ class Agreement:
 
 @dataclass(frozen=True)
 class Ranking:
-    """One figure of the rows that all places have."""
+    """One metric of the common rows of all folders."""
 
     key: str  # of metrics.json
-    rows: list[str]  # by name, the highest in the first place first
+    rows: list[str]  # names, in descending order in the first folder
     places: list[Place]
-    absent: dict[str, list[str]]  # rows that are left out, by name: the places that do not have them
+    absent: dict[str, list[str]]  # folders without the row, by name of an omitted row
 
     @classmethod
     def of(cls, key: str, comparisons: Sequence[ComparisonTable]) -> Ranking:
-        """Raise DataError if a folder lacks this metric, or if the folders have too few rows or sequences in common."""
+        """Return the ranking by a metric.
+
+        Raises DataError for a folder without the metric, or for too few common rows or sequences.
+        """
         names = _names(comparisons)
         found = [{row.name: row for row in one.rows if row.values(key)} for one in comparisons]
         for comparison, rows in zip(comparisons, found, strict=True):
@@ -103,8 +106,8 @@ class Ranking:
         common = [row for row in everywhere if row not in absent]
         if len(common) < FEWEST:
             raise DataError(
-                f"{key}: ranks need {FEWEST} rows or more that all folders have, found {len(common)}: "
-                f"{', '.join(common) or 'none'}; {_listed(absent)}"
+                f"{key}: expected at least {FEWEST} common rows of all folders, got {len(common)} "
+                f"({', '.join(common) or 'none'}); {_listed(absent)}"
             )
         places = [
             _place(name, comparison, [rows[row] for row in common], key)
@@ -116,14 +119,14 @@ class Ranking:
 
     @cached_property
     def columns(self) -> dict[str, Float64]:
-        """The rows' means by place, and where there are several others those of all places but the first."""
+        """Means of the rows by folder, and for more than two folders the mean over all folders except the first."""
         columns = {place.name: place.means for place in self.places}
         if len(self.places) > 2:
             columns[OTHERS] = _mean([place.means for place in self.places[1:]])
         return columns
 
     def agreements(self) -> Iterator[tuple[str, Agreement]]:
-        """Of each pair of places, and of the first with the mean of the others."""
+        """Yield the agreement of each pair of folders, and of the first folder with the mean of the others."""
         for one, other in combinations(self.places, 2):
             yield f"{one.name}, {other.name}", Agreement.of(one, [other])
         if OTHERS in self.columns:
@@ -141,8 +144,8 @@ def main() -> None:
         metavar="DIR",
         nargs="+",
         type=Path,
-        help="folder of the experiment's runs on one dataset; three or more: the first is also compared with the mean "
-        "of the others",
+        help="folder of the experiment's runs on one dataset; for three or more folders, the first is also compared "
+        "with the mean of the others",
     )
     parser.add_argument(
         "--metric", metavar="KEY", nargs="+", default=["instances.ap50"], help="keys of metrics.json, one table each"
@@ -156,13 +159,12 @@ def main() -> None:
 def write_ranks(directories: Sequence[Path], keys: Sequence[str], out: Path | None) -> str:
     """Compare the experiments in `directories` by each metric and return the Markdown.
 
-    Where `out` is a folder, ranks.md and ranks.csv are written into it. Raises DataError when there is nothing to
-    compare.
+    With `out`, ranks.md and ranks.csv are written into this folder. Raises DataError for incomparable folders.
     """
     if len(directories) < 2:
-        raise DataError(f"ranks compares two folders or more, found {len(directories)}")
+        raise DataError(f"DIR: expected at least two folders, got {len(directories)}")
     if len({directory.resolve() for directory in directories}) < len(directories):
-        raise DataError(f"ranks compares different folders, found one twice: {', '.join(map(str, directories))}")
+        raise DataError(f"DIR: expected each folder once, got {', '.join(map(str, directories))}")
     comparisons = [ComparisonTable.below(directory) for directory in directories]
     rankings = [Ranking.of(key, comparisons) for key in keys]
     text = markdown(rankings)
@@ -185,7 +187,7 @@ def markdown(rankings: Sequence[Ranking]) -> str:
 
 
 def rank_grid(ranking: Ranking) -> TextTable:
-    """Return a line for each row: its mean and rank in each folder."""
+    """Return a table with one line per row: mean and rank in each folder."""
     columns = [(means, ranks(means)) for means in ranking.columns.values()]
     digits = decimals(float(value) for means, _ in columns for value in means)
     body = [
@@ -199,7 +201,7 @@ def rank_grid(ranking: Ranking) -> TextTable:
 
 
 def agreement_grid(ranking: Ranking) -> TextTable:
-    """Return a line for each pair of folders."""
+    """Return a table with one line per pair of folders."""
     share = f"{CONFIDENCE:.0%}"
     body = [
         [pair, str(len(ranking.rows)), _signed(one.rho), _between(one.over_rows), _between(one.over_runs)]
@@ -209,7 +211,7 @@ def agreement_grid(ranking: Ranking) -> TextTable:
 
 
 def comma_separated(rankings: Sequence[Ranking]) -> str:
-    """One line a figure, row and place, all digits, for pandas."""
+    """Return one CSV line per metric, row and folder, with all digits."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["figure", "row", "place", "mean", "rank"])
@@ -221,16 +223,16 @@ def comma_separated(rankings: Sequence[Ranking]) -> str:
 
 
 def ranks(means: Float64) -> Float64:
-    """(R,) 1 = the highest; rows that are equal share the mean of their ranks."""
+    """Return the rank (R,) of each row, 1 = highest; ties share the mean of their ranks."""
     from scipy.stats import rankdata
 
     return np.asarray(rankdata(-means.round(DIGITS)), np.float64)
 
 
 def spearman(ours: Float64, theirs: Float64) -> Float64:
-    """(N,) Spearman's rho of each line of two (N, R) samples: Pearson's correlation of the ranks, ties sharing theirs.
+    """Return Spearman's rho (N,) for each line of two samples (N, R): Pearson's correlation of the ranks.
 
-    NaN where all of a line are equal.
+    Ties share the mean of their ranks. The result is NaN for a line of equal values.
     """
     from scipy.stats import rankdata
 
@@ -254,11 +256,11 @@ def _mean(values: Sequence[Float64]) -> Float64:
 
 
 def _place(name: str, comparison: ComparisonTable, rows: Sequence[RunRow], key: str) -> Place:
-    """Of the runs that every row has: another seed or sequence may be harder."""
+    """Return the folder with the common runs of all rows, because sequences and seeds differ in difficulty."""
     values = [row.values(key) for row in rows]
     shared: set[Run] = set(values[0]).intersection(*values)
     if not shared:
-        raise DataError(f"{comparison.root}: there is no run in which all rows have {key}; run what its table misses")
+        raise DataError(f"{comparison.root}: expected a run with {key} in all rows, got none; run the missing rows")
     by_row = [mean_by_sequence({run: of_row[run] for run in sorted(shared)}) for of_row in values]
     sequences = sorted({run[-1] for run in shared})
     matrix = np.array([[means[sequence].value for sequence in sequences] for means in by_row], np.float64)
@@ -275,11 +277,13 @@ def _unknown(key: str, comparison: ComparisonTable) -> str:
     known = sorted({name for row in comparison.rows for one in row.records.values() for name in one.metrics})
     close = get_close_matches(key, known, n=1)
     suggestion = f"; did you mean {close[0]}?" if close and close[0] != key else ""
-    return f"{comparison.root}: no run has a figure {key}{suggestion}"
+    return f"{comparison.root}: expected a run with the metric {key}, got none{suggestion}"
 
 
 def _listed(absent: dict[str, list[str]]) -> str:
-    return "; ".join(f"{row}: not in {', '.join(places)}" for row, places in absent.items()) or "no folder has others"
+    return (
+        "; ".join(f"{row}: not in {', '.join(places)}" for row, places in absent.items()) or "no folder has other rows"
+    )
 
 
 def _signed(value: float) -> str:
@@ -295,24 +299,23 @@ def _notes_of(ranking: Ranking) -> Iterator[str]:
     counts = ", ".join(f"{place.name} {place.runs}" for place in ranking.places)
     yield f"Runs of each row: {counts}."
     if ranking.absent:
-        yield f"Left out, rows that not all have: {_listed(ranking.absent)}."
+        yield f"Omitted rows, missing in some folders: {_listed(ranking.absent)}."
     if dropped := [f"{place.name} {place.left_out}" for place in ranking.places if place.left_out]:
-        yield f"Left out, runs in which not every row has this figure: {', '.join(dropped)}."
+        yield f"Omitted runs, without this metric in some rows: {', '.join(dropped)}."
 
 
 def _notes(ranking: Ranking) -> Iterator[str]:
-    yield "Rank 1 is the highest; equal rows share the mean of their ranks. Rows are matched by name."
+    yield "Rank 1 is the highest; ties share the mean of their ranks. Rows are matched by name."
     if OTHERS in ranking.columns:
         yield (
-            f"The others: all places but {ranking.places[0].name}. Each counts as one, so that those in which rows"
-            " differ more say more about the order."
+            f"Others: all folders except {ranking.places[0].name}, with equal weights. Folders with larger differences"
+            " between rows have more influence on the order."
         )
     yield (
         f"{CONFIDENCE:.0%} intervals: percentiles of {SAMPLES} bootstrap samples, seed {SEED}. Over rows: rows are"
-        " drawn with replacement, as if others had been tried. Over runs: of each place the sequences, or the seeds"
-        " where there is one sequence, are drawn, the same for all rows: what noise does to the order; of a few runs"
-        " they are too narrow. Rows that have much in common are no independent evidence, and seeds of one place say"
-        " nothing about other places."
+        " drawn with replacement. Over runs: the sequences of each folder are drawn with replacement, or the seeds of a"
+        " single sequence, with common samples for all rows. Intervals over few runs are too narrow. Similar rows are"
+        " not independent, and seeds do not represent other datasets."
     )
     for place in ranking.places:
         records = place.comparison.records
@@ -320,7 +323,7 @@ def _notes(ranking: Ranking) -> Iterator[str]:
             f"{stage}={counted(str(record.metrics.get(f'{CHOICE}{stage}')) for record in records)}"
             for stage in ("dataset", "detector")
         )
-        annotation = counted(record.annotation or "not named" for record in records)
+        annotation = counted(record.annotation or "unknown" for record in records)
         code = counted(record.code for record in records)
         yield (
             f"{place.name}: {chosen}, poses {counted(row.poses for row in place.comparison.rows)}; annotation: "

@@ -1,8 +1,8 @@
-"""Compare each row of an experiment with the row it changes, on several datasets: paired differences with intervals.
+"""Compare each row of an experiment with its baseline on several datasets: paired differences with intervals.
 
-`python docs/results/steps.py DIR DIR... --out FOLDER` reads the folders of the experiment's runs, one for each dataset
-and detector. Rows from `paper` to `default` are steps: each is compared with the row before. Later rows are compared
-with `default`; in an experiment without `default`, all rows are compared with the first.
+Usage: `python docs/results/steps.py DIR DIR... --out FOLDER`, with one folder of runs per dataset and detector. Rows
+from `paper` to `default` are steps: each row is compared with the previous row. Later rows are compared with `default`.
+In an experiment without `default`, all rows are compared with the first row.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from framework.tables.grid import TextTable, figure, markdown_grid
 from framework.tables.layouts import NOTHING, head
 from framework.tables.table_notes import counted, digest
 
-SAMPLES = 10000  # of a bootstrap
-SEED = 0  # of its random numbers, again for each row
-SYNTHETIC = "synthetic"  # the dataset whose seeds are scenes
+SAMPLES = 10000  # number of bootstrap samples
+SEED = 0  # random seed, reset for each row
+SYNTHETIC = "synthetic"  # dataset with one scene per seed
 START, END = "paper", "default"
-BENEFIT = 0.005  # AP, smallest mean difference that counts
+BENEFIT = 0.005  # AP, minimum relevant mean difference
 LINE_MM, HEAD_MM, AXIS_MM, NAMES_MM, GAP_MM = 3.4, 6.0, 5.0, 34.0, 3.0
 REAL_COLOR, SYNTHETIC_COLOR = "#0072b2", "#d55e00"  # for color-blind readers
 
@@ -41,12 +41,12 @@ class Scene:
 
     name: str
     synthetic: bool
-    values: dict[str, dict[str, float]]  # by row and metric: the mean over the seeds that all rows have
+    values: dict[str, dict[str, float]]  # by row and metric: mean over the common seeds of all rows
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Paired differences of a row to its base, one for each scene and detector."""
+    """Paired differences of a row from its baseline, one for each scene and detector."""
 
     values: Float64  # (n,)
 
@@ -56,7 +56,7 @@ class Difference:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Return the interval of the mean by a bootstrap over scenes and detectors; NaN if there are fewer than two."""
+        """Bootstrap interval of the mean over scenes and detectors; NaN for fewer than two."""
         n = len(self.values)
         if n < 2:
             return math.nan, math.nan
@@ -80,7 +80,7 @@ def main() -> None:
     )
     parser.add_argument(
         "--metric", metavar="KEY", nargs="+", default=["instances.ap50", "instances.ap50_agnostic"],
-        help="keys of metrics.json; the figure shows the first",
+        help="keys of metrics.json; the figure shows the first key",
     )  # fmt: skip
     parser.add_argument("--out", metavar="FOLDER", type=Path, help="also write steps.md, steps.png and steps.pdf")
     options = arguments(parser)
@@ -89,9 +89,9 @@ def main() -> None:
 
 
 def write_steps(directories: Sequence[Path], metrics: Sequence[str], out: Path | None) -> str:
-    """Compare the rows and return the Markdown; with `out`, write it and the figure into this folder.
+    """Compare the rows and return the Markdown. With `out`, write the Markdown and the figure into this folder.
 
-    Raises DataError if the folders have no common row, or a row has no such metric.
+    Raises DataError if the folders have fewer than two common rows.
     """
     comparisons = [ComparisonTable.below(directory) for directory in directories]
     scenes = [scene for one in comparisons for scene in scenes_of(one, metrics)]
@@ -106,18 +106,18 @@ def write_steps(directories: Sequence[Path], metrics: Sequence[str], out: Path |
 
 
 def scenes_of(comparison: ComparisonTable, metrics: Sequence[str]) -> Iterator[Scene]:
-    """Yield the scenes of a folder: one for each seed of synthetic scenes, else one."""
+    """Yield the scenes of a folder: one scene per seed for synthetic scenes, otherwise one scene."""
     choices = {
         key: {str(one.metrics.get(f"{CHOICE}{key}")) for one in comparison.records} for key in ("dataset", "detector")
     }
     if len(choices["dataset"]) > 1 or len(choices["detector"]) > 1:
         raise DataError(
-            f"{comparison.root}: expected one dataset and one detector, got {choices}; use a folder for each"
+            f"{comparison.root}: expected one dataset and one detector, got {choices}; use one folder per pair"
         )
     rows = {row.system or row.name: row for row in comparison.rows}
     seeds = set.intersection(*(set(row.records) for row in rows.values()))
     if not seeds:
-        raise DataError(f"{comparison.root}: no seed is complete in all rows; run the missing rows")
+        raise DataError(f"{comparison.root}: expected a complete seed in all rows, got none; run the missing rows")
     synthetic = choices["dataset"] == {SYNTHETIC}
     for group in [[seed] for seed in sorted(seeds)] if synthetic else [sorted(seeds)]:
         values = {name: {key: _mean(row, group, key) for key in metrics} for name, row in rows.items()}
@@ -126,16 +126,16 @@ def scenes_of(comparison: ComparisonTable, metrics: Sequence[str]) -> Iterator[S
 
 
 def common_rows(scenes: Sequence[Scene], comparison: ComparisonTable) -> list[str]:
-    """Return the rows that all scenes have, in the order of the experiment."""
+    """Return the common rows of all scenes, in the order of the experiment."""
     order = [*comparison.overrides, *(row.name for row in comparison.rows if row.system not in comparison.overrides)]
     rows = [row for row in order if all(row in scene.values for scene in scenes)]
     if len(rows) < 2:
-        raise DataError(f"expected two rows or more that all folders have, got {', '.join(rows) or 'none'}")
+        raise DataError(f"DIR: expected at least two common rows of all folders, got {', '.join(rows) or 'none'}")
     return rows
 
 
 def bases_of(rows: Sequence[str]) -> dict[str, str | None]:
-    """Return the row that each row is compared with; None for the first."""
+    """Return the baseline of each row; None for the first row."""
     if START in rows and END in rows:
         end = rows.index(END)
         before: list[str | None] = [None, *rows[:end]]
@@ -177,9 +177,9 @@ def markdown(
         parts += [f"## {head(metric)}", markdown_grid(TextTable(header, body))]
     absent = sorted({row for scene in scenes for row in scene.values} - set(bases))
     notes = [
-        *([f"Left out, rows that not all folders have: {', '.join(absent)}."] if absent else []),
+        *([f"Omitted rows, missing in some folders: {', '.join(absent)}."] if absent else []),
         f"Intervals: {CONFIDENCE:.0%}, bootstrap over scenes and detectors, {SAMPLES} samples, seed {SEED}. n: pairs "
-        "of scene and detector. Seeds of a real scene are averaged; each seed of the synthetic dataset is a scene.",
+        "of scene and detector. Seeds of a real scene are averaged. Each seed of the synthetic dataset is one scene.",
         *(
             f"{one.title}: {counted(str(record.metrics.get('frames')) for record in one.records)} frames, code "
             f"{counted(record.code for record in one.records)}; SHA-256 of all configs: {digest(one.records)}."
@@ -190,13 +190,13 @@ def markdown(
 
 
 def page(scenes: Sequence[Scene], bases: dict[str, str | None], metric: str) -> Page:
-    """Draw the mean of each row and its difference to its base with the interval."""
+    """Draw the mean of each row and its difference from the baseline with the interval."""
     height = HEAD_MM + LINE_MM * len(bases) + AXIS_MM
     counts = [sum(one.synthetic == synthetic for one in scenes) for synthetic in (False, True)]
-    compared = "the row above, below the line to the default" if END in bases.values() else next(iter(bases))
+    compared = "the row above (below the line: default)" if END in bases.values() else next(iter(bases))
     note = (
         f"{head(metric)}. Blue: real scenes, n = {counts[0]} pairs of scene and detector; orange: synthetic, n = "
-        f"{counts[1]}. Left: mean. Right: mean paired difference to {compared}, with its {CONFIDENCE:.0%} interval. "
+        f"{counts[1]}. Left: mean. Right: mean paired difference from {compared}, with its {CONFIDENCE:.0%} interval. "
         f"Gray band: differences below {BENEFIT}."
     )
     result = Page(PAGE_MM, height, note)
@@ -237,7 +237,7 @@ def page(scenes: Sequence[Scene], bases: dict[str, str | None], metric: str) -> 
 
 
 def _mean(row: RunRow, seeds: Sequence[tuple[str, ...]], metric: str) -> float:
-    """Return the mean of the runs with these seeds; NaN if one has no such metric."""
+    """Return the mean of the runs with these seeds; NaN if the metric is missing in a run."""
     values = row.values(metric)
     return float(np.mean([values.get(seed, math.nan) for seed in seeds]))
 

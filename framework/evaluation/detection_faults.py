@@ -1,8 +1,8 @@
-"""Statistics of a detector's errors over a video with true instances.
+"""Statistics of a detector's errors over a video with ground-truth instances.
 
-Averages over images, such as mask AP, do not show errors that an object has in all frames and that therefore do not
-average out in a map. So the appearances of each object are evaluated together. The presets of `detector=simulated` were
-fitted to these statistics.
+Averages over images, such as mask AP, do not show errors that repeat in all frames of an object. Such errors do not
+average out in a map. The appearances of each object are therefore evaluated together. The presets of
+`detector=simulated` were fitted to these statistics.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ import numpy as np
 
 from framework.data import Bool, Detections, FrameTruth, Int64
 
-SMALLEST = 64  # px, an appearance that counts
-FOUND_IOU = 0.3  # of an appearance that is found, whatever its class
+SMALLEST = 64  # px, minimum area of an evaluated appearance
+FOUND_IOU = 0.3  # minimum IoU of a found appearance, regardless of class
 SIDES = (32.0, 96.0)  # px, square roots of areas: COCO's bounds between small, medium and large
 ENOUGH = 5  # minimum appearances of an object for its detection rate
-RARELY, MOSTLY = 0.25, 0.75  # shares of an object's appearances
-PART_INSIDE, PART_COVERS = 0.6, 0.05  # least shares of the detection and of the object, for a part of an object
-ON_ONE = 0.6  # minimum fraction of a false detection on one thing to count as an object
+RARELY, MOSTLY = 0.25, 0.75  # fractions of an object's appearances
+PART_INSIDE, PART_COVERS = 0.6, 0.05  # minimum fractions of the detection and of the object, for a part of an object
+ON_ONE = 0.6  # minimum fraction of a false detection on one unknown object
 
 
 class Appearance(NamedTuple):
-    """One object of a known class in one frame, and its best detection if any."""
+    """One object of a known class in one frame, with its best detection if any."""
 
     instance: int
     side: float  # px, square root of the area
-    parts: int  # detections that lie mostly on it
+    parts: int  # number of detections mostly on the object
     iou: float = 0.0
     inside: float = 0.0  # fraction of the detection on the object
     covered: float = 0.0  # fraction of the object under the detection
@@ -40,11 +40,11 @@ class Appearance(NamedTuple):
 
 
 class FalseDetection(NamedTuple):
-    """A detection that lies mostly on no object of a known class."""
+    """A detection with at most half of its pixels on objects of known classes."""
 
     score: float
     side: float  # px
-    on_thing: bool  # mostly on one thing of unknown class
+    on_thing: bool  # True: mostly on one object of unknown class
 
 
 @dataclass
@@ -56,7 +56,7 @@ class DetectionFaults:
     false_detections: list[FalseDetection] = field(default_factory=list)
 
     def add(self, truth: FrameTruth, detections: Detections) -> None:
-        """Compare one frame's detections (masks of the image's size) with its true instances."""
+        """Compare one frame's detections (masks of the image's size) with its ground-truth instances."""
         self.frames += 1
         ids, shared = overlaps(truth, detections.masks)
         areas, shared = shared[0], shared[1:]
@@ -91,7 +91,7 @@ class DetectionFaults:
                 )
 
     def table(self) -> dict[str, float]:
-        """Return all statistics by name, in the order of the presets' cards; NaN where nothing counts."""
+        """Return all statistics by name, in the order of the model cards of the presets; NaN without data."""
         hits = [one for one in self.appearances if one.iou >= FOUND_IOU]
         scores = [one.score for one in hits]
         of_objects = _by_object(self.appearances)
@@ -110,15 +110,15 @@ class DetectionFaults:
             "objects found in < 1/4 of the frames": _mean(share < RARELY for share in objects),
             "objects found in > 3/4 of the frames": _mean(share > MOSTLY for share in objects),
             "mask IoU": _mean(one.iou for one in hits),
-            "share of the mask on the object": _mean(one.inside for one in hits),
-            "share of the object in the mask": _mean(one.covered for one in hits),
-            "class right": _mean(one.is_right for one in hits),
-            "class as in the object's other frames": most_often / sum(map(len, several)) if several else float("nan"),
+            "fraction of the mask on the object": _mean(one.inside for one in hits),
+            "fraction of the object in the mask": _mean(one.covered for one in hits),
+            "correct class": _mean(one.is_right for one in hits),
+            "same class as in the other frames": most_often / sum(map(len, several)) if several else float("nan"),
             "score": _mean(scores),
             "score, standard deviation": float(np.std(scores)) if scores else float("nan"),
-            "objects in several parts": _mean(one.parts > 1 for one in self.appearances),
-            "false detections an image": len(self.false_detections) / max(self.frames, 1),
-            "false detections on one thing": _mean(one.on_thing for one in self.false_detections),
+            "objects with several detections": _mean(one.parts > 1 for one in self.appearances),
+            "false detections per image": len(self.false_detections) / max(self.frames, 1),
+            "false detections on an unknown object": _mean(one.on_thing for one in self.false_detections),
             "score of false detections": _mean(one.score for one in self.false_detections),
             "side of false detections (px)": _mean(one.side for one in self.false_detections),
         }
@@ -132,7 +132,7 @@ def _by_object(appearances: Iterable[Appearance]) -> list[list[Appearance]]:
 
 
 def overlaps(truth: FrameTruth, masks: Bool) -> tuple[Int64, Int64]:
-    """Return the ids (M,) in a frame, and the pixels of each (1 + N, M): in all, and in each mask (N, H, W)."""
+    """Return the ids (M,) in a frame, and their pixel counts (1 + N, M): in the frame and in each mask (N, H, W)."""
     ids, index = np.unique(truth.instance_ids.ravel(), return_inverse=True)
     counts = [np.bincount(index, minlength=len(ids))]
     counts += [np.bincount(index[mask.ravel()], minlength=len(ids)) for mask in masks]

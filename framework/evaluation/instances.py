@@ -1,17 +1,18 @@
-"""Metrics of 3D instance segmentation: average precision and overlap of a map's instances with the true ones.
+"""Metrics of 3D instance segmentation: average precision and overlap with the ground-truth instances.
 
-Labels are transferred between map vertices and true surface points by nearest neighbor. Predictions are matched to true
-instances greedily in order of confidence. AP is the area under a class's precision-recall curve with all-point
-interpolation (Pascal VOC from 2010 on), averaged over the classes with a true instance.
+Labels are transferred between map vertices and ground-truth surface points by nearest neighbor. Predictions are matched
+to ground-truth instances greedily in order of confidence. AP is the area under a class's precision-recall curve with
+all-point interpolation (Pascal VOC from 2010 on). It is averaged over the classes with a ground-truth instance.
 
-A true instance is evaluated if its class is known and it has at least `min_points` points. The others are *ignored*
-instances. A prediction without a match is ignored, neither right nor wrong, if
+A ground-truth instance is evaluated if its class is known and it has at least `min_points` points. All other
+ground-truth instances are *ignored*. A prediction without a match is ignored, neither right nor wrong, if
 
 1. its best overlap with an ignored instance reaches the IoU threshold, or
 2. more than half of its points lie on ignored instances, or
 3. its class was not annotated (`SceneTruth.classes`).
 
-Every other prediction without a match is wrong, also on points of instance 0 (no instance) and far from the truth.
+Every other prediction without a match is wrong. This includes predictions on points of instance 0 (no instance) and far
+from the ground truth.
 """
 
 from __future__ import annotations
@@ -27,44 +28,42 @@ from scipy.spatial import cKDTree
 from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh, Int32, Int64, SceneTruth
 from framework.errors import DataError
 
-MAX_DISTANCE = 0.05  # m, to the nearest neighbor that a label is taken from
-MIN_POINTS = 100  # of a true instance that is evaluated
+MAX_DISTANCE = 0.05  # m, maximum distance of the nearest neighbor for the label transfer
+MIN_POINTS = 100  # minimum points of an evaluated ground-truth instance
 IOU_THRESHOLDS = tuple(percent / 100 for percent in range(50, 100, 5))  # averaged by `ap`, as in COCO
 
 
 class Transfer(Enum):
     """The direction of the label transfer."""
 
-    TO_TRUTH = "to_truth"  # each true point gets the instance of the nearest map vertex
-    TO_MAP = "to_map"  # each map vertex gets the instance of the nearest true point
+    TO_TRUTH = "to_truth"  # each ground-truth point gets the instance of the nearest map vertex
+    TO_MAP = "to_map"  # each map vertex gets the instance of the nearest ground-truth point
 
 
 @dataclass(frozen=True)
 class PredictedInstances:
     """The K instances of a map, as labeled points."""
 
-    points_world: Float32  # (V, 3) m, the whole surface: points of no instance take part in the transfer
+    points_world: Float32  # (V, 3) m, the whole surface: points without an instance are transferred, too
     instance_ids: Int32  # (V,), 0 = no instance
     ids: Int64  # (K,) every instance of the map, also without points
     confidences: Float64  # (K,) in [0, 1]
-    class_names: tuple[str, ...]  # K, the most probable ones
+    class_names: tuple[str, ...]  # K, most probable classes
 
     def __post_init__(self) -> None:
         counts = {name: len(getattr(self, name)) for name in ("ids", "confidences", "class_names")}
         if len(set(counts.values())) > 1:
-            raise DataError(f"PredictedInstances: expected equally many values, got {counts}")
+            raise DataError(f"PredictedInstances: expected equal lengths, got {counts}")
         shape = len(self.instance_ids), 3
         if self.points_world.shape != shape:
-            raise DataError(
-                f"PredictedInstances.points_world: expected the shape {shape}, got {self.points_world.shape}"
-            )
+            raise DataError(f"PredictedInstances.points_world: expected shape {shape}, got {self.points_world.shape}")
         if len(np.unique(self.ids)) != len(self.ids) or (self.ids < 1).any():
-            raise DataError("PredictedInstances.ids: expected unique positive integers")
+            raise DataError(f"PredictedInstances.ids: expected unique positive integers, got {self.ids.tolist()!s:.60}")
         if not np.isfinite(self.confidences).all():
             raise DataError("PredictedInstances.confidences: expected finite values, got NaN or infinity")
         unlisted = np.setdiff1d(self.instance_ids, np.append(self.ids, 0))
         if len(unlisted):
-            raise DataError(f"PredictedInstances: expected points labeled with its ids, got the label {unlisted[0]}")
+            raise DataError(f"PredictedInstances.instance_ids: expected labels in `ids`, got {unlisted[0]}")
 
     @classmethod
     def of_map(
@@ -79,7 +78,7 @@ class PredictedInstances:
     def on_mesh(
         cls, mesh: InstanceMesh, ids: Sequence[int], confidences: Sequence[float], class_names: Sequence[str]
     ) -> PredictedInstances:
-        """Return the instances `ids`; vertices of other, tentative instances have none."""
+        """Return the instances `ids`. Vertices of all other (tentative) instances get the id 0."""
         listed = np.array(ids, np.int64)
         return cls(
             points_world=mesh.vertices,
@@ -92,18 +91,18 @@ class PredictedInstances:
 
 @dataclass(frozen=True)
 class Score:
-    """The result of one class, or of all together, at one IoU threshold."""
+    """The result of one class, or of all classes together, at one IoU threshold."""
 
     ap: float  # area under the precision-recall curve
     true_positives: int
     false_positives: int
-    ignored: int  # predictions that are neither
-    truths: int  # evaluated true instances, at least 1
+    ignored: int  # ignored predictions
+    truths: int  # evaluated ground-truth instances, at least 1
     matched_iou: float  # sum over the true positives
 
     @property
     def panoptic_quality(self) -> float:
-        """Kirillov et al. 2019: matched IoU over TP + FP/2 + FN/2."""
+        """Panoptic quality (Kirillov et al. 2019): matched IoU divided by TP + FP/2 + FN/2."""
         missed = self.truths - self.true_positives
         return self.matched_iou / (self.true_positives + 0.5 * self.false_positives + 0.5 * missed)
 
@@ -111,48 +110,49 @@ class Score:
 class Outcome(Enum):
     """The result of one prediction."""
 
-    RIGHT = "right"  # matched with a true instance of its class
-    WRONG_CLASS = "wrong class"  # overlaps a true instance of another class enough
-    FALSE = "false"  # overlaps none enough, or only one that is matched with a more confident prediction
-    IGNORED = "not judged"  # unknown truth
+    RIGHT = "correct"  # matched with a ground-truth instance of its class
+    WRONG_CLASS = "wrong class"  # IoU with a ground-truth instance of another class reaches the threshold
+    FALSE = "false positive"  # insufficient IoU, or a duplicate of a more confident prediction
+    IGNORED = "ignored"  # unknown ground truth
 
 
 @dataclass(frozen=True)
 class Judgment:
-    """One prediction compared with the truth."""
+    """One prediction compared with the ground truth."""
 
     id: int
     outcome: Outcome
-    truth_id: int  # the matched true instance, or else the one with the largest overlap; 0 = none
+    truth_id: int  # matched ground-truth instance, otherwise the instance with the largest overlap; 0 = none
     truth_class: str | None  # None = unknown
-    iou: float  # with this true instance
+    iou: float  # with this ground-truth instance
 
 
 @dataclass(frozen=True)
 class InstanceEvaluation:
-    """The result of `evaluate`; empty without evaluated true instances."""
+    """The result of `evaluate`; empty without evaluated ground-truth instances."""
 
-    by_class: Mapping[float, Mapping[str, Score]]  # IoU threshold -> class with a true instance -> score
-    agnostic: Mapping[float, Score]  # IoU threshold -> score with all classes as one
+    by_class: Mapping[float, Mapping[str, Score]]  # IoU threshold -> class with a ground-truth instance -> score
+    agnostic: Mapping[float, Score]  # IoU threshold -> class-agnostic score
     overall: Score | None  # at IoU 0.5 over all classes; matches agree in class
-    best_ious: Mapping[int, float]  # evaluated true instance -> its best overlap with any prediction
-    best_ids: Mapping[int, int]  # evaluated true instance -> the prediction with this overlap, 0 = none
+    best_ious: Mapping[int, float]  # evaluated ground-truth instance -> best overlap with a prediction
+    best_ids: Mapping[int, int]  # evaluated ground-truth instance -> prediction with the best overlap, 0 = none
 
     def ap(self, threshold: float) -> float:
-        """Return the class-averaged AP at one IoU threshold, `nan` without truth."""
+        """Return the class-averaged AP at one IoU threshold, `nan` without ground truth."""
         scores = self.by_class.get(threshold, {})
         return float(np.mean([score.ap for score in scores.values()])) if scores else float("nan")
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics by their names in metrics.json; empty without evaluated true instances.
+        """Return the metrics by their names in metrics.json; empty without evaluated ground-truth instances.
 
         - `instances.ap50`, `ap25`: AP at IoU 0.5 and 0.25; `ap`: the mean over IOU_THRESHOLDS. Also for each class with
-          a true instance, as `instances.ap50.<class>`.
-        - `ap50_agnostic`, `ap25_agnostic`: AP with all classes as one.
-        - `mean_iou`: mean over the true instances of the best overlap with a prediction of any class.
-        - `precision50`, `recall50`, `f1_50`: at IoU 0.5, over all predictions and true instances.
+          a ground-truth instance, as `instances.ap50.<class>`.
+        - `ap50_agnostic`, `ap25_agnostic`: class-agnostic AP.
+        - `mean_iou`: mean over the ground-truth instances of the best overlap with a prediction of any class.
+        - `precision50`, `recall50`, `f1_50`: at IoU 0.5, over all predictions and ground-truth instances.
         - `pq50`: panoptic quality at IoU 0.5, averaged over classes.
-        - `true_count`: evaluated true instances, also by class; `ignored_count`: ignored predictions at IoU 0.5.
+        - `true_count`: evaluated ground-truth instances, also by class.
+        - `ignored_count`: ignored predictions at IoU 0.5.
         """
         if self.overall is None:
             return {}
@@ -187,9 +187,9 @@ def evaluate(
     max_distance: float = MAX_DISTANCE,
     min_points: int = MIN_POINTS,
 ) -> InstanceEvaluation:
-    """Compare a map's instances with the true ones by the rules in the module's docstring.
+    """Compare a map's instances with the ground truth by the rules in the module's docstring.
 
-    The result does not depend on the order of points or predictions; equal confidences are ranked by id.
+    The result does not depend on the order of points or predictions. Ties in confidence are ranked by id.
     """
     overlaps = _Overlaps.between(predictions, truth, transfer, max_distance, min_points)
     names = sorted(set(overlaps.truth_classes[overlaps.evaluated]))
@@ -210,9 +210,9 @@ def evaluate(
 def judge(
     predictions: PredictedInstances, truth: SceneTruth, threshold: float = 0.5
 ) -> tuple[list[Judgment], dict[int, str]]:
-    """Return the outcome of each prediction, best first, and the class of each missed true instance.
+    """Return the outcome of each prediction, best first, and the class of each missed ground-truth instance.
 
-    The matching is that of `InstanceEvaluation.overall`.
+    Predictions are matched as for `InstanceEvaluation.overall`.
     """
     overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
     everything = np.ones(len(overlaps.predicted_ids), np.bool_)
@@ -224,26 +224,26 @@ def judge(
     return judged, {key: name for key, name, counts in counted if counts and key not in found}
 
 
-IGNORED, NO_MATCH = -2, -1  # in place of a true instance's column
+IGNORED, NO_MATCH = -2, -1  # in place of the column of a ground-truth instance
 
 
 @dataclass(frozen=True)
 class _Overlaps:
-    """The overlaps of K predictions, best first, with T true instances."""
+    """The overlaps of K predictions, best first, with T ground-truth instances."""
 
     iou: Float64  # (K, T)
-    ignorable: Bool  # (K,) more than half of the points on ignored instances, or of a class that was not annotated
+    ignorable: Bool  # (K,) more than half of the points on ignored instances, or class not annotated
     predicted_ids: Int64  # (K,)
     predicted_classes: npt.NDArray[np.object_]  # (K,)
     truth_ids: Int64  # (T,)
     truth_classes: npt.NDArray[np.object_]  # (T,) name or None
-    evaluated: Bool  # (T,) of a known class and large enough; the others are ignored
+    evaluated: Bool  # (T,) True: known class and sufficient size; False: ignored
 
     @classmethod
     def between(
         cls, predictions: PredictedInstances, truth: SceneTruth, transfer: Transfer, reach: float, min_points: int
     ) -> _Overlaps:
-        """Count the points with each pair of labels, transferred by up to `reach` m."""
+        """Count the points of each pair of labels after a transfer over at most `reach` m."""
         truth_ids, truth_sizes = np.unique(truth.instance_ids[truth.instance_ids > 0], return_counts=True)
         ranks = np.lexsort((predictions.ids, -predictions.confidences))
         ids = predictions.ids[ranks]
@@ -271,9 +271,9 @@ class _Overlaps:
         )
 
     def score(self, threshold: float, predicted: Bool, truths: Bool, allowed: Bool) -> Score:
-        """Match the chosen predictions (K,) in order of confidence with `allowed` (K, T) true instances."""
+        """Match the chosen predictions (K,) in order of confidence with `allowed` (K, T) ground-truth instances."""
         matches = self.matches(threshold, predicted, allowed)
-        hits = [match >= 0 for _, match in matches if match != IGNORED]  # of the judged predictions, best first
+        hits = [match >= 0 for _, match in matches if match != IGNORED]  # evaluated predictions, best first
         count = int((truths & self.evaluated).sum())
         return Score(
             ap=average_precision(np.array(hits, np.bool_), count),
@@ -285,7 +285,7 @@ class _Overlaps:
         )
 
     def matches(self, threshold: float, predicted: Bool, allowed: Bool) -> list[tuple[int, int]]:
-        """Return the chosen predictions (K,), best first, each with the column of its match, NO_MATCH or IGNORED."""
+        """Return pairs of a chosen prediction (K,) and the column of its match, NO_MATCH or IGNORED, best first."""
         ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
         unknown = self.ignorable | (ignored_iou >= threshold)
         free = np.ones(len(self.truth_ids), np.bool_)
@@ -301,7 +301,7 @@ class _Overlaps:
         return found
 
     def judgment(self, k: int, match: int, threshold: float) -> Judgment:
-        """Return the judgment of prediction k with this result of `matches`."""
+        """Return the judgment of prediction k, given its result of `matches`."""
         t = match if match >= 0 else int(self.iou[k].argmax()) if len(self.truth_ids) else -1
         iou = float(self.iou[k, t]) if t >= 0 else 0.0
         truth_id, truth_class = (int(self.truth_ids[t]), self.truth_classes[t]) if iou > 0 else (0, None)
@@ -311,7 +311,7 @@ class _Overlaps:
         return Judgment(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
 
     def best(self) -> tuple[dict[int, float], dict[int, int]]:
-        """Return the best overlap of each evaluated true instance, and the prediction with it, of any class."""
+        """Return the best overlap of each evaluated ground-truth instance and its prediction, regardless of class."""
         columns = {int(self.truth_ids[t]): self.iou[:, t] for t in np.flatnonzero(self.evaluated)}
         ious = {key: float(column.max(initial=0.0)) for key, column in columns.items()}
         ids = {key: int(self.predicted_ids[columns[key].argmax()]) if iou > 0 else 0 for key, iou in ious.items()}
@@ -321,33 +321,34 @@ class _Overlaps:
 def average_precision(hits: Bool, truths: int) -> float:
     """Return the area under the precision-recall curve of ranked predictions `hits` (K,), True = right.
 
-    All-point interpolation: the sum over the hits of the largest precision at this or a lower rank, by `truths`.
+    Uses all-point interpolation: the sum, over the hits, of the largest precision at the same or a lower rank, divided
+    by `truths`.
     """
     if truths == 0:
-        raise ValueError("average precision: expected at least one true instance, got none")
+        raise ValueError("average precision: expected at least one ground-truth instance, got none")
     precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
     return float(envelope[hits].sum() / truths)
 
 
 def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distance: float) -> Int32:
-    """Return the label of the nearest of `points` for each target, 0 = none within `max_distance` m."""
+    """Return the label of the nearest point for each target, 0 = no point within `max_distance` m."""
     if not len(points) or not len(targets):
         return np.zeros(len(targets), np.int32)
-    import numba  # here: commands that only read figures do not load it
+    import numba  # imported here to keep commands that only read metrics fast
 
-    # The order of vertices differs between runs: sorted, equally near points give the same label each time.
+    # The order of vertices differs between runs. Sorting makes ties deterministic.
     order = np.lexsort((labels, points[:, 2], points[:, 1], points[:, 0]))
     points, labels = points[order], labels[order]
     tree = cKDTree(points, balanced_tree=False)
-    bound = np.nextafter(max_distance, np.inf)  # exclusive in SciPy
+    bound = np.nextafter(max_distance, np.inf)  # SciPy's bound is exclusive
     _, nearest = tree.query(targets, distance_upper_bound=bound, workers=numba.get_num_threads())
-    transferred: Int32 = np.append(labels, np.int32(0))[nearest]  # SciPy's "none" is the index after the last
+    transferred: Int32 = np.append(labels, np.int32(0))[nearest]  # SciPy returns the index after the last for "none"
     return transferred
 
 
 def _contingency(predicted: Int32, true: Int32, predicted_ids: Int64, truth_ids: Array) -> Int64:
-    """Return the points (1 + K, 1 + T) with each pair of labels; row and column 0 are for no instance."""
+    """Return the point counts (1 + K, 1 + T) of each pair of labels; row and column 0 mean no instance."""
     rows, columns = _positions(predicted, predicted_ids), _positions(true, truth_ids)
     shape = 1 + len(predicted_ids), 1 + len(truth_ids)
     return np.bincount(rows * shape[1] + columns, minlength=shape[0] * shape[1]).reshape(shape)

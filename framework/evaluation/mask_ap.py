@@ -1,4 +1,4 @@
-"""COCO's mask AP (Lin et al. 2014), by its reference implementation pycocotools: all areas, at most 100 detections."""
+"""COCO mask AP (Lin et al. 2014) by its reference implementation pycocotools: all areas, at most 100 detections."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class MaskAp:
 def mask_ap(
     pictures: Iterable[tuple[Bool, Sequence[str | None], Detections]], classes: Sequence[str], min_pixels: int = 1
 ) -> MaskAp:
-    """Return the AP over pictures with true masks (N, H, W), their class names (N,), None = unknown, and detections.
+    """Return the AP over images: ground-truth masks (N, H, W), class names (N,), None = unknown, and detections.
 
-    The class of a detection is its most likely one. Objects of unknown class and objects smaller than `min_pixels`
-    count neither for nor against a detection (COCO's `iscrowd`).
+    A detection has its most likely class. Objects of unknown class and objects smaller than `min_pixels` count neither
+    for nor against a detection (COCO's `iscrowd`).
     """
     category = {name: k for k, name in enumerate(classes, start=1)}
     images: list[dict[str, int]] = []
@@ -76,7 +76,7 @@ def mask_ap(
 
 
 def _annotation(image: int, category: int, mask: Bool) -> dict[str, Any]:
-    """Return COCO's fields of a mask (H, W), run-length encoded."""
+    """Return the COCO fields of a mask (H, W), run-length encoded."""
     segmentation = rle.encode(np.asfortranarray(mask, np.uint8))
     return {"image_id": image, "category_id": category, "segmentation": segmentation}
 

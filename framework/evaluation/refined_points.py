@@ -1,4 +1,4 @@
-"""The effect of a refiner on the point clusters of one frame: their points and their fit to the true masks."""
+"""The effect of a refiner on the point clusters of one frame: point counts and fit to the ground-truth masks."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from framework.interfaces import ClusterRefiner
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 
-TIMED = 5  # number of timed calls, for the median; an earlier call may compile
+TIMED = 5  # number of timed calls for the median; the call before them may compile kernels
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """The N clusters of one frame before and the M clusters after its refiner, which may split clusters."""
+    """The N clusters of one frame before refinement and the M clusters after it. Refiners may split clusters."""
 
     frame: Frame
     before: PointClusters
@@ -29,7 +29,10 @@ class Refinement:
 
     @classmethod
     def of(cls, refiner: ClusterRefiner, detections: Detections, frame: Frame) -> Refinement:
-        """Lift the detections at the frame's true pose, or in the camera's frame without one, and refine them."""
+        """Lift the detections at the frame's ground-truth pose and refine them.
+
+        Without a ground-truth pose, they are lifted in the camera frame.
+        """
         pose = Pose(np.eye(4) if frame.T_world_camera is None else frame.T_world_camera)
         before = lift(detections, frame, pose)
         after = refine(refiner, before, frame)
@@ -42,10 +45,10 @@ class Refinement:
 
     @cached_property
     def origin(self) -> Int32:
-        """(M,) the original cluster of each refined cluster, -1 = none.
+        """Original cluster (M,) of each refined cluster, -1 = none.
 
-        Refiners that keep the number of clusters keep their order. Otherwise a refined cluster comes from the one with
-        which it shares most pixels, the first of equals.
+        Refiners that keep the number of clusters keep their order. Otherwise, a refined cluster is assigned to the
+        original cluster with the most common pixels. Ties go to the first.
         """
         n, m = len(self.before), len(self.after)
         if n == m or n == 0:
@@ -55,7 +58,7 @@ class Refinement:
 
     @cached_property
     def main_part(self) -> Int32:
-        """(N,) the largest refined cluster of each original cluster, -1 = none."""
+        """Largest refined cluster (N,) of each original cluster, -1 = none."""
         sizes = point_counts(self.after)
         largest_last = np.argsort(sizes, kind="stable")
         main = np.full(len(self.before), -1, np.int32)
@@ -65,35 +68,35 @@ class Refinement:
 
     @cached_property
     def points_before(self) -> Int32:
-        """(N,) points of each original cluster."""
+        """Point count (N,) of each original cluster."""
         return point_counts(self.before)
 
     @cached_property
     def points_after(self) -> Int32:
-        """(N,) remaining points of each original cluster."""
+        """Remaining point count (N,) of each original cluster."""
         known = self.origin >= 0
         sums = np.bincount(self.origin[known], point_counts(self.after)[known], minlength=len(self.before))
         return sums.astype(np.int32)
 
     @cached_property
     def fit_before(self) -> TrueFit | None:
-        """The fit of the N clusters; None without true instances."""
+        """Fit of the N clusters; None without ground-truth instances."""
         return None if self.frame.truth is None else true_fit(self.before, self.frame, self.frame.truth)
 
     @cached_property
     def fit_after(self) -> TrueFit | None:
-        """The fit of the M clusters; None without true instances."""
+        """Fit of the M clusters; None without ground-truth instances."""
         return None if self.frame.truth is None else true_fit(self.after, self.frame, self.frame.truth)
 
     @cached_property
     def judged_before(self) -> Bool:
-        """(N,) True for the clusters that count: not on an object of unknown class; none without truth."""
+        """Mask (N,) of the evaluated clusters: not on an object of unknown class. All False without ground truth."""
         fit = self.fit_before
         return np.zeros(len(self.before), np.bool_) if fit is None else ~fit.unknown
 
     @cached_property
     def judged_after(self) -> Bool:
-        """(M,) True for the clusters whose original cluster counts."""
+        """Mask (M,) of the refined clusters with an evaluated original cluster."""
         fit = self.fit_after
         if fit is None:
             return np.zeros(len(self.after), np.bool_)
@@ -102,11 +105,11 @@ class Refinement:
 
 @dataclass(frozen=True)
 class TrueFit:
-    """The fit of N clusters to their best-fitting true objects of known class, as seen in the frame."""
+    """The fit of N clusters to their best-fitting ground-truth objects of known class, as seen in the frame."""
 
-    iou: Float64  # (N,) intersection over union with that object; 0 for an empty cluster
-    points_inside: Int32  # (N,) points of the cluster on that object
-    unknown: Bool  # (N,) an object of unknown class fits better: not evaluated
+    iou: Float64  # (N,) intersection over union with the object; 0 for an empty cluster
+    points_inside: Int32  # (N,) points of the cluster on the object
+    unknown: Bool  # (N,) True: an object of unknown class fits better; not evaluated
 
 
 def point_counts(clusters: PointClusters) -> Int32:
@@ -120,14 +123,17 @@ def pixel_index(clusters: PointClusters, frame: Frame) -> Int32:
 
 
 def _membership(clusters: PointClusters, frame: Frame) -> csr_array:
-    """Return (N, H * W), 1 where a cluster has a point at the pixel."""
+    """Return the indicator matrix (N, H * W): 1 if a cluster has a point at the pixel."""
     held = clusters.cluster >= 0
     entries = clusters.cluster[held], pixel_index(clusters, frame)[held]
     return csr_array((np.ones(held.sum(), np.int32), entries), (len(clusters), frame.depth.size))
 
 
 def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:
-    """Compare clusters with the true objects, over the pixels with a depth reading: clusters have no others."""
+    """Compare clusters with the ground-truth objects over the pixels with a depth reading.
+
+    Clusters contain no other pixels.
+    """
     ids = np.where(frame.depth > 0, truth.instance_ids, 0).ravel()
     objects, of_pixel, areas = np.unique(ids, return_inverse=True, return_counts=True)
     n, held = len(clusters), clusters.cluster >= 0

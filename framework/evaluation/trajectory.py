@@ -1,13 +1,13 @@
-"""Trajectory errors ATE and RPE, in evo's symbols and equal to evo's values.
+"""Trajectory errors ATE and RPE, in evo's notation and with evo's values.
 
-Q_i and P_i are the reference and the estimated T_world_camera of frame i.
+Q_i and P_i are the ground-truth and the estimated T_world_camera of frame i.
 
 - ATE (absolute trajectory error, Sturm et al. 2012): the RMSE of |trans E_i| with E_i = Q_i^-1 S P_i, where the rigid S
   aligns the positions in the least squares sense (Umeyama 1991, without scale).
 - RPE (relative pose error) with delta = 1 frame: the RMSE of |trans E_i| and of the angle of rot E_i with
   E_i = (Q_i^-1 Q_{i+1})^-1 (P_i^-1 P_{i+1}).
 
-Frames with a lost or an unknown true pose are left out, and for RPE the pairs with them.
+Frames with a lost pose or an unknown ground-truth pose are omitted, and so are their pairs for RPE.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class TrajectoryError:
     ate_rmse_m: float
     rpe_rmse_m: float
     rpe_rotation_rmse_rad: float
-    frames: int  # compared by ATE
-    pairs: int  # compared by RPE
+    frames: int  # number of frames in the ATE
+    pairs: int  # number of frame pairs in the RPE
 
     def metrics(self) -> dict[str, float]:
         """Return the defined errors by their names in metrics.json."""
@@ -43,13 +43,14 @@ class TrajectoryError:
 
 
 def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> TrajectoryError:
-    """Compare the poses of consecutive frames with the true T_world_camera (4, 4); None = unknown.
+    """Compare the poses of consecutive frames with the ground-truth T_world_camera (4, 4); None = unknown.
 
     Raises DataError if the numbers of poses differ.
     """
     if len(reference) != len(estimated):
         raise DataError(
-            f"trajectories: expected equal lengths, got {len(reference)} true and {len(estimated)} estimated poses"
+            f"trajectories: expected equal lengths, got {len(reference)} ground-truth and {len(estimated)} estimated "
+            "poses"
         )
     usable = np.array([q is not None and not p.lost for q, p in zip(reference, estimated, strict=True)], np.bool_)
     Q = np.array([np.eye(4) if q is None else q for q in reference]).reshape(-1, 4, 4)
@@ -72,9 +73,9 @@ def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> 
 
 
 def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
-    """Return R (3, 3) and t (3,) that minimize sum |y_i - (R x_i + t)|^2: Umeyama 1991, eqs. (40) to (43).
+    """Return the R (3, 3) and t (3,) that minimize sum |y_i - (R x_i + t)|^2: Umeyama 1991, eqs. (40) to (43).
 
-    The points are (n, 3). If they are fewer than three or on a line, R is one of several solutions.
+    The points are (n, 3). With fewer than three points or points on a line, R is one of several solutions.
     """
     mu_x, mu_y = x.mean(axis=0), y.mean(axis=0)
     U, _, Vt = np.linalg.svd((y - mu_y).T @ (x - mu_x) / len(x))
@@ -84,10 +85,10 @@ def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
 
 
 def align(P: Float64, Q: Float64) -> Float64:
-    """Return the rigid T (4, 4) that moves the poses P (n, 4, 4) nearest to Q (n, 4, 4), n >= 1.
+    """Return the rigid T (4, 4) that best aligns the poses P (n, 4, 4) with Q (n, 4, 4), n >= 1.
 
-    As in `umeyama`, for the positions and the points 1 m along each camera's axes. The points determine the rotation
-    for a camera that only turns, too.
+    `umeyama` is applied to the positions and the points 1 m along each camera's axes. The additional points determine
+    the rotation of a camera that only rotates.
     """
     R, t = umeyama(_axis_points(P), _axis_points(Q))
     T = np.eye(4)
@@ -96,7 +97,7 @@ def align(P: Float64, Q: Float64) -> Float64:
 
 
 def _axis_points(P: Float64) -> Float64:
-    """Return (4n, 3) the positions of poses (n, 4, 4) and the points 1 m along their axes."""
+    """Return the positions of poses (n, 4, 4) and the points 1 m along their axes, (4n, 3)."""
     positions = P[:, None, :3, 3]
     return np.concatenate([positions, positions + P[:, :3, :3].transpose(0, 2, 1)], axis=1).reshape(-1, 3)
 
@@ -111,7 +112,7 @@ def _inverse(T: Float64) -> Float64:
 
 
 def _angles(R: Float64) -> Float64:
-    """Return the angles (n,) of rotations (n, 3, 3) in rad, accurate for small ones: see geometry.rotation_angle."""
+    """Return the angles (n,) of rotations (n, 3, 3) in rad, accurate for small angles; see geometry.rotation_angle."""
     axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
     return np.asarray(np.arctan2(np.linalg.norm(axis, axis=1) / 2, (np.trace(R, axis1=1, axis2=2) - 1) / 2))
 

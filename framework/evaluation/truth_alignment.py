@@ -1,4 +1,4 @@
-"""The ground truth in the world of a map."""
+"""Alignment of the ground truth with the world frame of a map."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from framework.errors import DataError
 from framework.evaluation.trajectory import align
 from framework.geometry import transform
 
-SAME_POSE = 1e-6  # largest difference of an entry of a pose that was written to a file and read
+SAME_POSE = 1e-6  # maximum difference of a pose entry after writing and reading a file
 
 
 def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> SceneTruth:
-    """Return the ground truth in the world of the map with this trajectory.
+    """Return the ground truth in the world frame of the map with this trajectory.
 
-    A map that begins with a given pose of the truth's trajectory is in the world of the truth. The truth is moved for
-    all others: rigidly, to the best agreement of the poses at the same times.
+    If the map begins with a given pose of the ground-truth trajectory, both share one world frame. Otherwise the ground
+    truth is aligned rigidly by the poses at common times.
 
     Args:
         truth: The ground truth.
@@ -26,7 +26,7 @@ def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> Scen
         poses: (F, 4, 4) T_map_camera.
 
     Raises:
-        DataError: The two trajectories have no time in common.
+        DataError: The two trajectories have no common time.
     """
     reference = truth.trajectory
     if reference is None:
@@ -35,8 +35,8 @@ def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> Scen
     common = at >= 0
     if not common.any():
         raise DataError(
-            f"dataset.ground_truth: expected camera poses of the mapped frames to align the map, got {len(at)} frames"
-            " and none with the time of a pose; choose a ground truth of the same recording"
+            f"dataset.ground_truth: expected poses at the times of the {len(at)} mapped frames, got none; choose the "
+            "ground truth of the same recording"
         )
     T_truth_camera, T_map_camera = reference.T_world_camera[at[common]], poses[common]
     if reference.given and np.allclose(T_truth_camera[0], T_map_camera[0], rtol=0, atol=SAME_POSE):

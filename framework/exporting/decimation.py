@@ -1,6 +1,6 @@
 """Cutting, joining and decimation of meshes.
 
-Decimation keeps the texture of flat surfaces and is fast for huge maps.
+Decimation preserves the texture of flat surfaces and is fast for huge maps.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from scipy.spatial import cKDTree
 from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, Int64
 
 OBJECTS_SHARE = 0.5  # fraction of the triangles for objects
-FEWEST = 4  # triangles of a closed surface
-QUADRIC_STEP = 2.5  # quadric decimation is quadratic in the ratio of triangles: larger meshes are clustered first
+FEWEST = 4  # minimum triangles of a closed surface
+QUADRIC_STEP = 2.5  # maximum ratio of triangles for quadric decimation alone, which takes quadratic time in the ratio
 LEFT_TO_QUADRIC = 1.8  # ratio of triangles after clustering and after quadric decimation
-FEW = 20_000  # triangles, below which a mesh is not clustered: cells would be as large as objects
-RELIEF = 0.03  # m between white and black
+FEW = 20_000  # minimum triangles after clustering; for fewer triangles, cells would be as large as objects
+RELIEF = 0.03  # m, offset between white and black vertices
 BRIGHTNESS = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R BT.601
-COARSER = 1.3  # ratio of two cell sizes that are tried
+COARSER = 1.3  # ratio of successive cell sizes
 
 
 def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Return the mesh with at most so many triangles (at least FEWEST).
+    """Return the mesh with at most the given number of triangles (at least FEWEST).
 
-    Method: Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997, of Open3D, after
-    vertex clustering of meshes that are much larger.
+    Method: quadric decimation by Open3D (Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics",
+    SIGGRAPH 1997), after vertex clustering of much larger meshes.
     """
     most = max(triangles, FEWEST)
     wanted = max(most, FEW)
@@ -43,9 +43,10 @@ def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Decimate a mesh, its objects less than the rest.
+    """Decimate a mesh, with finer objects than background.
 
-    The two are decimated separately, which keeps their border; vertices outside objects lose their labels.
+    Objects and background are decimated separately to preserve their border. Vertices outside objects lose their
+    labels.
     """
     owners = triangle_labels(mesh.triangles, mesh.instance_ids)
     of_object = owners > 0
@@ -53,7 +54,7 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
     objects = min(counts[0], max(int(OBJECTS_SHARE * triangles), triangles - counts[1]))
     ids = mesh.instance_ids.copy()
     corners = mesh.triangles[of_object]
-    bare = ids[corners] == 0  # on the border; a coarse triangle may have only such corners
+    bare = ids[corners] == 0  # corners on the border; all corners of a coarse triangle may be on the border
     ids[corners[bare]] = np.broadcast_to(owners[of_object, None], corners.shape)[bare]
     found = submesh(replace(mesh, instance_ids=ids), corners_of(mesh, of_object), of_object)
     around = submesh(replace(mesh, instance_ids=np.zeros_like(ids)), corners_of(mesh, ~of_object), ~of_object)
@@ -61,9 +62,9 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_of_triangle: int) -> InstanceMesh:
-    """Cluster vertices until the mesh is small enough.
+    """Cluster vertices until the mesh has at most `most_bytes`.
 
-    Unlike collapsing edges, this also reduces triangles without a common edge.
+    Unlike edge collapse, clustering also reduces triangles without a common edge.
     """
     cell = 0.5 * _cell(mesh, max(1, len(mesh.triangles)))
     while bytes_of_vertex * len(mesh.vertices) + bytes_of_triangle * len(mesh.triangles) > most_bytes:
@@ -73,15 +74,15 @@ def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_o
 
 
 def triangle_labels(triangles: Int32, labels: Int32) -> Int32:
-    """Return (F,) the label of at least two corners, else of the first; triangles (F, 3), labels (V,)."""
+    """Return the label (F,) of at least two corners, otherwise of the first corner; triangles (F, 3), labels (V,)."""
     corners = labels[triangles]
     return np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])
 
 
 def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Collapse edges by quadrics on a relief of the brightness, which preserves the texture of flat surfaces.
+    """Collapse edges by quadrics on a brightness relief, which preserves the texture of flat surfaces.
 
-    Each remaining vertex is replaced by the nearest original one, with its color and labels.
+    Each remaining vertex is replaced by the nearest original vertex with its color and labels.
     """
     model = _open3d(mesh)
     model.compute_vertex_normals()
@@ -102,7 +103,7 @@ def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def _cell(mesh: InstanceMesh, count: int) -> float:
-    """Return the cell size, m, that leaves about `count` triangles: two per square of the surface."""
+    """Return the cell size, m, for about `count` triangles: two triangles per square of the surface."""
     a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
     return max(float(np.sqrt(2 * area / count)), 1e-4)
@@ -123,7 +124,7 @@ def _vectors(rows: Float32 | Float64) -> Any:
 
 
 def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
-    """Convert a mesh of Open3D, each vertex with the labels of the nearest one of `mesh`."""
+    """Convert an Open3D mesh. Each vertex gets the labels of the nearest vertex of `mesh`."""
     model.remove_unreferenced_vertices()
     kept = np.asarray(model.vertices).astype(np.float32).reshape(-1, 3)
     nearest = _nearest(mesh.vertices, kept)
@@ -133,14 +134,14 @@ def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
 
 
 def _nearest(places: Float32 | Float64, asked: Float32 | Float64) -> Int64:
-    """Return (N,) the index of the nearest of the places (M, 3) to each of those asked for (N, 3)."""
+    """Return the index (N,) of the nearest position (M, 3) to each query position (N, 3)."""
     if not len(asked):
         return np.zeros(0, np.int64)
     return np.asarray(cKDTree(places, balanced_tree=False).query(asked)[1])
 
 
 def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
-    """Return the mesh of some vertices (V,) and triangles (F,); None = all triangles between these vertices."""
+    """Return the mesh of masked vertices (V,) and triangles (F,); None = all triangles between these vertices."""
     number = np.cumsum(kept, dtype=np.int32) - 1
     chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
     return InstanceMesh(
@@ -154,14 +155,14 @@ def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> In
 
 
 def corners_of(mesh: InstanceMesh, triangles: Bool) -> Bool:
-    """Return (V,), true for the vertices of the triangles (F,)."""
+    """Return the mask (V,) of the vertices of the masked triangles (F,)."""
     used = np.zeros(len(mesh.vertices), np.bool_)
     used[mesh.triangles[triangles]] = True
     return used
 
 
 def joined(meshes: Sequence[InstanceMesh]) -> InstanceMesh:
-    """Join at least one mesh of the same map."""
+    """Join one or more meshes of a map."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return InstanceMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

@@ -1,4 +1,4 @@
-"""Exports of a run."""
+"""Export of a run to file formats of other programs."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ class Chosen:
     """Options of an export."""
 
     objects: Sequence[str] = ()  # ids or classes; () = the whole room
-    min_confidence: float = LIKELY  # of an object, in [0, 1]; LIKELY = as in figures
-    triangles: int | None = None  # limit for the scene and for each object's own file, >= 4; None = no limit
+    min_confidence: float = LIKELY  # minimum confidence of an object, in [0, 1]; LIKELY = as in figures
+    triangles: int | None = None  # maximum triangles of the scene and of each object file, >= 4; None = no limit
     coloring: Coloring = Coloring.APPEARANCE
     collision: Collision = Collision.HULL
     resolution: float = 0.05  # cell size of a plan, m, in [0.01, 1]
@@ -69,13 +69,16 @@ class Chosen:
 
     @classmethod
     def named(cls, objects: Sequence[str | int] = (), **choices: Any) -> Chosen:
-        """Return the options with enumeration members by value: `coloring="class"`. Raises ConfigError."""
+        """Return the options, given enumeration members by value, such as `coloring="class"`.
+
+        Raises ConfigError for unknown options or values.
+        """
         for name, kind in (("coloring", Coloring), ("collision", Collision)):
             if name in choices:
                 choices[name] = one_of(kind, name, choices[name])
         if unknown := choices.keys() - {field.name for field in fields(cls)}:
             known = ", ".join(f.name for f in fields(cls))
-            raise ConfigError(f"export: expected options in {known}, got {min(unknown)!r}")
+            raise ConfigError(f"export: expected options among {known}, got {min(unknown)!r}")
         return cls(tuple(map(str, objects)), **choices)
 
 
@@ -83,7 +86,7 @@ Option = TypeVar("Option", bound=Enum)
 
 
 def one_of(kind: type[Option], name: str, value: object) -> Option:
-    """Return the member with this value. Raises ConfigError, which lists all values."""
+    """Return the enumeration member with this value. Raises ConfigError that lists all values."""
     found = next((option for option in kind if option.value == value), None)
     if found is None:
         known = ", ".join(option.value for option in kind)
@@ -99,10 +102,21 @@ def export(
     up: Sequence[float] | None = None,
     floor: float | None = None,
 ) -> list[Path]:
-    """Write a run in the formats of other programs, to `out` (default: `export` in the run directory).
+    """Export a run to file formats of other programs. The files are deterministic and written atomically.
 
-    `up` (3,) and `floor` (m along up) replace what the run directory does not contain. The same run gives the same
-    bytes. Returns the files, which are written atomically. Raises DataError.
+    Args:
+        run: Run directory.
+        formats: File formats.
+        out: Output folder; None = `export` in the run directory.
+        chosen: Options; None = defaults.
+        up: (3,) up direction; None = stored direction.
+        floor: Floor height, m along up; None = stored height.
+
+    Returns:
+        The paths of the files.
+
+    Raises:
+        DataError: The run or an option is invalid, or a format requires an unknown up direction or floor height.
     """
     formats, chosen = list(dict.fromkeys(formats)), chosen or Chosen()
     if ExportFormat.USD in formats:
@@ -133,15 +147,15 @@ def _check_known(run: Path, room: UprightRoom, formats: Sequence[ExportFormat]) 
     if not room.up_known and flat:
         raise DataError(f"{run}: expected an up direction for {flat[0]}, got none; set --up X Y Z --floor M")
     if not room.up_known:
-        log.warning("%s: no up direction; using the world's z axis; set another with --up X Y Z", run)
+        log.warning("%s: expected an up direction, got none; using the world's z axis; set --up X Y Z", run)
     elif not room.floor_known and ExportFormat.FLOORPLAN in formats:
         raise DataError(f"{run}: expected a floor height for floorplan, got none; set --floor M")
     elif not room.floor_known and ExportFormat.GRAPH in formats:
-        log.warning("%s: no floor height; the graph omits floor, walls and rooms; set --floor M", run)
+        log.warning("%s: expected a floor height, got none; omitting floor, walls and rooms; set --floor M", run)
 
 
 def _write_surfaces(room: UprightRoom, formats: Sequence[ExportFormat], directory: Path, chosen: Chosen) -> list[Path]:
-    """Write the scene, unless only some objects are chosen, and each object on its own."""
+    """Write one file per object, and the scene unless objects are selected."""
     files: dict[str, list[Part]] = {}
     if not chosen.objects:
         if not len(room.mesh.triangles):
@@ -172,7 +186,7 @@ def _write_parts(path: Path, kind: ExportFormat, shown: Sequence[Part], chosen: 
 
 
 def _placed(shown: Sequence[Part], coloring: Coloring) -> dict[str, InstanceMesh]:
-    """Return the meshes of parts by name, in the room's frame and with their colors."""
+    """Return the colored meshes of the parts by name, in the room frame."""
     meshes = {}
     for part, colors in zip(shown, part_colors(shown, coloring), strict=True):
         vertices = transform(part.T_room_part, part.mesh.vertices.astype(np.float64)).astype(np.float32)
@@ -181,7 +195,7 @@ def _placed(shown: Sequence[Part], coloring: Coloring) -> dict[str, InstanceMesh
 
 
 def _obj(meshes: Mapping[str, InstanceMesh]) -> str:
-    """Return an OBJ file with the meshes under their names; `v` lines include an sRGB color: x y z r g b."""
+    """Return an OBJ file with named meshes; `v` lines include an sRGB color: x y z r g b."""
     scene = trimesh.Scene()
     for name, mesh in meshes.items():
         if len(mesh.triangles):
@@ -189,4 +203,4 @@ def _obj(meshes: Mapping[str, InstanceMesh]) -> str:
             scene.add_geometry(shape, name, name)
     export_obj: Callable[..., str] = trimesh.exchange.obj.export_obj
     text = export_obj(scene, include_normals=False, digits=OBJ_DIGITS, header=None)
-    return f"# InstanceMap; meters, z up; colors behind the vertices: x y z r g b\n{text}\n"
+    return f"# InstanceMap; meters, z up; vertices with colors: x y z r g b\n{text}\n"

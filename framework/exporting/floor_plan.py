@@ -1,4 +1,4 @@
-"""Floor plans: an image with outlines of objects, their names and a scale bar, and the outlines as GeoJSON."""
+"""Floor plans: an image with object outlines, names and a scale bar, and the outlines as GeoJSON."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ TONES = {
     "unobserved": UNSEEN,
 }
 DPI = 150
-TINT = 0.6  # fraction of an object's color in its cells
-DARKER = 0.65  # factor of an outline's color
+TINT = 0.6  # fraction of the object's color in its cells
+DARKER = 0.65  # brightness factor of outlines
 LONGER_SIDE, SHORTEST_SIDE = 9.0, 4.5  # of the plan, inches
 FOOT = 0.72  # height of the legend, inches
 EDGE = 0.15  # inches
@@ -42,19 +42,19 @@ BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # possible lengths of t
 BAR_SHARE = 0.25  # maximum length of the scale bar, as a fraction of the plan's width
 MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1), (-0.6, -1))
 """Candidate offsets of a name, in its own widths and heights."""
-COORDINATES = "meters in the room: x, y; z is up, and the floor at 0. They are not longitude and latitude."
+COORDINATES = "x, y in meters in the room frame (z up, floor at z = 0), not longitude and latitude"
 DIGITS = 4  # decimal places, of meters
 
 
 def write_floor_plan(path: Path, room: UprightRoom, plan: Plan, robot_height: float) -> None:
-    """Draw the plan as a PNG file; output is deterministic."""
+    """Draw the plan as a PNG file. The file is deterministic."""
     with warnings.catch_warnings(), written_whole(path) as temporary:
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)  # drawn as boxes
         _drawn(room, plan, robot_height).savefig(temporary, dpi=DPI)
 
 
 def tones(plan: Plan) -> UInt8:
-    """Return (H, W, 3) RGB of the cells, row 0 with the lowest y."""
+    """Return the RGB colors (H, W, 3) of the cells; row 0 has the lowest y."""
     image = np.tile(np.array(UNSEEN, np.uint8), (*plan.shape, 1))
     for chosen, tone in ((plan.floor, FLOOR), (plan.free, FREE), (plan.occupied, OCCUPIED), (plan.wall, WALL)):
         image[chosen] = tone
@@ -84,14 +84,14 @@ def _drawn(room: UprightRoom, plan: Plan, robot_height: float) -> Figure:
 
 
 def _draw_outlines(axes: Axes, room: UprightRoom) -> None:
-    """Draw the outlines of the objects, low ones first, so that objects on top of others stay visible."""
+    """Draw the outlines of the objects in ascending order of height, so that upper objects stay visible."""
     for one in sorted(room.objects, key=lambda one: (one.top, one.id)):
         dark = _share([round(DARKER * channel) for channel in one.color.tolist()])
         axes.add_patch(Polygon(outline(room, one), fill=False, edgecolor=dark, linewidth=1.0, joinstyle="round"))
 
 
 def _draw_names(axes: Axes, objects: Sequence[RoomObject]) -> None:
-    """Write class and id at each object, large ones first, only the id if there is no space, else nothing."""
+    """Write class and id at each object, large objects first. Without space, write only the id or nothing."""
     figure = axes.figure
     assert isinstance(figure, Figure)
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -157,20 +157,20 @@ def _draw_foot(figure: Figure, page: tuple[float, float], plan: Plan, robot_heig
         handlelength=1.4,
         columnspacing=1.6,
     )
-    note = f"cells of {plan.resolution:g} m; free: for a robot of {robot_height:g} m"
+    note = f"cell size {plan.resolution:g} m; free: for a robot height of {robot_height:g} m"
     figure.text(EDGE / page[0], 0.1 / page[1], note, fontsize=SMALL_PT, color=edge, va="bottom")
 
 
 def _share(color: Sequence[int]) -> tuple[float, float, float]:
-    """Return an RGB color as matplotlib expects it."""
+    """Return an RGB color in [0, 1] for matplotlib."""
     red, green, blue = (channel / 255 for channel in color)
     return red, green, blue
 
 
 def write_geojson(path: Path, room: UprightRoom) -> None:
-    """Write the outline of each object as a GeoJSON polygon, counterclockwise.
+    """Write the outline of each object as a counterclockwise GeoJSON polygon.
 
-    RFC 7946 defines coordinates as longitude and latitude; these are meters, as the file states.
+    RFC 7946 defines coordinates as longitude and latitude. This file states that its coordinates are meters.
     """
     write_json(
         path,
@@ -184,7 +184,7 @@ def write_geojson(path: Path, room: UprightRoom) -> None:
 
 
 def outline(room: UprightRoom, one: RoomObject) -> Float64:
-    """Return (N, 2) m, the convex hull of an object on the floor, counterclockwise; its box if that has no area."""
+    """Return the outline (N, 2) of an object on the floor, m, counterclockwise: convex hull, or box without an area."""
     points = room.mesh.vertices[one.vertices, :2]
     hull = cv2.convexHull(np.ascontiguousarray(points), clockwise=False)[:, 0].astype(np.float64)
     return hull if len(hull) >= 3 else one.footprint

@@ -1,7 +1,7 @@
-"""Binary glTF 2.0: a node for each object, with its data in `extras`, and one for the rest of the room.
+"""Binary glTF 2.0: one node per object, with its data in `extras`, and one node for the rest of the room.
 
-y is up. Colors are linear. Appearance is unlit (KHR_materials_unlit), because it contains the light; colors of objects
-or classes are lit. The rest of the room is one-sided, so that its inside is visible from outside.
+y is up. Colors are linear. Appearance is unlit (KHR_materials_unlit), because image colors already contain the light.
+Instance and class colors are lit. The rest of the room is one-sided: its inside is visible from outside.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ UNSIGNED_SHORT = 5123
 
 @dataclass(frozen=True)
 class Node:
-    """A named surface of V vertices and F triangles; without triangles, a node without a mesh."""
+    """A named surface of V vertices and F triangles. A node without triangles has no mesh."""
 
     name: str  # unique
     vertices: Float32  # (V, 3) m, in the node's frame
@@ -34,11 +34,11 @@ class Node:
     T_gltf_node: Float64  # (4, 4)
     one_sided: bool  # visible only from the front
     extras: Mapping[str, Any]
-    attributes: Mapping[str, Float32] = field(default_factory=dict)  # (V,) by name, which starts with _
+    attributes: Mapping[str, Float32] = field(default_factory=dict)  # (V,) by name; names start with _
 
 
 def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> bytes:
-    """Return parts of a room as a GLB file; output is deterministic."""
+    """Return parts of a room as a GLB file. The result is deterministic."""
     return glb_of(
         [_node(part, colors) for part, colors in zip(shown, part_colors(shown, coloring), strict=True)],
         lit=coloring is not Coloring.APPEARANCE,
@@ -46,7 +46,7 @@ def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> byte
 
 
 def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
-    """Return nodes, lit or unlit, as a GLB file; output is deterministic."""
+    """Return lit or unlit nodes as a GLB file. The result is deterministic."""
     scene: Any = trimesh.Scene(base_frame="world")
     for node in nodes:
         extras = dict(node.extras)
@@ -68,7 +68,7 @@ def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
 
 
 def _node(part: Part, colors: UInt8) -> Node:
-    """Convert a part, with y up in its own frame, too."""
+    """Convert a part. Its own frame is y up, too."""
     vertices = (part.mesh.vertices @ T_GLTF_ROOM[:3, :3].T).astype(np.float32)
     T_gltf_part = T_GLTF_ROOM @ part.T_room_part @ T_GLTF_ROOM.T
     return Node(part.name, vertices, part.mesh.triangles, colors, T_gltf_part, part.object is None, extras(part))
@@ -83,12 +83,12 @@ def extras(part: Part) -> dict[str, Any]:
 
 
 def _unit(normals: Float32) -> Float32:
-    """Replace zero normals (V, 3) of degenerate triangles, which glTF does not allow."""
+    """Replace zero normals (V, 3) of degenerate triangles; glTF forbids zero normals."""
     return np.where(np.abs(normals).max(axis=1, keepdims=True) > 0.1, normals, np.array([0, 1, 0], np.float32))
 
 
 def _shorts(colors: UInt8) -> UInt16:
-    """Return (V, 4) linear 16-bit RGBA."""
+    """Return the colors as linear 16-bit RGBA (V, 4)."""
     full = np.full((len(colors), 4), np.iinfo(np.uint16).max, np.uint16)
     full[:, :3] = np.rint(linear(colors) * np.float32(np.iinfo(np.uint16).max))
     return full

@@ -1,4 +1,4 @@
-"""Objects of a room, each upright at the origin of its own frame, and the rest of the room."""
+"""Object meshes, upright at the origin of their own frames, and the mesh of the rest of the room."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Part:
 
     @property
     def alone(self) -> Part:
-        """Return the part at the origin."""
+        """The part at the origin."""
         return replace(self, T_room_part=np.eye(4))
 
 
 def parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
-    """Return the rest of the room and its objects, with about `triangles` in total; None = all."""
+    """Return the rest of the room and its objects, with about `triangles` triangles in total; None = no limit."""
     found = [rest(room), *(object_part(room, one) for one in room.objects)]
     total = sum(len(part.mesh.triangles) for part in found)
     if triangles is None or total <= triangles:
@@ -45,13 +45,13 @@ def parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
 
 
 def object_parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
-    """Return each object with at most about `triangles`; None = all."""
+    """Return the objects, each with at most about `triangles` triangles; None = no limit."""
     found = [object_part(room, one) for one in room.objects]
     return found if triangles is None else _decimated(found, [triangles] * len(found))
 
 
 def object_part(room: UprightRoom, one: RoomObject) -> Part:
-    """Return an object in its own frame: upright, along the sides of its box, with the center of its base at 0."""
+    """Return an object in its own frame: upright, aligned with its box, with the center of its base at the origin."""
     T_room_part = np.eye(4)
     T_room_part[:3, :3] = one.box.rotation
     T_room_part[:3, 3] = one.box.center - (0.0, 0.0, one.box.extent[2] / 2)
@@ -61,7 +61,7 @@ def object_part(room: UprightRoom, one: RoomObject) -> Part:
 
 
 def rest(room: UprightRoom) -> Part:
-    """Return the rest of the room, with the triangles between objects, to avoid gaps."""
+    """Return the rest of the room, including the triangles between objects to avoid gaps."""
     owner = _marked(room.mesh, room.objects)
     corners = owner[room.mesh.triangles]
     outside = (corners[:, 0] == 0) | (corners != corners[:, :1]).any(axis=1)
@@ -69,7 +69,7 @@ def rest(room: UprightRoom) -> Part:
 
 
 def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
-    """Return (V,) the number of each vertex's object from 1; 0 = none."""
+    """Return the object number (V,) of each vertex, from 1; 0 = none."""
     owner = np.zeros(len(mesh.vertices), np.int32)
     for number, one in enumerate(objects, start=1):
         owner[one.vertices] = number
@@ -77,7 +77,7 @@ def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
 
 
 def _decimated(found: Sequence[Part], most: Sequence[int]) -> list[Part]:
-    """Decimate parts to at most `most` triangles each, with a progress bar: a million takes ten seconds."""
+    """Decimate parts to at most `most` triangles each, with a progress bar: a million triangles take ten seconds."""
     fewer = []
     total = sum(len(part.mesh.triangles) for part in found)
     with Progress(total, " triangles", unit_scale=True, leave=False) as bar:
@@ -92,7 +92,7 @@ GRAY = (176, 176, 172)  # of the rest of the room
 
 
 class Coloring(Enum):
-    """The colors of vertices."""
+    """The coloring of vertices."""
 
     APPEARANCE = "appearance"  # of the camera images
     INSTANCE = "instance"
@@ -113,7 +113,7 @@ def part_colors(parts: Sequence[Part], coloring: Coloring) -> list[UInt8]:
 
 
 def linear(colors: UInt8) -> Float32:
-    """Convert sRGB (IEC 61966-2-1) to linear colors in [0, 1], as in glTF and USD."""
+    """Convert sRGB (IEC 61966-2-1) to linear colors in [0, 1] for glTF and USD."""
     encoded = np.arange(256) / 255
     table = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
     return np.asarray(table[colors])

@@ -1,15 +1,15 @@
 """Occupancy of the floor for robots: free, occupied or unknown.
 
-A map stores only voxels near surfaces and thus omits most of the free space. The surface is therefore rendered from
-poses along the whole trajectory. A cell is free if
+A map stores only voxels near surfaces and omits most of the free space. The surface is therefore rendered from poses
+along the whole trajectory. A cell is free if
 
-- the floor was observed there,
+- the floor was observed in the cell,
 - no surface is between `CLEARANCE` and the robot's height,
 - all space between these heights was observed as free.
 
-A cell with a surface between these heights is occupied, all others are unknown. A run does not contain the camera's
-field of view; that of a Kinect is used (`queries.changes.EYE`). Glass and mirrors are invisible to depth cameras and
-may be classified as free.
+A cell with a surface between these heights is occupied. All other cells are unknown. A run does not contain the
+camera's field of view; the field of view of a Kinect is used (`queries.changes.EYE`). Depth cameras do not observe
+glass and mirrors, which may be classified as free.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ LEVEL_STEP = 0.1  # vertical sampling of free space, m
 SLACK = 0.03  # minimum distance of a surface behind free space, m
 FARTHEST = 5.0  # range of the camera, m: the default of fuser.max_depth
 WALL_SPAN = 1.0  # minimum height of a wall, m
-MOST_CELLS = 2**24  # of a plan
+MOST_CELLS = 2**24  # maximum cells of a plan
 
 
 @dataclass(frozen=True)
 class Plan:
     """A grid over the floor, seen from above. Row 0 has the lowest y, column 0 the lowest x."""
 
-    resolution: float  # m, > 0, the side of a cell
-    origin: Float64  # (2,) m, the lower left corner of the first cell
+    resolution: float  # m, > 0, side of a cell
+    origin: Float64  # (2,) m, lower left corner of the first cell
     occupied: Bool  # (H, W)
     free: Bool  # (H, W)
-    floor: Bool  # (H, W) where the floor was seen
+    floor: Bool  # (H, W) observed floor
     wall: Bool  # (H, W)
     highest: Int32  # (H, W) id of the object with the highest surface, 0 = none
 
@@ -53,20 +53,23 @@ class Plan:
         return self.free.shape[0], self.free.shape[1]
 
     def cells(self, xy: Float64) -> Int64:
-        """Return (P, 2) row and column of points (P, 2) m; the nearest cell for points outside."""
+        """Return the row and column (P, 2) of points (P, 2) m. Points outside get the nearest cell."""
         columns, rows = np.floor((xy - self.origin) / self.resolution).astype(np.int64).T
         return np.stack([np.clip(rows, 0, self.shape[0] - 1), np.clip(columns, 0, self.shape[1] - 1)], axis=1)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Return lowest and highest x, lowest and highest y, m."""
+        """Lowest and highest x, lowest and highest y, m."""
         rows, columns = self.shape
         x, y = self.origin.tolist()
         return x, x + columns * self.resolution, y, y + rows * self.resolution
 
 
 def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
-    """Return the plan of a room with a known floor height; cell size and robot height in m. Raises DataError."""
+    """Return the plan of a room with a known floor height; cell size and robot height in m.
+
+    Raises DataError for an empty map or more than MOST_CELLS cells.
+    """
     found = surface_points(room, resolution / 2)
     if not len(found.points):
         raise DataError("map: expected a surface for the plan, got an empty map")
@@ -75,7 +78,7 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
     columns, rows = (np.floor((high - origin) / resolution) + 2).astype(np.int64).tolist()
     if rows * columns > MOST_CELLS:
         cells = f"{columns} x {rows} cells of {resolution:g} m"
-        raise DataError(f"plan: expected at most {MOST_CELLS} cells, got {cells}; raise the resolution")
+        raise DataError(f"plan: expected at most {MOST_CELLS} cells, got {cells}; increase resolution")
     column, row = np.floor((found.points[:, :2] - origin) / resolution).astype(np.int64).T
     number = row * columns + column  # (P,) cell of each point
     heights = found.points[:, 2]
@@ -92,7 +95,7 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
 
 
 def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
-    """Return (H, W), see the module."""
+    """Return the mask (H, W) of the free cells."""
     free = drawn.floor & ~drawn.occupied
     rows, columns = np.nonzero(free)
     levels = np.arange(CLEARANCE, robot_height, LEVEL_STEP) + LEVEL_STEP / 2
@@ -104,7 +107,7 @@ def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
 
 
 def looked_through(room: UprightRoom, places: Float64) -> Bool:
-    """Return (P,) true if the run observed free space at a point (P, 3) m of the room."""
+    """Return the mask (P,) of the points (P, 3) m, room, with observed free space."""
     through = np.zeros(len(places), np.bool_)
     rasterizer = Rasterizer(room.mesh.vertices, room.mesh.triangles)
     for k in np.unique(np.linspace(0, len(room.poses) - 1, LOOKS).round().astype(int)) if len(room.poses) else []:
@@ -123,7 +126,7 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
 
 
 def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
-    """Return (cells,) true for at least WALL_SPAN of upright surface outside of objects."""
+    """Return the mask (cells,) of cells with at least WALL_SPAN of upright surface outside of objects."""
     chosen = found.upright & (found.owner == 0)
     step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)
     lowest, highest = step.min(initial=0), step.max(initial=0)
@@ -132,16 +135,16 @@ def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
 
 
 def _highest(found: SurfacePoints, number: Int64, cells: int) -> Int32:
-    """Return (cells,), see Plan."""
+    """Return the id (cells,) of the object with the highest surface, 0 = none."""
     chosen = np.flatnonzero(found.owner > 0)
     rising = chosen[np.argsort(found.points[chosen, 2], kind="stable")]
     ids = np.zeros(cells, np.int32)
-    ids[number[rising]] = found.owner[rising]  # the last of several writes counts
+    ids[number[rising]] = found.owner[rising]  # repeated indices: the last value is stored
     return ids
 
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # gray levels of map_saver
-OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # of (255 - level) / 255: UNKNOWN is just above FREE_THRESHOLD
+OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # of (255 - level) / 255; UNKNOWN is just above FREE_THRESHOLD
 
 
 def write_ros_map(directory: Path, found: Plan) -> list[Path]:
@@ -165,6 +168,6 @@ def write_ros_map(directory: Path, found: Plan) -> list[Path]:
 
 
 def levels(found: Plan) -> UInt8:
-    """Return the image (H, W); its first row has the highest y."""
+    """Return the gray image (H, W); the first row has the highest y."""
     gray = np.where(found.occupied, OCCUPIED, np.where(found.free, FREE, UNKNOWN)).astype(np.uint8)
     return np.ascontiguousarray(gray[::-1])

@@ -1,7 +1,7 @@
-"""Spatial relations between objects, by geometry alone: on, in, next to, attached to a wall.
+"""Spatial relations between objects by geometry alone: on, in, next to, attached to a wall.
 
-Contact surfaces are hidden: the table under a cup is not in the map. An object is therefore on another object with a
-level surface around its foot at the height of its base, or with its top at that height.
+Contact surfaces are occluded: the table under a cup is not in the map. An object is therefore on another object in two
+cases: the other object has a level surface around the foot at the height of the base, or its top has this height.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in a bowl, an
 MAX_NEIGHBOR_DISTANCE = 0.3  # m
 ON_WALL = 0.10  # maximum distance from a wall, m
 HANGING = 0.7  # minimum fraction of points near a wall
-STRAY = 2.0  # %, fraction of a surface at its lower and upper end treated as noise
+STRAY = 2.0  # %, noise fraction of a surface at its lower and upper end
 MOST_POINTS = 3000  # maximum number of points of an object for distances
 
 
 @dataclass(frozen=True)
 class Relation:
-    """`source` is `name` `target`: ids of objects, or "floor" and "walls"."""
+    """A relation `name` of object `source` to `target`: an object id, "floor" or "walls"."""
 
     source: int
     name: str  # "on", "in", "next_to", "attached_to"
@@ -48,7 +48,7 @@ class Relation:
 
 
 def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:
-    """Return all relations of a room's objects; without a plan, none to floor and walls."""
+    """Return all relations of a room's objects. Without a plan, relations to floor and walls are omitted."""
     found = surface_points(room, SPACING)
     things = []
     for one in room.objects:
@@ -137,7 +137,7 @@ def _carries(below: _Thing, above: _Thing) -> float:
 
 
 def _is_in(inner: _Thing, outer: _Thing) -> bool:
-    """Return true if an object is in the box of another one whose surface surrounds or covers it."""
+    """Return True if an object is in the box of another object and surrounded or covered by its surface."""
     box = outer.box.box
     local = np.abs((inner.points - box.center) @ box.rotation)
     if float(np.mean((local <= box.extent / 2 + SPACING).all(axis=1))) < WITHIN:
@@ -155,7 +155,7 @@ def _is_in(inner: _Thing, outer: _Thing) -> bool:
 
 
 def _gap(a: _Thing, b: _Thing) -> float:
-    """Return the distance of two surfaces, m; infinite if their heights do not overlap or they are far apart."""
+    """Return the distance of two surfaces, m; infinite for disjoint heights or more than MAX_NEIGHBOR_DISTANCE."""
     if min(a.top, b.top) < max(a.base, b.base):
         return float("inf")
     fewer, more = sorted((a, b), key=lambda thing: thing.tree.n)

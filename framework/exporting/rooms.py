@@ -1,7 +1,8 @@
-"""Rooms of a plan: its known floor, separated by walls with openings of at most a door.
+"""Rooms of a plan: its known floor, separated by walls with openings of at most a door width.
 
-Areas farther than half a door from every wall are the interiors of rooms; they are grown until they meet in the doors.
-Only walls separate rooms, not furniture or unobserved areas: without observed walls, the plan has one room.
+Areas farther than half a door width from every wall are the interiors of rooms. The interiors are grown until they meet
+in the doors. Only walls separate rooms, not furniture or unobserved areas: without observed walls, the plan has one
+room.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from scipy import ndimage
 from framework.data import Bool, Float64, Int32
 from framework.exporting.occupancy import Plan
 
-DOOR = 1.0  # m, the widest opening that separates rooms; most doors have 0.7 to 0.95
+DOOR = 1.0  # m, maximum width of an opening between rooms; most doors have 0.7 to 0.95 m
 GAP = 0.3  # maximum width of filled gaps, m
-LEAST_INSIDE = 0.5  # minimum interior of a room, m^2
+LEAST_INSIDE = 0.5  # minimum interior area of a room, m^2
 
 
 @dataclass(frozen=True)
@@ -25,13 +26,13 @@ class Door:
     """The opening between two rooms."""
 
     rooms: tuple[int, int]
-    place: Float64  # (2,) m
+    place: Float64  # (2,) m, center
     width: float  # m
 
 
 @dataclass(frozen=True)
 class Rooms:
-    """The rooms of a plan, numbered from 1 by decreasing area."""
+    """The rooms of a plan, numbered from 1 in descending order of area."""
 
     labels: Int32  # (H, W) 0 = none
     doors: tuple[Door, ...]
@@ -46,11 +47,11 @@ class Rooms:
         return float(np.count_nonzero(self.labels == room)) * self.plan.resolution**2
 
     def center(self, room: int) -> Float64:
-        """Return the center of a room, (2,) m."""
+        """Return the center (2,) of a room, m."""
         return _place(self.plan, self.labels == room)
 
     def of(self, xy: Float64) -> int:
-        """Return the room nearest to most of the points (P, 2) m, P > 0; 0 = no rooms."""
+        """Return the nearest room to most of the points (P, 2) m, P > 0; 0 = no rooms."""
         if not self.count:
             return 0
         nearest = ndimage.distance_transform_edt(self.labels == 0, return_distances=False, return_indices=True)
@@ -105,7 +106,7 @@ def _doors(labels: Int32, plan: Plan) -> tuple[Door, ...]:
 
 
 def _place(plan: Plan, cells: Bool) -> Float64:
-    """Return (2,) m, the center of cells (H, W)."""
+    """Return the center (2,) of masked cells (H, W), m."""
     rows, columns = np.nonzero(cells)
     return np.asarray((np.array([columns.mean(), rows.mean()]) + 0.5) * plan.resolution + plan.origin)
 

@@ -17,12 +17,12 @@ DIGITS = 4  # decimal places of meters
 
 
 def write_scene_graph(path: Path, room: UprightRoom, plan: Plan | None) -> None:
-    """Write the graph of a room; without a plan (unknown floor), it omits floor, walls and rooms."""
+    """Write the scene graph of a room. Without a plan (unknown floor), floor, walls and rooms are omitted."""
     write_json(path, scene_graph(room, plan))
 
 
 def scene_graph(room: UprightRoom, plan: Plan | None) -> dict[str, Any]:
-    """Return the scene graph of a room, as for JSON."""
+    """Return the scene graph of a room as JSON-serializable data."""
     divided = rooms(plan) if plan is not None else None
     nodes = [_object_node(one) for one in room.objects]
     edges = _edges(room, relations(room, plan))
@@ -74,7 +74,7 @@ def _edges(room: UprightRoom, found: list[Relation]) -> list[dict[str, Any]]:
 
 
 def _room_edges(room: UprightRoom, divided: Rooms) -> list[dict[str, Any]]:
-    """Return the room of each object, and the doors between rooms."""
+    """Return the edges from objects to rooms, and the doors between rooms."""
     inside = [(one, divided.of(room.mesh.vertices[one.vertices, :2].astype(np.float64))) for one in room.objects]
     placed = [{"source": one.name, "relation": "in", "target": f"room_{k}"} for one, k in inside if k]
     doors = [

@@ -1,7 +1,7 @@
 """A stored run in an upright frame on the floor: its surface, its objects, and points on the surface.
 
-The room frame is in meters, z up, the floor at z = 0: the world, rotated by the smallest angle to upright, and
-translated along z. If the world's z is up, x and y are the world's.
+The room frame is in meters, z up, with the floor at z = 0. It is the world frame, rotated upright by the smallest angle
+and translated along z. If the world's z axis is up, x and y are equal in both frames.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from framework.runs.run_directory import LIKELY
 from framework.runs.stored_map import read_labeled_mesh
 from framework.runs.stored_runs import INSTANCES, MESH, TRAJECTORY, read_figures
 
-LONGEST_NAME = 60  # characters of a class in names of files and nodes
+LONGEST_NAME = 60  # maximum characters of a class in names of files and nodes
 UP = np.array([0.0, 0.0, 1.0])
-HIGHEST = 1e4  # limit of the floor height, m; vertices are float32
-SPECK = 0.01  # fraction of an object's vertices: loose pieces at depth edges would widen its box
-MOST_POINTS = 2**24  # limit of a room; 100 m^2 of surface have 4 million at 1 cm voxels
+HIGHEST = 1e4  # maximum absolute floor height, m; vertices are float32
+SPECK = 0.01  # maximum fraction of vertices in removed components; components at depth edges would enlarge the box
+MOST_POINTS = 2**24  # maximum points of a room; 100 m^2 of surface have 4 million points at 1 cm voxels
 LEVEL = float(np.cos(np.radians(30.0)))  # minimum z of the normal of a supporting surface
 UPRIGHT = float(np.sin(np.radians(20.0)))  # maximum |z| of the normal of a wall
 SHORTEST_UP = 1e-6  # minimum length of an up direction
@@ -49,20 +49,20 @@ class RoomObject:
     id: int
     class_name: str
     confidence: float  # in [0, 1]
-    probability: float | None  # of its class, in [0, 1]; None = unknown
-    vertices: Int32  # (M,) indices into the room's mesh, M > 0, without specks
-    box: Box  # upright, in the room
+    probability: float | None  # of the class, in [0, 1]; None = unknown
+    vertices: Int32  # (M,) indices into the room's mesh, M > 0, without small components
+    box: Box  # upright, room frame
     color: UInt8  # (3,) sRGB, as in overview.png
     class_color: UInt8  # (3,) sRGB
 
     @property
     def name(self) -> str:
-        """Return a unique name: `chair_7`."""
+        """Unique name, such as `chair_7`."""
         return plain_name(self.class_name, self.id)
 
     @property
     def footprint(self) -> Float64:
-        """Return (4, 2) m, the corners of its box on the floor, counterclockwise from above."""
+        """Corners (4, 2) of the box on the floor, m, counterclockwise from above."""
         (x, y, _), (width, depth, _) = self.box.center, self.box.extent
         first, second = self.box.rotation[:2, 0] * width / 2, self.box.rotation[:2, 1] * depth / 2
         corners = [-first - second, first - second, first + second, second - first]
@@ -70,12 +70,12 @@ class RoomObject:
 
     @property
     def base(self) -> float:
-        """Return the height of its lowest point, m."""
+        """Height of the lowest point, m."""
         return float(self.box.center[2] - self.box.extent[2] / 2)
 
     @property
     def top(self) -> float:
-        """Return the height of its highest point, m."""
+        """Height of the highest point, m."""
         return float(self.box.center[2] + self.box.extent[2] / 2)
 
 
@@ -83,21 +83,21 @@ class RoomObject:
 class UprightRoom:
     """The surface and objects of a stored run."""
 
-    mesh: InstanceMesh  # in the room frame; with the labels of all objects, also of those not in `objects`
-    objects: tuple[RoomObject, ...]  # by id
+    mesh: InstanceMesh  # room frame; with the labels of all objects, including objects not in `objects`
+    objects: tuple[RoomObject, ...]  # sorted by id
     poses: Float64  # (F, 4, 4) T_room_camera of the mapped frames
     T_room_world: Float64  # (4, 4)
-    up_known: bool  # false: the world's z is used
-    floor_known: bool  # false: z = 0 as in the world
+    up_known: bool  # False: up is the world's z axis
+    floor_known: bool  # False: z = 0 as in the world frame
 
     @cached_property
     def surface(self) -> Surface:
         return Surface(self.mesh.vertices, self.mesh.triangles)
 
     def chosen(self, asked: Sequence[str], min_confidence: float) -> UprightRoom:
-        """Return the room with the objects that have these ids or classes; () = all.
+        """Return the room with the objects of the given ids or classes; () = all.
 
-        Objects that are not chosen by id need the minimum confidence. Raises DataError for an unknown id or class.
+        Objects selected by class need the minimum confidence. Raises DataError for an unknown id or class.
         """
         likely = [one for one in self.objects if one.confidence >= min_confidence]
         if not asked:
@@ -119,7 +119,7 @@ class UprightRoom:
 
 
 def plain_name(class_name: str, key: int) -> str:
-    """Return a name for files, nodes and prims: ASCII letters, digits and underscores, such as `chair_7`."""
+    """Return a name for files, nodes and prims, such as `chair_7`: ASCII letters, digits and underscores."""
     plain = re.sub(r"[^A-Za-z0-9]+", "_", class_name).strip("_")[:LONGEST_NAME]
     return f"{plain if plain[:1].isalpha() else f'object_{plain}'.rstrip('_')}_{key}"
 
@@ -151,7 +151,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
 
 
 def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple[RoomObject, ...]:
-    """Return the objects with vertices in a room's mesh by id, without loose pieces of less than SPECK."""
+    """Return the objects with vertices in a room's mesh by id, without connected components smaller than SPECK."""
     pieces = _pieces(mesh)
     order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
     ids = mesh.instance_ids[order]
@@ -170,7 +170,9 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
         found.append(
             RoomObject(
                 id=one.id,
-                class_name=one.class_name.encode(errors="backslashreplace").decode(),  # may not be valid text
+                class_name=one.class_name.encode(
+                    errors="backslashreplace"
+                ).decode(),  # the name may contain invalid Unicode
                 confidence=one.confidence,
                 probability=one.probability,
                 vertices=own,
@@ -183,7 +185,7 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
 
 
 def _pieces(mesh: InstanceMesh) -> Int32:
-    """Return (V,) the connected piece of each vertex; only triangles within one object connect."""
+    """Return the connected component (V,) of each vertex; only triangles within one object are edges."""
     ids = mesh.instance_ids[mesh.triangles]
     joined = mesh.triangles[(ids > 0).all(axis=1) & (ids == ids[:, :1]).all(axis=1)]
     edges = np.concatenate([joined[:, :2], joined[:, 1:]]).T
@@ -192,7 +194,7 @@ def _pieces(mesh: InstanceMesh) -> Int32:
 
 
 def facing(box: Box) -> Box:
-    """Return the same upright box with its first axis nearest to the room's x axis."""
+    """Return the upright box with permuted axes, such that its first axis is nearest to the room's x axis."""
     angle = float(np.arctan2(box.rotation[1, 0], box.rotation[0, 0]))
     turns = round(angle / (np.pi / 2))
     yaw = angle - turns * np.pi / 2
@@ -204,7 +206,7 @@ def facing(box: Box) -> Box:
 
 
 def upright(up: Float64, floor: float) -> Float64:
-    """Return T_room_world (4, 4): the smallest rotation of the unit vector `up` to z, with `floor` m along it at 0."""
+    """Return T_room_world (4, 4): rotates the unit vector `up` to z by the smallest angle, and moves `floor` m to 0."""
     T = np.eye(4)
     across, cosine = skew(np.cross(up, UP)), float(up @ UP)
     T[:3, :3] += across + across @ across / (1 + cosine) if cosine > -1 + 1e-9 else np.diag([0.0, -2.0, -2.0])
@@ -241,27 +243,27 @@ def _hint(word: str, objects: Sequence[RoomObject]) -> str:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """P points on a room's surface, evenly spread regardless of triangle sizes."""
+    """P points on a room's surface, evenly spaced regardless of triangle sizes."""
 
     points: Float32  # (P, 3) m, room
-    normal_z: Float32  # (P,) of the unit normal
-    owner: Int32  # (P,) id of the object that contains the whole triangle, 0 = none
+    normal_z: Float32  # (P,) z component of the unit normal
+    owner: Int32  # (P,) id of the object with the whole triangle, 0 = none
 
     @property
     def level(self) -> Bool:
-        """Return (P,) true if it faces up."""
+        """Mask (P,) of points on upward-facing surfaces."""
         return np.asarray(self.normal_z > LEVEL)
 
     @property
     def upright(self) -> Bool:
-        """Return (P,) true if it may be part of a wall."""
+        """Mask (P,) of points on vertical surfaces, such as walls."""
         return np.asarray(np.abs(self.normal_z) < UPRIGHT)
 
 
 def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
-    """Return the centers of a room's triangles after splitting them into pieces with sides of at most `spacing` m.
+    """Return the centers of a room's triangles, subdivided to sides of at most `spacing` m.
 
-    Raises DataError for more than MOST_POINTS.
+    Raises DataError for more than MOST_POINTS points.
     """
     vertices, triangles = room.mesh.vertices, room.mesh.triangles
     corners = vertices[triangles]  # (F, 3, 3)
@@ -269,8 +271,8 @@ def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
     cuts = np.maximum(np.ceil(longest / spacing), 1)
     if float((cuts**2).sum()) > MOST_POINTS:
         raise DataError(
-            f"surface: expected at most {MOST_POINTS} points at a spacing of {spacing:g} m, got more; raise the "
-            "resolution, or map with larger voxels"
+            f"surface: expected at most {MOST_POINTS} points at a spacing of {spacing:g} m, got "
+            f"{float((cuts**2).sum()):.0f}; increase resolution, or map with larger voxels"
         )
     normals = room.surface.face_normals
     normal_z = (normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-20)).astype(np.float32)
@@ -294,7 +296,7 @@ def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
 
 
 def middles(n: int) -> Float64:
-    """Return (n^2, 3) barycentric coordinates of the centers of equal pieces of a triangle, n along each side."""
+    """Return the barycentric coordinates (n^2, 3) of the centers of n^2 equal parts of a triangle."""
     i, j = (index.ravel() for index in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
     up, down = i + j < n, i + j < n - 1
     first = np.stack([i[up] + 1 / 3, j[up] + 1 / 3], axis=1)

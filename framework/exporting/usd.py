@@ -2,12 +2,12 @@
 
     /World                      kind = assembly, z up, meters
       PhysicsScene              gravity
-      room                      the rest of the room: static, its triangles collide
+      room                      the rest of the room: static, collision by triangles
       chair_7                   kind = component; UsdSemantics label "class"; UsdPhysics rigid body, not enabled
         visual                  Mesh with linear displayColor
         collision               Mesh (convex hull) or Cube, purpose = guide
 
-An object stands at the origin of its prim, and is static until `physics:rigidBodyEnabled` is set.
+Each object is at the origin of its prim and static until `physics:rigidBodyEnabled` is set.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from framework.files.atomic_write import written_whole
 
 MISSING = "usd: expected the package usd-core, got none; run pip install instancemap[usd]"
 NOT_WRITTEN = "the USD library failed to write the stage"
-THINNEST = 0.002  # minimum side of a collision box, m: an object seen from one side may be flat
+THINNEST = 0.002  # minimum side of a collision box, m; an object observed from one side may be flat
 GRAVITY = 9.81  # m/s^2
 
 
@@ -39,7 +39,7 @@ class Collision(Enum):
 
 
 def check_usd() -> None:
-    """Raise DataError with the extra to install if USD is missing."""
+    """Raise DataError that names the extra if USD is not installed."""
     try:
         import pxr  # noqa: F401
     except ImportError as error:
@@ -49,7 +49,7 @@ def check_usd() -> None:
 def write_usd(
     path: Path, parts: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE, collision: Collision = Collision.HULL
 ) -> None:
-    """Write parts as one stage, in the room frame; output is deterministic. Raises DataError."""
+    """Write parts as one stage in the room frame. The file is deterministic. Raises DataError if USD is missing."""
     check_usd()
     from pxr import Gf, Kind, Tf, Usd, UsdGeom, UsdPhysics
 
@@ -109,7 +109,7 @@ def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> 
 
 
 def _add_proxy(stage: Any, path: str, vertices: Float32, collision: Collision) -> None:
-    """Add the collision shape of an object, which is not rendered."""
+    """Add the invisible collision shape of an object."""
     from pxr import Gf, UsdGeom, UsdPhysics
 
     hull = convex_hull(vertices) if collision is Collision.HULL else None
@@ -147,7 +147,7 @@ def _color(mesh: Any, colors: UInt8) -> None:
 
 
 def convex_hull(vertices: Float32) -> tuple[Float32, Int32] | None:
-    """Return the vertices (H, 3) and outward triangles of the convex hull of points (M, 3) m; None = no volume."""
+    """Return the vertices (H, 3) and outward triangles of the convex hull of points (M, 3) m; None without volume."""
     try:
         hull = ConvexHull(vertices.astype(np.float64))
     except (QhullError, ValueError):

@@ -1,1 +1,1 @@
-"""Figures of runs, refinements and checked recordings."""
+"""Figures of runs, refinements and recording checks."""

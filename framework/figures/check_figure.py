@@ -1,4 +1,4 @@
-"""Figure of a checked recording: alignment of depth, color and poses, and the error of each pose convention."""
+"""Figure of a recording check: alignment of depth, color and poses, and the error of each pose convention."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from framework.geometry import back_project, project, transform
 
 SIZE_IN, DPI = (15.0, 9.4), 100
 TITLE_PT, TEXT_PT = 10.0, 9.0
-LINE = 180  # characters of a line of findings
+LINE = 180  # maximum characters per line of findings
 COLORS = {Verdict.FINE: "#1a7f37", Verdict.UNKNOWN: "#787e86", Verdict.NOTE: "#9a6700", Verdict.FAULT: "#cf222e"}
 CHOSEN, OTHER = "#1a7f37", "#b0b6be"
 
@@ -72,7 +72,7 @@ def _edges_on_color(frame: Frame) -> UInt8:
 
 
 def _warped(axes: Axes, title: str, pair: MatchedPair | None, fit: PoseFit | None) -> None:
-    """Draw a frame in red and a second frame, warped to it, in cyan: aligned pixels are gray."""
+    """Draw a frame in red and a second frame, warped to the first, in cyan: aligned pixels are gray."""
     if pair is None:
         _say(axes, "no pair of frames with enough overlap")
         return
@@ -80,7 +80,7 @@ def _warped(axes: Axes, title: str, pair: MatchedPair | None, fit: PoseFit | Non
         T_second_first, factor, title = pair.T_second_first, 1.0, "from image matches"
     else:
         T_second_first, factor = motion_of(pair, fit.reading), fit.depth_factor
-    title = f"{title}: frame {pair.first.index} red,\n{pair.second.index} warped to it cyan, gray = aligned"
+    title = f"{title}: frame {pair.first.index} red,\nframe {pair.second.index}, warped, cyan; gray = aligned"
     _image(axes, title, _moved(pair, T_second_first, factor))
 
 
@@ -119,9 +119,9 @@ def _readings(axes: Axes, poses: PoseJudgment) -> None:
 
 
 def _delays(axes: Axes, check: RecordingCheck) -> None:
-    """Draw the agreement of depth and color edges by delay."""
+    """Draw the agreement of depth and color edges for each delay."""
     if not check.by_delay:
-        _say(axes, "too few edges to compare color and depth")
+        _say(axes, "too few edges to compare depth and color")
         return
     delays = [agreement.delay for agreement in check.by_delay]
     strengths = [agreement.strength for agreement in check.by_delay]
@@ -130,7 +130,7 @@ def _delays(axes: Axes, check: RecordingCheck) -> None:
     axes.set_xticks(delays)
     axes.tick_params(labelsize=TEXT_PT)
     axes.set_ylim(0, 1.1 * max(best, 1e-3))
-    axes.set_title("agreement of color and depth edges,\nby delay of depth in frames", fontsize=TITLE_PT)
+    axes.set_title("agreement of depth and color edges,\nby delay of depth in frames", fontsize=TITLE_PT)
 
 
 def _findings(axes: Axes, check: RecordingCheck) -> None:

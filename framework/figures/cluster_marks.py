@@ -1,4 +1,4 @@
-"""Colors of a frame's clusters in the refinement figure, with the pixels that refinement dropped and added."""
+"""Colors of a frame's clusters in the refinement figure, with the pixels dropped and added by the refiner."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from framework.evaluation.refined_points import Refinement, pixel_index, point_c
 from framework.rendering.palette import instance_colors
 
 DROPPED = (214, 28, 44)  # RGB
-DROPPED_DISTANCE = 160  # sum of the channel differences that a cluster color has to DROPPED, at least
+DROPPED_DISTANCE = 160  # minimum sum of the channel differences between a cluster color and DROPPED
 
 
 @dataclass(frozen=True)
 class ClusterMarks:
-    """The clusters before or after refinement, and how they are drawn."""
+    """The clusters before or after refinement, with their drawing styles."""
 
     heading: str
     clusters: PointClusters
     colors: UInt8  # (K, 3) RGB
-    owner: Int32  # (H, W) the smallest cluster with this pixel, -1 = none
-    dropped: Bool  # (H, W) in a cluster before refinement, in none after it
-    added: Bool  # (H, W) not in the owner before refinement
+    owner: Int32  # (H, W) smallest cluster with this pixel, -1 = none
+    dropped: Bool  # (H, W) True: in a cluster only before refinement
+    added: Bool  # (H, W) True: not in the owner before refinement
 
     @classmethod
     def before(cls, refinement: Refinement) -> ClusterMarks:
@@ -46,14 +46,14 @@ class ClusterMarks:
         return cls("after", after, _colors_after(refinement), owner, dropped, added)
 
     def mask(self, k: int) -> Bool:
-        """Return the pixels of cluster k, (H, W)."""
+        """Return the mask (H, W) of cluster k."""
         mask = np.zeros(self.owner.shape, np.bool_)
         u, v = self.clusters.pixels[self.clusters.cluster == k].T
         mask[v, u] = True
         return mask
 
     def by_size(self) -> list[int]:
-        """Return the clusters with points, the largest first."""
+        """Return the nonempty clusters, largest first."""
         sizes = point_counts(self.clusters)
         return [k for k in np.argsort(-sizes, kind="stable").tolist() if sizes[k]]
 
@@ -72,7 +72,7 @@ def _colors(count: int) -> UInt8:
 
 
 def _colors_after(refinement: Refinement) -> UInt8:
-    """Return the colors (M, 3): the largest part of a cluster keeps its color, all other clusters get new ones."""
+    """Return the colors (M, 3): the largest part of a cluster keeps its color, all other clusters get new colors."""
     n, m = len(refinement.before), len(refinement.after)
     color_index = np.full(m, -1)
     known = np.flatnonzero(refinement.main_part >= 0)

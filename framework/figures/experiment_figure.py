@@ -1,4 +1,4 @@
-"""Figure of an experiment, from its runs to PNG and PDF."""
+"""Figure of an experiment's runs, as PNG and PDF."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from framework.runs.sweep_file import SWEEP
 from framework.runs.timings_file import StageTimes, read_timings
 from framework.tables.table_notes import counted, data, machine
 
-NAME = "figure"  # of the files, and of the config block
+NAME = "figure"  # name of the files and of the config block
 
 log = logging.getLogger(__name__)
 
@@ -34,9 +34,9 @@ Read = TypeVar("Read")
 
 
 def write_figure(directory: Path) -> list[Path]:
-    """Write figure.png and figure.pdf into `directory`, from the runs below it, and return their paths.
+    """Write figure.png and figure.pdf of the runs below `directory` into it, and return their paths.
 
-    Incomplete or unreadable runs are logged and omitted. Raises DataError if nothing is left.
+    Incomplete or unreadable runs are logged and omitted. Raises DataError if no run remains.
     """
     pictured = Pictured.below(directory)
     if missing := list(pictured.missing()):
@@ -56,14 +56,14 @@ class Pictured:
     def below(cls, directory: Path) -> Pictured:
         """Read the runs in and below `directory`, according to the sweep's config.
 
-        Raises DataError for a sweep without figure or complete runs, ConfigError for an invalid figure.
+        Raises DataError for a sweep without a figure or complete runs, and ConfigError for an invalid figure.
         """
         if not directory.is_dir():
-            raise DataError(f"{directory}: expected a folder of runs")
+            raise DataError(f"{directory}: expected a folder of runs, got no folder")
         if not (directory / SWEEP).exists():
             raise DataError(
-                f"{directory}: expected the folder of an experiment, got no {SWEEP}; run "
-                "one such as experiment=figure4_progress"
+                f"{directory}: expected the folder of an experiment, got no {SWEEP}; run an experiment such as "
+                "experiment=figure4_progress"
             )
         sweep = read_yaml(directory / SWEEP)
         if not sweep.get(NAME):
@@ -86,7 +86,7 @@ class Pictured:
 
     @property
     def runs(self) -> list[Run]:
-        """All runs of the rows, by sequence."""
+        """All runs of the rows, sorted by sequence."""
         found = {run for row in self.rows.values() if row for run in row.records}
         return sorted(found, key=lambda run: natural(run[::-1]))
 
@@ -95,12 +95,12 @@ class Pictured:
         return [record for row in self.rows.values() if row for record in row.records.values()]
 
     def called(self, run: Run) -> str:
-        """Return the sequence, and the seed if there are several."""
+        """Return the name of the sequence, with the seed for several seeds."""
         seeds = {other[0] for other in self.runs}
         return run[-1] if len(run) == 1 or len(seeds) == 1 else f"{run[-1]}, seed {run[0]}"
 
     def missing(self) -> Iterator[str]:
-        """Yield incomplete runs with their reason, and the runs that a row lacks."""
+        """Yield incomplete runs with their reasons, and the missing runs of each row."""
         for one in self.incomplete:
             yield f"{one.directory.name}: {one.reason}"
         for name, row in self.rows.items():
@@ -118,9 +118,9 @@ def _stage_times(pictured: Pictured) -> Page:
     sequences = [pictured.called(run) for run in pictured.runs if any(run in times for times in read.values())]
     stages = "; ".join(f"{name}: {' and '.join(added)}" for name, added in COLUMNS.items())
     note = (
-        f"{stages}. Mean of {counts} sequences ({', '.join(sequences)}) of running medians over {WINDOW} frames. "
-        "Bands: fastest to slowest sequence. Right: median over all frames, and × the median of the last third of the "
-        "frames divided by that of the first third."
+        f"{stages}. Lines: mean over {counts} sequences ({', '.join(sequences)}) of running medians over {WINDOW} "
+        "frames. Bands: fastest to slowest sequence. Right: median over all frames. ×: median of the last third of the "
+        "frames divided by the median of the first third."
     )
     if any(one.longest > one.frames[-1] for one in shown):
         note += " Lines end with the shortest sequence."
@@ -154,8 +154,8 @@ def _maps(pictured: Pictured) -> Page:
     if not lines:
         raise DataError("maps: expected a readable map, got none; the log lists the reasons")
     note = (
-        "An object has the same color in all pictures of a line. Dark: no match with a true object. "
-        "Beige: a true object of unknown class, which is not evaluated."
+        "An object has the same color in all images of a line. Dark: no match with a ground-truth object. "
+        "Beige: ground-truth object of unknown class, not evaluated."
     )
     if any(record.annotation for record in pictured.records):
         note += f" Annotation: {counted(record.annotation or 'unknown' for record in pictured.records)}."
@@ -163,7 +163,7 @@ def _maps(pictured: Pictured) -> Page:
 
 
 DRAWN: Mapping[str, Callable[[Pictured], Page]] = {"stage_times": _stage_times, "maps": _maps}
-"""By FigureChoice.kind."""
+"""Drawing functions by FigureChoice.kind."""
 
 
 def _truth(record: Record) -> SceneTruth | None:
@@ -180,7 +180,7 @@ def _caption(stored: StoredMap | None) -> str:
 
 
 def _if_readable(read: Callable[[Record], Read], record: Record) -> Read | None:
-    """Return None, and log the reason, if files of the run or its dataset cannot be read."""
+    """Return the result of `read`. If files cannot be read, log the reason and return None."""
     try:
         return read(record)
     except InstanceMapError as error:

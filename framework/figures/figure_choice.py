@@ -16,12 +16,12 @@ KINDS = ("stage_times", "maps")
 class FigureChoice:
     """A figure of an experiment's runs.
 
-    `stage_times` shows the stage times over the frames, averaged over sequences, in one diagram for each row.
-    `maps` shows the maps of each sequence, in a column for each row, next to the ground truth.
+    `stage_times` shows the stage times over the frames, averaged over sequences, in one diagram per row.
+    `maps` shows the maps of each sequence next to the ground truth, in one column per row.
     """
 
     kind: str = "maps"  # kind of the figure, one of KINDS
-    sequences: str = "dataset.scene"  # config key that identifies the sequence
+    sequences: str = "dataset.scene"  # config key of the sequence
     names: dict[str, str] = field(default_factory=dict)  # display names of rows
     zoom: bool = False  # close-up of the largest difference between the columns, for `maps`
 
@@ -29,11 +29,11 @@ class FigureChoice:
         if self.kind not in KINDS:
             raise ConfigError(f"figure.kind: expected one of {', '.join(KINDS)}, got {self.kind!r}")
         if self.zoom and self.kind != "maps":
-            raise ConfigError(f"figure.zoom: expected figure.kind=maps with zoom=true, got {self.kind}")
+            raise ConfigError(f"figure.kind: expected maps with figure.zoom=true, got {self.kind}")
 
     @classmethod
     def of(cls, node: Any) -> FigureChoice:
-        """Build from a config block. Raises ConfigError for unknown keys and wrong types."""
+        """Return the choice of a config block. Raises ConfigError for unknown keys and wrong types."""
         return cls(**checked_block(cls, "figure", node))
 
     def called(self, row: RunRow) -> str:
@@ -42,5 +42,5 @@ class FigureChoice:
 
     @property
     def over(self) -> list[str]:
-        """Config keys in which the runs of one row differ."""
+        """Config keys with different values among the runs of a row."""
         return list(dict.fromkeys(("seed", self.sequences)))

@@ -26,9 +26,9 @@ PNG_DPI = 200
 PDF_DPI = 300  # of raster images
 NOTE_LINE_MM = 2.35  # line spacing of the note
 MARGIN_MM = 1.0
-HINTED = 1.03  # maximum ratio of the width of text in a PNG to its outlines, because of hinting
+HINTED = 1.03  # maximum ratio of hinted text width in a PNG to the width of the outlines
 
-logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs a hundred lines about each font in a PDF
+logging.getLogger("fontTools").setLevel(logging.WARNING)  # fontTools logs a hundred lines about each font in a PDF
 
 
 class Page:
@@ -84,16 +84,16 @@ def _wrapped(text: str, width: float) -> list[str]:
 
 
 def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, width_mm: float) -> None:
-    """Write names on the objects of a picture, or next to them with a line.
+    """Write names on the objects of an image, or next to small objects with a line.
 
     Args:
-        axes: Axes of the picture.
-        ids: (H, W) object of each pixel, 0 = none; the axes have these pixels as unit.
-        names: by object; one without space is omitted.
-        size: of the letters, pt.
-        width_mm: of the printed picture.
+        axes: Axes of the image, in pixels.
+        ids: (H, W) object of each pixel, 0 = none.
+        names: Name by object; names without space are omitted.
+        size: Font size, pt.
+        width_mm: Width of the printed image, mm.
     """
-    scale = ids.shape[1] / width_mm  # px by mm
+    scale = ids.shape[1] / width_mm  # px per mm
     halo = [withStroke(linewidth=0.25 * size, foreground="white", alpha=0.85)]
     style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": size, "color": INK, "path_effects": halo}
     line = {"arrowstyle": "-", "color": INK, "linewidth": 0.07 * size, "shrinkA": 0, "shrinkB": 0}

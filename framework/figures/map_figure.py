@@ -37,11 +37,11 @@ class CaptionedLine:
 
     name: str  # the sequence
     panels: PanelLine
-    captions: Sequence[str]  # below each map, and the truth as the last one
+    captions: Sequence[str]  # below each map; the last is for the ground truth
 
     @property
     def rows(self) -> int:
-        """Number of panels below each other."""
+        """Number of rows of panels."""
         return 2 if self.panels.window else 1
 
 
@@ -52,7 +52,13 @@ def panel_size(columns: int) -> tuple[int, int]:
 
 
 def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) -> Page:
-    """Draw the page. `heads` name the columns, the last one is the ground truth; `note` is the small print."""
+    """Draw the page.
+
+    Args:
+        heads: Column headings; the last column is the ground truth.
+        lines: One line per sequence.
+        note: Note at the bottom of the page.
+    """
     width = _panel_mm(len(heads))
     height = width * ASPECT
     lefts = [LEFT_MM + k * (width + GAP_MM) for k in range(len(heads))]
@@ -69,8 +75,8 @@ def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) 
             page.text(left + width / 2, foot - 1, caption, ha="center", va="top", fontsize=SMALL_PT, color=FAINT_INK)
         overall = [page.axes(left, top - height, width, height) for left in lefts]
         for axes, panel in zip(overall, line.panels.maps, strict=False):
-            _draw(axes, panel, "not complete")
-        _draw(overall[-1], line.panels.truth, "no true instances")
+            _draw(axes, panel, "incomplete")
+        _draw(overall[-1], line.panels.truth, "no ground truth")
         if line.panels.truth:
             draw_names(overall[-1], line.panels.truth.objects, line.panels.truth.names, NOTE_PT, width)
         if window := line.panels.window:
@@ -101,7 +107,7 @@ def _draw(axes: Axes, panel: Panel | None, otherwise: str) -> None:
 
 
 def _draw_path(axes: Axes, path: ProjectedPath) -> None:
-    """Draw the path, thin where it is occluded."""
+    """Draw the path; occluded segments are thin."""
     shades = path.shades() / 255.0
     segments = [path.pixels[k : k + 2] for k in range(len(path.pixels) - 1)]
     widths = [0.4 if hidden else 0.9 for hidden in path.hidden[:-1]]

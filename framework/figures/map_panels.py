@@ -1,4 +1,4 @@
-"""Maps of one scene next to the ground truth: from one viewpoint, with one color for each object."""
+"""Maps of one scene next to the ground truth: from one viewpoint, with one color per object."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from framework.rendering.surface import FrontSides, Surface
 from framework.rendering.viewpoint import best_view, fitted
 from framework.runs.stored_map import StoredMap
 
-ZOOM = 2.5  # magnification of the window in which the columns differ most
-FRAMING_SCALE = 0.1  # of the small picture whose points a view is framed for
+ZOOM = 2.5  # magnification of the window with the largest differences
+FRAMING_SCALE = 0.1  # scale of the small image for framing a view
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A picture of one map."""
+    """An image of one map."""
 
     image: UInt8  # (H, W, 3) RGB
-    objects: Int32  # (H, W) of each pixel, 0 = none
+    objects: Int32  # (H, W) object of each pixel, 0 = none
     names: Mapping[int, str]  # by object
-    path: ProjectedPath | None = None  # None = the same in all columns
+    path: ProjectedPath | None = None  # None = identical in all columns
 
 
 @dataclass(frozen=True)
 class Window:
-    """A part of a picture, px from its upper left corner."""
+    """A part of an image, px from its upper left corner."""
 
     left: int
     top: int
@@ -40,7 +40,7 @@ class Window:
     height: int
 
     def seen_by(self, camera: Camera) -> Camera:
-        """Return the camera whose image is the window, enlarged to the image size of `camera`."""
+        """Return the camera for the window, enlarged to the image size of `camera`."""
         scale = camera.width / self.width
         return replace(
             camera,
@@ -57,9 +57,9 @@ class PanelLine:
 
     maps: Sequence[Panel | None]  # by column; None = no map
     truth: Panel | None  # None = no ground truth
-    true_count: int  # instances of known class in the picture of the ground truth
+    true_count: int  # instances of known class in the image of the ground truth
     window: Window | None = None  # None = no enlarged panels
-    zoomed: Sequence[Panel | None] = ()  # the window in the maps and in the ground truth
+    zoomed: Sequence[Panel | None] = ()  # enlarged window of the maps and of the ground truth
 
 
 def panel_line(
@@ -68,10 +68,10 @@ def panel_line(
     """Draw the maps of one scene. The last map determines the viewpoint and the surface of the ground truth.
 
     Args:
-        maps: at least one is not None.
-        truth: None = unknown; then the objects are those of the last map.
-        size: width and height of a panel, px.
-        zoom: also draw the window in which the maps differ most.
+        maps: Maps; at least one is not None.
+        truth: Ground truth; None = the last map is used as the reference.
+        size: Width and height of a panel, px.
+        zoom: True: also draw the window with the largest differences.
     """
     last = [one for one in maps if one is not None][-1]
     reference = truth or SceneTruth(last.mesh.vertices, last.ids, last.class_names)
@@ -100,7 +100,7 @@ def panel_line(
 
 @dataclass(frozen=True)
 class _Column:
-    """A surface with objects on it."""
+    """A surface with labeled objects."""
 
     surface: Surface
     colors: UInt8  # (V, 3) RGB
@@ -116,7 +116,7 @@ class _Column:
 
     @classmethod
     def of_truth(cls, stored: StoredMap, truth: SceneTruth, colors: ObjectColors) -> _Column:
-        """Return the true instances on the surface of a map."""
+        """Return the ground-truth instances on the surface of a map."""
         objects = relabeled(stored.true_ids(truth), colors.true_objects)
         return cls(_surface(stored), stored.mesh.colors, objects, colors.name_of, stored.poses)
 
@@ -128,11 +128,11 @@ class _Column:
 
 
 def _with_path(column: _Column, camera: Camera, T_world_camera: Float64) -> tuple[Camera, Float64]:
-    """Move the view back until it contains the path of the column's cameras."""
+    """Move the view back until it contains the camera path of the column."""
     R_world_camera = T_world_camera[:3, :3]
     hits = FrontSides(column.surface, T_world_camera[:3, 3]).seen_by(camera.scaled(FRAMING_SCALE), R_world_camera)
     path = column.poses[:, :3, 3].astype(np.float32)
-    # as many points as the surface has, because outliers are not framed
+    # as many points as the surface, because outliers are not framed
     path = path[np.linspace(0, len(path) - 1, int(hits.seen.sum())).astype(int)]
     return fitted(R_world_camera, np.concatenate([hits.points_world[hits.seen], path]), camera.width, camera.height)
 
@@ -142,9 +142,9 @@ def _surface(stored: StoredMap) -> Surface:
 
 
 def _most_different(images: Sequence[Int32], colors: ObjectColors) -> Window | None:
-    """Return the window in which object images (H, W) differ in most pixels, None if they are equal.
+    """Return the window with the most differing pixels of object images (H, W), None if they are equal.
 
-    A difference counts if one of the images shows a true object there.
+    A pixel counts if at least one image shows a ground-truth object.
     """
     stack = np.stack(images)
     true = np.isin(stack, list(colors.name_of)).any(axis=0)

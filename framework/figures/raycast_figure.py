@@ -1,4 +1,4 @@
-"""The ray-cast view of a map: depth, normals, vertices, RGB and object indices (the panels of the paper's Figure 2)."""
+"""Ray-cast view of a map: depth, normals, vertices, RGB and object indices (panels of Figure 2 in the paper)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from framework.rendering.palette import object_colors
 
 COLUMNS, ROWS = 3, 2
 GAP_MM, LEFT_MM, HEAD_MM, CAPTION_MM = 2.0, 1.5, 4.0, 4.0
-BAR_MM, BAR_SPACE_MM = 1.6, 9.0  # width of the colorbar, and of the space for it and its labels
+BAR_MM, BAR_SPACE_MM = 1.6, 9.0  # widths of the colorbar and of the space for colorbar and labels
 DEPTH_COLORS = "viridis"
 WITHOUT_OBJECT = (226, 226, 224)  # RGB of the surface without a listed object
 
@@ -26,9 +26,9 @@ def write_raycast(path: Path, view: View, names: Mapping[int, str], centers: Map
     Args:
         path: PNG file.
         view: Ray-cast view.
-        names: class of each object, by id; other ids are shown without color.
-        centers: (3,) m of the same objects, which choose their colors.
-        note: at the bottom of the page.
+        names: Class of each object, by id; all other ids are gray.
+        centers: Center (3,) m of each object, by id; determines the color.
+        note: Note at the bottom of the page.
     """
     page = raycast_page(view, names, centers, note)
     with written_whole(path) as temporary:
@@ -76,7 +76,7 @@ def raycast_page(view: View, names: Mapping[int, str], centers: Mapping[int, Flo
 
 
 def normal_colors(view: View) -> UInt8:
-    """Return the colors (H, W, 3) of normals in the camera frame, of which y and z are reversed."""
+    """Return the colors (H, W, 3) of normals in the camera frame with reversed y and z."""
     normals = view.normals_world @ view.T_world_camera[:3, :3] * (1, -1, -1)
     return np.asarray(np.rint(np.clip(127.5 + 127.5 * normals, 0, 255)), np.uint8)
 

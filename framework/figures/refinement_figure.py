@@ -42,8 +42,8 @@ def refinement_figure(refinement: Refinement, title: str, refiner: str) -> Figur
 
     Args:
         refinement: Clusters before and after refinement.
-        title: frame and detector.
-        refiner: name of the refiner.
+        title: Title with the frame and the detector.
+        refiner: Name of the refiner.
     """
     frame = refinement.frame
     columns = ClusterMarks.before(refinement), ClusterMarks.after(refinement)
@@ -89,7 +89,7 @@ def draw_image(axes: Axes, frame: Frame, marks: ClusterMarks, width_in: float) -
     for k in marks.by_size():
         cluster = marks.mask(k).astype(np.uint8)
         closed = cv2.morphologyEx(cluster, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-        smooth = cv2.medianBlur(np.where(frame.depth == 0, closed, cluster), 5)  # without holes where depth is missing
+        smooth = cv2.medianBlur(np.where(frame.depth == 0, closed, cluster), 5)  # fills holes at missing depth
         if smooth.any():
             outline = axes.contour(*_region(smooth), [0.5], colors=[0.62 * marks.colors[k] / 255], linewidths=1.2)
             outline.set(path_effects=[withStroke(linewidth=2.2, foreground="white")])
@@ -122,7 +122,7 @@ def tinted(frame: Frame, marks: ClusterMarks) -> UInt8:
 
 
 def _region(mask: Array) -> tuple[Array, Array, Array]:
-    """Return x, y and values of a mask (H, W) with a border, so that its contours are closed."""
+    """Return x, y and values of a mask (H, W) with a border that closes its contours."""
     height, width = mask.shape
     return np.arange(-1, width + 1), np.arange(-1, height + 1), np.pad(mask.astype(float), 1)
 
@@ -138,12 +138,12 @@ def _summary(refinement: Refinement) -> str:
     judged = refinement.judged_before, refinement.judged_after
     if was is not None and now is not None and judged[0].any() and judged[1].any():
         iou = was.iou[judged[0]].mean(), now.iou[judged[1]].mean()
-        parts.append(f"mean IoU with the true masks {iou[0]:.2f} → {iou[1]:.2f}")
+        parts.append(f"mean IoU with the ground-truth masks {iou[0]:.2f} → {iou[1]:.2f}")
         inside = (
             _percentage(was.points_inside[judged[0]], refinement.points_before[judged[0]]),
             _percentage(now.points_inside[judged[1]], point_counts(refinement.after)[judged[1]]),
         )
-        parts.append(f"points on the true object {inside[0]} → {inside[1]}")
+        parts.append(f"points on the ground-truth object {inside[0]} → {inside[1]}")
     return "   ·   ".join([*parts, f"{refinement.milliseconds:.1f} ms"])
 
 
@@ -162,7 +162,7 @@ def _draw_table(axes: Axes, refinement: Refinement, marks: ClusterMarks, rows: i
         if k % rows == 0:
             write(left + POINTS_AT, 1.5, "points")
             if was is not None:
-                write(right, 1.5, "IoU with the true mask", ha="right")
+                write(right, 1.5, "IoU with ground truth", ha="right")
         axes.plot(left + 0.005, y, "s", markersize=10, color=marks.colors[k] / 255, clip_on=False)
         write(left + NAME_AT, y, _shortened(marks.name(k), MAX_NAME), INK, TEXT_PT)
         before, after = int(refinement.points_before[k]), int(refinement.points_after[k])

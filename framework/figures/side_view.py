@@ -1,4 +1,4 @@
-"""A frame's depth readings and clusters from the side, where depth is visible."""
+"""Side view of a frame's depth readings and clusters, to make depth differences visible."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import looking, upward
 
 AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(75), np.deg2rad(14)  # at 90 degrees, planes would become lines
-MARGIN = 0.09  # of the view around the clusters, relative to its size
-MIN_HEIGHT_M = 0.4  # of the view
-CELLS = 300  # across the view, in which the visible points are counted
-POINT_SIZE = 1.2  # of a drawn point, relative to the distance between readings
+MARGIN = 0.09  # around the clusters, relative to the size of the view
+MIN_HEIGHT_M = 0.4  # minimum height of the view
+CELLS = 300  # grid cells across the view for counting visible points
+POINT_SIZE = 1.2  # size of a drawn point, relative to the distance between readings
 MIN_POINT_PT, MAX_POINT_PT = 0.7, 2.2
-GRID_CELLS = 120  # across the coarse surface that the vertical is estimated from
+GRID_CELLS = 120  # grid cells across the coarse surface for estimating the up direction
 LEVEL_RAD = np.deg2rad(6)  # maximum slope of a floor
-PITCHES_RAD = np.deg2rad([0, 30])  # downward pitches of the camera that the search for the floor starts from
-MAX_DEPTH_STEP = 0.1  # between readings of one surface, relative to depth
+PITCHES_RAD = np.deg2rad([0, 30])  # initial downward pitches of the camera in the floor search
+MAX_DEPTH_STEP = 0.1  # maximum difference between readings of one surface, relative to depth
 SCALE_BARS_M = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0])
-SCALE_BAR = 0.15  # of the width of the view, approximately
+SCALE_BAR = 0.15  # approximate length, relative to the width of the view
 
 
 @dataclass(frozen=True)
 class SideView:
-    """The P depth readings of a frame, seen orthographically from the side."""
+    """Orthographic side view of the P depth readings of a frame."""
 
-    rows: Array  # (P,) of the readings in the frame
+    rows: Array  # (P,) of the readings in the image
     columns: Array  # (P,)
     points: Float32  # (P, 3) m, x right, y down, z forward
     spacing: Float32  # (P,) m, between neighboring readings
@@ -44,13 +44,13 @@ class SideView:
 
     @classmethod
     def of(cls, frame: Frame, before: ClusterMarks, after: ClusterMarks, aspect: float) -> SideView | None:
-        """Return the view from the left or right that shows more changed points, None without depth readings.
+        """Return the view from the left or right with more changed points, None without depth readings.
 
         Args:
             frame: Frame with depth.
             before: Clusters before refinement.
             after: Clusters after refinement.
-            aspect: width of the view divided by its height.
+            aspect: Width of the view divided by its height.
         """
         rows, columns = np.nonzero(frame.depth)
         if len(rows) == 0:
@@ -79,7 +79,7 @@ class SideView:
 
 
 def draw_side(axes: Axes, frame: Frame, marks: ClusterMarks, side: SideView | None, height_in: float) -> None:
-    """Draw the readings as points, the clusters in their colors in front, with a scale bar."""
+    """Draw the readings as points with a scale bar; the colored clusters are in front."""
     axes.set_facecolor(np.array(NOTHING) / 255)
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
@@ -112,7 +112,7 @@ def draw_side(axes: Axes, frame: Frame, marks: ClusterMarks, side: SideView | No
 
 
 def _up(frame: Frame) -> Float64:
-    """Return the up direction (3,) in the camera's frame, estimated from visible floors and table tops."""
+    """Return the up direction (3,) in the camera frame, estimated from visible floors and table tops."""
     step = max(1, min(frame.depth.shape) // GRID_CELLS)
     depth = frame.depth[::step, ::step]
     height, width = depth.shape
@@ -136,7 +136,7 @@ def _up(frame: Frame) -> Float64:
 
 
 def _turned(up: Float64, azimuth: float) -> Float64:
-    """Return R_camera_view (3, 3), turned by `azimuth` about the vertical and looking slightly down."""
+    """Return R_camera_view (3, 3), rotated by `azimuth` about the up direction, with a slight downward pitch."""
     forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
     if np.linalg.norm(forward) < 0.1:  # the camera looks straight down or up
         forward = np.array([0.0, -1.0, 0.0]) + up[1] * up

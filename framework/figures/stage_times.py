@@ -24,27 +24,27 @@ COLUMNS = {
     "GMM": ("refinement",),
     "map integration": ("update", "integration"),
 }
-"""The stages whose times add up to a line, by its name in the paper (the assignment is ours)."""
+"""Stages by line, with the names of the paper; the assignment of stages to names is our interpretation."""
 COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # for color-blind readers
-RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # ms a frame
+RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # ms per frame
 PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights of a diagram, its heading and its axis labels
-LEFT_MM, RIGHT_MM = 9.5, 25.5  # left and right of the diagram
+LEFT_MM, RIGHT_MM = 9.5, 25.5  # margins of the diagram
 PLOT_WIDTH_MM = COLUMN_MM - LEFT_MM - RIGHT_MM
-LABEL_PLACES_MM = (2.2, 2.8, 12.5)  # right of the diagram: line end, name and median, growth
-LABEL_MM, LABEL_LINE_MM = 6.4, 2.6  # distance of the labels, and of their two lines
-LOWEST_MS = 0.1  # shorter times are drawn with this value
+LABEL_PLACES_MM = (2.2, 2.8, 12.5)  # distance to the right of the diagram: line end, name and median, growth
+LABEL_MM, LABEL_LINE_MM = 6.4, 2.6  # spacing of the labels and of their two lines
+LOWEST_MS = 0.1  # lower limit of drawn times
 
 
 @dataclass(frozen=True)
 class MeanTimes:
-    """The smoothed times of several sequences, up to the end of the shortest one."""
+    """The smoothed times of several sequences, up to the end of the shortest sequence."""
 
     frames: Int64  # (G,) frame numbers
     mean: Mapping[str, Float64]  # by name in COLUMNS: (G,) ms, NaN = unknown
     lowest: Mapping[str, Float64]  # of the fastest sequence at each frame
     highest: Mapping[str, Float64]  # of the slowest sequence at each frame
-    count: int  # sequences
-    longest: int  # the last frame of the longest sequence
+    count: int  # number of sequences
+    longest: int  # last frame of the longest sequence
 
     @classmethod
     def of(cls, runs: Sequence[StageTimes]) -> MeanTimes:
@@ -59,14 +59,14 @@ class MeanTimes:
                     _column(run, name), WINDOW
                 )[run.frames <= end]
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)  # where all are NaN
+                warnings.simplefilter("ignore", RuntimeWarning)  # all values may be NaN
                 mean[name] = np.nanmean(smooth, axis=0)
                 lowest[name], highest[name] = np.nanmin(smooth, axis=0), np.nanmax(smooth, axis=0)
         return cls(frames, mean, lowest, highest, len(runs), max(int(run.frames[-1]) for run in runs))
 
     @property
     def columns(self) -> list[str]:
-        """Columns with known times."""
+        """Names of the columns with known times."""
         return [name for name, values in self.mean.items() if np.isfinite(values).any()]
 
     def growth(self, name: str) -> float:
@@ -79,17 +79,17 @@ class MeanTimes:
 
 
 def running_median(values: Float64, window: int) -> Float64:
-    """Return the median (F,) of the `window` (odd) values around each value, fewer at the ends. NaN values stay NaN."""
+    """Return the running median (F,) over `window` (odd) values, fewer at the ends. NaN values stay NaN."""
     half = window // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, constant_values=np.nan), window)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # windows of NaN alone
+        warnings.simplefilter("ignore", RuntimeWarning)  # windows may contain only NaN
         medians = np.nanmedian(around, axis=1)
     return np.where(np.isnan(values), np.nan, medians)
 
 
 def spread(positions: Sequence[float], gap: float) -> list[float]:
-    """Move positions apart until neighbors have a distance of at least `gap`, with the least squared displacement."""
+    """Move positions apart to a minimum distance of `gap` with the smallest sum of squared displacements."""
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(len(order))
     result = np.empty(len(order))
@@ -98,21 +98,21 @@ def spread(positions: Sequence[float], gap: float) -> list[float]:
 
 
 def stage_times_figure(rows: Mapping[str, MeanTimes | None], note: str) -> Page:
-    """Draw one diagram for each row, None = no run. `note` is the small print."""
+    """Draw one diagram per row, None = no run. `note` is printed at the bottom."""
     step = HEAD_MM + PLOT_MM + AXIS_MM
     page = Page(COLUMN_MM, step * len(rows), note)
     for k, (name, times) in enumerate(rows.items(), start=1):
         axes = page.axes(LEFT_MM, step * (len(rows) - k) + AXIS_MM, PLOT_WIDTH_MM, PLOT_MM)
         axes.set_title(name, fontsize=TEXT_PT, loc="left", pad=3, color=INK)
         if times is None:
-            say_inside(axes, "not complete")
+            say_inside(axes, "incomplete")
         else:
             _draw(axes, times)
     return page
 
 
 def _column(run: StageTimes, name: str) -> Float64:
-    """Return the sum (F,) of the stages of a column; NaN where one of them did not run."""
+    """Return the sum (F,) of the stages of a column; NaN if a stage did not run."""
     nothing = np.full(len(run.frames), np.nan)
     return np.asarray(np.sum([run.milliseconds.get(stage, nothing) for stage in COLUMNS[name]], axis=0), np.float64)
 
@@ -136,7 +136,7 @@ def _draw(axes: Axes, times: MeanTimes) -> None:
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlabel("frame", fontsize=SMALL_PT, labelpad=1.5, color=INK)
-    axes.set_ylabel("milliseconds a frame", fontsize=SMALL_PT, labelpad=1.5, color=INK)
+    axes.set_ylabel("milliseconds per frame", fontsize=SMALL_PT, labelpad=1.5, color=INK)
     for milliseconds, rate in RATES.items():
         axes.axhline(milliseconds, color=FAINT_INK, linewidth=0.5, dashes=(1.5, 2))
         halo = [withStroke(linewidth=1.2, foreground="white")]
@@ -149,7 +149,7 @@ def _draw_labels(axes: Axes, times: MeanTimes) -> None:
     """Draw the name, the median and the growth at the right end of each line."""
     low, high = np.log10(axes.get_ylim())
     ends = [np.maximum(times.mean[name][np.isfinite(times.mean[name])][-1], LOWEST_MS) for name in times.columns]
-    heights = [float((np.log10(end) - low) / (high - low)) for end in ends]  # as shares of the diagram
+    heights = [float((np.log10(end) - low) / (high - low)) for end in ends]  # relative to the height of the diagram
     line_x, name_x, growth_x = (1 + place / PLOT_WIDTH_MM for place in LABEL_PLACES_MM)
     half = LABEL_LINE_MM / 2 / PLOT_MM
     for name, height, place in zip(times.columns, heights, spread(heights, LABEL_MM / PLOT_MM), strict=True):

@@ -1,8 +1,8 @@
 """A thread that draws a run without blocking the pipeline.
 
-Frames that arrive during drawing are drawn next; only the newest picture and map are drawn. The thread does not read
-the map, because the fuser may be writing it: the pipeline's thread takes snapshots between two frames. The time for
-snapshots and for drawing is limited to fixed fractions, however large the map is.
+Frames that arrive during drawing are drawn next. Of images and maps, only the newest is drawn. The fuser may write the
+map at any time, so the pipeline's thread takes snapshots between two frames. The time for snapshots and drawing is
+limited to fixed fractions, regardless of the map's size.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from framework.interfaces import SceneMap
 log = logging.getLogger(__name__)
 
 SNAPSHOT_SHARE = 0.02  # maximum fraction of the pipeline's time for snapshots of the map
-FIRST_UP, UP_GROWTH = 2, 4  # snapshots 2, 8, 32 ... estimate the up direction, which takes 0.1 s
-PICTURE_SHARE, MAP_SHARE = 0.08, 0.08  # maximum fraction of a core's time for drawing
-IDLE_S = 0.5  # after which pending data are drawn if no frame follows
+FIRST_UP, UP_GROWTH = 2, 4  # the up direction is estimated at snapshots 2, 8, 32, ...; an estimate takes 0.1 s
+PICTURE_SHARE, MAP_SHARE = 0.08, 0.08  # maximum fractions of a core's time for drawing images and maps
+IDLE_S = 0.5  # delay before drawing pending data without a new frame
 LAST_S = 30.0  # maximum wait for the last drawing at the end of a run
 
 
 @dataclass(frozen=True)
 class FrameNote:
-    """The data of every frame."""
+    """The data recorded for every frame."""
 
     index: int  # Frame.index
     timestamp: float  # s
@@ -51,7 +51,7 @@ class FrameUpdate:
 
 @dataclass(frozen=True)
 class MapSnapshot:
-    """The map after a frame; it is not modified later."""
+    """An immutable copy of the map after a frame."""
 
     index: int  # Frame.index of the last integrated frame
     timestamp: float  # s
@@ -61,21 +61,21 @@ class MapSnapshot:
 
 
 class Drawing(Protocol):
-    """Receiver of updates. All calls come from one thread."""
+    """Receiver of updates, called from one thread only."""
 
     def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: FrameUpdate | None) -> None:
-        """Draw the frames since the last call, the reasons for skipped ones, and the newest picture if it is new."""
+        """Draw the frames since the last call, the reasons for skipped frames, and a new image if available."""
 
     def draw_map(self, snapshot: MapSnapshot) -> None:
         """Draw the current map."""
 
     def close(self) -> None:
-        """Finish."""
+        """Finish drawing."""
 
 
 @dataclass
 class _Pending:
-    """Data that have not been drawn yet."""
+    """Data for the next drawing."""
 
     notes: list[FrameNote] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
@@ -84,7 +84,7 @@ class _Pending:
 
 
 class DrawingThread:
-    """Thread that draws every `frame_interval`-th picture, and the map at intervals of at least `map_interval` s."""
+    """Thread that draws every `frame_interval`-th image, and the map at intervals of at least `map_interval` s."""
 
     def __init__(self, scene: SceneMap, drawing: Drawing, frame_interval: int, map_interval: float) -> None:
         self._scene, self._drawing, self._frame_interval = scene, drawing, frame_interval
@@ -103,7 +103,7 @@ class DrawingThread:
         self._thread.start()
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
-        """Add a frame; call it from the thread that writes the map."""
+        """Add a frame. Call it only from the thread that writes the map."""
         note = FrameNote(frame.index, frame.timestamp, pose, stage_ms)
         if not pose.lost:
             self._last = note
@@ -133,7 +133,7 @@ class DrawingThread:
         self._wanted.set()
         self._thread.join(LAST_S)
         if self._thread.is_alive():
-            log.warning("viewer: expected the last drawing within %g s, got a timeout", LAST_S)
+            log.warning("viewer: expected the last drawing within %g s, got a timeout; the view is incomplete", LAST_S)
 
     def _take_snapshot(self) -> None:
         if self._failed or self._last is None or not self._scene.statistics.voxels:
@@ -153,7 +153,7 @@ class DrawingThread:
             self._pending.snapshot = snapshot
 
     def _run(self) -> None:
-        numba.set_num_threads(1)  # parallel kernels would compete with those of the pipeline
+        numba.set_num_threads(1)  # parallel kernels would compete with the pipeline
         try:
             while not self._ending:
                 self._wanted.wait(IDLE_S)
@@ -192,7 +192,7 @@ class Pace:
     def __init__(self, interval: float, share: float, clock: Callable[[], float] = time.perf_counter) -> None:
         self.interval = interval  # s
         self.share = share  # in (0, 1]
-        self.clock = clock  # s; time.thread_time counts only the computing time of the calling thread
+        self.clock = clock  # s; time.thread_time measures only the CPU time of the calling thread
         self._next = 0.0  # s, by time.perf_counter
 
     def due(self) -> bool:

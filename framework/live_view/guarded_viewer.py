@@ -1,4 +1,4 @@
-"""A viewer whose errors do not end a run."""
+"""Wrapper that prevents viewer errors from ending a run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class GuardedViewer(Viewer):
-    """A wrapper that disables a viewer after its first error. Errors of `begin` are raised; `end` is always called."""
+    """Wrapper that disables a viewer after its first error. Errors of `begin` are raised; `end` is always called."""
 
     def __init__(self, viewer: Viewer) -> None:
         self._viewer = viewer

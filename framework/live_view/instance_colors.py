@@ -1,4 +1,4 @@
-"""Colors of instances in a growing map; an instance keeps its color."""
+"""Colors of instances in a growing map. Each instance keeps its color."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from framework.data import Bool, Float64, Frame, InstanceMesh, Int32, UInt8
 from framework.geometry import inverse, project, transform
 from framework.rendering.palette import instance_colors
 
-TINT = 0.6  # fraction of the instance's color in that of its vertices; the rest is their brightness
+TINT = 0.6  # fraction of the instance color in a vertex color; the rest is the vertex brightness
 
 
 class InstanceColors:
     """Palette of overview.png, by instance."""
 
     def __init__(self) -> None:
-        self._centroids: dict[int, Float64] = {}  # (3,) m, when it was first seen
+        self._centroids: dict[int, Float64] = {}  # (3,) m, at the first observation
         self._colors: dict[int, UInt8] = {}  # (3,) RGB
 
     def add(self, centroids: Mapping[int, Float64]) -> None:
@@ -47,14 +47,14 @@ class InstanceColors:
 
 
 MOST_POINTS = 8_000  # maximum number of map points projected into a frame
-NEAR = 0.05  # maximum distance of a point from the depth reading, relative to depth
-LEAST_SHARE = 0.3  # minimum fraction of the points under a mask that belong to its instance
+NEAR = 0.05  # maximum distance between a point and the depth reading, relative to depth
+LEAST_SHARE = 0.3  # minimum fraction of the points under a mask with its instance
 
 
 def seen_instances(masks: Bool, frame: Frame, T_world_camera: Float64, mesh: InstanceMesh) -> Int32:
-    """Return the instance (N,) of most points under each mask (N, H, W), 0 = none has LEAST_SHARE of them.
+    """Return the instance (N,) of most points under each mask (N, H, W); 0 = no instance has LEAST_SHARE of the points.
 
-    The points are vertices of the mesh, with or without an instance, that agree with the frame's depth.
+    The points are mesh vertices with or without an instance that agree with the frame's depth.
     """
     chosen = slice(None, None, -(-len(mesh.vertices) // MOST_POINTS) or 1)
     points_camera = transform(inverse(T_world_camera), mesh.vertices[chosen])

@@ -16,22 +16,22 @@ Region = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class MeshPart:
-    """The triangles whose first vertex lies in a region, with all their vertices."""
+    """The triangles with the first vertex in a region, and all vertices of these triangles."""
 
     vertices: Float32  # (V, 3) m, world
-    triangles: Int32  # (F, 3); no vertices and triangles = removed
+    triangles: Int32  # (F, 3); no vertices and no triangles = removed part
     colors: UInt8  # (V, 3) RGB
 
 
 class MeshRegions:
-    """Cubes of `side` m, with digests of their last content."""
+    """Cubes of `side` m with digests of their last content."""
 
     def __init__(self, side: float) -> None:
         self.side = side
         self._digests: dict[Region, bytes] = {}
 
     def changed(self, vertices: Float32, triangles: Int32, colors: UInt8) -> Iterator[tuple[Region, MeshPart]]:
-        """Yield the parts of a mesh that have changed or disappeared since the last call."""
+        """Yield the changed and removed parts of a mesh since the last call."""
         gone = set(self._digests)
         for region, chosen in _by_region(vertices, triangles, self.side):
             gone.discard(region)
@@ -49,7 +49,7 @@ class MeshRegions:
 
 
 def _by_region(vertices: Float32, triangles: Int32, side: float) -> Iterator[tuple[Region, Int64]]:
-    """Yield the triangles (M,) of each nonempty region, in order."""
+    """Yield the triangle indices (M,) of each nonempty region, in ascending order of the regions."""
     if not len(triangles):
         return
     cubes = np.floor(vertices[triangles[:, 0]] / np.float32(side)).astype(np.int64)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import open3d  # noqa: F401  # needed by boxes; imported before the run
+import open3d  # noqa: F401  # required for boxes; imported early to avoid a delay during the run
 import simplejpeg
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +22,7 @@ from framework.mapping.instances.instance_list import box_around, vertices_by_id
 if TYPE_CHECKING:
     import rerun as rr
 
-PATH_PIECE = 200  # poses that are redrawn when one is added
+PATH_PIECE = 200  # maximum poses redrawn for a new pose
 MM = 1000  # units of depth images per m
 UNKNOWN = 65535  # label of masks without an instance of the map
 UNKNOWN_COLOR = np.array([235, 235, 235], np.uint8)
@@ -30,12 +30,12 @@ MASK_OPACITY = 0.5
 PATH_COLOR, LOST_COLOR = (40, 160, 255), (230, 60, 50)
 NAME_RADIUS = 0.005  # m
 PATH_RADIUS = 0.004  # m
-FRUSTUM_M = 0.25  # m, from the camera to its picture
-LEAST_TURN = 0.01  # minimum change of the up direction, of a unit vector
+FRUSTUM_M = 0.25  # m, distance of the image plane from the camera
+LEAST_TURN = 0.01  # minimum change of the up direction (unit vector)
 
 
 class RerunDrawing:
-    """A `Drawing` that logs to a recording stream, with the parameters of `RerunViewer`."""
+    """Drawing into a rerun recording stream, with the parameters of `RerunViewer`."""
 
     def __init__(
         self, recording: rr.RecordingStream, stride: int, jpeg_quality: int, region: float, min_confidence: float
@@ -46,13 +46,13 @@ class RerunDrawing:
         self._stride, self._jpeg_quality, self._min_confidence = stride, jpeg_quality, min_confidence
         self._regions, self._colors = MeshRegions(region), InstanceColors()
         self._first_s: float | None = None  # timestamp of the first frame
-        self._path: list[Float32] = []  # (3,) of the last piece
+        self._path: list[Float32] = []  # (3,) positions of the last path segment
         self._pieces = 0
-        self._up: Float64 | None = None  # (3,) as it is drawn
+        self._up: Float64 | None = None  # (3,) as drawn
         self._forward: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) direction of the first camera
         self._mesh: InstanceMesh | None = None  # as last drawn, with the shown instances
-        self._names: dict[int, str] = {}  # of the shown instances
-        self._named: dict[int, str] = {}  # of all instances so far
+        self._names: dict[int, str] = {}  # names of the shown instances
+        self._named: dict[int, str] = {}  # names of all instances so far
         recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         stages, colors = [*at.STAGE_COLORS], [*at.STAGE_COLORS.values()]
         recording.log(at.STAGE_MS, rerun.SeriesLines(names=stages, colors=colors), static=True)
@@ -103,13 +103,13 @@ class RerunDrawing:
         return timestamp - self._first_s
 
     def _turn(self, up: Float64) -> None:
-        """Rotate the world so that `up` (3,) is the z axis of the view."""
+        """Rotate the world frame to align `up` (3,) with the z axis of the view."""
         if self._up is None or not np.allclose(self._up, up, atol=LEAST_TURN):
             self._up = up
             self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._forward)))
 
     def _begin_world(self, T_world_camera: Float64) -> None:
-        """Orient the world and the view by the first camera, until the map provides the up direction."""
+        """Orient the world frame and the view by the first camera until the map provides the up direction."""
         up, self._forward = -T_world_camera[:3, 1], T_world_camera[:3, 2]
         self._turn(up)
         T_view_camera = T_world_camera.copy()
@@ -182,7 +182,7 @@ class RerunDrawing:
         boxes = (found.boxes[named] + 0.5) / stride  # in rerun, integer coordinates are corners of pixels
         form = self._rr.Box2DFormat.XYXY
         self._recording.log(at.FOUND, self._rr.Boxes2D(array=boxes, array_format=form, colors=colors))
-        middles = (boxes[:, :2] + boxes[:, 2:]) / 2  # the label of a box may lie outside of the picture
+        middles = (boxes[:, :2] + boxes[:, 2:]) / 2  # rerun may place the label of a box outside of the image
         names = self._rr.Points2D(middles, labels=labels, colors=_lighter(colors), radii=2.0, show_labels=True)
         self._recording.log(at.NAMES, names)
 
@@ -203,7 +203,7 @@ class RerunDrawing:
         )
 
     def _name_masks(self) -> None:
-        """Log the names of the labels in images of masks."""
+        """Log the names of the labels in mask images."""
         known = [(key, name, self._colors[key]) for key, name in self._named.items()]
         nothing, unknown = (0, "nothing", np.zeros(4, np.uint8)), (UNKNOWN, "not in the map", UNKNOWN_COLOR)
         self._recording.log(at.MASKS, self._rr.AnnotationContext([nothing, unknown, *known]), static=True)
@@ -240,7 +240,7 @@ class RerunDrawing:
 
 
 def turned(up: Float64, forward: Float64) -> Float64:
-    """Return R_view_world (3, 3) that maps the unit vector `up` (3,) to z and the level part of `forward` (3,) to y."""
+    """Return R_view_world (3, 3): maps the unit vector `up` (3,) to z and the level part of `forward` (3,) to y."""
     across = np.cross(forward, up)
     across = across / np.linalg.norm(across) if across.any() else np.linalg.svd(up[None])[2][1]
     return np.stack([across, np.cross(up, across), up])

@@ -11,7 +11,7 @@ from framework.data import Float64
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-WORLD = "world"  # the map's coordinates, rotated upright
+WORLD = "world"  # world frame of the map, rotated upright
 MESH, PATH = f"{WORLD}/mesh", f"{WORLD}/path"
 OBJECTS, OBJECT_NAMES = f"{WORLD}/objects/boxes", f"{WORLD}/objects/names"
 CAMERA = f"{WORLD}/camera"
@@ -35,7 +35,7 @@ STAGE_COLORS = {
 }
 """RGB by stage, as in a report."""
 
-TIMES_SHOWN = 300  # frames before the current one
+TIMES_SHOWN = 300  # frames before the current frame
 EYE_BACK, EYE_ABOVE = 1.2, 0.8  # m, from the first camera to the view's position
 AIM_FORWARD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to the view's target
 
@@ -43,7 +43,7 @@ AIM_FORWARD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to the view's targ
 def layout(T_view_camera: Float64 | None = None) -> rrb.Blueprint:
     """Return the layout: map and stage times on the left, frame and depth on the right.
 
-    The view's position is behind the first camera at `T_view_camera`, z up; None = unknown.
+    The view is behind the first camera at `T_view_camera`, z up; None = unknown.
     """
     import rerun.blueprint as rrb
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 HERE = "127.0.0.1"
-TIMEOUT_S = 60.0  # until it listens, on a busy machine
+TIMEOUT_S = 60.0  # maximum startup time on a busy machine
 POLL_S = 0.05
 
 
@@ -46,7 +46,7 @@ def open_window(port: int, memory_limit: str) -> None:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         env=os.environ | {"RUST_LOG": "error"},
-        start_new_session=True,  # keeps running after the run, also after Ctrl-C
+        start_new_session=True,  # the viewer stays open after the run, also after Ctrl-C
     )
     _wait_for(viewer, port)
 
@@ -55,7 +55,7 @@ def open_window(port: int, memory_limit: str) -> None:
 def page_server() -> Iterator[str]:
     """Run rerun's web server and return its address. Raises OSError on failure.
 
-    Each call has a new home folder, because rerun sends usage statistics from the second start on.
+    Each call uses a new home folder: rerun sends usage statistics from the second start on.
     """
     port = free_port()
     ports = ["--port", str(free_port()), "--web-viewer-port", str(port)]
@@ -93,7 +93,7 @@ def _wait_for(process: subprocess.Popen[bytes], port: int) -> None:
     deadline = time.monotonic() + TIMEOUT_S
     while not listens(port):
         if process.poll() is not None:
-            raise OSError(f"rerun exited with status {process.returncode}")
+            raise OSError(f"rerun: expected a server on port {port}, got exit status {process.returncode}")
         if time.monotonic() > deadline:
-            raise OSError(f"rerun did not respond within {TIMEOUT_S:g} s")
+            raise OSError(f"rerun: expected a server on port {port} within {TIMEOUT_S:g} s, got a timeout")
         time.sleep(POLL_S)

@@ -1,8 +1,8 @@
 """rerun's web viewer on 127.0.0.1, with a Content-Security-Policy that blocks requests to other hosts.
 
 In rerun-sdk 0.41, `rr.serve_web_viewer` has no bind address and listens on 0.0.0.0. `rerun --serve-web --bind` listens
-on 127.0.0.1, but sends no policy: its page sends usage statistics and requests news, examples and fonts. This module
-downloads the page's files once from that server, stops it, and serves them with a policy.
+on 127.0.0.1 but sends no policy. Its page sends usage statistics and requests news, examples and fonts. This module
+downloads the page's files once from rerun's server, stops the server, and serves the files with a policy.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SOURCE_TIMEOUT_S = 30.0
 
 
 class SealedPage:
-    """Server of the page on `port` of 127.0.0.1, until it is closed. The page may connect only to `data_port`.
+    """Server of the page on `port` of 127.0.0.1, until `close`. The page may connect only to `data_port`.
 
     Raises OSError if the port is in use or the page is not available.
     """
@@ -65,7 +65,7 @@ class SealedPage:
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
-    """Return content and type of the page's files, by path. Raises OSError if rerun's server fails."""
+    """Return the content and type of the page's files by path. Raises OSError if rerun's server fails."""
     opener = build_opener(ProxyHandler({}))  # no proxy for 127.0.0.1
     files = {}
     with page_server() as address:

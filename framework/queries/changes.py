@@ -1,9 +1,9 @@
-"""Changes between two visits of a place: objects that appeared, vanished or moved, with probabilities.
+"""Changes between two visits of a scene: appeared, vanished or moved objects, with probabilities.
 
-The map of each visit is rendered from the poses of its camera. An object of the other visit is absent if the camera
-observed free space at its surface, and present if it observed a surface and the same object. It is unobserved if it was
-occluded or outside of all views. Both maps must share one world frame: map the second with `localize_in=` of the first,
-or both with given poses.
+The map of each visit is rendered from its camera poses. An object of the other visit is absent if the camera observed
+free space at its surface. It is present if the camera observed a surface and the same object. It is unobserved if it
+was occluded or outside of all views. Both maps must share one world frame: map the second visit with `localize_in=` of
+the first, or both visits with given poses.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from framework.errors import DataError
 from framework.geometry import inverse, project, transform
 from framework.interfaces import SceneMap
 
-LOOKS = 60  # evenly spaced poses of a visit from which its map is rendered
+LOOKS = 60  # number of evenly spaced poses for rendering the map of a visit
 EYE = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)  # assumed camera of a visit: half the resolution of a Kinect
 SAMPLED = 400  # maximum number of sampled vertices of an object
 BEHIND, BEHIND_SHARE = 0.06, 0.02  # m and m per m of depth: minimum distance of a surface behind free space
 LEAST_SEEN = 0.3  # minimum fraction of an object's vertices observed in the other visit
-BESIDE = 0.05  # m, largest distance to a vertex of the other map at the same position
+BESIDE = 0.05  # m, maximum distance to a vertex of the other map at the same position
 STAYS = 0.9  # prior probability that an object stays from one visit to the next
-CLUTTER = 0.1  # probability of another surface or object where an object is gone
+CLUTTER = 0.1  # probability of another surface or object at the position of an absent object
 GONE = 0.5  # minimum probability of a vanished object
-SAME_THING = 0.3  # minimum fraction of an object's surface that coincides with the same object of the other visit
+SAME_THING = 0.3  # minimum common fraction of the surface for the same object in both visits
 
 
 class Kind(Enum):
@@ -49,11 +49,11 @@ class Change:
 
     kind: Kind
     name: str  # of its class
-    probability: float  # of `kind`; for NOT_SEEN, that it is an object at all
+    probability: float  # of `kind`; for NOT_SEEN, probability that the object exists
     before: int | None  # id in the first map
     after: int | None  # id in the second map
-    place: Float64  # (3,) m, last center in the world
-    distance: float = 0.0  # m, by which it moved
+    place: Float64  # (3,) m, last center in the world frame
+    distance: float = 0.0  # m, displacement of a moved object
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ class _Object:
 
     instance: Instance
     name: str  # of its class
-    seen: float  # fraction of its surface that the other visit observed
-    gone: float  # probability that it is absent in the other visit
-    match: int | None  # object of the other visit at its position
+    seen: float  # observed fraction of the surface in the other visit
+    gone: float  # probability of absence in the other visit
+    match: int | None  # object of the other visit at the same position
 
     @property
     def is_gone(self) -> bool:
@@ -84,12 +84,12 @@ class _Object:
 
     @property
     def confidence(self) -> float:
-        """The probability that it is an object."""
+        """Probability that the object exists."""
         return float(min(max(self.instance.confidence, 0.0), 1.0))
 
 
 def changes(before: Visit, after: Visit) -> list[Change]:
-    """Return all objects of both visits, changed ones first, by decreasing probability."""
+    """Return all objects of both visits: changed objects first, then by decreasing probability."""
     old, new = _observe(before, after), _observe(after, before)
     pairs = _moved(old, new) if before.scene.classes == after.scene.classes else []
     found = []
@@ -129,9 +129,9 @@ def _observe(visit: Visit, other: Visit) -> list[_Object]:
 
 
 def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
-    """Return two (P,) masks of points (P, 3) m of the world: the visit observed a surface, or free space.
+    """Return two masks (P,) of the points (P, 3) m, world: observed surface, and observed free space.
 
-    A point in free space from any pose is absent, whatever the other poses show.
+    A point is free space if it is free from at least one pose, regardless of the other poses.
     """
     there, through = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
     for k in np.unique(np.linspace(0, len(visit.poses) - 1, LOOKS).round().astype(int)):
@@ -150,10 +150,16 @@ def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
 
 
 def probability_gone(confidence: float, there: Bool, through: Bool, matched: bool) -> float:
-    """Return the probability, by Bayes' rule, that an object is gone.
+    """Return the probability of an object's absence, by Bayes' rule.
 
-    there, through (M,): observations of its surface points; `matched`: True if an object is found at its position. A
-    present object has a surface, and is detected as often as before; a gone one has both only by clutter.
+    A present object has a surface and is detected as often as before. An absent object has a surface and a detection
+    only by clutter.
+
+    Args:
+        confidence: Confidence of the object.
+        there: (M,) mask of the surface points with an observed surface.
+        through: (M,) mask of the surface points with observed free space.
+        matched: True if the other visit has an object at the same position.
     """
     observed = int(np.count_nonzero(there | through))
     if observed < LEAST_SEEN * len(there):
@@ -167,7 +173,7 @@ def probability_gone(confidence: float, there: Bool, through: Bool, matched: boo
 
 
 def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
-    """Return the object (P,) of the nearest vertex within BESIDE; 0 = none."""
+    """Return the object (P,) of the nearest vertex within BESIDE m; 0 = none."""
     if not len(mesh.vertices):
         return np.zeros(len(points), np.int32)
     distance, nearest = KDTree(mesh.vertices).query(points, distance_upper_bound=BESIDE)
@@ -176,7 +182,7 @@ def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
 
 
 def _match(labels: Int32) -> int | None:
-    """Return the object under the largest part of a surface if that part is large enough."""
+    """Return the most frequent object of the labels (M,), None if its fraction is below SAME_THING."""
     ids, counts = np.unique(labels[labels > 0], return_counts=True)
     if not len(ids) or counts.max() < SAME_THING * len(labels):
         return None
@@ -184,7 +190,7 @@ def _match(labels: Int32) -> int | None:
 
 
 def _moved(old: Sequence[_Object], new: Sequence[_Object]) -> list[tuple[_Object, _Object, float]]:
-    """Return pairs of a vanished and an appeared object of similar class and size, with their probability."""
+    """Return pairs of vanished and appeared objects of similar class and size, with their probabilities."""
     vanished, appeared = [one for one in old if one.is_gone], [one for one in new if one.is_gone]
     if not vanished or not appeared:
         return []
@@ -207,7 +213,7 @@ def _similarity(a: Instance, b: Instance) -> float:
 
 
 def _change(one: _Object, kind: Kind) -> Change:
-    """Return the change of an object that did not move: `kind` (VANISHED or APPEARED) if it is gone."""
+    """Return the change of an unmoved object: STAYED, NOT_SEEN, or `kind` (VANISHED or APPEARED)."""
     found, probability, match = Kind.NOT_SEEN, one.confidence, None
     if one.seen >= LEAST_SEEN and one.gone < GONE:
         found, probability, match = Kind.STAYED, probability * (1 - one.gone), one.match

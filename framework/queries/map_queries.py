@@ -18,7 +18,7 @@ from framework.mapping.gravity import floor_height
 
 
 class Map:
-    """Thread-safe queries of a map of any fuser."""
+    """Thread-safe queries of a map, for all fusers."""
 
     scene: SceneMap
     lock: threading.RLock  # held during a query and while a frame is mapped
@@ -40,9 +40,13 @@ class Map:
         return self.scene.classes
 
     def instances(self, class_: str | None = None) -> Mapping[int, Instance]:
-        """Return the objects by id; with `class_`, those whose most likely class it is.
+        """Return the objects by id.
 
-        Raises DataError for an unknown class.
+        Args:
+            class_: Most likely class of the returned objects; None = all objects.
+
+        Raises:
+            DataError: The class is unknown.
         """
         with self.lock:
             found = self.scene.instances()
@@ -60,7 +64,18 @@ class Map:
         return self.classes[int(probabilities.argmax())] if len(probabilities) else "object"
 
     def nearest(self, point: Sequence[float] | Float64, class_: str | None = None) -> Instance | None:
-        """Return the object with the surface nearest to a point (3,) m of the world, None without objects."""
+        """Return the object with the nearest surface to a point.
+
+        Args:
+            point: (3,) m, world.
+            class_: Most likely class of the object; None = all classes.
+
+        Returns:
+            The object, None without objects.
+
+        Raises:
+            DataError: The point is invalid or the class is unknown.
+        """
         target = np.asarray(point, np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():
             raise DataError(f"point: expected 3 finite numbers in m (world), got {point!r:.60}")
@@ -74,7 +89,15 @@ class Map:
             return min(found.values(), key=distance, default=None)
 
     def view(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return the view of the map from a pose, with ids of `instances` only."""
+        """Return the view of the map from a pose.
+
+        Args:
+            camera: Camera of the view.
+            T_world_camera: (4, 4) pose.
+
+        Returns:
+            The view. It contains only ids of `instances`.
+        """
         with self.lock:
             view = self.scene.render(camera, T_world_camera)
             unknown = ~np.isin(view.instance_ids, [0, *self.scene.instances()])
@@ -85,16 +108,30 @@ class Map:
         )
 
     def at_pixel(self, u: int, v: int, camera: Camera, T_world_camera: Float64) -> Instance | None:
-        """Return the object at pixel (u, v) of the view from a pose, or None. Raises DataError outside the image."""
+        """Return the object at a pixel of the view from a pose.
+
+        Args:
+            u: Column, px.
+            v: Row, px.
+            camera: Camera of the view.
+            T_world_camera: (4, 4) pose.
+
+        Returns:
+            The object, None if the pixel has no object.
+
+        Raises:
+            DataError: The pixel is outside the image.
+        """
         if not (0 <= u < camera.width and 0 <= v < camera.height):
-            raise DataError(f"pixel: expected one in the image of {camera.width}x{camera.height} px, got ({u}, {v})")
+            raise DataError(f"pixel: expected u, v in an image of {camera.width}x{camera.height} px, got ({u}, {v})")
         with self.lock:
             return self.scene.instances().get(int(self.view(camera, T_world_camera).instance_ids[int(v), int(u)]))
 
     def up(self) -> Float64 | None:
-        """Return the up direction (3,), a unit vector in the world and the axis of boxes (`obb`); None if unknown.
+        """Return the up direction (3,), a unit vector in the world frame; None if unknown.
 
-        It is measured by a sensor if frames have `up`, otherwise estimated from floor, walls and camera orientation.
+        The direction is measured by a sensor if frames have `up`. Otherwise it is estimated from floor, walls and
+        camera orientation. It is also the vertical axis of the boxes (`obb`).
         """
         with self.lock:
             return self.scene.gravity().up
@@ -105,13 +142,23 @@ class Map:
             return self.scene.gravity().source
 
     def floor(self) -> float | None:
-        """Return the floor height, m along `up`: a point is `point @ up - floor` above it. None if not observed."""
+        """Return the floor height, m along `up`; None if the floor was not observed.
+
+        The height of a point above the floor is `point @ up - floor`.
+        """
         with self.lock:
             up, mesh = self.scene.gravity().up, self.scene.mesh()
             return None if up is None else floor_height(mesh.vertices, mesh.triangles, up)
 
     def mesh(self, instance: Instance | int | None = None) -> InstanceMesh:
-        """Return the surface of the map or of one object. Raises DataError for an unknown object."""
+        """Return the surface of the map or of one object.
+
+        Args:
+            instance: Object or its id; None = the whole map.
+
+        Raises:
+            DataError: The object is unknown.
+        """
         with self.lock:
             whole = self.scene.mesh()
             if instance is None:
@@ -123,6 +170,10 @@ class Map:
             return whole.of(found)
 
     def save(self, path: Path | str) -> None:
-        """Write the map to one file atomically; `load_map` reads it."""
+        """Write the map to one file by an atomic write. Read it with `load_map`.
+
+        Args:
+            path: Path of the file.
+        """
         with self.lock:
             self.scene.save(path)

@@ -1,4 +1,4 @@
-"""Text search for objects of a map, by image embeddings or by class names and colors."""
+"""Text queries for objects of a map, by image embeddings or by class names and colors."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from framework.vocabulary.color_names import COLOR_NAMES, fits, nearest_names
 from framework.vocabulary.text_queries import object_words
 
 BY = ("embeddings", "names")
-LEAST_MATCH = 0.1  # smallest similarity by names
-LONGEST_QUERY = 1000  # characters
+LEAST_MATCH = 0.1  # minimum similarity by names
+LONGEST_QUERY = 1000  # maximum characters of a query
 NAME_IT = "set --model (Python: model=)"
 WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instancemap[transformers])"
 
 
 @dataclass(frozen=True)
 class Match:
-    """An object that matches a query."""
+    """An object matching a text query."""
 
     instance: Instance
-    name: str  # of its most likely class
+    name: str  # name of the most likely class
     similarity: float  # by embeddings: cosine in [-1, 1]; by names: probability of class and color in [0, 1]
-    color: str  # name of the most frequent color of its observed surface: "brown"
-    centroid: Float64  # (3,) m, of its vertices
+    color: str  # name of the most frequent color of the observed surface, such as "brown"
+    centroid: Float64  # (3,) m, mean of the vertices
 
 
 @dataclass(frozen=True)
 class QueryResult:
-    """The objects of a map that match a text query."""
+    """The objects of a map matching a text query."""
 
     by: str  # "embeddings" of images, or "names" of classes and colors
-    space: str  # model and version of the map's embeddings; "" = the map has none
-    objects: tuple[Match, ...]  # best first; by embeddings all that have one, by names the matching ones
+    space: str  # model and version of the map's embeddings; "" = no embeddings
+    objects: tuple[Match, ...]  # best first; by embeddings: all objects with an embedding; by names: matching objects
 
 
 @dataclass(frozen=True)
 class TextQuery:
     """A text query. Raises ConfigError for invalid values."""
 
-    words: str
-    by: str | None = None  # of BY; None = embeddings if the map has any or a model is named, else names
-    model: str | None = None  # embedding model of the query: folder, file or id; None = that of the run's detector
+    words: str  # text of 1 to 1000 characters
+    by: str | None = None  # embeddings or names; None = embeddings if the map has any or `model` is set, else names
+    model: str | None = None  # embedding model of the query: folder, file or id; None = model of the run's detector
 
     def __post_init__(self) -> None:
         if not isinstance(self.words, str) or not 0 < len(self.words.strip()) <= LONGEST_QUERY:
@@ -61,9 +61,15 @@ class TextQuery:
 
 
 def search(scene: Map, query: TextQuery, run: Path | None = None) -> QueryResult:
-    """Return the objects that match a query; `run`: directory of the map's run, if any.
+    """Return the objects matching a text query.
 
-    Raises DataError for unknown words, and for missing embeddings or embeddings of another model.
+    Args:
+        scene: Map.
+        query: Text query.
+        run: Run directory of the map, if any.
+
+    Raises:
+        DataError: A word is unknown, or embeddings are missing or of another model.
     """
     space = scene.scene.embedding_space
     by = query.by or ("embeddings" if space or query.model is not None else "names")
@@ -88,7 +94,7 @@ def _embedded(query: TextQuery, space: str, run: Path | None) -> Float32:
 
 
 def _model_of(run: Path | None) -> tuple[str, str]:
-    """Return model and revision of a run's detector. Raises DataError if its config has none."""
+    """Return the model and revision of a run's detector. Raises DataError if its config has no model."""
     if run is None:
         raise DataError(f"model: expected the model of the map's embeddings, got none; {NAME_IT}, or query its run")
     node = read_yaml(run / CONFIG).get("detector") if is_there(run / CONFIG) else None
@@ -98,23 +104,22 @@ def _model_of(run: Path | None) -> tuple[str, str]:
 
 
 def by_embedding(scene: Map, text: Float32) -> list[Match]:
-    """Return the objects with an embedding by its cosine with the embedding of a text (D,), largest first.
+    """Return the objects with an embedding, ranked by the cosine with a text embedding (D,), largest first.
 
     Raises DataError if the map's embeddings have another length.
     """
     with scene.lock:
         known = {k: i.embedding for k, i in scene.instances().items() if i.embedding is not None}
-        if any(embedding.shape != text.shape for embedding in known.values()):
-            raise DataError(
-                f"map: expected embeddings of length {len(text)} as of the model's texts, got another length"
-            )
+        lengths = {len(embedding) for embedding in known.values()}
+        if lengths - {len(text)}:
+            raise DataError(f"map: expected embeddings of length {len(text)}, got {max(lengths - {len(text)})}")
         return _found(scene, {k: float(embedding @ text) for k, embedding in known.items()})
 
 
 def by_names(scene: Map, query: str) -> list[Match]:
-    """Return the objects by the probability of the query's classes times the fit of its colors, then by confidence.
+    """Return the objects ranked by the probability of the query's classes times the fit of its colors.
 
-    Raises DataError for a query with an unknown word, or without a class or color.
+    Ties are ranked by confidence. Raises DataError for a query with an unknown word, or without a class and color.
     """
     with scene.lock:
         words = object_words(query, scene.classes)
@@ -136,7 +141,7 @@ def by_names(scene: Map, query: str) -> list[Match]:
 
 
 def color_fit(mesh: InstanceMesh, instance: Instance, colors: Sequence[str]) -> float:
-    """Return the fit of the best of these colors to an object, in [0, 1]: the mean over its vertices."""
+    """Return the fit of the best color to an object, in [0, 1], averaged over its vertices."""
     observed = _colors(mesh, instance)
     return max((float(fits(observed, name).mean()) for name in colors), default=0.0) if len(observed) else 0.0
 
@@ -147,7 +152,7 @@ def _colors(mesh: InstanceMesh, instance: Instance) -> Float32:
 
 
 def _found(scene: Map, similarities: dict[int, float]) -> list[Match]:
-    """Return the objects with these similarities by id, best first, then by confidence."""
+    """Return the objects with the given similarities by id, best first; ties are ranked by confidence."""
     instances, mesh = scene.instances(), scene.mesh()
     return [
         Match(

@@ -1,7 +1,7 @@
 """Screen-space ambient occlusion.
 
-Ritschel, Grosch and Seidel, "Approximating Dynamic Global Illumination in Image Space", I3D 2009: rays around a point
-are traced in the depth image.
+Rays around each point are traced in the depth image: Ritschel, Grosch and Seidel, "Approximating Dynamic Global
+Illumination in Image Space", I3D 2009.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ DEPTH = 0.75  # darkening of a fully occluded point
 
 
 def openness(camera: Camera, depth: Float32, normals_camera: Float32) -> Float32:
-    """Return the fraction (H, W) of the ambient light, in (0, 1].
+    """Return the unoccluded fraction (H, W) of the ambient light, in (0, 1].
 
     Args:
         camera: Camera of the depth image.
@@ -36,12 +36,12 @@ def _directions() -> Float32:
     """Return cosine-weighted rays (TILE^2, RAYS, 3) in the frame of two tangents and the normal."""
     pixel, ray = np.arange(TILE**2)[:, None], np.arange(RAYS)
     angle = 2 * np.pi / RAYS * (ray + (pixel * 7 % TILE**2) / TILE**2)
-    sine = np.sqrt(((ray + pixel) % RAYS + 0.5) / RAYS)  # a tile has each elevation in each direction
+    sine = np.sqrt(((ray + pixel) % RAYS + 0.5) / RAYS)  # a tile contains each elevation in each direction
     return np.stack([sine * np.cos(angle), sine * np.sin(angle), np.sqrt(1 - sine**2)], axis=-1).astype(np.float32)
 
 
 def _reaches() -> Float32:
-    """Return the sampled distances along a ray (TILE^2, STEPS) m: its end, and jittered ones before it."""
+    """Return the sampled distances along a ray (TILE^2, STEPS) m: jittered distances and the end."""
     pixel = np.arange(TILE**2)
     shift = (pixel * 5 % TILE**2 + 0.5) / TILE**2
     share = (np.arange(STEPS) + shift[:, None]) / (STEPS - 1)

@@ -1,4 +1,4 @@
-"""The camera path in the picture of a map."""
+"""The camera path in the image of a map."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ProjectedPath:
 
     @classmethod
     def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> ProjectedPath:
-        """Project the positions of `poses` (F, 4, 4) in front of `camera`, whose view of the surface is `hits`."""
+        """Project the positions of `poses` (F, 4, 4) into `camera`; `hits` is the view of the surface."""
         positions = poses[:, :3, 3]
         points = transform(inverse(T_world_camera), positions)
         points = points[points[:, 2] > 0.05]
@@ -42,7 +42,7 @@ class ProjectedPath:
         return np.asarray(np.rint(mixed), np.uint8)
 
     def draw(self, image: Image.Image) -> None:
-        """Draw a line with dots at its ends, thin where it is occluded."""
+        """Draw a line with dots at its ends; occluded segments are thin."""
         canvas = ImageDraw.Draw(image)
         points = [tuple(pixel) for pixel in self.pixels.tolist()]
         shades = [tuple(shade) for shade in self.shades().tolist()]

@@ -1,4 +1,4 @@
-"""Placement of object names in a picture: on large objects, next to small ones with a line."""
+"""Placement of object names in an image: on large objects, or next to small objects with a line."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from PIL import Image, ImageDraw, ImageFont
 from framework.data import Bool, Int32
 from framework.rendering.palette import INK, PAPER
 
-MIN_PIXELS = 60  # of an object with a name
+MIN_PIXELS = 60  # minimum size of an object with a name
 ROOM = 0.75  # minimum distance from the name to the border of its object, relative to the height of the name
 NEAREST, FARTHEST, STEP = 24, 160, 8  # px, distances of a name next to its object
 DIRECTIONS = 32
-ABOUT = 0.9  # minimum distance from the border, relative to the largest one
-ON_OTHERS = 0.1  # maximum fraction of a name on its object that covers other objects
-COVERING = 150.0  # px, cost of covering objects with the whole box
-CROSSING = 100.0  # px, cost of a line that lies on other objects
+ABOUT = 0.9  # minimum distance from the border, relative to the largest distance
+ON_OTHERS = 0.1  # maximum fraction of a name over other objects, for a name on its object
+COVERING = 150.0  # px, cost of a name completely over objects
+CROSSING = 100.0  # px, cost of a line completely over other objects
 SAMPLES = 24  # points of a line
-DOT = 2.5  # px, the radius of a line's end on the object
+DOT = 2.5  # px, radius of a line's end on the object
 AROUND = 3  # px, margin of a name
 HALO = 3  # px
 
@@ -40,10 +40,10 @@ class Label:
 
 
 def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tuple[float, float]]) -> list[Label]:
-    """Place the `names` by id in a picture of `ids` (H, W), 0 = none, starting with large objects.
+    """Place the `names` by id in an image of `ids` (H, W), 0 = none, starting with large objects.
 
-    Names do not overlap and are inside the picture; a name without space is omitted. `size` returns the width and
-    height of a text, px.
+    Names do not overlap and are inside the image. Names without space are omitted. `size` returns the width and height
+    of a text, px.
     """
     pixels = np.bincount(ids.ravel(), minlength=max([0, *names]) + 1)
     shown = sorted((key for key in names if pixels[key] >= MIN_PIXELS), key=lambda key: (-pixels[key], key))
@@ -92,7 +92,7 @@ def text_size(text: str, font: ImageFont.FreeTypeFont) -> tuple[float, float]:
 def _widest_part(mask: Bool) -> tuple[float, float, float]:
     """Return the point (u, v) with the largest distance from the border of a mask (H, W), and this distance, px.
 
-    Of points with similar distances, it is the one nearest to the center.
+    Among points with similar distances, the point nearest to the center is returned.
     """
     u, v, width, height = cv2.boundingRect(mask.astype(np.uint8))
     framed = np.pad(mask[v : v + height, u : u + width], 1).astype(np.uint8)
@@ -142,5 +142,5 @@ def _is_free(box: Box, taken: Sequence[Box], shape: tuple[int, ...]) -> bool:
 
 
 def _nearest_point(box: Box, u: float, v: float) -> tuple[float, float]:
-    """Return the point of a box that is nearest to (u, v)."""
+    """Return the nearest point of a box to (u, v)."""
     return min(max(u, box[0]), box[2]), min(max(v, box[1]), box[3])

@@ -1,4 +1,4 @@
-"""Images of a lit surface: in its own colors, or in instance colors on a pale background."""
+"""Images of a lit surface in its own colors, or in instance colors on a pale background."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class LitView:
         """Return the image (H, W, 3) RGB with one color per instance.
 
         Args:
-            colors: (V, 3) RGB of the vertices, whose brightness remains visible.
+            colors: (V, 3) RGB of the vertices; their brightness remains visible.
             ids: (V,) instances of the vertices, 0 = none.
-            color_of: RGB (3,) of each id.
+            color_of: RGB color (3,) by id.
         """
         palette = np.zeros((max([0, *color_of]) + 1, 3), np.float32)
         for key, rgb in color_of.items():
@@ -52,7 +52,7 @@ class LitView:
         return self._developed(painted)
 
     def _developed(self, color: Float32) -> UInt8:
-        """Return the lit image in the camera's size. Modifies `color`."""
+        """Return the lit image at the camera's resolution. Modifies `color`."""
         np.clip(color * self._light[..., None], 0, 255, out=color)
         color[self._fine.depth <= 0] = NOTHING
         return np.asarray(cv2.resize(color, self.hits.depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)

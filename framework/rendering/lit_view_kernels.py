@@ -14,7 +14,7 @@ AMBIENT, DIFFUSE = 0.70, 0.34  # light from all directions and from the lamp
 
 @njit(cache=True, nogil=True)
 def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float32) -> None:
-    """Write the brightness (H, W), and turn the normals (H, W, 3) into unit vectors to the camera, in its frame."""
+    """Write the brightness (H, W). Convert the normals (H, W, 3) to unit vectors towards the camera, in its frame."""
     R = R_world_camera
     for v in range(normals.shape[0]):
         y = (v - K[1, 2]) / K[1, 1]

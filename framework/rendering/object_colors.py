@@ -1,4 +1,4 @@
-"""Matching of objects between maps, for consistent colors across pictures."""
+"""Matching of objects between maps, for consistent colors across images."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from framework.data import Int32, SceneTruth, UInt8
 from framework.rendering.palette import DARK, instance_colors
 
 SAME_OBJECT_IOU = 0.25  # minimum IoU of matching instances
-UNKNOWN = (206, 184, 152)  # RGB of true instances of unknown class, which are not evaluated
+UNKNOWN = (206, 184, 152)  # RGB of ground-truth instances of unknown class (not evaluated)
 
 
 class ObjectColors:
-    """The objects of one scene in several maps, numbered from 1: true instances, and unmatched ones of the maps."""
+    """Objects of one scene in several maps, numbered from 1: ground-truth instances and unmatched map instances."""
 
     def __init__(self, truth: SceneTruth) -> None:
         ids = np.setdiff1d(truth.instance_ids, [0]).tolist()
-        self.true_objects = {key: k for k, key in enumerate(ids, start=1)}  # by true instance
+        self.true_objects = {key: k for k, key in enumerate(ids, start=1)}  # by ground-truth instance
         self.name_of = {k: name for key, k in self.true_objects.items() if (name := truth.class_names.get(key))}
         self.color_of: dict[int, UInt8] = dict.fromkeys(self.true_objects.values(), np.array(UNKNOWN, np.uint8))  # (3,)
         named = [key for key in ids if self.true_objects[key] in self.name_of]
@@ -28,11 +28,11 @@ class ObjectColors:
         self.color_of |= {self.true_objects[key]: color for key, color in zip(named, colors, strict=True)}
 
     def objects(self, ids: Int32, true_ids: Int32) -> dict[int, int]:
-        """Return the object of each instance of a map; unmatched instances get new objects in dark colors.
+        """Return the object of each instance of a map. Unmatched instances become new objects in dark colors.
 
         Args:
-            ids: (V,) instances of points, 0 = none.
-            true_ids: (V,) true instances of the same points, 0 = none.
+            ids: (V,) instances of the points, 0 = none.
+            true_ids: (V,) ground-truth instances of the points, 0 = none.
         """
         same = {key: self.true_objects[true] for key, true in same_objects(ids, true_ids).items()}
         others = np.setdiff1d(ids, [0, *same]).tolist()
@@ -42,9 +42,9 @@ class ObjectColors:
 
 
 def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
-    """Match instances to true instances one-to-one with the largest sum of IoU; both (V,) of the same points, 0 = none.
+    """Match instances and ground-truth instances (V,) of the same points one-to-one; 0 = none.
 
-    Pairs with an IoU below SAME_OBJECT_IOU are omitted.
+    The matching maximizes the sum of IoU. Pairs with an IoU below SAME_OBJECT_IOU are omitted.
     """
     found, rows = np.unique(ids, return_inverse=True)
     true, columns = np.unique(true_ids, return_inverse=True)
@@ -57,6 +57,6 @@ def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
 
 
 def relabeled(ids: Int32, object_of: Mapping[int, int]) -> Int32:
-    """Return the objects of `ids` (V,), 0 = none."""
+    """Return the object (V,) of each id, 0 = none."""
     values, inverse = np.unique(ids, return_inverse=True)
     return np.array([object_of.get(key, 0) for key in values.tolist()], np.int32)[inverse]

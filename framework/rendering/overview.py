@@ -1,4 +1,4 @@
-"""overview.png: the map in its colors and its instances, side by side, from one viewpoint."""
+"""overview.png: the map in its colors and in instance colors, side by side, from one viewpoint."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PANEL_WIDTH, PANEL_HEIGHT = 960, 760  # px
 TITLE_HEIGHT = 56  # px
 LEGEND_ROW = 30  # px
 LEGEND_COLUMNS, LEGEND_ROWS = 9, 4
-PNG_LEVEL = 3  # of zlib; the default, 6, is much slower for a file 3% smaller
+PNG_LEVEL = 3  # zlib level; the default of 6 is much slower for a 3% smaller file
 LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22
 
 
@@ -34,9 +34,9 @@ def write_overview(
     Args:
         path: PNG file.
         mesh: Mesh of the map.
-        instances: class name and confidence by id; other ids are background.
-        poses: (F, 4, 4) T_world_camera of the frames that were mapped.
-        title: above the pictures.
+        instances: Class name and confidence by id; all other ids are background.
+        poses: (F, 4, 4) T_world_camera of the mapped frames.
+        title: Title above the images.
     """
     image = overview(mesh, instances, poses, title)
     with written_whole(path) as temporary:
@@ -44,7 +44,7 @@ def write_overview(
 
 
 def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], poses: Float64, title: str) -> UInt8:
-    """Return the picture (H, W, 3) RGB."""
+    """Return the overview image (H, W, 3) RGB."""
     ids = np.where(np.isin(mesh.instance_ids, list(instances)), mesh.instance_ids, 0).astype(np.int32)
     shown = [key for key in sorted(instances) if (ids == key).any()]
     centroids = np.array([mesh.vertices[ids == key].mean(axis=0) for key in shown], np.float64).reshape(-1, 3)
@@ -80,7 +80,7 @@ def _text_panel(text: str, height: int, x: int, ink: tuple[int, int, int], ancho
 
 
 def _legend(entries: Iterable[tuple[UInt8, str, float]]) -> UInt8:
-    """Draw the names and confidences of the colors, the most confident first."""
+    """Draw the names and confidences of the colors, most confident first."""
     ranked = sorted(entries, key=lambda entry: -entry[2])
     rows = min(LEGEND_ROWS, -(-len(ranked) // LEGEND_COLUMNS))
     image = Image.new("RGB", (2 * PANEL_WIDTH, LEGEND_ROW * rows + 20), PAPER)

@@ -1,4 +1,4 @@
-"""Colors of pictures; nearby instances have dissimilar colors."""
+"""Colors for images; nearby instances get dissimilar colors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from framework.data import Float64, UInt8
 
 PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)
 
-NEAR_M = 0.8  # distance scale within which colors should be dissimilar
+NEAR_M = 0.8  # distance scale for dissimilar colors
 ALIKE = 22.0  # CIE76 difference of similar colors
 HUES = 18
 CLEAR = ((165, 245), (105, 250), (190, 200))  # saturation and value
@@ -19,14 +19,14 @@ DARK = ((130, 95), (60, 125))  # disjoint from CLEAR
 
 
 def candidates(shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """Return RGB colors (K, 3): all hues in each shade."""
+    """Return the RGB colors (K, 3) of all hues in each shade."""
     hues = np.arange(HUES) * (180 // HUES)
     hsv = np.array([(hue, *shade) for shade in shades for hue in hues], np.uint8)
     return np.asarray(cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0], np.uint8)
 
 
 def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """Return RGB colors (N, 3) of objects at centroids (N, 3) m, chosen greedily to differ from those nearby."""
+    """Return RGB colors (N, 3) for objects at centroids (N, 3) m. Nearby objects get dissimilar colors, greedily."""
     rgb = candidates(shades)
     lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
     likeness = np.exp(-np.linalg.norm(lab[:, None] - lab[None], axis=2) / ALIKE)  # (K, K)
@@ -39,17 +39,17 @@ def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEA
 
 
 def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[int, UInt8]:
-    """Return RGB (3,) by id of objects at centroids (3,) m: likely objects have the colors of overview.png."""
+    """Return RGB colors (3,) by id for objects at centroids (3,) m; likely objects have the colors of overview.png."""
     ordered = sorted(centroids, key=lambda key: (key not in likely, key))
     positions = np.array([centroids[key] for key in ordered], np.float64).reshape(-1, 3)
     return dict(zip(ordered, instance_colors(positions), strict=True))
 
 
 def class_colors(objects: Sequence[tuple[str, float]]) -> dict[str, UInt8]:
-    """Return RGB (3,) by class, given class and confidence of objects; likely classes differ most."""
+    """Return RGB colors (3,) by class, given class and confidence of objects; likely classes differ most."""
     most: dict[str, float] = {}
     for name, confidence in objects:
         most[name] = max(confidence, most.get(name, 0.0))
     names = sorted(most, key=lambda name: (-most[name], name))
-    # at one position, so that each differs from all others
+    # equal positions make all colors dissimilar
     return dict(zip(names, instance_colors(np.zeros((len(names), 3))), strict=True))

@@ -1,7 +1,7 @@
-"""Rasterization of triangle meshes; for small triangles several times faster than ray casting.
+"""Rasterization of triangle meshes, several times faster than ray casting for small triangles.
 
-Edge functions are evaluated in homogeneous coordinates (Olano and Greer, "Triangle Scan Conversion Using 2D Homogeneous
-Coordinates", Graphics Hardware 1997): no clipping is needed, and triangles with a common edge leave no gap.
+Edge functions are evaluated in homogeneous coordinates: Olano and Greer, "Triangle Scan Conversion Using 2D Homogeneous
+Coordinates", Graphics Hardware 1997. No clipping is needed, and triangles with a common edge leave no gap.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class VisibilityBuffer:
         """Return the label (H, W) of the corner with the largest barycentric weight, 0 = none.
 
         Args:
-            triangles: (F, 3).
-            labels: (V,).
+            triangles: (F, 3) vertex indices of the mesh.
+            labels: (V,) labels of the vertices.
         """
         image = np.zeros(self.triangle.shape, np.int32)
         nearest(self.triangle, self.uv, triangles, labels, image)
@@ -38,7 +38,7 @@ class Rasterizer:
     """Rasterizer of a fixed triangle mesh. It is thread-safe."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
-        """Vertices are (V, 3) m, world; triangles (F, 3) are two-sided."""
+        """Prepare a mesh of vertices (V, 3) m, world, and two-sided triangles (F, 3)."""
         self._vertices = np.ascontiguousarray(vertices, np.float32)
         # spatial order improves culling and cache locality
         self._order = np.argsort(morton_codes(self._vertices, triangles), kind="stable").astype(np.int32)
@@ -46,7 +46,7 @@ class Rasterizer:
         self._spheres = bounding_spheres(self._vertices, self._triangles)
 
     def draw(self, camera: Camera, T_world_camera: Float64) -> VisibilityBuffer:
-        """Return the first intersection of each pixel's ray. Ties are broken deterministically."""
+        """Return the nearest triangle of each pixel. Ties are broken deterministically."""
         triangle = np.empty(camera.shape, np.int32)
         depth = np.empty(camera.shape, np.float32)
         uv = np.empty((*camera.shape, 2), np.float32)

@@ -9,10 +9,10 @@ from numba import njit
 from framework.data import Float32, Float64, Int32
 
 NO_TRIANGLE = -1
-CHUNK = 32  # triangles that are culled together
+CHUNK = 32  # number of triangles culled together
 SLACK = 0.01  # px, margin of bounds against rounding
 CELLS = 1023  # along each axis of the bounding cube
-NEAR = 1e-9  # m, near plane for the bounds of triangles that reach behind the camera
+NEAR = 1e-9  # m, near plane for the bounds of triangles partly behind the camera
 
 
 @njit(cache=True, nogil=True)
@@ -75,7 +75,7 @@ def draw_triangles(
     depth: Float32,
     uv: Float32,
 ) -> None:
-    """Write the last three arguments, (H, W) and (H, W, 2); x (W,) and y (H,) are pixel coordinates at z = 1."""
+    """Write triangle (H, W), depth (H, W) and uv (H, W, 2); x (W,) and y (H,) are pixel coordinates at z = 1."""
     height, width = triangle.shape
     closeness = np.zeros((height, width))  # 1/m
     triangle[:] = NO_TRIANGLE  # indices into `triangles` until the second pass
@@ -149,7 +149,7 @@ def interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32,
 
 @njit(cache=True, nogil=True, inline="always")
 def _corners(vertices, triangles, f, T_world_camera):
-    """Return the corners of triangle f, camera frame."""
+    """Return the corners of triangle f in the camera frame."""
     i, j, k = np.uint64(triangles[f, 0]), np.uint64(triangles[f, 1]), np.uint64(triangles[f, 2])
     return (
         _in_camera(T_world_camera, vertices[i, 0], vertices[i, 1], vertices[i, 2]),
@@ -160,7 +160,7 @@ def _corners(vertices, triangles, f, T_world_camera):
 
 @njit(cache=True, nogil=True, inline="always")
 def _edge_functions(a, b, c):
-    """Return the three edge functions of a triangle, and the triple product of its corners, which is not negative.
+    """Return the three edge functions of a triangle and the nonnegative triple product of its corners.
 
     The barycentric weight of a corner is proportional to the product of the pixel's ray and the cross product of the
     other two corners. For a common edge, neighbors compute the same value except for the sign, which leaves no gap.
@@ -190,7 +190,7 @@ def _cross(p, q):
 
 @njit(cache=True, nogil=True)
 def _is_out_of_sight(center, radius, intrinsics, width, height):
-    """Return whether a sphere is outside of the view frustum."""
+    """Return True if a sphere is outside of the view frustum."""
     fx, fy, cx, cy = intrinsics
     x, y, z = center
     for distance, slope in (
@@ -207,7 +207,7 @@ def _is_out_of_sight(center, radius, intrinsics, width, height):
 
 @njit(cache=True, nogil=True, inline="always")
 def _pixels_of(a, b, c, intrinsics, width, height):
-    """Return begin and end of the columns and of the rows that a triangle in front of the camera can cover."""
+    """Return the ranges of columns and rows possibly covered by a triangle: column begin and end, row begin and end."""
     fx, fy, cx, cy = intrinsics
     if min(a[2], b[2], c[2]) > NEAR:
         za, zb, zc = 1 / a[2], 1 / b[2], 1 / c[2]
@@ -225,7 +225,7 @@ def _pixels_of(a, b, c, intrinsics, width, height):
 
 @njit(cache=True, nogil=True)
 def _bounds_in_front(a, b, c):
-    """Return left, right, top and bottom at z = 1 of the part of a triangle in front of z = NEAR."""
+    """Return left, right, top and bottom at z = 1 of a triangle clipped at z = NEAR."""
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     for p, q in ((a, b), (b, c), (c, a)):
         x, y, z = p

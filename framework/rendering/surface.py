@@ -11,7 +11,7 @@ from framework.data import Bool, Camera, Float32, Float64, Int32
 from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
 from framework.rendering.rasterizer_kernels import NO_TRIANGLE, interpolate
 
-VOTES, VOTERS = 20000, 50  # triangles and cameras that determine the front side
+VOTES, VOTERS = 20000, 50  # sampled triangles and cameras for determining the front side
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,13 @@ class Hits:
         return replace(self, camera=camera, buffer=buffer)
 
     def interpolated(self, values: Float32) -> Float32:
-        """Interpolate values (V, C) of the vertices, (H, W, C), 0 = none."""
+        """Return the interpolated values (H, W, C) of the vertices (V, C), 0 = none."""
         image = np.zeros((*self.camera.shape, values.shape[1]), np.float32)
         interpolate(self.buffer.triangle, self.buffer.uv, self.triangles, np.ascontiguousarray(values), image)
         return image
 
     def nearest(self, labels: Int32) -> Int32:
-        """Return the label (V,) of the nearest corner, (H, W), 0 = none."""
+        """Return the label (H, W) of the nearest corner from the labels (V,), 0 = none."""
         return self.buffer.nearest(self.triangles, labels)
 
 
@@ -67,9 +67,9 @@ class Surface:
 
     @classmethod
     def seen_from(cls, vertices: Float32, triangles: Int32, poses: Float64) -> Surface:
-        """Orient the surface with its front towards the cameras at `poses` (F, 4, 4).
+        """Return the surface with its front towards the cameras at `poses` (F, 4, 4).
 
-        The winding of meshes depends on their extractor.
+        Mesh extractors use different winding orders.
         """
         some = cls(vertices, triangles[:: max(1, len(triangles) // VOTES)])
         centers = vertices[some.triangles].mean(axis=1)
@@ -98,7 +98,7 @@ class Surface:
 
 
 class FrontSides:
-    """The triangles of a surface that face a viewpoint, without the walls and ceilings in between."""
+    """The front-facing triangles of a surface from a viewpoint, without back-facing walls and ceilings in between."""
 
     def __init__(self, surface: Surface, eye_world: Float64) -> None:
         self._eye_world = eye_world  # (3,) m

@@ -1,4 +1,4 @@
-"""Viewpoint selection for a map: obliquely from above, into the room, with many visible objects."""
+"""Viewpoint selection for a map: an oblique view from above into the room with many visible objects."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, for a weak perspective
 ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])
 AZIMUTHS = 16  # candidates around the vertical
 MARGIN = 1.04  # size of the view relative to its content
-TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, of the images of candidates
-TRIAL_POINTS = 60000  # vertices in these images
+TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, size of candidate images
+TRIAL_POINTS = 60000  # maximum vertices in candidate images
 LEVEL_CONE_RAD = np.deg2rad(30)  # maximum angle of floor normals to the mean up direction of the cameras
 
 
@@ -36,8 +36,8 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
 
     Args:
         surface: Surface in view.
-        instance_ids: (V,) of the surface's vertices, 0 = no instance.
-        poses: (F, 4, 4) of the cameras that mapped the surface.
+        instance_ids: (V,) instances of the surface's vertices, 0 = none.
+        poses: (F, 4, 4) T_world_camera of the mapped frames.
         width: Width of the image in px.
         height: Height of the image in px.
     """
@@ -68,7 +68,7 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
 
 
 def looking(forward: Float64, up: Float64) -> Float64:
-    """Return the rotation (3, 3) of a camera that looks along `forward` (3,) with `up` (3,) upwards in the image."""
+    """Return the rotation (3, 3) of a camera with viewing direction `forward` (3,) and image up direction `up` (3,)."""
     z = forward / np.linalg.norm(forward)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
@@ -76,7 +76,7 @@ def looking(forward: Float64, up: Float64) -> Float64:
 
 
 def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the nearest camera with this rotation whose image of width x height px contains the points (P, 3)."""
+    """Return the nearest camera with this rotation and the points (P, 3) inside its image of width x height px."""
     return _framed(R_world_camera, _without_strays(points_world), width, height)
 
 
@@ -88,7 +88,7 @@ def _without_strays(points: Float32) -> Float32:
 
 
 def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the camera of `fitted`, for all points."""
+    """Return the camera of `fitted` for all points, including outliers."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     x, y, z = R_world_camera.T @ points_world.T
@@ -106,11 +106,14 @@ def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: 
 def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
     """Return the nearest front-facing point of each pixel, as indices into the points (P, 3)."""
     nearest = np.full(camera.shape, -1, np.int32)
-    points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)  # as the kernel is compiled
+    points, normals = (
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(normals),
+    )  # the compiled signature of the kernel requires contiguous arrays
     draw_fronts(points, normals, T_world_camera, (camera.fx, camera.fy, camera.cx, camera.cy), nearest)
     return np.asarray(nearest[nearest >= 0])
 
 
 def _score(instance_ids: Int32) -> float:
-    """Rate an image by the ids of its pixels. Square roots rate ten small objects higher than one large object."""
+    """Return the score of an image from its pixel ids. Square roots favor ten small objects over one large object."""
     return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))

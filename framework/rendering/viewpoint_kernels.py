@@ -26,7 +26,7 @@ def sum_level_normals(normals: Float32, up: Float64, cosine: float) -> tuple[Flo
 def draw_fronts(
     points: Float32, normals: Float32, T: Float64, intrinsics: tuple[float, float, float, float], nearest: Int32
 ) -> None:
-    """Write the index (H, W) of the nearest front-facing point (P, 3) for the camera at T, T_world_camera."""
+    """Write the index (H, W) of the nearest front-facing point (P, 3) for the camera at T = T_world_camera."""
     fx, fy, cx, cy = intrinsics
     height, width = nearest.shape
     depth = np.full(nearest.shape, np.inf)

@@ -1,4 +1,4 @@
-"""Charts of a report: matplotlib figures as SVG elements whose colors follow the light or dark style of the page."""
+"""Charts of a report: matplotlib figures as SVG elements in the light or dark colors of the page."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ WIDTH, HEIGHT, FLAT_HEIGHT, TIMES_HEIGHT, GROWTH_HEIGHT = 560.0, 380.0, 180.0, 2
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px around the axes
 TEXT_PX, DOT_PX = 12.0, 10.0
 FOOT = 36.0  # px below a top view, for the scale bar
-MARGIN = 0.08  # of the size of a top view
-MIN_EXTENT_M = 0.04  # of the shorter side of a top view
-LABEL_WIDTH_PX = 46.0  # of the smallest footprint with a label
-MAX_POINTS = 240  # of a line
+MARGIN = 0.08  # relative to the size of a top view
+MIN_EXTENT_M = 0.04  # minimum extent of the shorter side of a top view
+LABEL_WIDTH_PX = 46.0  # minimum width of a footprint with a label
+MAX_POINTS = 240  # maximum points of a line
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 COLORS = {
     "card": "#ffffff",
@@ -52,7 +52,7 @@ COLORS = {
     "run-4": "#8a6d00",
     "run-5": "#5b6570",
 }
-"""The light colors of report.css by the name of their variable, which replaces them in the SVG."""
+"""Light colors of report.css by variable name; the SVG contains the variables."""
 RUN_COLORS = ("accent", "refinement", "tracking", "run-3", "run-4", "run-5")
 RUN_WIDTHS = (6.0, 4.5, 3.0, 2.2, 1.6, 1.2)  # px: coinciding paths remain visible
 VARIABLES = {color: f"var(--{name})" for name, color in COLORS.items()}
@@ -72,7 +72,7 @@ class PlottedPath:
     """The path of one camera."""
 
     positions: Float64  # (P, 3) m, world
-    lost_after: Sequence[int] = ()  # positions after which the pose was unknown for a while
+    lost_after: Sequence[int] = ()  # indices of the last positions before tracking was lost
     color: str = "accent"  # of COLORS
     width: float = 2.0  # px
 
@@ -88,7 +88,7 @@ class StageRow:
 
 
 def box_corners(box: Box) -> Float64:
-    """Return the corners of a box, (8, 3) m."""
+    """Return the corners (8, 3) of a box, m."""
     return np.asarray(box.center + (CORNERS * box.extent) @ box.rotation.T)
 
 
@@ -109,7 +109,10 @@ def top_view(
     up: Float64,
     height: float = HEIGHT,
 ) -> tuple[str, float]:
-    """Draw the paths from above (true ones dashed) with the objects. Also return the size of the paths by the width."""
+    """Draw the paths and objects from above; ground-truth paths are dashed.
+
+    Also returns the size of the paths relative to the width of the view.
+    """
     plot_height = height - FOOT
     plane = _horizontal(paths[0].positions, up)
     shown = np.concatenate([path.positions for path in paths] + list(true_paths)) @ plane.T
@@ -171,13 +174,13 @@ def stage_areas(times: StageTimes) -> str:
 
 
 def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int], last_frame: int) -> str:
-    """Draw the fraction of the final surface and the number of the final objects that each frame had reached.
+    """Draw the fraction of the final surface and the number of final objects up to each frame.
 
     Args:
         frames: Frames of `fraction`.
         fraction: (n,) fraction of the final surface.
-        first_frames: of the objects.
-        last_frame: of the sequence.
+        first_frames: First frame of each object.
+        last_frame: Last frame of the sequence.
     """
     first, last = min([0, *frames]), max(last_frame, 1)
     figure, axes = _chart(GROWTH_HEIGHT, first, last, "", LEFT)
@@ -197,13 +200,13 @@ def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int]
 
 
 def round_length(longest: float) -> float:
-    """Return the largest of 1, 2 or 5 times a power of ten that is at most as long."""
+    """Return the largest length of 1, 2 or 5 times a power of ten that is at most `longest`."""
     power = 10.0 ** np.floor(np.log10(max(longest, 1e-9)))
     return float(max(factor * power for factor in (1, 2, 5) if factor * power <= longest * (1 + 1e-9) or factor == 1))
 
 
 def _chart(height: float, first: float, last: float, title: str, right: float = RIGHT) -> tuple[Figure, Axes]:
-    """Return empty axes over the frames."""
+    """Return a figure with empty axes over the frames."""
     figure = Figure((WIDTH / 72, height / 72), dpi=72, facecolor="none")
     inner = 1 - (LEFT + right) / WIDTH, 1 - (TOP + BOTTOM) / height
     axes = figure.add_axes((LEFT / WIDTH, BOTTOM / height, *inner), facecolor="none")
@@ -220,7 +223,7 @@ def _chart(height: float, first: float, last: float, title: str, right: float = 
 
 
 def _horizontal(positions: Float64, up: Float64) -> Float64:
-    """Return the directions to the right and away, (2, 3), of the top view in which the path is widest."""
+    """Return the right and forward directions (2, 3) of the top view with the widest path."""
     any_level = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     level = np.stack([any_level, np.cross(up, any_level)]) / np.linalg.norm(any_level)
     _, _, Vt = np.linalg.svd((positions - positions.mean(axis=0)) @ level.T, full_matrices=True)
@@ -229,10 +232,10 @@ def _horizontal(positions: Float64, up: Float64) -> Float64:
 
 
 def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, px: float, gid: str) -> bool:
-    """Return whether the object at `corners` (8, 2) m has an area; `px` is the size of a pixel, m."""
+    """Draw an object at `corners` (8, 2) m. Return False if it has no area. `px` is the size of a pixel, m."""
     try:
         outline = corners[ConvexHull(corners).vertices]
-    except QhullError:  # a line from above
+    except QhullError:  # the object is a line in the top view
         return False
     axes.fill(*outline.T, facecolor=(one.color, 0.22), edgecolor=(one.color, 0.7), linewidth=1, gid=gid)
     if np.ptp(outline[:, 0]) > LABEL_WIDTH_PX * px:
@@ -244,10 +247,10 @@ def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, px: float, gid
 
 
 def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) -> str:
-    """Return an `<svg>` element without inline styles, which the policy of the page forbids."""
+    """Return an `<svg>` element without inline styles: the page's policy forbids inline styles."""
     file = StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "instancemap"}), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph")  # the browser has further fonts
+        warnings.filterwarnings("ignore", "Glyph")  # the browser has additional fonts
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
     text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", file.getvalue(), flags=re.DOTALL)
     text = re.sub(r' style="([^"]*)"', _attributes, text[text.index("<svg") :])
@@ -260,7 +263,7 @@ def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) ->
 
 
 def _attributes(style: re.Match[str]) -> str:
-    """Return CSS properties as presentation attributes, with the color variables of the page."""
+    """Convert CSS properties to presentation attributes with the color variables of the page."""
     pairs = [item.split(":", 1) for item in style[1].split(";") if ":" in item]
     kept = [(key.strip(), value.strip()) for key, value in pairs if not key.strip().startswith("font")]
     return "".join(f' {key}="{VARIABLES.get(value, value)}"' for key, value in kept)

@@ -22,7 +22,7 @@ from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
-MOST_MAPS = 6  # runs with a map in the page; the size limit of one map applies to all of them together
+MOST_MAPS = 6  # maximum runs with a map in the page; together they have the size limit of one map
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Row:
 ROWS = (
     Row("frames", "Frames", "", 0),
     Row("frames_lost", "Frames lost", "", 0, better=-1),
-    Row("fps", "Frames a second", "/s", 1, better=1),
+    Row("fps", "Frames per second", "/s", 1, better=1),
     Row("instances.count", "Objects", "", 0),
     Row("instances.ap50", "AP50", "", 3, better=1),
     Row("instances.ap25", "AP25", "", 3, better=1),
@@ -59,7 +59,7 @@ ROWS = (
 
 @dataclass(frozen=True)
 class Cell:
-    """A value of one run."""
+    """The value of one run."""
 
     text: str  # "" = unknown
     best: bool = False
@@ -68,7 +68,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class TableRow:
-    """A value of all runs."""
+    """The values of all runs."""
 
     name: str
     cells: list[Cell]
@@ -81,15 +81,15 @@ class Table:
 
     id: str
     title: str
-    first: str  # head of the first column
+    first: str  # heading of the first column
     rows: list[TableRow]
     lead: str = ""
-    empty: str = ""  # text instead of rows; "" = no section without rows
+    empty: str = ""  # text for a table without rows; "" = omit the section
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """N runs that are compared with the first one."""
+    """A comparison of N runs with the first run."""
 
     runs: Sequence[RunContents]
     names: Sequence[str]  # unique
@@ -98,14 +98,14 @@ class Comparison:
 
     @classmethod
     def of(cls, runs: Sequence[RunContents], links: Sequence[str]) -> Comparison:
-        """Decimate the maps so that together they are as large as the map of one run."""
+        """Decimate the maps to a total size of one map."""
         mapped = runs[:MOST_MAPS]
         no_footage = Footage(NOT_CAMERA, {}, {}, {}, {})
         scenes = [MapScene.of(run, no_footage, 1 / len(mapped)) for run in mapped]
         return cls(runs, short_names([run.record.directory for run in runs]), links, scenes)
 
     def html(self) -> str:
-        """Return the page, identical for the same runs."""
+        """Return the HTML page. The result is deterministic."""
         shown = [(name, scene) for name, scene in zip(self.names, self.scenes, strict=False) if scene is not None]
         sequences = {run.name for run in self.runs}
         title = next(iter(sequences)) if len(sequences) == 1 else f"{len(sequences)} sequences"
@@ -159,7 +159,7 @@ class Comparison:
     def _settings(self) -> Table:
         configs = [dict(run.record.config) for run in self.runs]
         rows = []
-        for group in STAGES:  # another plugin has other parameters
+        for group in STAGES:  # different plugins have different parameters
             targets = [_target(config.get(group)) for config in configs]
             if len(set(targets)) > 1:
                 rows.append(TableRow(group, [Cell(target) for target in targets]))
@@ -201,7 +201,7 @@ class Comparison:
 
 
 def compared(values: Sequence[float | None], digits: int, better: int) -> list[Cell]:
-    """Mark the best value, and add the differences from the first one that the digits show."""
+    """Mark the best value, and add nonzero rounded differences from the first value."""
     known = [round(value, digits) for value in values if value is not None]
     best = None if not better or len(set(known)) < 2 else max(known) if better > 0 else min(known)
     cells = []

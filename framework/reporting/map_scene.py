@@ -1,4 +1,4 @@
-"""The map of a run in the viewer: decimated, with colors for its objects and an initial view."""
+"""The map of a run for the viewer: decimated, with object colors and an initial view."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from framework.runs.instances_file import StoredInstance
 from framework.runs.run_directory import LIKELY
 
 VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, aspect ratio of the initial view
-PATH_POINTS = 400  # of the camera path
-PROGRESS_PICTURES = 4  # at equal intervals; the last one shows the whole map
-PROGRESS_SCALE = 0.5  # of their size, relative to the initial view
+PATH_POINTS = 400  # maximum points of the camera path
+PROGRESS_PICTURES = 4  # number of images at equal intervals; the last image shows the whole map
+PROGRESS_SCALE = 0.5  # image size relative to the initial view
 PROGRESS_QUALITY = 80  # of WebP
 
 
 @dataclass(frozen=True)
 class ProgressPicture:
-    """The part of the final map that was visible up to a frame."""
+    """An image of the visible part of the final map up to a frame."""
 
     url: str  # data:
     frame: int
-    fraction: float  # of the surface
+    fraction: float  # visible fraction of the surface
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class MapScene:
 
     @classmethod
     def of(cls, contents: RunContents, footage: Footage, share: float = 1.0) -> MapScene | None:
-        """Decimate the map, to `share` of the maximum triangles and bytes. Return None for an empty map."""
+        """Decimate the map to a fraction `share` of the maximum triangles and bytes. Return None for an empty map."""
         if contents.mesh is None or not len(contents.poses):
             return None
         mesh = replace(contents.mesh, instance_ids=contents.instance_ids(contents.mesh))
@@ -68,7 +68,7 @@ class MapScene:
         return cls(contents, mesh, surface, seen, up)
 
     def glb(self) -> str:
-        """Return the map as GLB, compressed by gzip, in base64. The result is deterministic."""
+        """Return the map as base64 of a gzip-compressed GLB file. The result is deterministic."""
         steps = max(1, len(self.sightings.chosen))
         names = {one.id: one.class_name for one in self.contents.objects}
         content = scene_glb(self.mesh, (self.sightings.first_seen / steps).astype(np.float32), names, self.up)
@@ -76,14 +76,14 @@ class MapScene:
 
     @property
     def likely_labels(self) -> Int32:
-        """For each vertex (V,) the index of its likely object, from 1; 0 = none."""
+        """Index (V,) of the likely object of each vertex, from 1; 0 = none."""
         likely = np.array([0, *likely_ids(self.contents)])
         indices = np.minimum(np.searchsorted(likely, self.mesh.instance_ids), len(likely) - 1)
         return np.where(likely[indices] == self.mesh.instance_ids, indices, 0).astype(np.int32)
 
     @cached_property
     def view(self) -> tuple[Camera, Float64]:
-        """The initial view: a camera and its T_world_camera."""
+        """Initial view: a camera and its T_world_camera."""
         return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
 
     def data(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ class MapScene:
         }
 
     def progress_pictures(self) -> list[ProgressPicture]:
-        """Render the visible instances at some frames from the initial view. Short runs have no pictures."""
+        """Render the visible instances at some frames from the initial view. Short runs have no images."""
         steps = len(self.sightings.chosen)
         if steps < PROGRESS_PICTURES:
             return []
@@ -136,12 +136,12 @@ class MapScene:
 
 
 def likely_ids(contents: RunContents) -> list[int]:
-    """Return the objects that overview.png shows."""
+    """Return the ids of the objects in overview.png."""
     return [one.id for one in contents.objects if one.confidence >= LIKELY]
 
 
 def colors_by_id(objects: tuple[StoredInstance, ...]) -> dict[int, UInt8]:
-    """Return the RGB colors (3,), gray for objects without a position."""
+    """Return the RGB color (3,) by object id, gray for objects without a position."""
     positions = {one.id: one.centroid for one in objects if one.centroid is not None}
     colors = object_colors(positions, {one.id for one in objects if one.confidence >= LIKELY})
     return {one.id: colors.get(one.id, np.array((150, 150, 150), np.uint8)) for one in objects}

@@ -1,4 +1,4 @@
-"""HTML pages from Jinja2 templates: values are escaped, and a page loads nothing from the network."""
+"""HTML pages from Jinja2 templates. Values are escaped, and pages load nothing from the network."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ POLICY = (
 
 
 def page(template: str, title: str, context: Mapping[str, Any], data: Mapping[str, Any], maps: Sequence[str]) -> str:
-    """Return the whole file. Its policy allows only our scripts, and no network access.
+    """Return the HTML file. Its policy allows only the project's scripts and no network access.
 
     Args:
-        template: a file of templates/ that extends page.html.
+        template: File in templates/ that extends page.html.
         title: Title of the page.
         context: Variables of the template.
-        data: for the scripts, as JSON.
-        maps: GLB, gzip, base64.
+        data: Data for the scripts, written as JSON.
+        maps: Maps as base64 of gzip-compressed GLB.
     """
     style, *scripts = [(ASSETS / name).read_text(encoding="utf-8") for name in (STYLE, *SCRIPTS)]
     script = "\n".join(scripts)
     if "</script" in script.lower() or "</style" in style.lower():
-        raise DataError(f"{ASSETS}: expected no end tag in scripts and styles")
+        raise DataError(f"{ASSETS}: expected no end tag in scripts and styles, got </script or </style")
     environment = Environment(
         loader=PackageLoader("framework.reporting"),
         autoescape=True,

@@ -1,4 +1,4 @@
-"""The objects of a map, as rows of a table and as data of the panel next to the map."""
+"""The objects of a map as rows of a table and as data for the panel next to the map."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from framework.reporting.run_contents import RunContents
 from framework.reporting.truth_section import css_class
 from framework.runs.instances_file import StoredInstance
 
-SHOWN_CLASSES = 6  # of an object's class distribution
+SHOWN_CLASSES = 6  # maximum shown classes of an object's class distribution
 
 
 @dataclass(frozen=True)
 class ObjectRow:
-    """An object in the table."""
+    """One row of the object table."""
 
     instance: StoredInstance
     color: str  # #rrggbb
@@ -30,14 +30,14 @@ class ObjectRow:
     longest: float  # cm
     position: str
     truth: str  # "" = not compared
-    css: str  # class of the outcome
+    css: str  # CSS class of the outcome
     iou: str
 
 
 def object_rows(
     contents: RunContents, pictures: Mapping[int, Picture], judgments: Mapping[int, Judgment]
 ) -> list[ObjectRow]:
-    """Return the rows of the table, the most confident object first."""
+    """Return the rows of the table, most confident object first."""
     colors = colors_by_id(contents.objects)
     rows = []
     for one in sorted(contents.objects, key=lambda one: (-one.confidence, one.id)):
@@ -61,7 +61,7 @@ def object_rows(
 def object_data(
     one: StoredInstance, contents: RunContents, picture: Picture | None, judgment: Judgment | None
 ) -> dict[str, Any]:
-    """Return the data of an object in the panel."""
+    """Return the data of an object for the panel."""
     likeliest = sorted(one.class_probabilities.items(), key=lambda entry: (-entry[1], entry[0]))[:SHOWN_CLASSES]
     height = _height_above_floor(one, contents)
     return {
@@ -81,7 +81,7 @@ def object_data(
 
 
 def _size(one: StoredInstance, up: Float64 | None) -> str:
-    """Return the sides of the box in cm: length, width and height; without `up` sorted by length."""
+    """Return length, width and height of the box in cm; without `up`, the sides are sorted by length."""
     sides = np.sort(one.obb.extent)[::-1]
     if up is not None:
         upright = int(np.abs(one.obb.rotation.T @ up).argmax())

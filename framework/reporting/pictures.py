@@ -1,4 +1,4 @@
-"""Pictures of objects: cropped from the frame with the best view, or from a rendering of the map."""
+"""Images of objects, cropped from the frame with the best view or from a rendering of the map."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from framework.rendering.surface import Surface
 from framework.reporting.run_source import Footage
 
 WIDTH, HEIGHT = 264, 198  # px
-MANY = 120  # objects; with more of them, pictures are smaller
+MANY = 120  # objects; images are smaller for more objects
 QUALITY = 78  # of WebP
 MARGIN = 0.25  # around an object, relative to its size
 MIN_CROP = 0.12  # relative to the width of the image
@@ -27,14 +27,14 @@ OUTLINE = (255, 255, 255)  # on both sides of the colored outline
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture in the page."""
+    """An image in the page."""
 
     url: str  # data:
     source: str  # "frame 12" or "map"
 
 
 class Photographer:
-    """Renderer of object pictures of one map."""
+    """Renderer of object images of one map."""
 
     def __init__(self, mesh: InstanceMesh, surface: Surface, poses: Float64, footage: Footage) -> None:
         self._mesh, self._surface, self._poses, self._footage = mesh, surface, poses, footage
@@ -42,12 +42,12 @@ class Photographer:
         self._rasterizer = Rasterizer(mesh.vertices, mesh.triangles)
 
     def pictures(self, labels: Int32, best: Mapping[int, int], colors: Mapping[int, UInt8]) -> dict[int, Picture]:
-        """Return a picture of each label, outlined in its color (3,), from the pose with the best view.
+        """Return an image of each label, outlined in its color, from the pose with the best view.
 
         Args:
-            labels: (V,) of the mesh's vertices, 0 = none.
-            best: index of the pose, by label.
-            colors: (3,) color by label.
+            labels: (V,) labels of the mesh's vertices, 0 = none.
+            best: Index of the pose with the best view, by label.
+            colors: RGB color (3,) by label.
         """
         taken: dict[int, Picture] = {}
         scale = 1.0 if len(best) <= MANY else 0.6
@@ -89,7 +89,7 @@ def _crop(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
 
 
 def webp_url(image: Image.Image, quality: int) -> str:
-    """Return a picture as a `data:` URL."""
+    """Return an image as a `data:` URL."""
     file = BytesIO()
     image.save(file, "WEBP", quality=quality, method=4)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"

@@ -1,4 +1,4 @@
-"""The outputs of a run that its report shows."""
+"""The outputs of a run for its report."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ class RunContents:
     """The outputs of a run; None = missing."""
 
     record: Record
-    partial: str  # why the run ended early, "" = it is complete
+    partial: str  # reason for an early end, "" = complete run
     mesh: InstanceMesh | None
-    objects: tuple[StoredInstance, ...]  # by id
-    timestamps: Float64  # (P,) s, of the frames that were mapped
+    objects: tuple[StoredInstance, ...]  # sorted by id
+    timestamps: Float64  # (P,) s, of the mapped frames
     poses: Float64  # (P, 4, 4) T_world_camera
     times: StageTimes | None
 
     @classmethod
     def read(cls, directory: Path) -> RunContents:
-        """Read a run. Raise DataError, naming the file, if there is no run or a file is damaged or of another run."""
+        """Read a run. Raises DataError for a missing run, a damaged file, or files of different runs."""
         if is_there(directory / METRICS):
             record, partial = read_record(directory), ""
         elif is_there(directory / PARTIAL_METRICS):
@@ -74,7 +74,7 @@ class RunContents:
 
     @property
     def up(self) -> Float64 | None:
-        """Unit vector (3,) against gravity, None if unknown."""
+        """Unit vector (3,) opposite to gravity, None if unknown."""
         values = [self.record.metrics.get(f"map.up.{axis}") for axis in "xyz"]
         up = np.array([value if is_number(value) else np.nan for value in values], np.float64)
         length = np.linalg.norm(up)
@@ -104,18 +104,18 @@ class RunContents:
 
     @property
     def lost_after(self) -> list[int]:
-        """Indices of the poses after which frames were lost."""
+        """Indices of the last poses before lost frames."""
         before = np.searchsorted(self.tracked_frames, self.lost_frames) - 1
         return sorted({max(0, int(k)) for k in before})
 
     def instance_ids(self, mesh: InstanceMesh) -> Int32:
-        """Return the listed objects of the mesh's vertices (V,), 0 = none."""
+        """Return the object ids of the mesh's vertices (V,), 0 = none or not in instances.json."""
         listed = np.isin(mesh.instance_ids, [one.id for one in self.objects])
         return np.where(listed, mesh.instance_ids, 0).astype(np.int32)
 
 
 def _map_of(record: Record) -> tuple[InstanceMesh | None, list[StoredInstance]]:
-    """Read mesh.ply and instances.json, and check that they are of one run."""
+    """Read mesh.ply and instances.json. Raises DataError if they belong to different runs."""
     mesh, instances = record.directory / MESH, record.directory / INSTANCES
     if is_there(mesh) and is_there(instances):
         return read_objects(record)

@@ -39,14 +39,20 @@ from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
-OVERVIEW_WIDTH = 1400  # px, of the picture for browsers without WebGL
-SMALL_PATH = 0.3  # of the width of the top view: a smaller path is also shown enlarged
-TOP_VIEW_KEY = (("mine", "estimated"), ("truth", "true"), ("start", "start"), ("end", "end"), ("lost", "tracking lost"))
+OVERVIEW_WIDTH = 1400  # px, of the image for browsers without WebGL
+SMALL_PATH = 0.3  # relative to the width of the top view: smaller paths are also shown enlarged
+TOP_VIEW_KEY = (
+    ("mine", "estimated"),
+    ("truth", "ground truth"),
+    ("start", "start"),
+    ("end", "end"),
+    ("lost", "tracking lost"),
+)
 
 
 @dataclass(frozen=True)
 class RunReport:
-    """Everything that a run's page shows."""
+    """The contents of a run's page."""
 
     contents: RunContents
     scene: MapScene | None  # None = empty map
@@ -54,7 +60,7 @@ class RunReport:
     pictures: Mapping[int, Picture]
     true_path: TruePath | None
     check: TruthCheck | None
-    why_unchecked: str  # reason for a missing comparison of an evaluated run
+    why_unchecked: str  # reason for the missing comparison of an evaluated run
 
     @classmethod
     def of(cls, contents: RunContents) -> RunReport:
@@ -74,7 +80,7 @@ class RunReport:
         return cls(contents, scene, source, pictures, true_path, check, why)
 
     def html(self) -> str:
-        """Return the page, identical for the same run and sequence."""
+        """Return the HTML page. The result is deterministic."""
         contents, metrics = self.contents, self.contents.record.metrics
         judgments = self.check.judgments if self.check else {}
         data: dict[str, Any] = {
@@ -110,8 +116,8 @@ class RunReport:
             notices.append(f"This run is partial: {self.contents.partial}. The page shows the map up to that point.")
         if self.source.why_not:
             notices.append(
-                f"The sequence could not be read ({self.source.why_not}): object pictures are rendered from the "
-                "map, and the true path is unknown."
+                f"The sequence could not be read ({self.source.why_not}). Object images are rendered from the map, "
+                "and the ground-truth path is unknown."
             )
         return notices
 
@@ -132,7 +138,7 @@ class RunReport:
         return {"whole": whole, "text": self._path_text(), "legend": keys, "details": details}
 
     def _top_views(self, up: Float64) -> tuple[str, str | None]:
-        """Return the path with the objects, and enlarged if it is small."""
+        """Return the chart of the path with the objects, and an enlarged chart for a small path."""
         contents = self.contents
         colors = colors_by_id(contents.objects)
         likely = set(likely_ids(contents))
@@ -161,10 +167,10 @@ class RunReport:
             if is_number(value := metrics.get(key)):
                 parts.append(f"{name} {1e3 * value:.1f} mm")
         if is_number(value := metrics.get("trajectory.rpe_rotation_rmse_rad")):
-            parts.append(f"RPE {np.rad2deg(value):.2f}° a frame")
+            parts.append(f"RPE {np.rad2deg(value):.2f}° per frame")
         assert self.true_path is not None
-        looked = f"computed from {len(self.true_path.chosen)} frames, after alignment"
-        return f"{', '.join(parts)} over all frames; {looked}." if parts else f"{looked.capitalize()}."
+        chart = f"The chart shows {len(self.true_path.chosen)} frames, after alignment."
+        return f"{', '.join(parts)} over all frames. {chart}" if parts else chart
 
     def _progress(self) -> dict[str, Any] | None:
         contents, scene = self.contents, self.scene
@@ -178,7 +184,7 @@ class RunReport:
 
 
 def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
-    """Return label, value, unit and note of the main metrics that the run has."""
+    """Return the label, value, unit and note of each available main metric."""
     metrics = contents.record.metrics
 
     def known(key: str) -> float | None:
@@ -190,14 +196,14 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
         lost = int(known("frames_lost") or 0)
         found.append(("Frames", f"{frames:.0f}", "", f"{lost} lost" if lost else "none lost"))
     if (fps := known("fps")) is not None:
-        found.append(("Speed", f"{fps:.1f}", "/s", "whole loop"))
+        found.append(("Frames per second", f"{fps:.1f}", "/s", "all stages"))
     if (count := known("instances.count")) is not None:
         found.append(("Objects", str(len(likely_ids(contents))), "", f"likely, of {count:.0f}"))
     if (ap50 := known("instances.ap50")) is not None:
         ap25 = known("instances.ap25")
         found.append(("AP50", f"{ap50:.2f}", "", "" if ap25 is None else f"AP25 {ap25:.2f}"))
     if metrics.get("pose_source") == "ground_truth":
-        found.append(("Poses", "given", "", "not estimated"))
+        found.append(("Poses", "ground truth", "", "not estimated"))
     elif (ate := known("trajectory.ate_rmse_m")) is not None:
         found.append(("ATE", f"{1e3 * ate:.1f}", "mm", "after alignment"))
     if (voxels := known("map.voxels")) is not None:
@@ -207,7 +213,7 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
 
 
 def overview_url(path: Path) -> str:
-    """Return overview.png scaled down, "" if it cannot be read."""
+    """Return the scaled overview.png as a `data:` URL, "" if it cannot be read."""
     try:
         small = Image.fromarray(read_color(path))
     except FrameError:

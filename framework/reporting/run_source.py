@@ -1,4 +1,4 @@
-"""The sequence that a run was made from, if it is still available: its images and its true poses."""
+"""The sequence of a run, if it is still available: its images and ground-truth poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MIN_CLARITY = 0.3  # a blurred image of an object is better than a distant view
 
 @dataclass(frozen=True)
 class RunSource:
-    """The sequence of a run, and which of its frames were tracked."""
+    """The sequence of a run with its tracked frames."""
 
     contents: RunContents
     video: RGBDSequence | None
@@ -33,7 +33,7 @@ class RunSource:
 
     @classmethod
     def of(cls, contents: RunContents) -> RunSource:
-        """Open the sequence from the run's config. A sequence that cannot be read is None."""
+        """Open the sequence from the run's config. An unreadable sequence is None."""
         dataset = contents.record.dataset
         if any("${" in str(value) for _, value in leaves({"dataset": dataset})):
             return cls(contents, None, "the config of the run is not resolved")
@@ -45,7 +45,7 @@ class RunSource:
             return cls(contents, None, "the run mapped a live camera")
         source = cls(contents, video, "")
         if len(contents.poses) and source.frame(0) is None:
-            return cls(contents, None, "the first frame differs from the one of the run")
+            return cls(contents, None, "the first frame differs from the run's first frame")
         return source
 
     @property
@@ -58,7 +58,7 @@ class RunSource:
         if self.video is None or not numbers or self.contents.times is None:
             return None
         first = int(np.searchsorted(self.contents.times.frames, numbers[k]))
-        skipped = len(self.video) - len(self.contents.times.frames)  # frames without times may precede it
+        skipped = len(self.video) - len(self.contents.times.frames)  # frames without times may precede the frame
         for position in range(first, min(first + max(skipped, 0) + 1, len(self.video))):
             try:
                 frame = self.video[position]
@@ -71,9 +71,9 @@ class RunSource:
         return None
 
     def scene_truth(self) -> tuple[SceneTruth | None, str]:
-        """Return the true instances of the run's evaluation in the world of its map, or None and the reason.
+        """Return the ground-truth instances of the run's evaluation in the world frame of its map.
 
-        The reason is "" for a run without them.
+        If they are unavailable, returns None and the reason; the reason is "" for a run without ground truth.
         """
         expected = self.contents.record.metrics.get(TRUTH)
         if self.video is None:
@@ -83,7 +83,7 @@ class RunSource:
         except (InstanceMapError, OSError) as error:
             return None, str(error)
         if truth is None:
-            return None, "the dataset has no ground-truth instances anymore" if expected else ""
+            return None, "the dataset no longer has ground-truth instances" if expected else ""
         if expected is not None and truth_sha256(truth) != expected:
             return None, "the ground-truth instances differ from those used in the run"
         try:
@@ -94,12 +94,12 @@ class RunSource:
 
 @dataclass(frozen=True)
 class Footage:
-    """Frames of the sequence, by the index of their pose in the trajectory. Unreadable frames are missing."""
+    """Frames of the sequence by their pose index in the trajectory. Unreadable frames are missing."""
 
     camera: Camera  # of the images
     images: Mapping[int, UInt8]  # (H, W, 3) RGB
     frames: Mapping[int, int]  # frame numbers in the sequence
-    true_positions: Mapping[int, Float64]  # (3,) m, of frames with a true pose
+    true_positions: Mapping[int, Float64]  # (3,) m, of frames with a ground-truth pose
     clarity: Mapping[int, float]  # in [MIN_CLARITY, 1], 1 = at least as sharp as the median
 
     @classmethod
@@ -123,15 +123,15 @@ class Footage:
 
 @dataclass(frozen=True)
 class TruePath:
-    """The true camera path, aligned rigidly to the trajectory as for the ATE."""
+    """The ground-truth camera path, aligned rigidly with the trajectory as for the ATE."""
 
-    chosen: list[int]  # poses of the trajectory, n
+    chosen: list[int]  # indices of n poses of the trajectory
     positions: Float64  # (n, 3) m
-    errors: Float64  # (n,) m, distance to the positions of the trajectory
+    errors: Float64  # (n,) m, distances to the positions of the trajectory
 
     @classmethod
     def of(cls, poses: Float64, true_positions: Mapping[int, Float64]) -> TruePath | None:
-        """Align true positions (3,) by pose index. Return None for fewer than three."""
+        """Align the ground-truth positions (3,), given by pose index. Return None for fewer than three."""
         chosen = sorted(true_positions)
         if len(chosen) < 3:
             return None

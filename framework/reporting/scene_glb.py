@@ -1,4 +1,4 @@
-"""A decimated map as a GLB file, with one node for each object and one for the background."""
+"""A decimated map as a GLB file, with one node per object and one background node."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from framework.exporting.glb import T_GLTF_ROOM, Node, glb_of
 from framework.exporting.object_meshes import REST
 from framework.exporting.upright_room import plain_name, upright
 
-MOST_BYTES = 9_500_000  # of the file; browsers of phones can show it
+MOST_BYTES = 9_500_000  # maximum size of the file, for browsers of phones
 BYTES_OF_VERTEX, BYTES_OF_TRIANGLE = 24, 12  # position, color, first view; three indices
 MOST_TRIANGLES = 300_000  # 7 MB together with their vertices
 NOT_GEOMETRY = 200_000  # bytes for names and nodes
@@ -23,12 +23,12 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
     """Return the map as binary glTF 2.0, unlit, with the attribute `_FIRST_SEEN`.
 
     Vertices have the coordinates of the map; the matrix of each node rotates them upright. Extras contain the id and
-    the class. A mesh of `light_enough` results in at most MOST_BYTES.
+    the class. The file of a `light_enough` mesh has at most MOST_BYTES.
 
     Args:
         mesh: Mesh of the map.
-        first_seen: (V,) in [0, 1], part of the sequence before the first view of each vertex.
-        names: class by id, of the objects with a node.
+        first_seen: (V,) in [0, 1], fraction of the sequence before the first view of each vertex.
+        names: Class by id, for the objects with a node.
         up: (3,) unit vector, world.
     """
     labels = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
@@ -47,5 +47,5 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
 
 
 def light_enough(mesh: InstanceMesh, most_bytes: int = MOST_BYTES) -> InstanceMesh:
-    """Return the mesh, coarser if its file would have more bytes."""
+    """Return the mesh, decimated to at most `most_bytes` in its file."""
     return clustered(mesh, most_bytes - NOT_GEOMETRY, BYTES_OF_VERTEX, BYTES_OF_TRIANGLE)

@@ -1,4 +1,4 @@
-"""Comparison of a run's objects with the ground truth: metrics, and galleries of missed, wrong and correct objects."""
+"""Comparison of a run's objects with the ground truth: metrics and galleries of missed, wrong and correct objects."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ METRICS = {
     "instances.pq50": "PQ",
 }
 GROUPS = {
-    Outcome.WRONG_CLASS: ("Wrong class", "IoU of at least 0.5 with a true object of another class"),
-    Outcome.FALSE: ("False positives", "IoU below 0.5 with every true object, or a duplicate"),
+    Outcome.WRONG_CLASS: ("Wrong class", "IoU of at least 0.5 with a ground-truth object of another class"),
+    Outcome.FALSE: ("False positives", "IoU below 0.5 with every ground-truth object, or a duplicate"),
     Outcome.RIGHT: ("Correct", "same class and an IoU of at least 0.5"),
     Outcome.IGNORED: ("Ignored", "in unlabeled regions, or of a class that is not evaluated"),
 }
@@ -52,7 +52,7 @@ class Card:
     confidence: str
     note: str
     picture: Picture | None
-    id: int | None  # of the object that a click selects
+    id: int | None  # object selected by a click
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Gallery:
 
 @dataclass(frozen=True)
 class TruthCheck:
-    """The outcome of every object, and the missed true objects."""
+    """The outcome of every object, and the missed ground-truth objects."""
 
     judgments: Mapping[int, Judgment]  # by object
     missed: list[Card]
@@ -82,7 +82,7 @@ class TruthCheck:
         photographer: Photographer | None,
         footage: Footage,
     ) -> TruthCheck | None:
-        """Return None for a run without a mesh."""
+        """Compare the objects with the ground truth. Return None for a run without a mesh."""
         if contents.mesh is None:
             return None
         objects = contents.objects
@@ -114,7 +114,7 @@ class TruthCheck:
         for one in contents.objects:
             if judgment := self.judgments.get(one.id):
                 cards[judgment.outcome].append(_card(one, judgment, pictures.get(one.id)))
-        note = "true objects without a match of their class"
+        note = "ground-truth objects without a match of their class"
         galleries = [Gallery("missed", "Missed", note, self.missed, bool(self.missed))]
         for outcome, (name, note) in GROUPS.items():
             is_open = outcome in (Outcome.WRONG_CLASS, Outcome.FALSE) and bool(cards[outcome])
@@ -125,7 +125,7 @@ class TruthCheck:
 def truth_section(
     check: TruthCheck | None, why_unchecked: str, contents: RunContents, pictures: Mapping[int, Picture]
 ) -> dict[str, Any] | None:
-    """Return the context of the section's template, None for a run without ground truth."""
+    """Return the context for the section's template, None for a run without ground truth."""
     metrics = contents.record.metrics
     main = [(name, f"{metrics[key]:.2f}") for key, name in METRICS.items() if is_number(metrics.get(key))]
     if not main and check is None:

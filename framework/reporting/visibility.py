@@ -1,4 +1,4 @@
-"""Visibility of a decimated map from the poses of a trajectory: first view of each vertex, best view of each object."""
+"""Visibility of a decimated map along a trajectory: first view of each vertex, best view of each object."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from framework.data import Bool, Camera, Float32, Float64, InstanceMesh, Int32
 from framework.geometry import inverse
 from framework.rendering.rasterizer import Rasterizer
 
-LOOKS = 80  # rendered poses of a trajectory
+LOOKS = 80  # maximum rendered poses of a trajectory
 LOOK_WIDTH = 200  # px, of the rendered images
 BEHIND, BEHIND_SHARE = 0.05, 0.03  # m and relative to depth: vertices farther behind the rendered depth are hidden
-NOT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # of a Kinect, if the camera is unknown
+NOT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # Kinect, used if the camera is unknown
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Sightings:
 
     chosen: list[int]  # indices of the poses
     first_seen: Int32  # (V,) index into `chosen`; n = never seen
-    best: Mapping[int, int]  # pose with the best view, by label; unseen labels are missing
+    best: Mapping[int, int]  # index of the pose with the best view, by label; unseen labels are missing
 
     @property
     def growth(self) -> Float64:
-        """Fraction (n,) of the seen vertices that were seen up to each pose."""
+        """Fraction (n,) of all seen vertices up to each pose."""
         counts = np.bincount(self.first_seen, minlength=len(self.chosen) + 1)[: len(self.chosen)]
         return np.asarray(np.cumsum(counts) / max(1, counts.sum()))
 
@@ -41,14 +41,14 @@ def spread_out(count: int, most: int = LOOKS) -> list[int]:
 def sightings(
     mesh: InstanceMesh, labels: Int32, poses: Float64, camera: Camera, clarity: Mapping[int, float]
 ) -> Sightings:
-    """Return the views of a mesh from the poses (P, 4, 4), by rendering it from some of them.
+    """Return the views of a mesh from the poses (P, 4, 4), rendered at evenly spaced poses.
 
     Args:
         mesh: Mesh of the map.
-        labels: (V,) of the vertices, 0 = none.
+        labels: (V,) labels of the vertices, 0 = none.
         poses: (P, 4, 4) T_world_camera.
-        camera: of the sequence.
-        clarity: sharpness of the image, by pose, in [0, 1]; 1 if missing.
+        camera: Camera of the sequence.
+        clarity: Sharpness of the image in [0, 1], by pose; 1 if missing.
     """
     chosen = spread_out(len(poses))
     small = camera.scaled(LOOK_WIDTH / camera.width)
@@ -74,14 +74,14 @@ def sightings(
 
 
 def _seen(vertices: Float32, T_world_camera: Float64, camera: Camera, depth: Float32) -> tuple[Bool, Bool]:
-    """Return which vertices (V,) project into the image, and which of them are visible, given its depth (H, W) m."""
+    """Return two masks (V,) of the vertices inside the image and of the visible vertices, given its depth (H, W) m."""
     T_camera_world = inverse(T_world_camera).astype(np.float32)
     x, y, z = T_camera_world[:3, :3] @ vertices.T + T_camera_world[:3, 3:]
     ahead = np.maximum(z, 1e-6)
     u, v = np.rint(camera.fx * x / ahead + camera.cx), np.rint(camera.fy * y / ahead + camera.cy)
     inside = (z > 1e-3) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     visible = np.zeros(len(vertices), np.bool_)
-    # a vertex on the border of the surface may be rounded to a pixel outside of it
+    # rounding may move a vertex at the border of the surface to a pixel outside
     bordered = np.where(depth > 0, depth, cv2.dilate(depth, np.ones((3, 3), np.uint8)))
     seen = bordered[v[inside].astype(int), u[inside].astype(int)]
     visible[inside] = z[inside] < seen + BEHIND + BEHIND_SHARE * seen

@@ -1,4 +1,4 @@
-"""The contents of a table: the run directories below a folder as rows, their baseline and the columns."""
+"""Contents of a table: the run directories below a folder as rows, their baseline and the columns."""
 
 from __future__ import annotations
 
@@ -30,26 +30,28 @@ PLAIN = (
     *("instances.count", "trajectory.ate_rmse_m", "frames_lost", "fps"),
     *(f"stage_ms.{stage}.median" for stage in ("refinement", "association", "update", "integration", "fusion")),
 )
-"""The columns without an experiment, if the runs have these figures: keys of metrics.json."""
+"""Default columns without an experiment, for metrics with values: keys of metrics.json."""
 
 
 @dataclass(frozen=True)
 class TableChoice:
     """The block `table` of an experiment.
 
-    A line is a row and a column is a metric, averaged over the runs that differ in `average_over` alone. With
-    `columns_by`, a column is a value of that key, such as a sequence, followed by the mean. With `group_by`, each value
-    has a group of lines.
+    Each line is a row and each column a metric. Cells are means over the runs that differ only in `average_over`. With
+    `columns_by`, each column is a value of that key, such as a sequence, followed by the mean. With `group_by`, each
+    value has a group of lines.
     """
 
-    # config keys, averaged over and paired by; runs that agree in the last one are not independent
+    # config keys for averaging and pairing; runs with the same value of the last key are not independent
     average_over: list[str] = field(default_factory=lambda: ["seed"])
-    columns_by: str | None = None  # config key with one column per value; None = columns are metrics
+    columns_by: str | None = None  # config key with one column per value; None = one column per metric
     group_by: str | None = None  # config key with one group of lines per value; None = one line per row
     baseline: str | None = None  # row for comparisons; None = the first row
-    columns: list[str] = field(default_factory=list)  # keys of metrics.json, at least one; with `columns_by`, just one
+    columns: list[str] = field(
+        default_factory=list
+    )  # keys of metrics.json, at least one; with `columns_by`, exactly one
     names: dict[str, str] = field(default_factory=dict)  # display names by row
-    published: str | None = None  # section of published.yaml, shown if all runs are of the real SceneNN; None = none
+    published: str | None = None  # section of published.yaml, shown if all runs use the real SceneNN data; None = none
 
     def __post_init__(self) -> None:
         for name in ("average_over", "columns"):
@@ -57,14 +59,14 @@ class TableChoice:
                 raise ConfigError(f"table.{name}: expected at least one key, got none")
         if self.columns_by and self.group_by:
             raise ConfigError(
-                f"table.columns_by={self.columns_by}, table.group_by={self.group_by}: expected one of them to be null"
+                f"table.columns_by, table.group_by: expected at most one key, got {self.columns_by} and {self.group_by}"
             )
         if self.split_key in self.average_over:
-            raise ConfigError(f"table.average_over: expected other keys than table.{self.layout}, got {self.split_key}")
+            raise ConfigError(f"table.average_over: expected keys without table.{self.layout}, got {self.split_key}")
         if self.columns_by and len(self.columns) > 1:
             raise ConfigError(
-                f"table.columns: expected one metric across {self.columns_by}, got {len(self.columns)}; set "
-                f"table.group_by={self.columns_by} to show several"
+                f"table.columns: expected one metric with table.columns_by, got {len(self.columns)}; set "
+                f"table.group_by={self.columns_by} for several metrics"
             )
         if self.published and read_published(self.published).layout != self.layout:
             raise ConfigError(
@@ -79,38 +81,38 @@ class TableChoice:
 
     @property
     def split_key(self) -> str | None:
-        """The key whose values are columns or groups of lines."""
+        """Key of the columns or groups of lines."""
         return self.columns_by or self.group_by
 
     @classmethod
     def of(cls, node: Any) -> TableChoice:
-        """Return the choice of a config's `table`; raise ConfigError for unknown keys and wrong types."""
+        """Return the choice of a config's `table`. Raises ConfigError for unknown keys and wrong types."""
         choice = cls(**checked_block(cls, "table", node))
         return replace(choice, columns=[current_key(key) for key in choice.columns])  # a stored sweep may be older
 
 
 @dataclass(frozen=True)
 class ComparisonTable:
-    """The contents of a table, independent of its format."""
+    """Contents of a table, independent of its format."""
 
     title: str
     choice: TableChoice
     rows: list[RunRow]  # each with at least one run
-    overrides: Mapping[str, Sequence[str]]  # of the experiment's rows, by name; some may have no run yet
-    asked: list[Run]  # the runs of the last sweep, for every row; some may not have begun
+    overrides: Mapping[str, Sequence[str]]  # by row of the experiment, also for rows without runs
+    asked: list[Run]  # requested runs of the last sweep for every row, also if not started
     incomplete: list[Incomplete]
-    superseded: int  # older records of the same runs
-    root: Path  # runs are named relative to it
-    left_out: Sequence[str] = ()  # of PLAIN, without a figure in any run
+    superseded: int  # number of older records of the same runs
+    root: Path  # base of relative run names
+    left_out: Sequence[str] = ()  # omitted columns of PLAIN, without values in all runs
 
     @classmethod
     def below(cls, directory: Path) -> ComparisonTable:
-        """Return the table of the runs at and below `directory`: its experiment's, or else with the columns PLAIN.
+        """Return the table of the runs at and below `directory`, by its experiment or with the columns PLAIN.
 
         Raises DataError if no run is complete or the experiment's config cannot be read.
         """
         if not directory.is_dir():
-            raise DataError(f"{directory}: expected a folder of runs")
+            raise DataError(f"{directory}: expected a folder of runs, got no folder")
         sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
         choice = TableChoice.of(sweep.get("table") or {"columns": list(PLAIN)})
         overrides = sweep_rows(sweep)
@@ -133,7 +135,7 @@ class ComparisonTable:
 
     @property
     def judged(self) -> bool:
-        """Return True if a figure depends on the true instances, whose annotation may have several releases."""
+        """Return True if a metric depends on ground-truth instances, which may have several annotation releases."""
         annotated = self.choice.split_key or any(record.annotation for record in self.records)
         return bool(annotated) and any(map(is_evaluation, self.choice.columns))
 
@@ -147,11 +149,11 @@ class ComparisonTable:
 
     @property
     def noun(self) -> str:
-        """The last word of the split key: `scene` for dataset.scene."""
+        """Last component of the split key: `scene` for dataset.scene."""
         return (self.choice.split_key or "").rpartition(".")[2]
 
     def base_of(self, row: RunRow) -> RunRow | None:
-        """Return the row that `row` is compared with; None for the base itself, and without one of this variant."""
+        """Return the baseline of `row`; None for the baseline itself and if the variant has no baseline."""
         named = [other for other in self.rows if other.name == self.base_name]
         bases = named or [r for r in self.rows if r.system == self.base_name and r.variant == row.variant]
         return bases[0] if bases and bases[0] is not row else None
@@ -162,7 +164,7 @@ class ComparisonTable:
 
     @property
     def compared(self) -> list[tuple[RunRow, RunRow]]:
-        """The rows that have a base, each with it."""
+        """Pairs of a row and its baseline."""
         pairs = ((row, self.base_of(row)) for row in self.rows)
         return [(row, base) for row, base in pairs if base is not None]
 
@@ -172,7 +174,7 @@ class ComparisonTable:
 
     @property
     def is_of_scenenn(self) -> bool:
-        """Return True if all runs are of the real SceneNN, as published numbers are, not of rooms in its format."""
+        """Return True if all runs use the real SceneNN data, as for published numbers, not synthetic scenes."""
         datasets = {record.metrics.get(f"{CHOICE}dataset") for record in self.records}
         return datasets == {DATASET} and not any(record.annotation.startswith(MADE_UP) for record in self.records)
 
@@ -184,17 +186,17 @@ class ComparisonTable:
 
     @property
     def published_rows(self) -> list[PublishedRow]:
-        """The published rows with a number that the table shows."""
+        """Published rows with a number in the table."""
         return [row for row in self.published.rows if row.knows(self._keys)]
 
     @property
     def published_unknown(self) -> list[PublishedRow]:
-        """The published rows whose numbers for this table were not looked up."""
+        """Published rows with numbers for this table that were not looked up."""
         return [row for row in self.published.rows if not row.knows(self._keys) and row.leaves_open(self._keys)]
 
     @property
     def _keys(self) -> list[Key]:
-        """The keys of the table's figures in published.yaml."""
+        """Keys of the table's metrics in published.yaml."""
         if self.choice.columns_by:
             return [(sequence,) for sequence in self.sequences]
         if self.choice.group_by:
@@ -203,7 +205,7 @@ class ComparisonTable:
 
     @cached_property
     def sequences(self) -> list[str]:
-        """The values of the split key: those of published tables first, then those of the runs."""
+        """Values of the split key: first of published tables, then of the runs."""
         found = {run[-1] for run in self._runs} if self.choice.split_key else set()
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))
@@ -215,7 +217,7 @@ class ComparisonTable:
         return ", ".join([named, *variant] if named else variant) or row.name
 
     def missing(self) -> Iterator[tuple[RunRow, list[Run]]]:
-        """Yield the rows that lack runs: requested ones, or of the seeds and sequences of other rows."""
+        """Yield the rows with missing runs: requested runs, or runs for the seeds and sequences of other rows."""
         runs = self._runs
         if self.choice.split_key:
             seeds, sequences = (dict.fromkeys(run[:-1] for run in runs), dict.fromkeys(run[-1] for run in runs))
@@ -226,18 +228,18 @@ class ComparisonTable:
 
     @property
     def _runs(self) -> list[Run]:
-        """The runs of all rows, and the requested ones."""
+        """Runs of all rows, and requested runs."""
         return [*(run for row in self.rows for run in row.records), *self.asked]
 
 
 @dataclass(frozen=True)
 class SequenceMean:
-    """The mean over sequences of their means over seeds."""
+    """The mean over sequences of the means over seeds."""
 
-    value: float  # NaN = of no sequence
-    deviation: float  # sample standard deviation of the means of the seeds that have all sequences; NaN = below two
-    count: int  # sequences
-    runs: int  # of all sequences
+    value: float  # NaN = no sequence
+    deviation: float  # sample standard deviation over the seeds with all sequences; NaN = fewer than two
+    count: int  # number of sequences
+    runs: int  # number of runs of all sequences
 
 
 def mean_by_sequence(values: Mapping[Run, float]) -> dict[str, Mean]:
@@ -260,5 +262,5 @@ def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
 
 
 def mean_difference(differences: Mapping[Run, float]) -> Mean:
-    """Return the mean of paired differences with its standard error over sequences: seeds are no further evidence."""
+    """Return the mean of paired differences with its standard error over sequences; seeds are not independent."""
     return Mean.of(mean.value for mean in mean_by_sequence(differences).values())

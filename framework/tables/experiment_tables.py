@@ -38,7 +38,7 @@ LAYOUTS: dict[str, tuple[Callable[[ComparisonTable], TextTable], Callable[[Compa
     "columns_by": (across_grid, difference_across_grid),
     "group_by": (by_grid, difference_grid),
 }
-"""TableChoice.layout -> the table of the figures, and the table of the differences to the base."""
+"""TableChoice.layout -> the table of the values, and the table of the differences from the baseline."""
 
 
 def _grids(comparison: ComparisonTable) -> Iterator[TextTable]:
@@ -49,7 +49,7 @@ def _grids(comparison: ComparisonTable) -> Iterator[TextTable]:
 
 
 def comma_separated_rows(comparison: ComparisonTable) -> str:
-    """Return a line per row, with all digits; unknown values are empty."""
+    """Return one CSV line per row, with all digits; unknown values are empty."""
     statistics = ("mean", "sd", "n", "difference", "se", "pairs")
     keys = [f"{column}.{name}" for column in comparison.choice.columns for name in statistics]
     text = io.StringIO()
@@ -70,7 +70,7 @@ def comma_separated_rows(comparison: ComparisonTable) -> str:
 
 
 def comma_separated_runs(comparison: ComparisonTable) -> str:
-    """Return a line per run and figure, with all digits; undefined figures have no line."""
+    """Return one CSV line per run and metric, with all digits; undefined metrics have no line."""
     split_key = comparison.choice.split_key
     assert split_key
     text = io.StringIO()

@@ -1,7 +1,7 @@
 """Layouts of a comparison: a line per row, a column per sequence, or a group of lines per sequence.
 
-In the layouts with sequences, rows of one pose source are adjacent, and the highest mean among them is bold. Only
-means over equally many runs compete.
+In the layouts with sequences, rows with the same pose source are adjacent, and their highest mean is bold. Only means
+over the same number of runs compete.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from framework.tables.grid import TextTable, decimals, figure
 from framework.tables.published import NOT_KNOWN, Key, PublishedRow
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
-NOTHING = "–"  # an undefined figure, such as the AP of a class without objects
-MISSING = "missing"  # a figure without a complete run
+NOTHING = "–"  # undefined value, such as the AP of a class without objects
+MISSING = "missing"  # value without a complete run
 
 HEADS = {
     "instances.ap": "AP",
@@ -41,11 +41,11 @@ HEADS = {
     "peak_rss_bytes": "peak memory (bytes)",
     **{f"instances.ap50.{coco}": name for name, coco in SCENENN_TO_COCO.items()},
 }
-"""The heads of columns; other columns are headed by their key."""
+"""Column headings by key; all other columns have their key as the heading."""
 
 
 def head(key: str) -> str:
-    """Return the head of a figure's column, with its unit."""
+    """Return the heading of a metric's column, with its unit."""
     parts = key.split(".")
     if parts[0] == "stage_ms" and len(parts) == 3:
         return f"{parts[1]} (ms{'' if parts[2] == 'median' else f', {parts[2]}'})"
@@ -71,7 +71,7 @@ def row_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def difference_grid(comparison: ComparisonTable) -> TextTable:
-    """Return each row's mean difference to the base with its standard error."""
+    """Return each row's mean difference from the baseline with its standard error."""
     keys, compared = comparison.choice.columns, comparison.compared
     means = {key: [mean_difference(row.differences(base, key)) for row, base in compared] for key in keys}
     digits = {key: decimals(mean.value for mean in of_key) for key, of_key in means.items()}
@@ -81,10 +81,10 @@ def difference_grid(comparison: ComparisonTable) -> TextTable:
         expected = len({run[-1] for run in pairs})
         cells = [_of(_difference(means[key][k], digits[key]), means[key][k].count, expected) for key in keys]
         body.append([comparison.called(row), str(len(pairs)), *cells])
-    return TextTable([f"less {comparison.base_called}", "pairs", *map(head, keys)], body)
+    return TextTable([f"minus {comparison.base_called}", "pairs", *map(head, keys)], body)
 
 
-_Cell = tuple[str, float]  # the text, and the figure that competes for the highest; NaN = does not compete
+_Cell = tuple[str, float]  # text and competing value; NaN = does not compete
 
 
 @dataclass(frozen=True)
@@ -95,21 +95,21 @@ class _Line:
 
 
 class _SequenceFigures:
-    """One figure of all rows as cells, by sequence and averaged over sequences."""
+    """One metric of all rows as cells, by sequence and averaged over sequences."""
 
     def __init__(self, comparison: ComparisonTable, key: str) -> None:
         self._rows = comparison.rows
-        self._seeds = len({run[:-1] for row in self._rows for run in row.records})  # runs expected in a sequence
+        self._seeds = len({run[:-1] for row in self._rows for run in row.records})  # expected runs of a sequence
         self.means = {row.name: mean_by_sequence(row.values(key)) for row in self._rows}
         self._overall = {row.name: mean_over_sequences(row.values(key)) for row in self._rows}
 
     @property
     def sequences(self) -> set[str]:
-        """The sequences in which a row has the figure."""
+        """Sequences with a value in at least one row."""
         return {sequence for of_row in self.means.values() for sequence in of_row}
 
     def cell(self, row: RunRow, sequence: str, digits: int) -> _Cell:
-        """Return mean ± deviation over seeds; with their number if a run is missing or does not have the figure."""
+        """Return mean ± deviation over seeds, with the number of seeds if values are missing."""
         if not any(run[-1] == sequence for run in row.records):
             return MISSING, math.nan
         mean = self.means[row.name].get(sequence, Mean.of(()))
@@ -118,7 +118,7 @@ class _SequenceFigures:
         return _mean_cell(mean, digits, self._seeds), mean.value if mean.count == most else math.nan
 
     def mean_cell(self, row: RunRow, expected: int, digits: int) -> _Cell:
-        """Return mean ± deviation over seeds; with the number of sequences or of runs if some are missing."""
+        """Return mean ± deviation over seeds, with the number of sequences or runs if some are missing."""
         mean = self._overall[row.name]
         others = [self._overall[other.name] for other in self._rows if other.variant == row.variant]
         competes = (mean.count, mean.runs) == max((other.count, other.runs) for other in others)
@@ -147,7 +147,7 @@ def across_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def by_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a group of lines per sequence, each line a row with all its figures; the last group holds the means."""
+    """Return a group of lines per sequence, one line per row with all metrics; the last group contains the means."""
     keys = comparison.choice.columns
     rows = [row for rows in _by_variant(comparison.rows) for row in rows]
     figures = [_SequenceFigures(comparison, key) for key in keys]
@@ -174,7 +174,7 @@ def by_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def difference_across_grid(comparison: ComparisonTable) -> TextTable:
-    """Return the base less each other row, by sequence, and the mean with its standard error."""
+    """Return the baseline minus each other row, by sequence, and the mean with its standard error."""
     [key] = comparison.choice.columns
     differences = {row.name: base.differences(row, key) for row, base in comparison.compared}
     paired = {run[-1] for runs in differences.values() for run in runs}
@@ -189,7 +189,7 @@ def difference_across_grid(comparison: ComparisonTable) -> TextTable:
             texts += [_difference(mean, digits) if mean.count else MISSING, str(len(differences[row.name]))]
             section.append(_row_line(comparison, row, [(text, math.nan) for text in texts]))
         sections.append(section)
-    heads = [*_labels(comparison, f"{comparison.base_called} less"), *sequences, "mean", "pairs"]
+    heads = [*_labels(comparison, f"{comparison.base_called} minus"), *sequences, "mean", "pairs"]
     return _grid(heads, sections, digits)
 
 
@@ -207,7 +207,7 @@ def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) ->
 
 
 def _highest(section: Sequence[_Line], digits: int) -> Iterator[tuple[int, int]]:
-    """Yield (line, column) of the figures that are highest as printed, where several lines compete."""
+    """Yield the (line, column) of the highest printed values among competing lines."""
     for k, line in enumerate(section):
         competing = [other.cells for other in section if other.variant == line.variant]
         for column, (_, value) in enumerate(line.cells):
@@ -221,7 +221,7 @@ def _decimals(figures: Iterable[_SequenceFigures]) -> int:
 
 
 def _by_variant(rows: Sequence[RunRow]) -> list[list[RunRow]]:
-    """Group the rows that can be compared, in the order of each group's first."""
+    """Group the comparable rows, in the order of the first row of each group."""
     groups: dict[tuple[str, ...], list[RunRow]] = {}
     for row in rows:
         groups.setdefault(row.variant, []).append(row)
@@ -229,7 +229,7 @@ def _by_variant(rows: Sequence[RunRow]) -> list[list[RunRow]]:
 
 
 def _labels(comparison: ComparisonTable, name: str, poses: str = "poses", annotation: str = "annotation") -> list[str]:
-    """Return the first cells of a line, or of the heads: a name, and the keys that must not be averaged."""
+    """Return the first cells of a line or of the headings: a name, poses and annotation."""
     return [name, poses, annotation] if comparison.judged else [name, poses]
 
 
@@ -249,7 +249,7 @@ def published_name(published: PublishedRow) -> str:
 
 
 def published_cell(published: PublishedRow, key: Key, digits: int) -> str:
-    """Return a published number; a number that was not looked up differs from one that the source lacks."""
+    """Return a published number as text: NOT_KNOWN if not looked up, NOTHING if missing in the source."""
     value = (published.values or {}).get(key, math.nan)
     if value is None:
         return NOT_KNOWN
@@ -261,13 +261,13 @@ def _mean_cell(mean: Mean, digits: int, expected: int) -> str:
 
 
 def _difference(mean: Mean, digits: int) -> str:
-    """Return signed mean ± standard error; * = significantly different from 0."""
+    """Return the signed mean ± standard error; * = significantly different from 0."""
     text = figure(mean.value, mean.error, digits, signed=True)
     return f"{text} *" if mean.is_not_zero else text
 
 
 def _of(text: str, count: int, expected: int) -> str:
-    """Return the text, with the count if it is not the expected one."""
+    """Return the text, with the count if it differs from the expected count."""
     if not count:
         return NOTHING
     return text if count == expected else f"{text} ({count} of {expected})"

@@ -13,11 +13,11 @@ import yaml
 from framework.errors import ConfigError
 
 FILE = Path(__file__).with_suffix(".yaml")
-DATASET = "scenenn"  # the dataset of the numbers
-MADE_UP = "synthetic"  # first word of the release of scenes that `instancemap synthesize` writes in its format
+DATASET = "scenenn"  # dataset of the numbers
+MADE_UP = "synthetic"  # first word of the annotation release of scenes written by `instancemap synthesize`
 NOT_KNOWN = "not known"  # printed for numbers that were not looked up
 
-Key = tuple[str, ...]  # ("fps",), ("011",) or ("011", "instances.ap50.bed"): by the layout of the table
+Key = tuple[str, ...]  # ("fps",), ("011",) or ("011", "instances.ap50.bed"), depending on the layout
 
 
 @dataclass(frozen=True)
@@ -29,15 +29,15 @@ class PublishedRow:
     remark: str  # conditions of the measurement
     poses: str
     annotation: str  # the release
-    decimals: int  # of the values, in our unit
-    values: Mapping[Key, float | None] | None  # in our unit; None = not looked up
+    decimals: int  # of the values, in the project's unit
+    values: Mapping[Key, float | None] | None  # in the project's unit; None = not looked up
 
     def knows(self, keys: Iterable[Key]) -> bool:
-        """Return True if a number of one of `keys` is known."""
+        """Return True if a number of any key is known."""
         return any((self.values or {}).get(key) is not None for key in keys)
 
     def leaves_open(self, keys: Iterable[Key]) -> bool:
-        """Return True if the source may have a number of one of `keys` that was not looked up."""
+        """Return True if a number of any key was not looked up."""
         return self.values is None or any(key in self.values and self.values[key] is None for key in keys)
 
 
@@ -45,8 +45,8 @@ class PublishedRow:
 class Published:
     """A section of the file."""
 
-    layout: str  # of the tables that show the numbers: rows, columns_by or group_by
-    sequences: tuple[str, ...]  # of the published table, in its order
+    layout: str  # layout of the table: rows, columns_by or group_by
+    sequences: tuple[str, ...]  # in the order of the published table
     rows: tuple[PublishedRow, ...]
 
 
@@ -55,7 +55,7 @@ NOTHING_PUBLISHED = Published("rows", (), ())
 
 @cache
 def read_published(section: str) -> Published:
-    """Return the numbers of a section; raise ConfigError if the file does not have it."""
+    """Return the numbers of a section. Raises ConfigError for an unknown section."""
     sections: dict[str, Any] = yaml.safe_load(FILE.read_text("utf-8"))
     if section not in sections:
         raise ConfigError(f"table.published: expected null or one of {', '.join(sections)}, got {section}")

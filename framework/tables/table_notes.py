@@ -1,4 +1,4 @@
-"""Notes below a table: computation of the metrics, and missing runs."""
+"""Notes below a table: computation of the metrics, provenance, and missing runs."""
 
 from __future__ import annotations
 
@@ -25,62 +25,62 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _averaging(comparison)
     yield from _winners(comparison)
     if comparison.left_out:
-        yield f"Left out, as no run has them: {_with_needs(comparison.left_out)}."
+        yield f"Omitted columns without values: {_with_needs(comparison.left_out)}."
     if comparison.overrides:
-        changes = (f"{name}: {' '.join(changes) or 'nothing'}" for name, changes in comparison.overrides.items())
-        yield f"What each row changes: {'; '.join(changes)}."
+        changes = (f"{name}: {' '.join(changes) or 'none'}" for name, changes in comparison.overrides.items())
+        yield f"Overrides of each row: {'; '.join(changes)}."
     if fixed := _same(comparison.records):
-        yield f"In all: {fixed}."
+        yield f"Common to all runs: {fixed}."
     yield from _protocol(comparison)
     yield from _published(comparison)
     yield f"Data: {data(comparison.records)}."
     yield f"Code: {counted(record.code for record in comparison.records)}."
     yield f"Machine: {counted(machine(record) for record in comparison.records)}."
-    yield f"Config: config.yaml beside each run; SHA-256 of all their hashes: {digest(comparison.records)}."
+    yield f"Config: config.yaml of each run; SHA-256 of all config hashes: {digest(comparison.records)}."
     yield from _missing(comparison)
 
 
 def _averaging(comparison: ComparisonTable) -> Iterator[str]:
-    """Explain the means, and how rows are compared."""
+    """Explain the means and the comparison of rows."""
     choice, over = comparison.choice, ", ".join(comparison.choice.average_over)
     if others := following(comparison.records, choice.average_over):
-        yield f"Averaged over with {over}, whose value they have in every run: {', '.join(others)}."
+        yield f"Also averaged over keys with the value of {over} in every run: {', '.join(others)}."
     if choice.split_key:
         yield (
-            f"Mean ± sample standard deviation over {over}, where there are several. The mean is over the sequences "
-            f"({choice.split_key}), each of which counts as one; its deviation is over the runs that have all of them. "
-            "In bold: the highest of the same poses, among means of as many runs. missing: no complete run."
+            f"Cells: mean ± sample standard deviation over {over}. mean: average of the sequences "
+            f"({choice.split_key}) with equal weights; its deviation is over the runs with all sequences. "
+            "Bold: highest value for the same poses and number of runs. missing: no complete run."
         )
     else:
-        yield f"Mean ± sample standard deviation over {over}; runs: how many are complete."
+        yield f"Cells: mean ± sample standard deviation over {over}. runs: number of complete runs."
     if not comparison.has_base:
-        yield f"No differences: {comparison.base_name} is no row with a complete run; table.baseline=ROW names another."
+        yield f"No differences: the baseline {comparison.base_name} has no complete run; set table.baseline=ROW."
     elif len(comparison.rows) > 1:
         keys = [*choice.average_over, *filter(None, [choice.split_key])]
         error = "mean ± standard error"
         if len(keys) > 1:
             kinds = "the sequences" if choice.split_key else f"the values of {keys[-1]}"
-            error += f" over {kinds}, of each of which the runs are averaged first"
+            error += f" over {kinds}, after averaging the runs of each"
         yield (
-            f"Differences are paired by {', '.join(keys)}: {error}; "
-            f"* where the {CONFIDENCE:.0%} interval of Student's t is without 0."
+            f"Differences are paired by {', '.join(keys)}: {error}. "
+            f"*: the {CONFIDENCE:.0%} interval of Student's t excludes 0."
         )
         bases = [base for _, base in comparison.compared]
         if alone := [row.name for row in comparison.rows if not (comparison.base_of(row) or row in bases)]:
-            yield f"Without a row of {comparison.base_name} that they could be compared with: {'; '.join(alone)}."
+            yield f"Rows without a matching row of {comparison.base_name}: {'; '.join(alone)}."
 
 
 def _with_needs(columns: Sequence[str]) -> str:
-    """Return the heads of figures, with the ground truth that they require."""
+    """Return the headings of metrics, with the required ground truth."""
     heads: dict[str, list[str]] = {}
     for key in columns:
-        what = "true instances" if is_evaluation(key) else "true poses" if key.startswith("trajectory.") else ""
-        heads.setdefault(f" (only with {what})" if what else "", []).append(head(key))
+        what = "instances" if is_evaluation(key) else "poses" if key.startswith("trajectory.") else ""
+        heads.setdefault(f" (only with ground-truth {what})" if what else "", []).append(head(key))
     return "; ".join(f"{', '.join(names)}{needs}" for needs, names in heads.items())
 
 
 def _winners(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield the sequences in which the base is better and worse than each other row."""
+    """Yield the counts of sequences with a better and a worse baseline, by row."""
     if not comparison.choice.columns_by:
         return
     [key] = comparison.choice.columns
@@ -89,50 +89,53 @@ def _winners(comparison: ComparisonTable) -> Iterator[str]:
         lost = [sequence for sequence in comparison.sequences if sequence in means and means[sequence].value < 0]
         won = sum(mean.value > 0 for mean in means.values())
         yield (
-            f"{comparison.base_called} against {comparison.called(row, without='tracker')}, {row.poses}: "
+            f"{comparison.base_called} compared with {comparison.called(row, without='tracker')}, {row.poses}: "
             f"higher in {won} of {len(means)} sequences, lower in {len(lost)}{': ' + ', '.join(lost) if lost else ''}."
         )
 
 
 def _protocol(comparison: ComparisonTable) -> Iterator[str]:
-    """Explain how the instances were compared with the truth."""
+    """Explain the comparison of the instances with the ground truth."""
     kinds = {key.startswith("instances.to_map.") for key in comparison.choice.columns if is_evaluation(key)}
     if not kinds:
         return
     near = f"within {MAX_DISTANCE * 100:.0f} cm"
     if False in kinds:
-        yield f"Transfer: each true vertex takes the instance of the map's nearest vertex {near}. AP is in [0, 1]."
+        yield (
+            f"Label transfer: each ground-truth vertex gets the instance of the nearest map vertex {near}. "
+            "AP is in [0, 1]."
+        )
     if True in kinds:
-        yield f"Transfer of to_map: each vertex of the map takes the instance of the nearest true vertex {near}."
+        yield f"Label transfer, to map: each map vertex gets the instance of the nearest ground-truth vertex {near}."
 
 
 def _published(comparison: ComparisonTable) -> Iterator[str]:
     if comparison.choice.published and not comparison.is_of_scenenn:
-        yield "Published numbers are of the real SceneNN (sequences=scenenn): none stand below figures of other data."
+        yield "Published numbers are for the real SceneNN data (sequences=scenenn) and omitted for other data."
     for row in comparison.published_rows:
         yield f"Published, {row.system}: {row.source}{f'; {row.remark}' if row.remark else ''}."
     if unknown := [f"{row.system} ({row.source})" for row in comparison.published_unknown]:
-        yield f"Published results whose numbers we do not have: {'; '.join(unknown)}."
+        yield f"Published results not looked up: {'; '.join(unknown)}."
 
 
 def _missing(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield the figures, rows, sequences and runs without a result, and the incomplete runs."""
+    """Yield the metrics, rows, sequences and runs without a result, and the incomplete runs."""
     known_keys = {key for record in comparison.records for key in record.metrics}
     if absent := [key for key in comparison.choice.columns if key not in known_keys]:
-        yield f"No run has a figure of this name: {', '.join(absent)}."
+        yield f"Metrics in no run: {', '.join(absent)}."
     begun = {row.system for row in comparison.rows}
     if absent := [name for name in comparison.overrides if name not in begun]:
-        yield f"Without a complete run: {', '.join(absent)}."
+        yield f"Rows without a complete run: {', '.join(absent)}."
     run_of = {run[-1] for row in comparison.rows for run in row.records}
     if absent := [sequence for sequence in comparison.sequences if sequence not in run_of]:
-        yield f"Without a complete run of any row: {comparison.choice.split_key}={','.join(absent)}."
+        yield f"Sequences without a complete run: {comparison.choice.split_key}={','.join(absent)}."
     keys = [*comparison.choice.average_over, *filter(None, [comparison.choice.split_key])]
     for row, missing in comparison.missing():
         yield f"Missing in {row.name}: {_as_overrides(keys, missing)}."
     if comparison.superseded:
-        yield f"Left out, older records of the same runs: {comparison.superseded}."
+        yield f"Omitted older records of the same runs: {comparison.superseded}."
     for one in comparison.incomplete:
-        yield f"Not complete: {one.directory.relative_to(comparison.root)}: {one.reason.rstrip('.')}."
+        yield f"Incomplete: {one.directory.relative_to(comparison.root)}: {one.reason.rstrip('.')}."
 
 
 def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
@@ -145,32 +148,32 @@ def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
 
 
 def _same(records: Sequence[Record]) -> str:
-    """Return the options that all runs share, by stage."""
+    """Return the common options of all runs, by stage."""
     chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
 
 
 def data(records: Sequence[Record]) -> str:
-    """Return the datasets with the releases of their annotation, and the numbers of frames."""
+    """Return the datasets with their annotation releases, and the range of frame counts."""
     names = (
         f"{record.metrics.get(f'{CHOICE}dataset')}{record.annotation and f', annotation {record.annotation}'}"
         for record in records
     )
     frames = sorted(number for record in records if is_number(number := record.metrics.get("frames")))
     lengths = dict.fromkeys(f"{number:g}" for number in frames[:1] + frames[-1:])
-    return f"dataset={counted(names)}" + (f"; {' to '.join(lengths)} frames a run" if frames else "")
+    return f"dataset={counted(names)}" + (f"; {' to '.join(lengths)} frames per run" if frames else "")
 
 
 def machine(record: Record) -> str:
-    """Return the cores and the number of threads."""
+    """Return the number of cores, the processor and the number of threads."""
     cores = f"{record.metrics.get('environment.cpus')} cores of {record.metrics.get('environment.processor')}"
     threads = record.config.get("threads")
     return f"{cores}, threads={threads}" if threads else cores
 
 
 def counted(words: Iterable[str]) -> str:
-    """Return the distinct words, with their counts if there are several."""
+    """Return the distinct words, with counts for several words."""
     counts = Counter(words).most_common()
     if len(counts) == 1:
         return counts[0][0]
@@ -178,6 +181,6 @@ def counted(words: Iterable[str]) -> str:
 
 
 def digest(records: Sequence[Record]) -> str:
-    """Return one short hash of the configs of several runs, in any order."""
+    """Return one short hash of the configs of several runs, independent of their order."""
     hashes = sorted(str(record.metrics["config_hash"]) for record in records)
     return hashlib.sha256("".join(hashes).encode()).hexdigest()[:12]

@@ -148,7 +148,7 @@ def test_only_runs_common_to_all_rows_are_compared(tmp_path: Path) -> None:
     lines = lines_of(write_ranks([one, other], [AP50], None))
     assert "| c | 0.700 | 3 | 0.700 | 3 |" in lines
     assert "| a | 0.900 | 1 | 0.900 | 1 |" in lines
-    assert "- Left out, runs in which not every row has this figure: one 1." in lines
+    assert "- Omitted runs, without this metric in some rows: one 1." in lines
 
 
 def test_folders_of_same_name_are_shown_with_path(tmp_path: Path) -> None:
@@ -159,7 +159,7 @@ def test_folders_of_same_name_are_shown_with_path(tmp_path: Path) -> None:
 def test_rows_missing_in_one_place_are_listed(places: list[Path]) -> None:
     run(places[1], "e", 0, 0.7)
     text = write_ranks(places, [AP50], None)
-    assert "- Left out, rows that not all have: e: not in rooms, hall." in text
+    assert "- Omitted rows, missing in some folders: e: not in rooms, hall." in text
     assert "| e " not in text
 
 
@@ -180,24 +180,28 @@ def test_several_figures_are_written_to_files(places: list[Path], tmp_path: Path
 
 def test_provenance_of_runs_is_printed(places: list[Path]) -> None:
     [line] = [line for line in lines_of(write_ranks(places, [AP50], None)) if line.startswith("- flat: ")]
-    assert "dataset=d, detector=seen, poses ground truth; annotation: not named; code 1234567; SHA-256" in line
+    assert "dataset=d, detector=seen, poses ground truth; annotation: unknown; code 1234567; SHA-256" in line
 
 
 @pytest.mark.parametrize(
     ("asked", "keys", "message"),
     [
-        (["rooms"], [AP50], "ranks compares two folders or more, found 1"),
-        (["rooms", "rooms/../rooms"], [AP50], "different folders, found one twice"),
-        (["rooms", "nowhere"], [AP50], "nowhere: expected a folder of runs"),
+        (["rooms"], [AP50], "DIR: expected at least two folders, got 1"),
+        (["rooms", "rooms/../rooms"], [AP50], "DIR: expected each folder once, got "),
+        (["rooms", "nowhere"], [AP50], "nowhere: expected a folder of runs, got no folder"),
         (["rooms", "empty"], [AP50], "expected a completed run, got none"),
         (
             ["rooms", "flat"],
             ["instances.ap51"],
-            r"rooms: no run has a figure instances.ap51; did you mean instances.ap50\?",
+            r"rooms: expected a run with the metric instances.ap51, got none; did you mean instances.ap50\?",
         ),
-        (["rooms", "flat"], ["zzz"], "rooms: no run has a figure zzz$"),
-        (["rooms", "small"], [AP50], "3 rows or more that all folders have, found 2: a, b; c: not in small; d: not in"),
-        (["rooms", "apart"], [AP50], "apart: there is no run in which all rows have instances.ap50"),
+        (["rooms", "flat"], ["zzz"], "rooms: expected a run with the metric zzz, got none$"),
+        (
+            ["rooms", "small"],
+            [AP50],
+            r"at least 3 common rows of all folders, got 2 \(a, b\); c: not in small; d: not in",
+        ),
+        (["rooms", "apart"], [AP50], "apart: expected a run with instances.ap50 in all rows, got none"),
     ],
 )
 def test_incomparable_folders_raise_one_line(
@@ -236,4 +240,4 @@ def test_script_error_is_one_line(tmp_path: Path) -> None:
     experiment(tmp_path / "rooms", {"a": (0.9,), "b": (0.8,), "c": (0.7,)})
     done = start(tmp_path, "rooms", "flat")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "error: flat: expected a folder of runs\n"
+    assert done.stderr == "error: flat: expected a folder of runs, got no folder\n"

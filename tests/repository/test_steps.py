@@ -70,10 +70,10 @@ def test_rows_missing_in_one_folder_are_excluded(tmp_path: Path) -> None:
     ]
     lines = lines_of(script.write_steps(places, [AP50], None))
     assert not any(line.startswith("| flat") for line in lines)
-    assert "- Left out, rows that not all folders have: flat." in lines
+    assert "- Omitted rows, missing in some folders: flat." in lines
 
 
 def test_folders_without_common_rows_raise(tmp_path: Path) -> None:
     places = [experiment(tmp_path / "a", {"paper": (0.1,)}), experiment(tmp_path / "b", {"flat": (0.1,)})]
-    with pytest.raises(DataError, match="expected two rows or more that all folders have, got none"):
+    with pytest.raises(DataError, match="expected at least two common rows of all folders, got none"):
         script.write_steps(places, [AP50], None)

@@ -1,1 +1,1 @@
-"""A refiner for InstanceMap: refiner=depth_median."""
+"""Refiner plugin for InstanceMap: refiner=depth_median."""

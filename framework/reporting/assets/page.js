@@ -1,11 +1,11 @@
 "use strict";
 
-// Joins the parts of a page: the map, the panel beside it, the table, the buttons.
+// Connects the parts of a page: the map, the side panel, the table and the buttons.
 
 const report = JSON.parse(document.getElementById("report-data").textContent);
 const byId = (id) => document.getElementById(id);
 
-/** An element with text or other elements in it: nothing from a record becomes markup. */
+/** Returns an element with text or child elements. Texts from run directories are never parsed as markup. */
 function made(name, css, ...children) {
   const element = document.createElement(name);
   if (css) element.className = css;
@@ -63,7 +63,7 @@ class Page {
       this.viewer = viewer;
     } catch (error) {
       document.querySelector(".viewer").classList.add("no-webgl");
-      byId("panel").firstElementChild.textContent = `The 3D view is not available (${error.message}); showing a picture.`;
+      byId("panel").firstElementChild.textContent = `The 3D view is not available (${error.message}); showing an image.`;
       this.legend();
       document.body.dataset.ready = "true";
       return;
@@ -144,7 +144,7 @@ class Page {
       : `${likely} with a confidence of ${this.confidence.toFixed(2)} or more; the others are dimmed`;
   }
 
-  /** Chooses an object, or none, everywhere. */
+  /** Selects an object, or none, in the map, the table and the panel. */
   choose(id, { fly = false } = {}) {
     if (!this.objects.has(id) && this.objects.size) id = null;
     this.chosen = id;
@@ -156,7 +156,7 @@ class Page {
     this.panel(id);
   }
 
-  /** Comes near an object in the map, and scrolls to the map where little of it is in sight. */
+  /** Moves the camera to an object, and scrolls to the map if most of it is not visible. */
   fly(id) {
     this.viewer.flyTo(id);
     const { top, bottom, height } = byId("canvas").getBoundingClientRect();

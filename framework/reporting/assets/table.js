@@ -1,6 +1,6 @@
 "use strict";
 
-// A table whose columns sort it, whose rows can be chosen, and which shows only what is looked for.
+// A table with sortable columns, selectable rows and a search filter.
 
 class ObjectTable {
   constructor(table, onChoose) {
@@ -25,7 +25,7 @@ class ObjectTable {
     });
   }
 
-  /** Numbers begin with the largest, words with A; again turns that around. */
+  /** Sorts by a column: numbers in descending order, words in ascending order. A second call reverses the order. */
   sort(column) {
     const head = this.heads[column];
     const numeric = head.classList.contains("number");
@@ -40,7 +40,7 @@ class ObjectTable {
     this.body.append(...this.rows);
   }
 
-  /** Hides rows without these words; pales those that are less confident. Returns how many are shown. */
+  /** Hides rows that do not match the search and dims rows with less confidence. Returns the number of shown rows. */
   filter(words, confidence) {
     let shown = 0;
     for (const row of this.rows) {

@@ -1,7 +1,7 @@
 "use strict";
 
-// The map in 3D: colors, instances or classes; objects that are clicked on; the map as it grew.
-// Colors are mixed as overview.png has them: instances in one color, some texture showing through.
+// 3D viewer of the map: colors, instances or classes; selection of objects; mapping progress.
+// Colors are mixed as in overview.png: one color per instance, with some texture.
 
 const VERTEX_SHADER = `
   attribute float firstSeen;
@@ -42,18 +42,18 @@ const FRAGMENT_SHADER = `
   }`;
 
 const FLIGHT_MS = 600;
-const FADED = 0.62; // of what is not chosen, while something is
-const PATH_WIDTH = 0.0022; // of the distance from which a map is looked at
+const FADED = 0.62; // fading of unselected objects during a selection
+const PATH_WIDTH = 0.0022; // relative to the distance of the initial view
 const PATH_SIDES = 6;
-const CLICK_PX = 5; // that a finger or a hand may move in a click
+const CLICK_PX = 5; // maximum movement of the pointer during a click
 
 class MapViewer {
-  /** Shows `scene`, a GLB and what report-data says of it, in `canvas`. Calls `onChoose` with an object's id, or null. */
+  /** Shows maps in `canvas`. Calls `onChoose` with the id of a clicked object, or null. */
   constructor(canvas, onChoose) {
     this.canvas = canvas;
     this.onChoose = onChoose;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
-    this.renderer.outputColorSpace = "srgb-linear"; // the shader encodes what it writes
+    this.renderer.outputColorSpace = "srgb-linear"; // the shader encodes its output
     this.camera = new THREE.PerspectiveCamera(32, 1, 0.02, 500);
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     this.controls.enableDamping = true;
@@ -72,7 +72,7 @@ class MapViewer {
     this.listenForClicks();
   }
 
-  /** Reads a GLB, ArrayBuffer, and adds it as a map that `show` can show. */
+  /** Reads a GLB (ArrayBuffer) and adds it as a map for `show`. */
   async add(content, data) {
     const { scene } = await new THREE.GLTFLoader().parseAsync(content, "");
     const map = { group: new THREE.Group(), data, parts: new Map(), path: pathTube(data) };
@@ -92,7 +92,7 @@ class MapViewer {
     this.maps.push(map);
   }
 
-  /** Shows one of the maps; the camera stays where it is, or goes to where that map is seen best. */
+  /** Shows one of the maps; the camera keeps its pose or moves to the initial view of the map. */
   show(number, { keepView = false } = {}) {
     if (this.shown) this.scene.remove(this.shown.group);
     this.shown = this.maps[number];
@@ -107,7 +107,7 @@ class MapViewer {
     this.flight = null;
     this.camera.up.set(...up);
     this.camera.fov = fov;
-    // another OrbitControls: it takes the direction up when it is made
+    // OrbitControls reads the up direction only in its constructor
     this.controls.dispose();
     this.controls = new THREE.OrbitControls(this.camera, this.canvas);
     this.controls.enableDamping = true;
@@ -115,7 +115,7 @@ class MapViewer {
     this.controls.addEventListener("change", () => this.draw());
     this.controls.target.set(...target);
     const aspect = this.camera.aspect;
-    const away = Math.max(1, 1.5 / aspect); // the view was chosen for 3 by 2
+    const away = Math.max(1, 1.5 / aspect); // the initial view has an aspect ratio of 3:2
     this.camera.position.set(...eye).sub(this.controls.target).multiplyScalar(away).add(this.controls.target);
     this.controls.update();
     this.draw();
@@ -131,7 +131,7 @@ class MapViewer {
     this.paint();
   }
 
-  /** Turns to an object and comes near it. */
+  /** Moves the camera to an object. */
   flyTo(id) {
     const part = this.shown.parts.get(id);
     if (!part) return;
@@ -233,7 +233,7 @@ class MapViewer {
     this.draw();
   }
 
-  /** The likely object in front at a place of the window, null where there is none. */
+  /** Returns the id of the frontmost likely object at a window position, or null. */
   objectAt(x, y) {
     const { left, top, width, height } = this.canvas.getBoundingClientRect();
     const place = new THREE.Vector2((2 * (x - left)) / width - 1, 1 - (2 * (y - top)) / height);
@@ -264,7 +264,7 @@ function material() {
   });
 }
 
-/** The camera's way as a tube, blue at its beginning, orange at its end. */
+/** Returns the camera path as a tube with colors from blue (start) to orange (end). */
 function pathTube({ path, eye, target }) {
   if (path.length < 2) return null;
   const curve = new THREE.CatmullRomCurve3(path.map((point) => new THREE.Vector3(...point)));
@@ -288,7 +288,7 @@ function rgb(hex) {
 
 function styleColor(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); }
 
-/** A GLB out of the page: base64, gzip. */
+/** Returns a GLB of the page, stored as base64 of gzip. */
 async function unpacked(element) {
   const bytes = Uint8Array.from(atob(element.textContent), (letter) => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));

@@ -1,4 +1,4 @@
-// What of three.js reports use; `npm ci && npm run build` bundles it into ../assets/three.min.js, as `THREE`.
+// Parts of three.js for reports; `npm ci && npm run build` bundles them into ../assets/three.min.js as `THREE`.
 export {
   BufferAttribute,
   BufferGeometry,

@@ -50,12 +50,12 @@ def test_detection_faults_of_ground_truth_are_zero() -> None:
         "found, small",
         "found, medium",
         "mask IoU",
-        "share of the mask on the object",
-        "class right",
+        "fraction of the mask on the object",
+        "correct class",
     ):
         assert table[name] == 1, name
     assert np.isnan(table["found, large"])
-    assert table["false detections an image"] == table["objects in several parts"] == 0
+    assert table["false detections per image"] == table["objects with several detections"] == 0
     assert table["score"] == pytest.approx(0.7)
     assert table["score, standard deviation"] == pytest.approx(0.1)
 
@@ -64,23 +64,23 @@ def test_detection_faults_of_oversized_mask_lower_iou() -> None:
     """Of the chair's 400 px 300 are covered by 500: IoU 300 / 600."""
     table = counted(detections((block(5, 0, 25, 20), 0, 0.8), (BED, 0, 0.6)))
     assert table["mask IoU"] == pytest.approx((300 / 600 + 1) / 2)
-    assert table["share of the mask on the object"] == pytest.approx((300 / 500 + 1) / 2)
-    assert table["share of the object in the mask"] == pytest.approx((300 / 400 + 1) / 2)
-    assert table["class right"] == 0.5
+    assert table["fraction of the mask on the object"] == pytest.approx((300 / 500 + 1) / 2)
+    assert table["fraction of the object in the mask"] == pytest.approx((300 / 400 + 1) / 2)
+    assert table["correct class"] == 0.5
 
 
 def test_detection_faults_split_object_is_not_false_detection() -> None:
     halves = detections((CHAIR, 0, 0.8), (block(0, 30, 20, 30), 1, 0.7), (block(20, 30, 20, 30), 1, 0.6))
     table = counted(halves)
-    assert table["objects in several parts"] == 0.5
-    assert table["false detections an image"] == 0
+    assert table["objects with several detections"] == 0.5
+    assert table["false detections per image"] == 0
     assert table["found"] == 1
 
 
 def test_detection_faults_count_false_detections() -> None:
     table = counted(detections((block(40, 0, 20, 20), 0, 0.5), (block(50, 40, 10, 10), 1, 0.2)), detections())
-    assert table["false detections an image"] == 1
-    assert table["false detections on one thing"] == 0.5
+    assert table["false detections per image"] == 1
+    assert table["false detections on an unknown object"] == 0.5
     assert table["score of false detections"] == pytest.approx(0.35)
     assert table["side of false detections (px)"] == pytest.approx((20 + 10) / 2)
     assert table["found"] == 0
@@ -92,8 +92,8 @@ def test_detection_faults_summarize_objects_over_frames() -> None:
     table = counted(*frames)
     assert table["found"] == pytest.approx(9 / 16)
     assert table["objects found in < 1/4 of the frames"] == table["objects found in > 3/4 of the frames"] == 0.5
-    assert table["class as in the object's other frames"] == pytest.approx(7 / 8)
-    assert table["class right"] == pytest.approx(8 / 9)
+    assert table["same class as in the other frames"] == pytest.approx(7 / 8)
+    assert table["correct class"] == pytest.approx(8 / 9)
 
 
 def test_overlaps_match_whole_image_counts() -> None:

@@ -68,7 +68,7 @@ def test_average_precision_matches_manual_result():
     """Ranked hits 1 0 1 1 0 of 5 truths: precision 1, 1/2, 2/3, 3/4, 3/5; envelope at the hits 1, 3/4, 3/4."""
     assert average_precision(np.array([1, 0, 1, 1, 0], bool), 5) == pytest.approx((1 + 0.75 + 0.75) / 5)
     assert average_precision(np.zeros(0, bool), 3) == 0.0
-    with pytest.raises(ValueError, match="average precision: expected at least one true instance, got none"):
+    with pytest.raises(ValueError, match="average precision: expected at least one ground-truth instance, got none"):
         average_precision(np.zeros(0, bool), 0)
 
 

@@ -70,7 +70,7 @@ def test_trajectory_error_without_pose_pairs_is_empty():
     assert evaluate([], []).metrics() == {}
     assert evaluate([None], [Pose(np.eye(4))]).metrics() == {}
     assert evaluate([np.eye(4)], [Pose(np.eye(4))]).metrics() == {"trajectory.ate_rmse_m": 0.0}
-    with pytest.raises(DataError, match=r"trajectories: expected equal lengths, got .* true and .* estimated poses"):
+    with pytest.raises(DataError, match=r"expected equal lengths, got .* ground-truth and .* estimated poses"):
         evaluate([None], [])
 
 

@@ -424,7 +424,7 @@ def test_export_invalid_selection_raises(run: Path, tmp_path: Path) -> None:
 def test_export_up_option_replaces_missing_up_direction(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = TURNED.write(tmp_path / "run", figures=False)
     export(run, [ExportFormat.PLY], tmp_path / "as_it_is")
-    assert "no up direction" in caplog.text
+    assert "expected an up direction, got none" in caplog.text
     assert read_mesh(tmp_path / "as_it_is" / "scene.ply").vertices[:, 1].max() == pytest.approx(1.25, abs=1e-5)
     caplog.clear()
     export(run, [ExportFormat.PLY], tmp_path / "told", up=(0, 2, 0), floor=-1.25)

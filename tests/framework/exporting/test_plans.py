@@ -78,7 +78,7 @@ def test_surface_points_have_owner_and_given_spacing(room: UprightRoom) -> None:
     np.testing.assert_allclose(cube.max(axis=0), (1.45, 1.45, 0.95), atol=0.01)
     top = found.points[(found.owner == 2) & found.level]
     np.testing.assert_allclose(top[:, 2], 0.95, atol=1e-5)
-    with pytest.raises(DataError, match="raise the resolution"):
+    with pytest.raises(DataError, match="increase resolution"):
         surface_points(room, 1e-5)
 
 

@@ -123,7 +123,7 @@ def test_map_figure_has_sequences_as_lines_and_rows_as_columns(maps: Path) -> No
         assert found.count(text) == 1
     assert found.count("20 frames, 2 instances, AP50 0.50") == 2
     assert found.count("2 instances") == 2
-    assert found.count("not complete") == 1
+    assert found.count("incomplete") == 1
     [note] = [text for text in found if text.startswith("An object")]
     for message in ("Annotation: made up.", "2 cores of Z80", "code 1234567."):
         assert message in " ".join(note.split())
@@ -133,7 +133,7 @@ def test_map_figure_omits_damaged_maps_and_missing_truth(maps: Path, caplog: pyt
     (maps / "dataset.scene=011,row=part,seed=0" / "mesh.ply").write_bytes(b"ply\n")
     run(maps, "whole", "gone")
     found = texts(maps)
-    assert (found.count("not complete"), found.count("no true instances")) == (3, 1)
+    assert (found.count("incomplete"), found.count("no ground truth")) == (3, 1)
     message = [record.getMessage() for record in caplog.records]
     assert len(message) == 2
     assert "mesh.ply" in message[0]
@@ -190,19 +190,19 @@ def test_stage_times_figure_averages_sequences(tmp_path: Path, caplog: pytest.Lo
     assert Image.open(paths[0]).size[0] == pytest.approx(88 / 25.4 * 200, abs=1)
     assert [record.getMessage() for record in caplog.records][1].endswith("got '0,integration,x'")
     found = texts(root)
-    assert {"GMM", "map integration", "30 ms", "not complete"} <= set(found)
+    assert {"GMM", "map integration", "30 ms", "incomplete"} <= set(found)
     assert "tracking" not in found
     note = " ".join(found[0].split())
-    assert "map integration: update and integration. Mean of 2 sequences (011, 206) " in note
+    assert "map integration: update and integration. Lines: mean over 2 sequences (011, 206) " in note
     assert "Lines end with the shortest sequence." in note
-    assert "annotation made up; 12 to 20 frames a run." in note
+    assert "annotation made up; 12 to 20 frames per run." in note
 
 
 @pytest.mark.parametrize(
     ("figure", "message"),
     [
         ({"kind": "pie"}, r"figure\.kind: expected one of stage_times, maps, got 'pie'"),
-        ({"kind": "stage_times", "zoom": True}, r"figure\.zoom: expected figure\.kind=maps with zoom=true"),
+        ({"kind": "stage_times", "zoom": True}, r"figure\.kind: expected maps with figure\.zoom=true, got stage_times"),
         ({"colour": "red"}, "figure: Key 'colour'"),
         ("maps", "figure: expected keys and values"),
     ],
@@ -214,7 +214,7 @@ def test_figure_choice_invalid_settings_raise_one_line_error(figure: Any, messag
 
 
 def test_write_figure_without_data_raises_one_line_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="expected a folder of runs"):
+    with pytest.raises(DataError, match="expected a folder of runs, got no folder"):
         write_figure(tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"expected the folder of an experiment, got no multirun\.yaml"):
         write_figure(tmp_path)
@@ -240,7 +240,7 @@ def test_figures_command_prints_paths_and_errors(
     message = capsys.readouterr()
     assert ended.value.code == 1
     assert message.out.splitlines() == [str(maps / "figure.png"), str(maps / "figure.pdf")]
-    assert message.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs"
+    assert message.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs, got no folder"
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError("a worker died"), KeyboardInterrupt()])

@@ -87,7 +87,7 @@ def test_map_at_pixel_matches_view(asked: Map) -> None:
         assert found.id == key
     v, u = np.argwhere(view.instance_ids == 0)[0]
     assert asked.at_pixel(int(u), int(v), frame.camera, frame.T_world_camera) is None
-    with pytest.raises(DataError, match=r"pixel: expected one in the image of .*, got \(-1, 0\)"):
+    with pytest.raises(DataError, match=r"pixel: expected u, v in an image of .*, got \(-1, 0\)"):
         asked.at_pixel(-1, 0, frame.camera, frame.T_world_camera)
 
 

@@ -15,7 +15,7 @@ from framework.tables.comparison import TableChoice
         ({"average_over": [], "columns": ["fps"]}, r"table\.average_over: expected at least one key, got none"),
         (
             {"columns_by": "dataset.scene", "group_by": "dataset.scene", "columns": ["fps"]},
-            "columns_by=dataset.scene, table.group_by=dataset.scene",
+            "table.columns_by, table.group_by: expected at most one key, got dataset.scene and dataset.scene",
         ),
         (
             {"columns_by": "seed", "columns": ["fps"]},
@@ -27,7 +27,7 @@ from framework.tables.comparison import TableChoice
         ),
         (
             {"columns_by": "dataset.scene", "columns": ["fps", "frames"]},
-            r"table\.columns: expected one metric across .*, got 2; set table\.group_by=.* to show several",
+            r"table\.columns: expected one metric with table\.columns_by, got 2; set table\.group_by=",
         ),
         ({"published": "table4", "columns": ["fps"]}, r"table\.published: expected null or one"),
         (

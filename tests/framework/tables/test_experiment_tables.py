@@ -60,11 +60,11 @@ def test_write_tables_figures_match_manual_result(sweep: Path) -> None:
     assert "| chain | 3 | 0.700 ± 0.265 | 151.0 ± 1.0 | ground_truth |" in lines
     # -0.3, -0.2, -0.4: mean -0.3, standard error 0.1 / sqrt(3) = 0.0577; t = 5.2 > 4.3
     assert "| identity | 3 | -0.300 ± 0.058 * | -151.0 ± 0.6 * |" in lines
-    assert "| less chain | pairs | AP50 | refinement (ms) |" in lines
+    assert "| minus chain | pairs | AP50 | refinement (ms) |" in lines
     assert (sweep / "table.md").read_text() == text
-    assert "- What each row changes: identity: refiner=identity; chain: nothing; none_yet: refiner=none_yet." in lines
-    assert "- Without a complete run: none_yet." in lines
-    assert "- In all: fuser=f." in lines
+    assert "- Overrides of each row: identity: refiner=identity; chain: none; none_yet: refiner=none_yet." in lines
+    assert "- Rows without a complete run: none_yet." in lines
+    assert "- Common to all runs: fuser=f." in lines
     assert "- Code: 1234567." in lines
     assert "- Machine: 2 cores of Z80." in lines
     assert "Missing" not in text
@@ -89,7 +89,7 @@ def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
     text = write_tables(tmp_path)
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "| other | 6 | +0.200 ± 0.100 |" in lines  # over six runs, it would be 0.045 and called significant
-    assert "paired by seed, scene: mean ± standard error over the values of scene, of each of which the runs" in text
+    assert "paired by seed, scene: mean ± standard error over the values of scene, after averaging" in text
     with (tmp_path / "table.csv").open() as file:
         _, other = csv.DictReader(file)
     assert float(other["instances.ap50.se"]) == pytest.approx(0.1)
@@ -107,8 +107,8 @@ def test_table_notes_list_missing_runs(sweep: Path) -> None:
     assert "| identity | 1 | -0.300 | -150.0 |" in lines  # seed 0 is the only pair, and has no error
     assert "- Missing in chain: seed=1,7." in lines
     assert "- Missing in identity: seed=2." in lines
-    assert "- Not complete: row=chain,seed=1: failed: the map is full." in lines
-    assert sum(line.startswith("- Not complete: row=identity,seed=2: ") for line in lines) == 1
+    assert "- Incomplete: row=chain,seed=1: failed: the map is full." in lines
+    assert sum(line.startswith("- Incomplete: row=identity,seed=2: ") for line in lines) == 1
     assert "- Code: 1234567 (4 runs), 89abcde (1 run)." in lines
 
 
@@ -134,8 +134,8 @@ def test_table_notes_replace_line_breaks(sweep: Path) -> None:
     (sweep / "row=chain,seed=1" / "metrics.json").unlink()
     partial = {"partial": "the map\nis\r\nfull"}
     (sweep / "row=chain,seed=1" / "metrics.partial.json").write_text(json.dumps(partial))
-    assert "- Not complete: row=chain,seed=1: partial: the map is full." in write_tables(sweep).splitlines()
-    assert "% Not complete: row=chain,seed=1: partial: the map is full." in (sweep / "table.tex").read_text()
+    assert "- Incomplete: row=chain,seed=1: partial: the map is full." in write_tables(sweep).splitlines()
+    assert "% Incomplete: row=chain,seed=1: partial: the map is full." in (sweep / "table.tex").read_text()
 
 
 def test_table_notes_list_parameters_equal_to_seed(tmp_path: Path) -> None:
@@ -145,15 +145,15 @@ def test_table_notes_list_parameters_equal_to_seed(tmp_path: Path) -> None:
         (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
         metrics = json.loads((directory / "metrics.json").read_text()) | {"config_hash": config_hash(config)}
         (directory / "metrics.json").write_text(json.dumps(metrics))
-    assert "- Averaged over with seed, whose value they have in every run: dataset.stride." in write_tables(tmp_path)
+    assert "- Also averaged over keys with the value of seed in every run: dataset.stride." in write_tables(tmp_path)
 
 
 def test_table_without_baseline_has_no_differences(sweep: Path) -> None:
     for path in sweep.glob("row=chain*/metrics.json"):
         path.unlink()
     text = write_tables(sweep)
-    assert "less chain" not in text
-    assert "- No differences: chain is no row with a complete run; table.baseline=ROW names another." in text
+    assert "minus chain" not in text
+    assert "- No differences: the baseline chain has no complete run; set table.baseline=ROW." in text
     assert text.count("| identity ") == 1
 
 
@@ -162,7 +162,7 @@ def test_table_rows_use_configured_names(sweep: Path) -> None:
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
     text = write_tables(sweep)
     assert "| all of it |" in text
-    assert "| less all of it |" in text
+    assert "| minus all of it |" in text
 
 
 RUN_TIMES = {
@@ -189,9 +189,9 @@ def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str |
     assert "| the paper (published) | – | 10.8 | not known | – | tracked |" in lines
     assert "Voxblox++ (published)" not in text, "a line that says nothing"
     assert "- Published, the paper: DDNS 2020, article 2528954; all components on every frame of 640x480" in text
-    unknown = [line for line in lines if "Published results whose numbers we do not have" in line]
+    unknown = [line for line in lines if "Published results not looked up" in line]
     assert unknown == [
-        "- Published results whose numbers we do not have: Voxblox++ (Grinvald et al., RA-L 2019); Pham et al. (WACV "
+        "- Published results not looked up: Voxblox++ (Grinvald et al., RA-L 2019); Pham et al. (WACV "
         "2019); MaskFusion (Rünz et al., ISMAR 2018); Fusion++ (McCormac et al., 3DV 2018)."
     ]
 
@@ -215,8 +215,8 @@ def test_table_on_other_data_has_no_published_numbers(
     text = write_tables(sweep)
     assert "(published)" not in text
     assert "not known" not in text
-    assert "numbers we do not have" not in text
-    assert "- Published numbers are of the real SceneNN (sequences=scenenn): none stand below" in text
+    assert "not looked up" not in text
+    assert "- Published numbers are for the real SceneNN data (sequences=scenenn) and omitted" in text
 
 
 def test_published_row_without_column_values_is_only_named(sweep: Path) -> None:
@@ -227,7 +227,7 @@ def test_published_row_without_column_values_is_only_named(sweep: Path) -> None:
         (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
         text = write_tables(sweep)
         assert "(published)" not in text
-        assert ("looked the numbers up: the paper (DDNS 2020" in text) is named
+        assert ("not looked up: the paper (DDNS 2020" in text) is named
 
 
 def test_split_row_is_compared_with_matching_baseline(tmp_path: Path) -> None:
@@ -254,7 +254,7 @@ def test_table_unknown_metric_is_dash(sweep: Path) -> None:
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": TABLE | {"columns": ["no.such"]}, "rows": ROWS}))
     text = write_tables(sweep)
     assert "| identity |    3 |       – | ground_truth |" in text
-    assert "- No run has a figure of this name: no.such." in text, "it may be misspelt"
+    assert "- Metrics in no run: no.such." in text, "it may be misspelt"
 
 
 def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
@@ -266,10 +266,12 @@ def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[2] == "| row | runs | ATE (m) | frames lost | Hz | refinement (ms) | poses |"
     assert "| a | 1 | 0.012 | 2.00 | 21.5 | 1.000 | ground_truth |" in lines
-    assert "| less a | pairs | ATE (m) | frames lost | Hz | refinement (ms) |" in lines
-    absent = "- Left out, as no run has them: AP50, AP50 agnostic, AP25, AP, mean IoU (only with true instances); "
-    assert [line for line in lines if "Left out" in line] == [absent + f"instances, {FUSER_HEADS}."]
-    assert "Transfer" not in text, "nothing was compared with true instances"
+    assert "| minus a | pairs | ATE (m) | frames lost | Hz | refinement (ms) |" in lines
+    absent = (
+        "- Omitted columns without values: AP50, AP50 agnostic, AP25, AP, mean IoU (only with ground-truth instances); "
+    )
+    assert [line for line in lines if "Omitted" in line] == [absent + f"instances, {FUSER_HEADS}."]
+    assert "transfer" not in text, "nothing was compared with ground-truth instances"
     assert "ap50" not in (tmp_path / "table.csv").read_text()
 
 
@@ -279,9 +281,9 @@ def test_table_without_experiment_has_column_for_single_value(tmp_path: Path) ->
     lines = [" ".join(line.split()) for line in write_tables(tmp_path).splitlines()]
     assert lines[2] == "| row | runs | AP50 | mean IoU | refinement (ms) | poses |"
     assert "| a | 1 | – | 0.000 | 1.000 | ground_truth |" in lines
-    assert [line for line in lines if "Left out" in line] == [
-        "- Left out, as no run has them: AP50 agnostic, AP25, AP (only with true instances); "
-        f"instances, frames lost, Hz, {FUSER_HEADS}; ATE (m) (only with true poses)."
+    assert [line for line in lines if "Omitted" in line] == [
+        "- Omitted columns without values: AP50 agnostic, AP25, AP (only with ground-truth instances); "
+        f"instances, frames lost, Hz, {FUSER_HEADS}; ATE (m) (only with ground-truth poses)."
     ]
 
 
@@ -289,7 +291,7 @@ def test_table_without_metrics_has_all_columns(tmp_path: Path) -> None:
     run(tmp_path, "a", 0, None, 1.0, **{"stage_ms.refinement.median": None})
     text = write_tables(tmp_path)
     assert text.splitlines()[2].count("|") == 18  # row, runs, poses, and all 14 figures
-    assert "Left out" not in text
+    assert "Omitted" not in text
 
 
 def test_experiment_table_keeps_columns_without_values(sweep: Path) -> None:
@@ -297,20 +299,20 @@ def test_experiment_table_keeps_columns_without_values(sweep: Path) -> None:
         path.write_text(json.dumps(json.loads(path.read_text()) | {"instances.ap50": None}))
     text = write_tables(sweep)
     assert "| row      | runs | AP50 |" in text
-    assert "Left out" not in text
+    assert "Omitted" not in text
 
 
 def test_table_notes_count_older_records(sweep: Path) -> None:
     (sweep / "again").mkdir()
     run(sweep / "again", "chain", 0, 0.0, 1.0)
-    assert "- Left out, older records of the same runs: 1." in write_tables(sweep)
+    assert "- Omitted older records of the same runs: 1." in write_tables(sweep)
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ("table: [", "cannot be read"),
-        ("table: {columns: [], average_over: [seed]}", r"table\.columns: expected one metric across"),
+        ("table: {columns: [], average_over: [seed]}", r"table\.columns: expected at least one key, got none"),
     ],
 )
 def test_write_tables_invalid_experiment_raises_one_line_error(sweep: Path, content: str, message: str) -> None:
@@ -323,7 +325,7 @@ def test_write_tables_invalid_experiment_raises_one_line_error(sweep: Path, cont
 def test_write_tables_without_complete_run_raises_reason(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected a completed run, got none"):
         write_tables(tmp_path)
-    with pytest.raises(DataError, match="expected a folder of runs"):
+    with pytest.raises(DataError, match="expected a folder of runs, got no folder"):
         write_tables(tmp_path / "nowhere")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "metrics.partial.json").write_text('{"partial": "the map is full"}')
@@ -356,7 +358,7 @@ def test_table_old_stage_names_are_renamed(sweep: Path) -> None:
 def test_table_notes_name_data_without_evaluation(tmp_path: Path) -> None:
     for seed, frames in enumerate((600, 90)):
         run(tmp_path, "a", seed, None, 1.0, frames=frames, **{"choice.dataset": "desk"})
-    assert "- Data: dataset=desk; 90 to 600 frames a run.\n" in write_tables(tmp_path)
+    assert "- Data: dataset=desk; 90 to 600 frames per run.\n" in write_tables(tmp_path)
 
 
 def test_table_heads_have_units() -> None:
@@ -369,4 +371,4 @@ def test_tables_command_prints_table_or_error(sweep: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("# ablation_x")
     wrong = completed(CHECKOUT, "tables", str(sweep), "nowhere")
-    assert (wrong.returncode, wrong.stderr) == (1, "error: nowhere: expected a folder of runs\n")
+    assert (wrong.returncode, wrong.stderr) == (1, "error: nowhere: expected a folder of runs, got no folder\n")

@@ -87,27 +87,27 @@ GOLDEN = """\
 | Rival (re-implementation) | ground truth | made up    |     0.600 ± 0.141 | **0.500 ± 0.141** |   **0.550 ± 0.000** |
 | other                     | ground truth | made up    |     0.200 ± 0.000 |    0.100 (1 of 2) | 0.150 (3 of 4 runs) |
 
-| ours less                 | poses        | annotation |    011 |    016 |           mean | pairs |
+| ours minus                | poses        | annotation |    011 |    016 |           mean | pairs |
 | ------------------------- | ------------ | ---------- | -----: | -----: | -------------: | ----: |
 | Rival (re-implementation) | ground truth | made up    | +0.100 | -0.100 | +0.000 ± 0.100 |     4 |
 | other                     | ground truth | made up    | +0.500 | +0.400 | +0.450 ± 0.050 |     3 |
 
-- Mean ± sample standard deviation over seed, where there are several. The mean is over the sequences (dataset.scene), \
-each of which counts as one; its deviation is over the runs that have all of them. In bold: the highest of the same \
-poses, among means of as many runs. missing: no complete run.
-- Differences are paired by seed, dataset.scene: mean ± standard error over the sequences, of each of which the runs \
-are averaged first; * where the 95% interval of Student's t is without 0.
-- ours against Rival (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
-- ours against other, ground truth: higher in 2 of 2 sequences, lower in 0.
-- What each row changes: ours: nothing; rival: refiner=geometric; other: refiner=identity.
-- In all: dataset=scenenn, tracker=ground_truth.
-- Transfer: each true vertex takes the instance of the map's nearest vertex within 5 cm. AP is in [0, 1].
+- Cells: mean ± sample standard deviation over seed. mean: average of the sequences (dataset.scene) with equal \
+weights; its deviation is over the runs with all sequences. Bold: highest value for the same poses and number of runs. \
+missing: no complete run.
+- Differences are paired by seed, dataset.scene: mean ± standard error over the sequences, after averaging the runs of \
+each. *: the 95% interval of Student's t excludes 0.
+- ours compared with Rival (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
+- ours compared with other, ground truth: higher in 2 of 2 sequences, lower in 0.
+- Overrides of each row: ours: none; rival: refiner=geometric; other: refiner=identity.
+- Common to all runs: dataset=scenenn, tracker=ground_truth.
+- Label transfer: each ground-truth vertex gets the instance of the nearest map vertex within 5 cm. AP is in [0, 1].
 - Data: dataset=scenenn, annotation made up.
 - Code: 1234567.
 - Machine: 2 cores of Z80.
-- Config: config.yaml beside each run; SHA-256 of all their hashes: DIGEST.
+- Config: config.yaml of each run; SHA-256 of all config hashes: DIGEST.
 - Missing in other: seed=1 dataset.scene=016.
-- Not complete: dataset.scene=016,row=other,seed=1,tracker=ground_truth0: failed: the map is full.
+- Incomplete: dataset.scene=016,row=other,seed=1,tracker=ground_truth0: failed: the map is full.
 """
 
 
@@ -132,8 +132,8 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
         "| 0.655 | 0.033 | 0.676 | 0.269 | 0.517 | 0.325 | 0.299 | – | 0.190 | – | – |"
     )
     assert "- Published, Voxblox++ with Detectron2 panoptic: Han et al., ICRA 2021" in text
-    assert "numbers we do not have: the paper (DDNS 2020" in text
-    assert "- Without a complete run of any row: dataset.scene=030,061,078,086,096,206,223,255." in text
+    assert "not looked up: the paper (DDNS 2020" in text
+    assert "- Sequences without a complete run: dataset.scene=030,061,078,086,096,206,223,255." in text
     assert "seed=0 dataset.scene=255" not in text  # told once, not for each row and seed
 
 
@@ -145,7 +145,7 @@ def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: d
     text = write_tables(sweep)
     assert "(published)" not in text
     assert "030" not in text
-    assert "- Published numbers are of the real SceneNN" in text
+    assert "- Published numbers are for the real SceneNN data" in text
 
 
 def test_table_compares_rows_of_same_pose_source(sweep: Path) -> None:
@@ -174,7 +174,7 @@ def test_tracked_row_without_tracked_baseline_is_not_compared(sweep: Path) -> No
     text = write_tables(sweep)
     _, second = grids(text)
     assert len(second) == 3
-    assert "- Without a row of ours that they could be compared with: other, tracker=icp." in text
+    assert "- Rows without a matching row of ours: other, tracker=icp." in text
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
     assert first[5] == "| 016 | ours | ground truth | made up | 0.400 ± 0.141 | – | 0.400 ± 0.141 |"
     assert first[7] == "| | other | ground truth | made up | 0.100 (1 of 2) | – | 0.100 (1 of 2) |"
     assert first[8] == "| mean | ours | ground truth | made up | **0.550 ± 0.000** | – | **0.550 ± 0.000** |"
-    assert second[0] == "| less ours | pairs | sofa | television | AP50 |"
+    assert second[0] == "| minus ours | pairs | sofa | television | AP50 |"
     assert second[2] == "| Rival (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
 

@@ -336,7 +336,7 @@ if "--port" in sys.argv:
     assert f"--bind 127.0.0.1 --port {port} --memory-limit 1GB" in opened
     assert others == [disabled]
     program.write_text("#!/bin/sh\n[ $1 = analytics ]\n")
-    with pytest.raises(OSError, match="rerun exited with status 1"):
+    with pytest.raises(OSError, match=r"rerun: expected a server on port \d+, got exit status 1"):
         rerun_program.open_window(free_port(), "1GB")
 
 

@@ -106,7 +106,7 @@ def test_export_python_function_matches_command(run: Path, tmp_path: Path, monke
     assert written[0].read_bytes() == (tmp_path / "b" / "objects" / "cube_2.glb").read_bytes()
     for wrong, message in (
         ({"coloring": "rainbow"}, "coloring: expected one of appearance, instance, class, got 'rainbow'"),
-        ({"colours": "class"}, "export: expected options in .*, got 'colours'"),
+        ({"colours": "class"}, "export: expected options among .*, got 'colours'"),
     ):
         with pytest.raises(ConfigError, match=message):
             instancemap.export(run, "glb", out=tmp_path, **wrong)

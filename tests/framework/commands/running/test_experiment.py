@@ -65,8 +65,8 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
     text = (out / "table.md").read_text()
     assert text in first.stdout
     assert "| half | 2 | 4.00 ± 0.00 |" in " ".join(text.split())
-    assert "Without a complete run: broken." in text
-    assert "Not complete: row=broken,seed=3: failed: dataset" in text
+    assert "Rows without a complete run: broken." in text
+    assert "Incomplete: row=broken,seed=3: failed: dataset" in text
     assert "half: refiner=identity dataset.frames=4" in text
     assert (out / "table.tex").read_text().count("\\begin{tabular}") == 2
     assert {path.name for path in out.glob("figure.*")} == {"figure.png", "figure.pdf"}

@@ -103,7 +103,7 @@ def test_joblib_sweep_continues_after_failed_runs(
     assert set(recorded(directory)) == RUNS
     text = (directory / PLACE / "table.md").read_text()
     assert text in done.stdout
-    assert f"Not complete: {SLOW},row=broken,seed=1: failed: dataset" in text
+    assert f"Incomplete: {SLOW},row=broken,seed=1: failed: dataset" in text
     assert "threads=1" in text, "how fast the runs were depends on it"
 
 
