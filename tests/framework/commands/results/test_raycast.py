@@ -132,8 +132,9 @@ def test_raycast_error_is_one_line(stored: Path, command: Command, arguments: li
 def test_raycast_without_map_is_one_line(stored: Path, command: Command, tmp_path: Path) -> None:
     (stored / "map.npz").unlink()
     for run in (stored, tmp_path / "nowhere"):
-        message = "error: raycast: expected a run directory, got"
-        assert command(run) == (1, "", message)
+        status, output, error = command(run)
+        assert (status, output, error.count("\n")) == (1, "", 1)
+        assert error.startswith("error: raycast: expected a run directory, got")
 
 
 def test_raycast_without_mapped_frames_is_one_line(stored: Path, command: Command) -> None:
