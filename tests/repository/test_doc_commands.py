@@ -65,6 +65,7 @@ def test_all_documented_commands_and_scripts_are_tested() -> None:
     scripts = {
         CONTRACT,
         *OWN_DATA,
+        *blocks("python", "README.md"),  # test_new_plugin.py
         *blocks("python", "docs/python.md"),
         *(block("python", words) for words in EXECUTED),
     }

@@ -159,4 +159,4 @@ def test_compile_for_run_waits_for_other_process(
             time.sleep(0.01)
         compile_all([kernel])
     second.join()
-    assert caplog.messages == ["another process is compiling kernels"]
+    assert caplog.messages == ["another process is compiling kernels; waiting for it"]

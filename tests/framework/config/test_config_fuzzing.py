@@ -112,7 +112,7 @@ def test_invalid_option_file_raises_one_line_with_path(content: str, message: st
 
 def test_option_linked_to_device_raises(option: Path) -> None:
     option.symlink_to("/dev/zero")
-    with pytest.raises(InstanceMapError, match="there is no detector=mine"):
+    with pytest.raises(InstanceMapError, match="detector: expected one of"):
         composed("~dataset", "detector=mine")
 
 

@@ -184,4 +184,4 @@ def test_diff_command_lists_changes(
     monkeypatch.setattr("sys.argv", ["instancemap diff", str(tmp_path), str(tmp_path / "second")])
     with pytest.raises(SystemExit):
         diff.main()
-    assert "map.npz: expected a run directory" in capsys.readouterr().err
+    assert "diff: expected a run directory" in capsys.readouterr().err

@@ -46,7 +46,7 @@ def test_convert_weights_torchvision_keeps_classes_and_eps(tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("source", "target", "fault"),
     [
-        ("absent.pkl", "out.safetensors", "expected a network file, got none"),
+        ("absent.pkl", "out.safetensors", "expected a file or one of"),
         ("broken.pkl", "out.safetensors", "broken.pkl: expected a pickle of numpy arrays"),
         ("broken.pkl", "out.pth", "out.pth: expected the suffix .safetensors, got .pth"),
     ],

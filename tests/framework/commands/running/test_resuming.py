@@ -194,5 +194,5 @@ def test_localize_in_places_new_map_in_stored_world(tmp_path: Path) -> None:
     assert own.scene.statistics.voxels == pytest.approx(alone.scene.statistics.voxels, rel=0.05)
     with pytest.raises(ConfigError, match="resume_from and localize_in"):
         Mapper(*TRACKED, f"localize_in={tmp_path / 'first'}", f"resume_from={tmp_path / 'first'}")
-    with pytest.raises(DataError, match="localize_in: expected the directory of a run"):
+    with pytest.raises(DataError, match="localize_in: expected a run directory"):
         Mapper(*TRACKED, f"localize_in={tmp_path}")

@@ -243,7 +243,7 @@ def test_sweep_signal_leaves_partial_record_of_active_runs(
         process.send_signal(signal_sent)
     done = end(process)
     assert done.returncode == 128 + signal_sent
-    ending = "stopping after the active runs have written their outputs" if n_jobs > 1 else "after this frame"
+    ending = "after the active runs have written their outputs" if n_jobs > 1 else "after this frame"
     assert done.stderr.count(f"stopping {ending}; a second signal stops immediately") == 1
     assert done.stderr.splitlines()[-1] in ("interrupted by Ctrl-C", "ended by SIGTERM")
     assert "Traceback" not in done.stderr

@@ -167,7 +167,7 @@ def test_cache_identity_uses_detector_fingerprint(tmp_path: Path) -> None:
     assert CachedDetector(silent, tmp_path).reads == FRAME_FIELDS
     assert identity_of(Named()) == f"{fingerprint(Named())} main"
     assert CachedDetector(Named(), tmp_path).reads == ("color",)
-    with pytest.raises(ConfigError, match=r"NamedAsOnce.* call framework\.detection\.stored\.fingerprint"):
+    with pytest.raises(ConfigError, match=r"NamedAsOnce.* call fingerprint\(\) of framework"):
         CachedDetector(NamedAsOnce(), tmp_path)
 
 
