@@ -1,1 +1,1 @@
-"""The plugins that ship with InstanceMap: one file, one plugin."""
+"""Plugins that ship with InstanceMap, one plugin per file."""

@@ -1,16 +1,18 @@
-"""Class evidence of the voxels of a semantic map, background included, and its update by a frame.
+"""Class evidence of the voxels of a semantic map, including the background, and its update by a frame.
 
 After SemanticFusion (McCormac et al. 2017), eq. 2, which is eq. [7] with one distribution per pixel:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t),   c = background or a class
 
-In log space it is a sum, from a uniform start. Only ratios matter, so a voxel stores the log ratio of each class to the
-background, which wins if no class is above 0. A pixel under a mask has the distribution of the mask. Every pixel under
-no mask is the same evidence for the background, so a count of frames suffices; every block has it. Evidence of masks is
-in rows of 512 voxels, only for blocks that were under a mask: 5 bytes a class slot and 14 more, so at most 94 a voxel.
+In log space the update is a sum, from a uniform start. Only ratios matter, so a voxel stores the log ratio of each
+class to the background. The background wins if no class is above 0.
 
-A voxel stores the CLASS_SLOTS most likely classes and evicts the least likely one when another is named. The unnamed
-classes share one sum, `rest`, with which a class starts when it is named first.
+A pixel under a mask has the distribution of the mask. All pixels under no mask are equal evidence for the background,
+so every block stores a count of frames. Evidence of masks is in rows of 512 voxels, only for blocks that were under a
+mask. A voxel of a row takes 5 bytes per class slot and 14 more bytes, so at most 94 bytes.
+
+A voxel stores the CLASS_SLOTS most likely classes and evicts the least likely class when another class is named. The
+unnamed classes share one sum, `rest`. A newly named class starts with this sum.
 """
 
 from __future__ import annotations
@@ -31,19 +33,19 @@ from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-MAX_EXPONENT = 700.0  # of a ratio that float64 can represent
+MAX_EXPONENT = 700.0  # maximum log of a ratio in float64
 
 
 class ClassEvidence(NamedTuple):
-    """The class evidence of all voxels. The best class of a voxel is in slot 0."""
+    """Class evidence of all voxels. The best class of a voxel is in slot 0."""
 
-    unmasked: UInt16  # (B, 512) frames that saw the voxel under no mask; B as in the grid
+    unmasked: UInt16  # (B, 512) frames with the voxel under no mask; B as in the grid
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
-    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames that saw it under a mask
-    rest: Float32  # (R, 512) the same sum of each unnamed class
-    masked: UInt16  # (R, 512) the number of these frames
-    first_frame: Int32  # (R, 512) the first and the last one of them, -1 = none
-    last_frame: Int32  # (R, 512)
+    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames with the voxel under a mask
+    rest: Float32  # (R, 512) this sum for each unnamed class
+    masked: UInt16  # (R, 512) number of frames with the voxel under a mask
+    first_frame: Int32  # (R, 512) first of these frames, -1 = none
+    last_frame: Int32  # (R, 512) last of these frames, -1 = none
 
 
 ROW_ARRAYS = ClassEvidence._fields[1:]
@@ -51,18 +53,18 @@ NO_EVIDENCE = (NO_CLASS, 0, 0, 0, -1, -1)  # values of ROW_ARRAYS in a new row
 
 
 class MaskClasses(NamedTuple):
-    """The evidence of one frame's N masks for C classes."""
+    """Evidence of one frame's N masks for C classes."""
 
-    cluster: Int32  # (H * W,) the cluster with the best score over each pixel, -1 = none
+    cluster: Int32  # (H * W,) cluster with the best score over each pixel, -1 = none
     log_ratio: Float32  # (N, C) log P(class) / P(background)
-    unnamed: Float32  # (N,) the same of the mean of the classes that a cluster does not name
-    named_classes: UInt8  # (N, NEW_CLASSES) each cluster's best classes
+    unnamed: Float32  # (N,) log ratio of the mean of the unnamed classes of each cluster
+    named_classes: UInt8  # (N, NEW_CLASSES) best classes of each cluster
     named_bit: UInt8  # (N, NO_CLASS + 1) bit m of a cluster's m-th named class, 0 = unnamed
-    frame: int  # its index
+    frame: int  # index of the frame
 
 
 def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
-    """Return the evidence of the clusters of a frame with log P(class) / P(background) (N, C)."""
+    """Return the evidence of a frame's clusters from their log P(class) / P(background) (N, C)."""
     relative, named, bits = named_classes(log_ratio, logarithmic=True)
     best = best_clusters(points.offsets, points.clusters, clusters.scores)
     return MaskClasses(
@@ -81,7 +83,7 @@ class ClassRows:
     def __init__(self, voxels: VoxelGrid) -> None:
         self.voxels = voxels
         self.row_count = 0
-        self.evicted = 0  # slots given to another class so far
+        self.evicted = 0  # number of slots reassigned to another class
         self.evidence = _free_rows(0)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -101,7 +103,7 @@ class ClassRows:
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
     def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
-        """Update the voxels near the measured surface of the blocks that a frame has seen; None = no detection."""
+        """Update the voxels near the measured surface in the seen blocks of a frame; None = no detection."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.evidence.unmasked) < capacity:
             self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
@@ -115,24 +117,24 @@ class ClassRows:
         self.evicted += int(evicted.sum())
 
     def saved(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the arrays in use, by name."""
+        """Return the arrays in use by name."""
         rows = {name: getattr(self.evidence, name)[: self.row_count] for name in ROW_ARRAYS}
         return {"unmasked": self.evidence.unmasked[: self.voxels.block_count], **rows}
 
     def fill(self, arrays: dict[str, npt.NDArray[Any]], classes: int) -> None:
-        """Take over the arrays of a saved map with so many classes. Raises DataError if they are invalid."""
+        """Adopt the arrays of a saved map with `classes` classes. Raises DataError if they are invalid."""
         free = self.evidence._asdict()
         check_like(arrays, {"unmasked": free.pop("unmasked")}, self.voxels.block_count)
         check_like(arrays, free, len(arrays["rest"]))
         check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
         if len(arrays["rest"]) and not classes:
-            raise DataError("rest: expected no rows without classes, got some")
+            raise DataError(f"rest: expected no rows without classes, got {len(arrays['rest'])}")
         _check_order(arrays["class_ids"], arrays["log_ratio"], arrays["rest"], classes)
         self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
         self.row_count = len(self.evidence.rest)
 
     def _add_rows(self, blocks: Int32) -> None:
-        """Give each of these blocks a row, in the order given."""
+        """Add a row for each of the blocks, in the given order."""
         needed = self.row_count + len(blocks)
         if needed > len(self.evidence.rest):
             capacity = max(needed, 2 * len(self.evidence.rest))
@@ -147,18 +149,18 @@ class ClassRows:
 
 
 def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: int) -> None:
-    """Raise DataError unless the best class is in slot 0, and `rest` is not too large if no class is unnamed."""
+    """Raise DataError unless the best class is in slot 0 and `rest` is small in voxels without unnamed classes."""
     named = class_ids != NO_CLASS
     ratios = np.where(named, log_ratio, np.float32(-np.inf))
     best = ratios.max(axis=-1, initial=-np.inf)
     if (ratios[..., :1] < best[..., None]).any():
-        raise DataError("log_ratio: expected the best class of each voxel in slot 0, got another one")
+        raise DataError("log_ratio: expected the best class of each voxel in slot 0, got another class")
     if ((named.sum(axis=-1) == classes) & (rest - np.maximum(best, 0) > MAX_EXPONENT)).any():
         raise DataError("rest: expected a smaller value in a voxel that names all classes, got a larger one")
 
 
 def _free_rows(class_slots: int) -> ClassEvidence:
-    """Return evidence for no blocks."""
+    """Return evidence without rows."""
     voxels = (0, BLOCK_VOXELS)
     return ClassEvidence(
         unmasked=np.empty(voxels, np.uint16),

@@ -9,12 +9,12 @@ from framework.mapping.labels.class_slots import ALL_NAMED, NEW_CLASSES, NO_CLAS
 from framework.mapping.labels.label_evidence_kernels import best_first
 from framework.mapping.voxels.voxel_grid_kernels import device
 
-MAX_FRAMES = np.uint16(65535)  # that a voxel counts
+MAX_FRAMES = np.uint16(65535)  # largest frame count of a voxel
 
 
 @njit(cache=True, nogil=True)
 def best_clusters(offsets, clusters, scores):
-    """Return the cluster of each list (L,) with the best score, the first one of equals; -1 = there is none."""
+    """Return the cluster (L,) with the best score in each list, -1 = none; ties go to the first."""
     best = np.full(offsets.shape[0] - 1, -1, np.int32)
     for i in range(best.shape[0]):
         for entry in range(offsets[i], offsets[i + 1]):
@@ -26,9 +26,9 @@ def best_clusters(offsets, clusters, scores):
 
 @device
 def best_class(grid, evidence, log_missed, block, n):
-    """Return the most likely class of a voxel, -1 = the background, which wins ties.
+    """Return the most likely class of a voxel, -1 = background; ties go to the background.
 
-    `log_missed` is the evidence, for every class over the background, of a frame that saw the voxel under no mask.
+    `log_missed` is the evidence for every class over the background from a frame with the voxel under no mask.
     """
     row = grid.label_row[block]
     if row < 0 or evidence.class_ids[row, n, 0] == NO_CLASS:
@@ -39,7 +39,7 @@ def best_class(grid, evidence, log_missed, block, n):
 
 @device
 def _add_class(labels, sums, label, total):
-    """Give a class a free slot or that of the least likely class. Returns 1 if a class was evicted."""
+    """Assign a free slot or the slot of the least likely class to a class. Returns 1 if a class was evicted."""
     least = 0
     for s in range(len(labels)):
         if labels[s] == NO_CLASS:
@@ -56,9 +56,9 @@ def _add_class(labels, sums, label, total):
 
 @device
 def observe_mask(evidence, row, n, masks, k):
-    """Apply the recursion to a voxel that a frame sees under cluster k. Returns the number of evictions."""
+    """Apply the recursion to a voxel seen under cluster k. Returns the number of evictions."""
     labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
-    known = 0  # bits of the named classes that have a slot
+    known = 0  # bits of the named classes with a slot
     for s in range(len(labels)):
         if labels[s] == NO_CLASS:
             break  # slots are filled from the front
@@ -83,7 +83,7 @@ def observe_mask(evidence, row, n, masks, k):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_blocks_under_masks(grid, seen, cluster, wants_row):
-    """Fill wants_row (A,): true for blocks without a row that have a voxel under a mask."""
+    """Fill wants_row (A,) with True for blocks without a row and with a voxel under a mask."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
         start = seen.near_start[a]
@@ -96,7 +96,7 @@ def find_blocks_under_masks(grid, seen, cluster, wants_row):
 
 @njit(cache=True, nogil=True, parallel=True)
 def update_classes(grid, seen, evidence, masks, evicted):
-    """Update the near voxels of the seen blocks; evicted (A,) gets the evictions of each block."""
+    """Update the near voxels of the seen blocks; evicted (A,) gets the number of evictions of each block."""
     unmasked = evidence.unmasked  # numba 0.68 loses assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0

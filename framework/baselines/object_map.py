@@ -1,10 +1,11 @@
-"""A map of objects with a volume each, and a background volume of the whole scene.
+"""Map with one volume per object and a background volume of the whole scene.
 
-Differences from the original systems: Fusion++ (McCormac et al. 2018) gives an object 64^3 voxels of any size,
-resamples them as the object grows, integrates every frame that sees it, corrects object poses by loop closures, and
-tracks against a coarse background. MaskFusion (Runz et al. 2018) has surfels under the masks only, and tracks moving
-objects. Here all volumes have voxels of the same size, objects are static, and a volume changes only in frames that
-detect its object.
+Fusion++ (McCormac et al. 2018) gives an object 64^3 voxels of any size and resamples them as the object grows. It
+integrates every frame that shows the object, corrects object poses by loop closures, and tracks against a coarse
+background. MaskFusion (Runz et al. 2018) has surfels under the masks only, and tracks moving objects.
+
+Here all volumes have voxels of the same size, objects are static, and a volume changes only in frames that detect its
+object.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVo
 from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-FORMAT = "object_volumes 4"  # of the map file; increment it when the meaning of the contents changes
-OBJECT = "object_"  # prefix of the arrays that hold the volumes of all objects, one after the other
+FORMAT = "object_volumes 4"  # format of the map file; increment it when the meaning of the contents changes
+OBJECT = "object_"  # prefix of the arrays with the concatenated volumes of all objects
 
 Part = tuple[Float32, Int32, UInt8, Int32]
 """Vertices (V, 3) m, triangles (F, 3), colors (V, 3) and instance ids (V,) of a part of the mesh."""
@@ -61,7 +62,7 @@ class ObjectMap(InstanceTableMap):
 
     @property
     def block_count(self) -> int:
-        """Blocks of the background and of all objects."""
+        """Number of blocks of the background and of all objects."""
         return self.background.voxels.block_count + sum(volume.block_count for volume in self.volumes.values())
 
     @property
@@ -88,24 +89,25 @@ class ObjectMap(InstanceTableMap):
         self.background.changed(NO_BLOCKS)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, masks: Mapping[int, Bool], band: float) -> None:
-        """Integrate `frame` into the background and into the volumes of the objects with `masks` (H, W), by id.
+        """Integrate `frame` into the background and into the volumes of the objects with `masks` (H, W) by id.
 
-        Voxels within `band` m of the measured surface count whether they are under the object's mask. Raises
-        MapFullError if the block budget is reached.
+        Voxels within `band` m of the measured surface count their observations under and outside the object's mask.
+        Raises MapFullError if the block budget is reached.
         """
         self.background.integrate(frame, T_world_camera, band)
         for instance_id, mask in masks.items():
             self._integrate_object(self.volumes[instance_id], frame, T_world_camera, mask, band)
             if self.block_count > self.background.voxels.max_blocks:
                 raise MapFullError(
-                    f"the map is full: more than {self.background.voxels.max_blocks} blocks in the background and "
-                    f"{len(self.volumes)} objects; raise fuser.max_blocks or fuser.voxel_size"
+                    f"the map is full: expected at most {self.background.voxels.max_blocks} blocks in the background "
+                    f"and {len(self.volumes)} objects, got {self.block_count}; raise fuser.max_blocks or "
+                    "fuser.voxel_size"
                 )
 
     def _integrate_object(
         self, volume: ObjectVolume, frame: Frame, T_world_camera: Float64, mask: Bool, band: float
     ) -> None:
-        """Integrate the part of the image that contains the object's volume or its mask."""
+        """Integrate the part of the image with the object's volume or mask."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         u0, v0, u1, v1 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
         if volume.block_count:
@@ -123,8 +125,7 @@ class ObjectMap(InstanceTableMap):
     def instances_seen(self, camera: Camera, T_world_camera: Float64, depth: Float32, stride: int) -> Int32:
         """Return the object (ceil(H / stride), ceil(W / stride)) at each reading of the subsampled depth, 0 = none.
 
-        `depth` is (H, W) m. If several volumes contain a reading, it belongs to the one with the highest foreground
-        probability.
+        `depth` is (H, W) m. A reading in several volumes belongs to the object with the highest foreground probability.
         """
         shape = tuple(-(-side // stride) for side in depth.shape)
         instance_ids, best = np.zeros(shape, np.int32), np.full(shape, np.float32(FOREGROUND))
@@ -140,7 +141,7 @@ class ObjectMap(InstanceTableMap):
         return instance_ids
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return the surface of the background, labeled with the objects."""
+        """Return the surface of the background with the labels of the objects."""
         surface = self.background.render(camera, T_world_camera)
         instance_ids = self.instances_seen(camera, T_world_camera, surface.depth, stride=1)
         return View(**vars(surface), instance_ids=instance_ids, class_ids=self.table.class_ids()[instance_ids])
@@ -154,9 +155,9 @@ class ObjectMap(InstanceTableMap):
     def _labeled(self, background: UnlabeledMesh) -> InstanceMesh:
         """Return the background's surface, labeled with the most probable object, and the surfaces of the objects.
 
-        Both surfaces come from the same readings and nearly coincide. Without labels on the background, the nearest
-        vertex to a true point would be unlabeled by chance; without the background, there would be seams, and holes
-        where an object's volume has seen too little. Where objects overlap, each has its surface.
+        Both surfaces come from the same depth readings and nearly coincide. Without labels on the background, the
+        nearest vertex to a ground-truth point could be unlabeled by chance. Without the background, there would be
+        seams, and holes where an object's volume has too few observations. Overlapping objects each keep their surface.
         """
         counts = self.confirmation.counts(self.table)
         instance_ids = np.zeros(len(background.vertices), np.int32)
@@ -214,11 +215,11 @@ class ObjectMap(InstanceTableMap):
             scene.table = table_of(header.part("table"), len(scene.classes), arrays)
             objects = header.part("objects")
             if objects.values.keys() != {str(key) for key in scene.table.records}:
-                raise DataError("header.objects: expected the instances of the table, got others")
+                raise DataError(f"header.objects: expected the ids of the table, got {', '.join(objects.values)!s:.60}")
             counts = {int(key): objects.whole(key) for key in objects.values}
             check_like(arrays, scene._empty_volume().arrays(), sum(counts.values()), OBJECT)
             if (arrays[OBJECT + "foreground"] > arrays[OBJECT + "observed"]).any():
-                raise DataError(f"{OBJECT}foreground: expected at most {OBJECT}observed, got more")
+                raise DataError(f"{OBJECT}foreground: expected at most {OBJECT}observed, got a larger count")
             start = 0
             for key, blocks in counts.items():
                 volume = scene.volumes[key] = scene._empty_volume()
@@ -238,7 +239,7 @@ def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids:
 
 
 def _cropped(frame: Frame, u0: int, v0: int, u1: int, v1: int) -> Frame:
-    """Return the part of a frame from pixel (u0, v0) to before (u1, v1)."""
+    """Return the part of a frame from pixel (u0, v0) to (u1, v1), exclusive."""
     camera = frame.camera
     part = replace(camera, width=u1 - u0, height=v1 - v0, cx=camera.cx - u0, cy=camera.cy - v0)
     return Frame(frame.index, frame.timestamp, frame.color[v0:v1, u0:u1], frame.depth[v0:v1, u0:u1], part)

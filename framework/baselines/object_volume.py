@@ -1,11 +1,12 @@
-"""The volume of one object: a TSDF that grows where the object's masks are, and mask counts of its voxels.
+"""Volume of one object: a TSDF that grows under the object's masks, and mask counts of its voxels.
 
-After Fusion++ (McCormac et al. 2018): a voxel counts its observations under a mask of the object, and all of them. Its
-foreground probability is the mean of Beta(1 + foreground, 1 + background), and the object's surface is where it exceeds
-1/2. So occasional errors of masks are outvoted, and systematic ones are not.
+After Fusion++ (McCormac et al. 2018), a voxel counts its observations under a mask of the object, and all of its
+observations. Its foreground probability is the mean of Beta(1 + foreground, 1 + background). The object's surface is
+the part with a probability above 1/2. So occasional mask errors are outvoted, but systematic errors are not.
 
-Every reading in the blocks of the volume is integrated, whether masked or not, so that distances at the outline are as
-accurate as elsewhere. Blocks are aligned with those of other volumes; counts take 4 bytes a voxel in addition to 8.
+Every depth reading in the blocks of the volume is integrated, masked or not. So distances at the outline are as
+accurate as elsewhere. Blocks are aligned with the blocks of other volumes. Counts take 4 bytes per voxel in addition to
+8 bytes.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.mapping.voxels.voxel_grid import grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS
 
-FOREGROUND = 0.5  # probability above which a voxel belongs to the object
+FOREGROUND = 0.5  # minimum foreground probability of the object's voxels
 
-VOLUME_ARRAYS = (*(name for name in BLOCK_ARRAYS if name != "label_row"), *MaskCounts._fields)  # that are saved
+VOLUME_ARRAYS = (*(name for name in BLOCK_ARRAYS if name != "label_row"), *MaskCounts._fields)  # saved arrays
 
 
 class ObjectVolume:
@@ -34,7 +35,7 @@ class ObjectVolume:
         self.volume = TsdfVolume(voxel_size, sensor, max_blocks)
         self.voxels = self.volume.voxels
         self.counts = MaskCounts(np.zeros((0, BLOCK_VOXELS), np.uint16), np.zeros((0, BLOCK_VOXELS), np.uint16))
-        self.low = np.full(3, np.inf)  # m: corners of the bounding box of its blocks
+        self.low = np.full(3, np.inf)  # corners of the bounding box of the blocks, m
         self.high = np.full(3, -np.inf)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -50,10 +51,10 @@ class ObjectVolume:
         return self.voxels.byte_count + sum(counts[: self.block_count].nbytes for counts in self.counts)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> None:
-        """Integrate `frame` into the volume, which grows where `mask` (H, W) shows the object.
+        """Integrate `frame` into the volume. The volume grows only within the object's `mask` (H, W).
 
-        Voxels within `band` m of the measured surface count whether they are under the mask. Raises MapFullError if the
-        block budget is reached; nothing is integrated then.
+        Voxels within `band` m of the measured surface count their observations under and outside the mask. Raises
+        MapFullError if the block budget is reached; in this case nothing is integrated.
         """
         seen = self.volume.integrator.integrate_object(frame, T_world_camera, band, mask)
         self._grow()
@@ -62,7 +63,7 @@ class ObjectVolume:
         self.volume.changed(seen.blocks)
 
     def _grow(self) -> None:
-        """Allocate the counts of new blocks, which are 0."""
+        """Allocate the counts of new blocks, initially 0."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.counts.observed) < capacity:
             self.counts = MaskCounts(*(grown(counts, capacity, zeros=True) for counts in self.counts))
@@ -74,22 +75,22 @@ class ObjectVolume:
             self.low, self.high = coords.min(axis=0) * side, (coords.max(axis=0) + 1) * side
 
     def encloses(self, points_world: Float32) -> Bool:
-        """Return (P,) whether points (P, 3) m lie in the bounding box of the blocks."""
+        """Return an array (P,), True for points (P, 3) m in the bounding box of the blocks."""
         return np.asarray(((points_world >= self.low) & (points_world <= self.high)).all(axis=1))
 
     def foreground_at(self, points_world: Float32) -> Float32:
-        """Return the probability (P,) that points (P, 3) m of a surface belong to the object."""
+        """Return the foreground probability (P,) of surface points (P, 3) m."""
         probability = np.empty(len(points_world), np.float32)
         foreground_at(self.voxels.grid, self.counts, points_world, probability)
         return probability
 
     def arrays(self) -> dict[str, Array]:
-        """Return the arrays that are saved."""
+        """Return the arrays to save."""
         arrays = self.volume.saved()[1] | {n: counts[: self.block_count] for n, counts in self.counts._asdict().items()}
         return {name: arrays[name] for name in VOLUME_ARRAYS}
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Copy the saved arrays of another volume into an empty one."""
+        """Copy the saved arrays of another volume into this empty volume."""
         self.volume.fill(arrays)
         self._grow()
         for name, counts in self.counts._asdict().items():
@@ -98,16 +99,16 @@ class ObjectVolume:
 
 
 def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: Float64, near: float) -> Int32:
-    """Return u0, v0, u1, v1 (N, 4): the pixels, u1 and v1 exclusive, that can see boxes of the world.
+    """Return the pixel windows u0, v0, u1, v1 (N, 4) of boxes in the world frame, u1 and v1 exclusive.
 
     The windows are never too small. A box out of view has u1 <= u0 or v1 <= v0.
 
     Args:
-        T_world_camera: (4, 4) pose.
         camera: The camera.
-        low: (N, 3) m, lower corners of the boxes.
-        high: (N, 3) m, upper corners of the boxes.
-        near: The least visible depth, m.
+        T_world_camera: Pose (4, 4).
+        low: Lower corners (N, 3) of the boxes, m.
+        high: Upper corners (N, 3) of the boxes, m.
+        near: Minimum visible depth, m.
     """
     T_camera_world = inverse(T_world_camera)
     center = (low + high) / 2 @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
@@ -115,7 +116,7 @@ def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: F
     left, top, z0 = (center - half).T
     right, bottom, z1 = (center + half).T
     z0, z1 = np.maximum(z0, near), np.maximum(z1, near)
-    # rays diverge: a side is farthest out at its nearest depth, or at its farthest on the other side of the axis
+    # rays diverge: a side is farthest out at its nearest depth, or, across the axis, at its farthest depth
     first = np.stack([camera.fx * np.minimum(left / z0, left / z1), camera.fy * np.minimum(top / z0, top / z1)])
     last = np.stack([camera.fx * np.maximum(right / z0, right / z1), camera.fy * np.maximum(bottom / z0, bottom / z1)])
     middle, size = np.array([[camera.cx], [camera.cy]]), np.array([[camera.width], [camera.height]])

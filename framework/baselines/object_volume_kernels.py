@@ -16,10 +16,10 @@ from framework.mapping.voxels.voxel_grid_kernels import NO_LOOK_UP, device
 
 
 class MaskCounts(NamedTuple):
-    """Counts of the observations of each voxel, over the frames with a mask of the object."""
+    """Counts of the observations of each voxel in frames with a mask of the object."""
 
-    foreground: UInt16  # (B, 512) under a mask
-    observed: UInt16  # (B, 512) all; 65535 at most
+    foreground: UInt16  # (B, 512) observations under a mask
+    observed: UInt16  # (B, 512) all observations, at most 65535
 
 
 @device
@@ -31,7 +31,7 @@ def _probability(foreground, observed):
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_masks(seen, mask, counts):
-    """Count the near voxels of the seen blocks, and those whose pixel is in `mask` (H, W)."""
+    """Count observations of the near voxels of the seen blocks, in total and under `mask` (H, W)."""
     foreground, observed = counts
     largest = np.uint16(65535)
     inside = mask.ravel()
@@ -57,10 +57,10 @@ def look_up_object(
     instance_ids: Int32,
     best: Float32,
 ) -> None:
-    """Set instance_ids (h, w) and `best` (h, w) where the object is more probable than `best` at the reading's voxel.
+    """Set instance_ids (h, w) and `best` (h, w) if the object is more probable than `best` at a reading's voxel.
 
-    Readings are every stride-th one of every stride-th row of `depth` (H, W) m.
-    `window` holds the first row and column of (h, w) and the last ones, exclusive; `view` T_world_camera.
+    Reads every stride-th depth reading of every stride-th row of `depth` (H, W) m. `window` holds the first row and
+    column of (h, w), and the exclusive last row and column. `view` holds T_world_camera.
     """
     top, left, bottom, right = window
     for row in prange(top, bottom):
@@ -78,7 +78,7 @@ def look_up_object(
 
 @njit(cache=True, nogil=True, parallel=True)
 def foreground_at(grid, counts, points, probability):
-    """Fill probability (P,) with the foreground probability at points (P, 3) m, interpolated between voxels."""
+    """Fill probability (P,) with the interpolated foreground probability at points (P, 3) m."""
     for chunk in prange(-(-len(points) // CHUNK)):
         blocks, voxels = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
         weights = np.empty(CORNERS, np.float32)

@@ -24,22 +24,22 @@ from framework.mapping.storage.map_header import MapHeader
 from framework.mapping.voxels.integration_parameters import BOUNDS
 from framework.mapping.voxels.voxel_grid import MOST_BLOCKS
 
-ATTRIBUTES = {  # name: (type, channels) of a voxel; `integrate` of Open3D expects the first three
+ATTRIBUTES = {  # name: (type, channels) of a voxel; Open3D's `integrate` expects the first three
     "tsdf": (o3d.core.float32, 1),  # in truncation distances
     "weight": (o3d.core.float32, 1),  # frames
     "color": (o3d.core.float32, 3),  # in [0, 255]
     "instance": (o3d.core.int32, 1),  # 0 = no instance
-    "votes": (o3d.core.float32, 1),  # for that instance, minus those against it
+    "votes": (o3d.core.float32, 1),  # votes for the instance minus votes against it
 }
-FIRST_BLOCKS = 1000  # initial capacity; Open3D allocates it at once ...
-FIRST_VOXELS = 2**23  # ... and at most so many voxels, 0.2 GB
-METERS = 1.0  # depth_scale of Open3D: units of a float image per meter
-TOUCH_STRIDE = 4  # px between the pixels with which Open3D finds blocks
-NEAR = 0.05  # m, where rays start
-RANGE_TILE = 8  # px of the image per px of the range map that bounds rays, Open3D's default
+FIRST_BLOCKS = 1000  # initial capacity, blocks; Open3D allocates it immediately
+FIRST_VOXELS = 2**23  # maximum initial capacity, voxels; 0.2 GB
+METERS = 1.0  # Open3D's depth_scale: units of a float image per meter
+TOUCH_STRIDE = 4  # pixel stride of Open3D's block search, px
+NEAR = 0.05  # start depth of rays, m
+RANGE_TILE = 8  # image pixels per pixel of the range map that bounds rays, px; Open3D's default
 FRAGMENTS = 2**18  # capacity of the range map; a view of 10,000 blocks has 20,000 fragments
-FRAGMENT = 16 * 16  # pixels of the range map in a fragment
-MOST_RANGE_PIXELS = 2**24  # of the first range map: coarse voxels need fewer fragments
+FRAGMENT = 16 * 16  # range map pixels per fragment
+MOST_RANGE_PIXELS = 2**24  # maximum pixels of the first range map; coarse voxels need fewer fragments
 CPU = o3d.core.Device("CPU:0")
 
 
@@ -47,13 +47,13 @@ CPU = o3d.core.Device("CPU:0")
 class BlockGridSettings:
     """The parameters of a grid."""
 
-    voxel_size: float  # m
-    block_resolution: int  # voxels a side
-    truncation: float  # voxels
-    min_depth: float  # m
-    max_depth: float  # m
+    voxel_size: float  # side of a voxel, m
+    block_resolution: int  # side of a block, voxels
+    truncation: float  # truncation distance, voxels
+    min_depth: float  # minimum depth of integrated readings, m
+    max_depth: float  # maximum depth of integrated readings, m
     max_blocks: int
-    min_weight: float  # frames that must have seen a voxel of the surface
+    min_weight: float  # minimum number of observations of a surface voxel
 
     def __post_init__(self) -> None:
         check_bounds(self, block_resolution=(2, 64), max_blocks=(1, MOST_BLOCKS), min_weight=(1.0, 1e6))
@@ -73,11 +73,11 @@ class BlockGridSettings:
 
 
 class BlockGrid:
-    """Blocks of voxels with a signed distance, a color and labels. The index of a voxel is that in `flat`."""
+    """Blocks of voxels with a signed distance, a color and labels. Voxel indices refer to `flat`."""
 
     def __init__(self, settings: BlockGridSettings) -> None:
         self.settings = settings
-        self.frames = 0  # integrated
+        self.frames = 0  # number of integrated frames
         self.blocks = o3d.t.geometry.VoxelBlockGrid(
             attr_names=list(ATTRIBUTES),
             attr_dtypes=[dtype for dtype, _ in ATTRIBUTES.values()],
@@ -90,9 +90,9 @@ class BlockGrid:
         self._reserve_range_map()
 
     def _reserve_range_map(self) -> None:
-        """Ray-cast a large image first, because Open3D sizes the buffer of the range map by the first image.
+        """Ray-cast a large image first, because Open3D sizes the range map buffer by the first image.
 
-        If it is too small, views have holes.
+        Views have holes if the buffer is too small.
         """
         side = int(np.ceil(np.sqrt(min(FRAGMENTS * FRAGMENT * self.settings.voxel_size, MOST_RANGE_PIXELS))))
         nowhere = Tensor(np.zeros((1, 3), np.int32))
@@ -110,16 +110,16 @@ class BlockGrid:
 
     @property
     def byte_count(self) -> int:
-        """Bytes of the blocks in use; the hash map of Open3D has capacity for up to twice as many."""
+        """Bytes of the blocks in use; Open3D's hash map has up to twice this capacity."""
         return self.voxel_count * sum(dtype.byte_size() * channels for dtype, channels in ATTRIBUTES.values())
 
     @property
     def min_weight(self) -> float:
-        """The least weight of the surface, lower in the first frames, as in Open3D's SLAM."""
+        """Minimum weight of the surface, lower in the first frames as in Open3D's SLAM."""
         return min(self.settings.min_weight, float(self.frames))
 
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Integrate `frame`. Raises MapFullError if the block budget is reached; nothing is integrated then."""
+        """Integrate `frame`. Raises MapFullError if the block budget is reached; in this case nothing is integrated."""
         s = self.settings
         depth = self._usable(frame.depth)
         if not depth.any():
@@ -137,10 +137,10 @@ class BlockGrid:
         return np.where((depth >= s.min_depth) & (depth <= s.max_depth), depth, np.float32(0))
 
     def _touched(self, depth: Float32, camera: Camera, T_world_camera: Float64, band: float) -> Tensor:
-        """Return the blocks (B, 3) within `band` voxels of a reading of `depth` (H, W), along its ray.
+        """Return the blocks (B, 3) along the rays within `band` voxels of the readings of `depth` (H, W).
 
-        Open3D samples every 4th pixel of every 4th row. If these are more than half a block apart, the image is
-        enlarged, because the map would have holes.
+        Open3D samples every 4th pixel of every 4th row. If the samples are more than half a block apart, the image is
+        enlarged to avoid holes in the map.
         """
         s = self.settings
         distance = TOUCH_STRIDE * float(depth.max()) / min(camera.fx, camera.fy)
@@ -154,7 +154,7 @@ class BlockGrid:
         return self.blocks.compute_unique_block_coordinates(_image(depth), *view, METERS, s.max_depth, band)
 
     def _make_room(self, blocks: Tensor) -> None:
-        """Grow the hash map for `blocks` (B, 3), up to the block budget, which Open3D does not have."""
+        """Grow the hash map for `blocks` (B, 3) up to the block budget. Open3D has no budget."""
         hashmap = self.blocks.hashmap()
         new = blocks.shape[0]
         if hashmap.size():
@@ -162,14 +162,15 @@ class BlockGrid:
         needed = hashmap.size() + new
         if needed > self.settings.max_blocks:
             raise MapFullError(
-                f"the map is full: {self.settings.max_blocks} blocks of {self.settings.block_resolution}^3 "
-                f"voxels ({self.byte_count / 2**20:.0f} MiB in use); raise fuser.max_blocks or fuser.voxel_size"
+                f"the map is full: expected at most {self.settings.max_blocks} blocks of "
+                f"{self.settings.block_resolution}^3 voxels, got {needed} ({self.byte_count / 2**20:.0f} MiB in use); "
+                "raise fuser.max_blocks or fuser.voxel_size"
             )
         if needed > hashmap.capacity():
             hashmap.reserve(min(max(needed, 2 * hashmap.capacity()), self.settings.max_blocks))
 
     def voxels_seen(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> tuple[Int64, Int64]:
-        """Return the voxels (V,) within `band` voxels of the reading at their pixel (V,), both as flat indices.
+        """Return the voxels (V,) within `band` voxels of the depth reading at their pixels (V,), both as flat indices.
 
         Only pixels in `mask` (H, W) count. After integrate_custom.py of Open3D's examples.
         """
@@ -194,7 +195,7 @@ class BlockGrid:
         return voxels.numpy().ravel()[inside[near]], pixels[near]
 
     def voxels_at(self, points_world: Float32) -> Int64:
-        """Return the flat index (P,) of the voxel nearest to each of points (P, 3) m, -1 = none."""
+        """Return the flat index (P,) of the nearest voxel to each point (P, 3) m, -1 = none."""
         if not len(points_world) or not self.block_count:
             return np.full(len(points_world), -1)
         r = self.settings.block_resolution
@@ -217,7 +218,7 @@ class BlockGrid:
             found = self._cast(blocks, far, camera, T_world_camera)
             z = found["depth"][..., 0]
             length = np.linalg.norm(found["normal"], axis=-1)
-            seen = (z > 0) & (length > 0.5)  # Open3D normalizes all others
+            seen = (z > 0) & (length > 0.5)  # Open3D normalizes all valid normals
             behind = self._distance(found["index"][seen], found["interp_ratio"][seen] * found["mask"][seen])
             depth[seen] = np.maximum(z[seen] + behind, NEAR)
             normals[seen] = _towards(camera, T_world_camera, found["normal"] / np.maximum(length, 0.5)[..., None])[seen]
@@ -227,7 +228,7 @@ class BlockGrid:
     def _cast(self, blocks: Int32, far: float, camera: Camera, T_world_camera: Float64) -> dict[str, npt.NDArray[Any]]:
         """Return the results of Open3D's ray casting, each (H, W, channels).
 
-        The image is padded to multiples of RANGE_TILE, because the range map omits other last rows and columns.
+        The image is padded to multiples of RANGE_TILE, because the range map omits incomplete tiles.
         """
         names = ("depth", "normal", "color", "index", "mask", "interp_ratio")
         width, height = (RANGE_TILE * int(np.ceil(side / RANGE_TILE)) for side in (camera.width, camera.height))
@@ -247,7 +248,7 @@ class BlockGrid:
         return {name: hit[name].numpy()[: camera.height, : camera.width] for name in names}
 
     def _distance(self, corners: Int64, weights: Float32) -> Float32:
-        """Return the trilinear field (P,) m at points with voxels `corners` (P, 8), with `weights` (P, 8) of seen ones.
+        """Return the trilinear field (P,) m from the voxels `corners` (P, 8) and the `weights` (P, 8) of seen voxels.
 
         Open3D's rays sample the field at voxels, rounded down, and end half a voxel too far along each axis. The field
         falls by about 1 m per m behind the surface, so adding it is a Newton step.
@@ -257,7 +258,7 @@ class BlockGrid:
         return np.asarray(tsdf * np.float32(self.settings.truncation * self.settings.voxel_size), np.float32)
 
     def _blocks_in_view(self, camera: Camera, T_world_camera: Float64) -> tuple[Int32, float]:
-        """Return the coordinates (B, 3) of the blocks in view, and the depth (m) where they end."""
+        """Return the coordinates (B, 3) of the blocks in view, and their maximum depth (m)."""
         coords = self.block_coords()
         side = self.settings.block_resolution * self.settings.voxel_size
         radius = side * np.sqrt(3) / 2
@@ -283,9 +284,9 @@ class BlockGrid:
         return np.asarray(hashmap.key_tensor().numpy()[hashmap.active_buf_indices().numpy()], np.int32)
 
     def extract(self) -> tuple[Float32, Int32, UInt8]:
-        """Return vertices (V, 3) m, triangles (F, 3) and colors (V, 3) by marching cubes, in a deterministic order."""
+        """Return vertices (V, 3) m, triangles (F, 3) and colors (V, 3) of marching cubes in a deterministic order."""
         if self.block_count:
-            # weights are whole; marching cubes requires weights above the threshold, ray-casting at least equal ones
+            # weights are integers; marching cubes needs weights above the threshold, ray-casting at or above it
             mesh = self.blocks.extract_triangle_mesh(self.min_weight - 0.5)
             if mesh.triangle.indices.shape[0]:
                 colors = np.rint(255 * mesh.vertex.colors.numpy()).astype(np.uint8)
@@ -295,7 +296,7 @@ class BlockGrid:
     def arrays(self) -> dict[str, Array]:
         """Return the coordinates of the blocks and the attributes of their voxels, in a deterministic order.
 
-        `save` of Open3D terminates the process if the disk is full.
+        Open3D's `save` terminates the process if the disk is full.
         """
         coords = self.block_coords()
         order = np.lexsort(coords.T)
@@ -304,7 +305,7 @@ class BlockGrid:
         return {"block_coords": coords[order], **values}
 
     def fill(self, arrays: Mapping[str, Array]) -> None:
-        """Copy the saved arrays of another grid into an empty one."""
+        """Copy the saved arrays of another grid into this empty grid."""
         values = {name: self.blocks.attribute(name).numpy() for name in ATTRIBUTES}
         expected = {"block_coords": np.zeros((0, 3), np.int32), **values}
         check_like(arrays, expected, len(arrays["block_coords"]))
@@ -320,7 +321,7 @@ class BlockGrid:
 def _tensors(camera: Camera, T_world_camera: Float64, half: float = 0.0) -> tuple[Tensor, Tensor]:
     """Return the intrinsics (3, 3) and T_camera_world (4, 4), float64.
 
-    `integrate` of Open3D truncates pixel coordinates instead of rounding; `half` = 0.5 px compensates for that.
+    Open3D's `integrate` truncates pixel coordinates instead of rounding; `half` = 0.5 px compensates for this.
     """
     K = camera.K
     K[:2, 2] += half
@@ -338,7 +339,7 @@ def _blank(camera: Camera) -> tuple[Float32, Float32, UInt8]:
 
 
 def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
-    """Return the rays (H, W, 3) of the pixels, world, m per m of depth."""
+    """Return the world-frame rays (H, W, 3) of the pixels, m per m of depth."""
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
     x, y = (u - np.float32(camera.cx)) / np.float32(camera.fx), (v - np.float32(camera.cy)) / np.float32(camera.fy)
     R = T_world_camera[:3, :3].astype(np.float32)
@@ -346,7 +347,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """Return the points (H, W, 3) m, world, of a surface."""
+    """Return the world points (H, W, 3) m of a surface."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)
@@ -354,7 +355,7 @@ def points_of(surface: SurfaceView) -> Float32:
 
 
 def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -> Float32:
-    """Return Open3D's normals (H, W, 3), which are in camera axes, in the world and towards the camera."""
+    """Return Open3D's camera-frame normals (H, W, 3) in the world frame, towards the camera."""
     normals = normals_camera @ T_world_camera[:3, :3].T.astype(np.float32)
     away = np.einsum("hwi,hwi->hw", normals, _rays(camera, T_world_camera)) > 0
     normals[away] *= -1
@@ -362,7 +363,7 @@ def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -
 
 
 def _in_order(vertices: Float32, triangles: Int32, colors: UInt8) -> tuple[Float32, Int32, UInt8]:
-    """Sort vertices and triangles, whose order depends on Open3D's threads, and merge equal vertices."""
+    """Sort vertices and triangles and merge equal vertices. Their order depends on Open3D's threads."""
     order = np.lexsort(vertices.T)
     sorted_vertices = vertices[order]
     is_new = np.ones(len(order), np.bool_)

@@ -1,4 +1,4 @@
-"""A map of object instances in Open3D's voxel blocks, with one majority vote per voxel."""
+"""Map of object instances in Open3D's voxel blocks with one majority vote per voxel."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from framework.mapping.storage.map_file import (
     write_map,
 )
 
-FORMAT = "open3d_vbg 5"  # of the map file; increment it when the meaning of the contents changes
+FORMAT = "open3d_vbg 5"  # format of the map file; increment it when the meaning of the contents changes
 
 
 class Open3DMap(InstanceTableMap):
-    """The voxel blocks of Open3D and an instance table. All voxels of an instance have the class of its record."""
+    """Open3D's voxel blocks and an instance table. All voxels of an instance have the class of its record."""
 
     def __init__(self, settings: BlockGridSettings, confirmation: Confirmation) -> None:
         self.classes: tuple[str, ...] = ()
@@ -47,7 +47,7 @@ class Open3DMap(InstanceTableMap):
         return self.grid.settings.min_depth, self.grid.settings.max_depth
 
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Integrate `frame`. Raises MapFullError if the block budget is reached; nothing is integrated then."""
+        """Integrate `frame`. Raises MapFullError if the block budget is reached; in this case nothing is integrated."""
         self.grid.integrate(frame, T_world_camera)
         self.gravity_estimator.add_frame(T_world_camera, frame.up)
         self.changed()
@@ -55,8 +55,8 @@ class Open3DMap(InstanceTableMap):
     def vote(self, frame: Frame, T_world_camera: Float64, instance_ids: Int32, band: float) -> None:
         """Vote for instance_ids (H, W), 0 = no vote, in the voxels within `band` voxels of the measured depth.
 
-        A voxel stores one candidate and one counter, which find the majority, if there is one: Boyer and Moore, "MJRTY
-        - a fast majority vote algorithm", 1981.
+        A voxel stores one candidate and one counter. They find the majority if there is a majority (Boyer and Moore,
+        "MJRTY - a fast majority vote algorithm", 1981).
         """
         voxels, pixels = self.grid.voxels_seen(frame, T_world_camera, instance_ids > 0, band)
         ids = instance_ids.ravel()[pixels]
@@ -80,7 +80,7 @@ class Open3DMap(InstanceTableMap):
         self.__dict__.pop("_mesh", None)
 
     def instances_at(self, points_world: Float32) -> Int32:
-        """Return the instance (P,) of the voxel nearest to each of points (P, 3) m; 0 = none."""
+        """Return the instance (P,) of the nearest voxel to each point (P, 3) m, 0 = none."""
         voxels = self.grid.voxels_at(points_world)
         return np.where(voxels >= 0, self.grid.flat("instance")[voxels], 0).astype(np.int32)
 

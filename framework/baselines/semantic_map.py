@@ -1,4 +1,4 @@
-"""A semantic map: voxels store classes only; instances are the connected components of one class in the mesh."""
+"""Semantic map. Voxels store classes only, and instances are the connected components of one class in the mesh."""
 
 from __future__ import annotations
 
@@ -27,31 +27,31 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 
 MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the parameters; AREA in m^2
-SWEEPS = 20  # of the regularization, at most
-FORMAT = "semantic 4"  # of the map file; increment it when the meaning of the contents changes
+SWEEPS = 20  # maximum sweeps of the regularization
+FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
 
 
 class Elections(NamedTuple):
-    """How classes and instances follow from the evidence."""
+    """Parameters for the classes and instances from the evidence."""
 
-    missed: float  # P(no mask | a surface of any class) over that of the background
-    min_area: float  # m^2, of an instance
+    missed: float  # P(no mask | surface of any class) / P(no mask | background)
+    min_area: float  # minimum surface area of an instance, m^2
     smoothness: float  # log-odds for each neighboring vertex of the same class
 
 
 class ComponentStatistics(NamedTuple):
-    """Sums over the nearest voxels of the vertices of K components, by id; entry 0 is not used."""
+    """Sums over the nearest voxels of the vertices of K components by id; entry 0 is unused."""
 
-    probability_sums: Float64  # (K + 1, C) of each class, over the vertices; the remainder is the background's
-    masked: Int32  # (K + 1,) the most frames in which one of the voxels was under a mask
-    first_frame: Int32  # (K + 1,) the first and the last of these frames of any voxel, -1 = none
-    last_frame: Int32  # (K + 1,)
+    probability_sums: Float64  # (K + 1, C) sums of each class over the vertices; the rest belongs to the background
+    masked: Int32  # (K + 1,) maximum number of frames with a voxel under a mask
+    first_frame: Int32  # (K + 1,) first frame with any voxel under a mask, -1 = none
+    last_frame: Int32  # (K + 1,) last frame with any voxel under a mask, -1 = none
 
 
 class SemanticMap(SceneMap):
-    """A TSDF whose voxels store a distribution over the classes and the background.
+    """A TSDF with a distribution over the classes and the background in each voxel.
 
-    Instance ids hold for the current mesh only: after more frames, an object may have another id.
+    Instance ids are valid for the current mesh only. After more frames, an object may have another id.
     """
 
     def __init__(self, volume: TsdfVolume, elections: Elections) -> None:
@@ -61,7 +61,7 @@ class SemanticMap(SceneMap):
         self.labels = ClassRows(volume.voxels)
 
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Adopt the label space of the first frame. Raises DataError if a later frame has another one."""
+        """Adopt the label space of the first frame. Raises DataError if a later frame has a different label space."""
         if not self.classes:
             self.labels.begin(len(classes))
         self.classes = agreed_classes(self.classes, classes)
@@ -83,7 +83,7 @@ class SemanticMap(SceneMap):
         return np.float32(np.log(self.elections.missed))
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Return surface and classes; voxels have no instances."""
+        """Return the surface and the classes; voxels have no instances."""
         surface = self.volume.render(camera, T_world_camera)
         class_ids = np.empty(camera.shape, np.int32)
         view = pinhole(camera, T_world_camera)
@@ -97,7 +97,7 @@ class SemanticMap(SceneMap):
         return self.volume.mesh(self._labeled)
 
     def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
-        """Return the surface with instances and classes, elected as in an InstanceMap."""
+        """Return the surface with instances and classes by the majority rule of InstanceMap."""
         colors, class_ids = np.empty((len(surface.voxels), 3), np.uint8), np.empty(len(surface.voxels), np.int32)
         label_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface, colors, class_ids)
         if self.elections.smoothness > 0:
@@ -108,9 +108,9 @@ class SemanticMap(SceneMap):
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def _smooth(self, surface: UnlabeledMesh, class_ids: Int32) -> None:
-        """Regularize the classes (V,) in place: a Potts model over the edges of the mesh.
+        """Regularize the classes (V,) in place by a Potts model over the edges of the mesh.
 
-        The unary term is the class evidence of the voxel nearest to the vertex. Iterated conditional modes (Besag 1986)
+        The unary term is the class evidence of the nearest voxel to the vertex. Iterated conditional modes (Besag 1986)
         minimize the energy.
         """
         starts, neighbors = vertex_neighbors(surface.triangles, len(class_ids))
@@ -125,9 +125,9 @@ class SemanticMap(SceneMap):
     def instances(self) -> Mapping[int, Instance]:
         """Return the components of the mesh.
 
-        The class distribution is the mean over the nearest voxels of the vertices, without the background; confidence
-        is the mean probability of the class, with the background. Observations are the most frames in which one of
-        these voxels was under a mask.
+        The class distribution is the mean over the nearest voxels of the vertices, without the background. The
+        confidence is the mean probability of the class, with the background. The number of observations is the maximum
+        number of frames with one of these voxels under a mask.
         """
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)
@@ -184,7 +184,7 @@ class SemanticMap(SceneMap):
 def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) -> Int32:
     """Return the component (V,) of each vertex, numbered from 1 in the order of their first vertices.
 
-    A component is connected by edges of the triangles (F, 3) within one class. 0 = no class, or fewer vertices than
+    Components are connected by edges of the triangles (F, 3) within one class. 0 = no class or fewer vertices than
     `min_vertices`.
     """
     components = np.empty(len(class_ids), np.int32)
@@ -194,7 +194,7 @@ def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) 
 
 
 def vertex_neighbors(triangles: Int32, count: int) -> tuple[Int32, Int32]:
-    """Return the neighbors of V = `count` vertices along the edges of triangles (F, 3): starts (V + 1,) and indices."""
+    """Return the neighbors of V = `count` vertices along edges of triangles (F, 3) as starts (V + 1,) and indices."""
     a, b = (triangles[:, sides].ravel() for sides in ([0, 1, 2], [1, 2, 0]))
     both = np.concatenate([a, b]), np.concatenate([b, a])
     edges = coo_array((np.ones(len(both[0]), np.bool_), both), (count, count)).tocsr()

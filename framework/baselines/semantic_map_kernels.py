@@ -15,7 +15,7 @@ from framework.refinement.segmentation.union_find import root, unite
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_view(grid, evidence, log_missed, view, depth, class_ids):
-    """Fill class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W) m."""
+    """Fill class_ids (H, W) with the classes of the nearest voxels to the surface at `depth` (H, W) m."""
     for v in prange(depth.shape[0]):
         key, region = NO_LOOK_UP
         for u in range(depth.shape[1]):
@@ -28,7 +28,7 @@ def label_view(grid, evidence, log_missed, view, depth, class_ids):
 
 @device
 def _elect(grid, evidence, log_missed, blocks, voxels, weights, labels):
-    """Return the class with the majority of the voxels around a vertex, -1 if there is none."""
+    """Return the majority class of the voxels around a vertex, -1 without a majority."""
     keep_near(grid, blocks, voxels, weights)
     for c in range(CORNERS):
         labels[c] = 1 + best_class(grid, evidence, log_missed, blocks[c], voxels[c]) if weights[c] > 0 else 0
@@ -52,7 +52,7 @@ def label_classes(grid, evidence, log_missed, surface, colors, class_ids):
 
 @device
 def _log_ratio(grid, evidence, log_missed, block, n, label):
-    """Return the log ratio of a class of a voxel to the background; -1 = the background itself."""
+    """Return the log ratio of a voxel's class to the background; class -1 = the background itself."""
     if label < 0:
         return np.float32(0)
     absent = log_missed * np.float32(evidence.unmasked[block, n])
@@ -67,10 +67,10 @@ def _log_ratio(grid, evidence, log_missed, block, n, label):
 
 @njit(cache=True, nogil=True)
 def smooth_classes(grid, evidence, log_missed, voxels, starts, neighbors, smoothness, class_ids):
-    """Give each vertex, in order, the class with the best sum of evidence and agreeing neighbors. Returns the changes.
+    """Set each vertex in order to the class with the best sum of evidence and agreeing neighbors.
 
-    Candidates are the background, the best class of the nearest voxel and the classes of the neighbors. The current
-    class wins ties.
+    Candidates are the background, the best class of the nearest voxel and the classes of the neighbors. Ties go to the
+    current class. Returns the number of changes.
     """
     changes = 0
     for v in range(len(class_ids)):
@@ -112,7 +112,7 @@ def connect_vertices(triangles, class_ids, components):
 
 @njit(cache=True, nogil=True)
 def sum_components(grid, evidence, log_missed, voxels, instance_ids, found):
-    """Add up the evidence of the voxel nearest to each vertex, by component, in a ComponentStatistics of zeros."""
+    """Sum the evidence of the nearest voxel to each vertex, by component, in the zeroed ComponentStatistics `found`."""
     sums, masked, first_frame, last_frame = found.probability_sums, found.masked, found.first_frame, found.last_frame
     classes = sums.shape[1]
     unnamed_sums = np.zeros(len(sums))
@@ -128,7 +128,7 @@ def sum_components(grid, evidence, log_missed, voxels, instance_ids, found):
         while named < len(labels) and labels[named] != NO_CLASS:
             named += 1
         unnamed = evidence.rest[row, n] + absent
-        largest = max(0.0, unnamed)  # of the log ratios; that of the background is 0
+        largest = max(0.0, unnamed)  # largest log ratio; the background has 0
         if named > 0:
             largest = max(largest, ratios[0] + absent)
         p_unnamed = np.exp(unnamed - largest)
@@ -145,4 +145,4 @@ def sum_components(grid, evidence, log_missed, voxels, instance_ids, found):
             last_frame[k] = max(last_frame[k], evidence.last_frame[row, n])
     for k in range(len(sums)):
         for c in range(classes):
-            sums[k, c] = max(sums[k, c] + unnamed_sums[k], 0.0)  # rounding may leave a difference slightly below 0
+            sums[k, c] = max(sums[k, c] + unnamed_sums[k], 0.0)  # rounding may make the difference slightly negative

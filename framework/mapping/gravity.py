@@ -1,8 +1,8 @@
-"""The direction of gravity and the height of the floor.
+"""Direction of gravity and height of the floor.
 
-The direction is the mean of the sensor's directions over all frames, if frames have one. Otherwise it is estimated from
-the surface: up is the direction that most of the surface is perpendicular to or along, near the mean upper edge of the
-images, which distinguishes floors from walls, as does surface that faces up.
+If frames have a sensor direction, the direction of gravity is the mean over all frames. Otherwise it is estimated from
+the surface. Up is then the direction that is perpendicular or parallel to most of the surface. The mean upper edge of
+the images and surface that faces up distinguish floors from walls.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from framework.errors import DataError
 from framework.interfaces import Gravity
 from framework.mapping.storage.map_header import MapHeader
 
-MOST_FRAMES = 1e9  # of a map
-AGREED = 0.95  # least length of the mean of the sensor's unit vectors: they are within 18 degrees of it
-DIGITS = 6  # of the contribution of a frame: the last digits of float64 depend on the memory layout
-SAMPLED = 20_000  # triangles that refine a direction; each VOTING-th of them votes for it
+MOST_FRAMES = 1e9  # maximum number of frames of a map
+AGREED = 0.95  # minimum length of the mean of the sensor's unit vectors, as for vectors within 18 degrees of the mean
+DIGITS = 6  # decimals of a frame's contribution; the last digits of float64 depend on the memory layout
+SAMPLED = 20_000  # triangles that refine a direction; every VOTING-th triangle votes for candidates
 VOTING = 5
 DIRECTIONS = 3000  # candidates on half a sphere, 2.6 degrees apart
 SPREAD = np.radians(4.0)  # standard deviation of the normals of level and upright surfaces
-NEAR = np.radians(10.0)  # from the direction found, of surfaces that refine it
+NEAR = np.radians(10.0)  # maximum angle from the direction for surfaces that refine it
 HELD_WITHIN = np.radians(50.0)  # largest angle between up and the mean upper edge of the images
-FACING_UP = 2.0  # weight of surface that faces up; in a boxy room all three axes have the same surface otherwise
-LEAST_SHARE = 0.15  # of the surface, that must be level or upright; a heap of objects has less
-LEVEL = np.cos(np.radians(18.0))  # least dot product of up and the normal of a floor
-STEP = 0.05  # m, of heights
+FACING_UP = 2.0  # weight of surface that faces up; without it, the three axes of a box-shaped room have equal votes
+LEAST_SHARE = 0.15  # minimum fraction of the surface that is level or upright; a heap of objects has less
+LEVEL = np.cos(np.radians(18.0))  # minimum dot product of up and the normal of a floor
+STEP = 0.05  # bin size of heights, m
 FLOOR_SHARE = 0.05  # minimum fraction of all level surfaces within a step of the floor height
-BELOW_FLOOR = 0.02  # of all surface, that may lie below the floor: noise, windows and mirrors
+BELOW_FLOOR = 0.02  # maximum fraction of all surface below the floor: noise, windows and mirrors
 
 
 log = logging.getLogger(__name__)
@@ -41,9 +41,9 @@ class GravityEstimator:
     """Accumulator of the camera's orientation and the sensor's directions over frames."""
 
     def __init__(self) -> None:
-        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of the unit vectors to the upper edge of the images, world
-        self.sensed_up: Float64 = np.zeros(3)  # (3,) sum of the sensor's unit vectors against gravity, world
-        self.sensed_frames = 0  # frames with a direction of a sensor
+        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of the unit vectors to the upper edge of images, world frame
+        self.sensed_up: Float64 = np.zeros(3)  # (3,) sum of the sensor's unit vectors against gravity, world frame
+        self.sensed_frames = 0  # frames with a sensor direction
         self._warned = False
 
     def add_frame(self, T_world_camera: Float64, up_camera: Float64 | None = None) -> None:
@@ -77,21 +77,25 @@ class GravityEstimator:
         return found
 
     def sensed(self) -> Float64 | None:
-        """Return the sensor's unit vector (3,) up in the world; None if there is none, or frames disagree."""
+        """Return the sensor's up vector (3,) in the world frame, None without a sensor or if frames disagree."""
         length = float(np.linalg.norm(self.sensed_up))
         if not self.sensed_frames:
             return None
         if length < AGREED * self.sensed_frames:
             if not self._warned:
                 log.warning(
-                    "sensor gravity: expected one direction in the world, got several; estimating it from surfaces"
+                    "sensor gravity: expected one direction in the world frame, got several; estimating gravity from "
+                    "surfaces"
                 )
             self._warned = True
             return None
         return self.sensed_up / length
 
     def estimate(self, vertices: Float32, triangles: Int32) -> Gravity:
-        """Return the sensor's direction, otherwise that of the surface; unknown if no surface is level or upright."""
+        """Return the sensor's direction, or an estimate from the surface.
+
+        The direction is unknown if no surface is level or upright.
+        """
         sensed = self.sensed()
         if sensed is not None:
             return Gravity(sensed, "sensor")
@@ -123,7 +127,7 @@ def _vector(header: MapHeader, key: str) -> Float64:
 
 
 def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float64]:
-    """Return the unit normals (T, 3), areas (T,) m^2 and centers (T, 3) m of the triangles whose area is not 0."""
+    """Return the unit normals (T, 3), areas (T,) m^2 and centers (T, 3) m of the triangles with nonzero area."""
     a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
@@ -132,7 +136,7 @@ def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float6
 
 
 def half_sphere(count: int) -> Float64:
-    """Return (count, 3) unit vectors, evenly spread over half a sphere: a spiral by the golden angle."""
+    """Return unit vectors (count, 3) evenly spread over half a sphere, in a golden-angle spiral."""
     k = np.arange(count) + 0.5
     z = 1 - k / count
     turn, radius = np.pi * (1 + np.sqrt(5)) * k, np.sqrt(1 - z * z)
@@ -140,7 +144,7 @@ def half_sphere(count: int) -> Float64:
 
 
 def level_or_upright(normals: Float64, areas: Float64, directions: Float64, facing_up: float = 1.0) -> Float64:
-    """Return the share (D,) of the surface that is level or upright if a direction is up.
+    """Return the fraction (D,) of the surface that is level or upright if a direction is up.
 
     Surface that faces the direction counts `facing_up` times.
     """
@@ -153,7 +157,7 @@ def level_or_upright(normals: Float64, areas: Float64, directions: Float64, faci
 
 
 def _refined(up: Float64, normals: Float64, areas: Float64) -> Float64:
-    """Return the direction that is most along the normals of level surfaces, and most across those of walls."""
+    """Return the direction that best fits the normals of level surfaces and of walls."""
     for _ in range(5):
         cosines = normals @ up
         level, upright = np.abs(cosines) > np.cos(NEAR), np.abs(cosines) < np.sin(NEAR)
@@ -164,7 +168,7 @@ def _refined(up: Float64, normals: Float64, areas: Float64) -> Float64:
 
 
 def floor_height(vertices: Float32, triangles: Int32, up: Float64) -> float | None:
-    """Return the height of the floor, m along `up`; None if it was not seen.
+    """Return the height of the floor along `up`, m; None if the floor was not seen.
 
     The floor is the lowest large level surface, with almost no surface below it.
     """

@@ -1,4 +1,4 @@
-"""The map of object instances: voxels, label evidence and the instance table, as one SceneMap."""
+"""Map of object instances: voxels, label evidence and the instance table in one SceneMap."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.raycasting import render
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 
-FORMAT = 8  # of the map file; increment it when the meaning of the contents changes
-LARGEST_SCALE = 2**40  # of quantized class scores
+FORMAT = 8  # format of the map file; increment it when the meaning of the contents changes
+LARGEST_SCALE = 2**40  # largest scale of quantized class scores
 
 
 class InstanceMap(InstanceTableMap):
@@ -44,7 +44,7 @@ class InstanceMap(InstanceTableMap):
         self,
         volume: TsdfVolume,
         labels: EvidenceRows,
-        logarithmic: bool,  # the evidence is log-likelihoods
+        logarithmic: bool,  # True if the evidence is log-likelihoods
         confirmation: Confirmation,
         instance_class: InstanceClass = InstanceClass.DETECTIONS,
     ) -> None:
@@ -77,7 +77,7 @@ class InstanceMap(InstanceTableMap):
         return instance_ids
 
     def class_evidence(self) -> dict[int, Float64]:
-        """Return the class evidence (C,) of each confirmed instance, by id, of its detections or of its voxels."""
+        """Return the class evidence (C,) of each confirmed instance by id, from its detections or its voxels."""
         if self.instance_class is InstanceClass.DETECTIONS:
             return super().class_evidence()
         counts = self.confirmation.counts(self.table)
@@ -143,7 +143,7 @@ class InstanceMap(InstanceTableMap):
             expected = scene.labels.evidence._asdict()
             check_like(arrays, {"labeled": expected.pop("labeled")}, len(arrays["labeled"]))
             if storage is Storage.EXACT and arrays["instance_ids"].ndim:
-                slots = max(arrays["instance_ids"].shape[-1], 1)  # as many as the map needed
+                slots = max(arrays["instance_ids"].shape[-1], 1)  # the number of slots that the map needed
                 for name in ("instance_ids", "instance_value"):
                     expected[name] = np.empty((0, slots), expected[name].dtype)
             check_like(arrays, expected, len(arrays["instance_ids"]))

@@ -1,7 +1,7 @@
-"""Pieces of a cluster that are connected in the image and in depth.
+"""Connected components of a cluster, in the image and in depth.
 
-OpenCV and SciPy label binary images, without depth and only adjacent pixels; a graph of all near pairs takes 12 edges
-per point.
+OpenCV and SciPy label binary images: they ignore depth and connect only adjacent pixels. A graph of all near pairs
+takes 12 edges per point.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from framework.data import Bool, Frame, PointClusters
 from framework.refinement.connected_pieces_kernels import Connection, find_pieces
 from framework.refinement.neighborhood import members, thread_schedule
 
-LARGEST_ONLY = 2.0  # min_ratio that no other piece has
+LARGEST_ONLY = 2.0  # min_ratio that only the largest component satisfies
 
 
 def in_largest_piece(clusters: PointClusters, frame: Frame, connection: Connection) -> Bool:
-    """Return (P,) which points are in their cluster's largest connected piece, of equal ones the first in the image.
+    """Return an array (P,), True for points in the largest connected component of their cluster.
 
-    Points of no cluster are in.
+    Ties go to the first component in the image. Points of no cluster are True.
     """
     return in_near_pieces(clusters, frame, connection, min_ratio=LARGEST_ONLY, max_slope=0.0)
 
@@ -26,11 +26,11 @@ def in_largest_piece(clusters: PointClusters, frame: Frame, connection: Connecti
 def in_near_pieces(
     clusters: PointClusters, frame: Frame, connection: Connection, min_ratio: float, max_slope: float
 ) -> Bool:
-    """Return (P,) which points are in their cluster's largest piece, or in a piece at a similar depth.
+    """Return an array (P,), True for points in the largest component of their cluster or a component at similar depth.
 
-    Candidates are pieces with at least `min_ratio` of the largest one's points, in order of size. A candidate is kept
-    if most of its points differ in depth from the nearest kept point by at most the gap plus `max_slope` (m per m)
-    times the distance across. Large pieces are sampled.
+    Candidates are components with at least `min_ratio` times the points of the largest component, in order of size. A
+    candidate is kept if most of its points agree in depth with the nearest kept point. The allowed difference is the
+    gap plus `max_slope` (m per m) times the lateral distance. Large components are sampled.
     """
     order, firsts = members(clusters)
     stays = np.empty(firsts[-1], np.bool_)

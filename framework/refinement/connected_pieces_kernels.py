@@ -11,16 +11,16 @@ from framework.data import Bool, Float32, Int32, Int64
 from framework.refinement.neighborhood_kernels import ThreadSchedule, bounding_box
 from framework.refinement.segmentation.union_find import root, unite
 
-CHUNK = 512  # cells that are compared at once
-CANDIDATE_SAMPLES, KEPT_SAMPLES = 32, 256  # of a candidate, and of each kept piece
+CHUNK = 512  # number of cells compared at once
+CANDIDATE_SAMPLES, KEPT_SAMPLES = 32, 256  # samples of a candidate and of each kept component
 
 
 class Connection(NamedTuple):
     """The largest distance between connected points."""
 
-    gap: np.float32  # m of depth, ...
-    gap_per_depth: np.float32  # m per m, ... plus this times the depth of the nearer point
-    radius: int  # px
+    gap: np.float32  # maximum depth difference at depth 0, m
+    gap_per_depth: np.float32  # increase of the difference with the depth of the nearer point, m per m
+    radius: int  # maximum pixel distance, px
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -28,7 +28,7 @@ def find_pieces(
     pixels: Int32, firsts: Int64, depth: Float32, connection: Connection, min_ratio: np.float32, max_slope: np.float32,
     schedule: ThreadSchedule, stays: Bool,
 ) -> None:  # fmt: skip
-    """Set which points (M,) stay, as in `in_near_pieces`, with `max_slope` per pixel."""
+    """Set `stays` (M,) to True for the points that `in_near_pieces` keeps; `max_slope` is per pixel."""
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
             if firsts[k + 1] > firsts[k]:
@@ -40,10 +40,10 @@ def find_pieces(
 def _find_pieces_of(
     pixels: Int32, depth: Float32, connection: Connection, min_ratio: np.float32, max_slope: np.float32, stays: Bool
 ) -> None:
-    """Find one cluster's pieces by union-find over runs of connected pixels in each row.
+    """Find the components of one cluster by union-find over runs of connected pixels in each row.
 
-    Cells are in flat arrays, row by row, with empty ones at the end of each row, so that offsets to neighbors are
-    constant and no run continues in the next row.
+    Cells are in flat arrays, row by row, with empty cells at the end of each row. So offsets to neighbors are constant
+    and no run continues in the next row.
     """
     u0, v0, u1, v1 = bounding_box(pixels)
     reach = connection.radius
@@ -59,7 +59,7 @@ def _find_pieces_of(
     _name_by_roots(parents[:count])
     for cell in range(cells):
         runs[cell] = parents[runs[cell]]
-    for dv in range(reach + 1):  # one half-plane: each pair of neighbors once
+    for dv in range(reach + 1):  # one half-plane, so that each pair of neighbors occurs once
         for du in range(-reach if dv > 0 else 2, reach + 1):
             _unite_near(readings, runs, cells, dv * stride + du, connection, parents)
     _name_by_roots(parents[:count])
@@ -84,7 +84,7 @@ def _keep_near(
     pixels: Int32, piece: Int32, sizes: Int32, largest: int, min_ratio: np.float32, depth: Float32,
     connection: Connection, max_slope: np.float32, stays: Bool,
 ) -> None:  # fmt: skip
-    """Mark the pieces at a similar depth as the kept ones, the larger pieces first."""
+    """Mark the components at a depth similar to the kept components, larger components first."""
     least = min_ratio * np.float32(sizes[largest])
     candidates, waiting, count = np.empty(len(sizes), np.int64), np.zeros(len(sizes), np.bool_), 0
     for other in range(len(sizes)):
@@ -106,7 +106,7 @@ def _keep_near(
 
 @njit(cache=True, nogil=True)
 def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
-    """Return the largest waiting piece, of equal ones the first; they are few, and np.argsort compiles slowly."""
+    """Return the largest waiting component; ties go to the first. Few components; np.argsort compiles slowly."""
     largest = -1
     for piece in pieces:
         if waiting[piece] and (largest < 0 or sizes[piece] > sizes[largest]):
@@ -116,7 +116,7 @@ def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
 
 @njit(cache=True, nogil=True)
 def _sample(pixels: Int32, piece: Int32, wanted: int, most: int, samples: Int32) -> int:
-    """Write up to `most` evenly spaced pixels of a piece to samples; return their number."""
+    """Write up to `most` evenly spaced pixels of a component to samples; return their number."""
     size = 0
     for i in range(len(pixels)):
         size += piece[i] == wanted
@@ -133,7 +133,7 @@ def _sample(pixels: Int32, piece: Int32, wanted: int, most: int, samples: Int32)
 
 @njit(cache=True, nogil=True)
 def _is_near(samples: Int32, kept: Int32, depth: Float32, connection: Connection, max_slope: np.float32) -> bool:
-    """Return whether most samples differ in depth from the nearest kept pixel by at most a surface's possible rise."""
+    """Return True if most samples agree in depth with the nearest kept pixel, up to the maximum slope of a surface."""
     near = 0
     for k in range(len(samples)):
         u, v = samples[k, 0], samples[k, 1]
@@ -156,7 +156,7 @@ def _name_by_roots(parents: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _find_runs(readings: Float32, connection: Connection, runs: Int32, parents: Int32, sizes: Int32) -> int:
-    """Label the runs from 1 as separate pieces, 0 for empty cells; return the number of labels."""
+    """Label the runs from 1 as separate components, 0 for empty cells; return the number of labels."""
     run, begin = 0, 0
     parents[0], sizes[0] = 0, 0
     previous = np.float32(np.nan)
@@ -181,7 +181,7 @@ def _connected(a: np.float32, b: np.float32, connection: Connection) -> bool:
 def _unite_near(
     readings: Float32, runs: Int32, cells: int, offset: int, connection: Connection, parents: Int32
 ) -> None:
-    """Unite the runs of all cells that are `offset` apart and connected in depth."""
+    """Unite the runs of all cells at distance `offset` that are connected in depth."""
     for begin in range(0, cells, CHUNK):
         end = min(begin + CHUNK, cells)
         here, there = slice(begin, end), slice(begin + offset, end + offset)
@@ -193,7 +193,7 @@ def _unite_near_of(
     z: Float32, z_there: Float32, runs: Int32, runs_there: Int32, connection: Connection, parents: Int32
 ) -> None:
     apart = False
-    for i in range(len(z)):  # vectorized: mostly, all connected cells are already united
+    for i in range(len(z)):  # vectorized, because usually all connected cells are already united
         apart |= _connected(z[i], z_there[i], connection) & (runs[i] != runs_there[i])
     if not apart:
         return

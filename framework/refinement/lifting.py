@@ -12,10 +12,10 @@ from framework.refinement.lifting_kernels import count_readings, gather_readings
 
 
 def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
-    """Return each mask's pixels with a depth reading as points in the world.
+    """Return each mask's pixels with a depth reading as points in the world frame.
 
-    Masks may overlap. A mask without readings gives an empty cluster, so that cluster k is detection k. Raises
-    DataError if the masks have another size than the frame or `detections` has another type.
+    Masks may overlap. A mask without depth readings gives an empty cluster, so that cluster k is detection k. Raises
+    DataError if the mask size differs from the frame size or if `detections` has another type.
     """
     if not isinstance(cast(object, detections), Detections):
         raise DataError(f"frame {frame.index}: expected Detections from the detector, got {type(detections).__name__}")

@@ -9,7 +9,7 @@ from framework.data import Bool, Float32, Float64, Int32, Int64
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_readings(masks: Bool, depth: Float32, counts: Int64) -> None:
-    """Set counts[1:] (N * H,) to the number of readings in each row of each mask."""
+    """Set counts[1:] (N * H,) to the number of depth readings in each row of each mask."""
     height = depth.shape[0]
     for row in prange(masks.shape[0] * height):
         k, v = row // height, row % height

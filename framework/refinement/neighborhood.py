@@ -1,6 +1,6 @@
-"""The points of each mask together with a ring of points around it, which shows the object's surroundings.
+"""Points of each mask and of a ring around it, which shows the object's surroundings.
 
-Distances to a mask's border come from our own kernel: OpenCV's distance transform would pass over each mask twice, for
+A custom kernel computes distances to a mask's border. OpenCV's distance transform would pass over each mask twice, for
 the inside and the outside.
 """
 
@@ -25,18 +25,18 @@ from framework.refinement.neighborhood_kernels import (
     signed_distances,
 )
 
-MAX_RING_WIDTH = 80  # px; wider rings show nothing about the object
+MAX_RING_WIDTH = 80  # px; wider rings add no information about the object
 
 
 @dataclass(frozen=True)
 class Neighborhoods:
-    """Points of N masks, each followed by those of the ring around it, in one flat array.
+    """Points of N masks in one flat array, each mask followed by its ring.
 
-    Neighborhood k is `points_camera[starts[k]:starts[k + 1]]`; its first `mask_counts[k]` points are the mask's own.
+    Neighborhood k is `points_camera[starts[k]:starts[k + 1]]`. Its first `mask_counts[k]` points belong to the mask.
     """
 
     points_camera: Float32  # (S, 3) m
-    depth_in_mask: Float32  # (S,) px to the mask's border: positive inside, negative in the ring
+    depth_in_mask: Float32  # (S,) px to the mask's border, positive inside, negative in the ring
     starts: Int64  # (N + 1,)
     mask_counts: Int64  # (N,)
     ring_widths: Int64  # (N,) px
@@ -47,20 +47,21 @@ class Neighborhoods:
 
     @property
     def ring_counts(self) -> Int64:
-        """(N,) points of each ring."""
+        """Number of points (N,) of each ring."""
         return np.asarray(np.diff(self.starts) - self.mask_counts)
 
     @property
     def of_ring(self) -> Bool:
-        """(S,) which points are in a ring."""
+        """An array (S,), True for points in a ring."""
         parts = np.stack([self.mask_counts, self.ring_counts], axis=1).ravel()
         return np.repeat(np.arange(len(parts)) % 2 == 1, parts)
 
     def mask_log_odds(self, largest: float, expected_bleed: float) -> Float32:
-        """Return (S,) log-odds of each point for the object: `largest` deep in the mask, -`largest` far outside.
+        """Return the log-odds (S,) of each point for the object: `largest` deep in the mask, -`largest` far outside.
 
-        The linear ramp between them is 0 at `expected_bleed` ring widths inside of the mask's border and ends 1 - 2
-        `expected_bleed` ring widths outside of it. A thin mask gets a shorter ramp, so that its center has `largest`.
+        The linear ramp in between is 0 at `expected_bleed` ring widths inside the mask's border. It ends 1 - 2
+        `expected_bleed` ring widths outside the border. A thin mask gets a shorter ramp, so that its center has
+        `largest`.
         """
         reach = np.maximum(np.minimum(self.ring_widths, self.mask_radii), 1).astype(np.float32)
         log_odds, widths = np.empty_like(self.depth_in_mask), reach * np.float32(1 - expected_bleed)
@@ -70,42 +71,43 @@ class Neighborhoods:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The clusters of one frame with their rings, from which points can be gathered."""
+    """The clusters of one frame and their rings, with methods to gather points."""
 
     clusters: PointClusters
     frame: Frame
-    order: slice | Int64  # index of the M points of all clusters, cluster by cluster
+    order: slice | Int64  # indices of the M points of all clusters, cluster by cluster
     windows: Windows
-    steps: Int16  # (cells,) thirds of a pixel: depth in the mask, below 0 in the ring, 0 in neither
-    ring_counts: Int64  # (N,) readings in each ring
+    steps: Int16  # (cells,) signed distance in thirds of a pixel: above 0 in the mask, below 0 in the ring, otherwise 0
+    ring_counts: Int64  # (N,) depth readings in each ring
     ring_widths: Int64  # (N,) px
     mask_radii: Float32  # (N,) px
 
     @property
     def mask_counts(self) -> Int64:
-        """(N,) points of each cluster."""
+        """Number of points (N,) of each cluster."""
         return np.diff(self.windows.firsts)
 
     def of_at_least(self, min_points: int) -> Bool:
-        """Return (N,) which clusters have at least `min_points` points, and as many in their ring if there is one."""
+        """Return an array (N,), True for clusters with at least `min_points` points, also in the ring, if any."""
         return np.asarray(
             (self.mask_counts >= min_points) & ((self.ring_counts >= min_points) | (self.ring_widths == 0))
         )
 
     def sampled(self, max_points: int) -> Neighborhoods:
-        """Return every n-th point of each neighborhood, n chosen to leave at most `max_points`."""
+        """Return every n-th point of each neighborhood, with n chosen to keep at most `max_points`."""
         counts = self.mask_counts + self.ring_counts
         nth = np.maximum(-(-counts // max_points), 1)
         return self._gathered(-(-counts // nth), -(-self.mask_counts // nth), nth)
 
     def own(self) -> Neighborhoods:
-        """Return the M points of the clusters, without the rings."""
+        """Return the M points of the clusters without the rings."""
         return self._gathered(self.mask_counts, self.mask_counts, np.ones_like(self.ring_counts))
 
     def kept(self, good: Bool, judged: Bool) -> Bool:
-        """Return (P,) which points of the PointClusters stay: of `judged` clusters (N,) the `good` (M,) ones of `own`.
+        """Return an array (P,), True for the points of the PointClusters to keep.
 
-        Points of other clusters and of no cluster stay.
+        Clusters in `judged` (N,) keep the points of `own` that are `good` (M,). Points of other clusters and of no
+        cluster stay.
         """
         kept = np.ones(len(self.clusters.cluster), np.bool_)
         kept[self.order] = good | np.repeat(~judged, self.mask_counts)
@@ -123,7 +125,7 @@ class Surroundings:
 
 @dataclass
 class Ring:
-    """The band around a mask, and the points of both that a refiner uses."""
+    """The ring around a mask, and limits on the points of mask and ring."""
 
     ring_fraction: float = 0.25  # width of the ring over the square root of the mask's area, >= 0; 0 = no ring
     min_ring: int = 4  # minimum width of the ring, px, >= 1
@@ -144,10 +146,10 @@ class Ring:
 def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundings:
     """Return the N clusters of one frame with their rings.
 
-    A ring contains the pixels with a depth reading, outside of the cluster, within `ring_fraction` * sqrt(points in the
-    cluster) px of it, bounded to [`min_ring`, `max_ring`] px; with `ring_fraction=0` it is empty. It may contain pixels
-    of other clusters. Pixels of known structure count as pixels without a reading: they need no separation from the
-    object.
+    A ring contains the pixels with a depth reading around the cluster. Its width is `ring_fraction` * sqrt(points in
+    the cluster) px, clipped to [`min_ring`, `max_ring`] px. With `ring_fraction=0` the ring is empty. A ring may
+    contain pixels of other clusters. Pixels of known structure count as pixels without a reading, because they are
+    already separated from the object.
     """
     order, firsts = members(clusters)
     pixels, areas = clusters.pixels[order], np.diff(firsts)
@@ -165,10 +167,10 @@ def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundi
 
 
 def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
-    """Return the index of the points of all clusters, cluster by cluster, and (N + 1,) where each cluster begins.
+    """Return the indices of the points of all clusters, cluster by cluster, and the cluster starts (N + 1,).
 
-    Points of a cluster keep their order; points of no cluster (-1) are omitted. For points already in this order, as
-    from `lift`, the index is a slice, which avoids a copy.
+    Points of a cluster keep their order. Points of no cluster (-1) are omitted. For points already in this order, such
+    as the result of `lift`, the indices are a slice to avoid a copy.
     """
     if (clusters.cluster[:-1] <= clusters.cluster[1:]).all():
         firsts = np.searchsorted(clusters.cluster, np.arange(len(clusters) + 1))
@@ -178,7 +180,7 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
 
 
 def thread_schedule(costs: Int64) -> ThreadSchedule:
-    """Distribute N clusters over the threads: the costliest first, to the thread with the least work (Graham 1969).
+    """Distribute N clusters over the threads, costliest first, to the thread with the least work (Graham 1969).
 
     Numba splits a parallel loop into parts of equal length, but a few large clusters contain most of the points.
     """
@@ -187,5 +189,5 @@ def thread_schedule(costs: Int64) -> ThreadSchedule:
 
 
 def pinhole(camera: Camera) -> Float32:
-    """Return (4,) fx, fy, cx, cy in the precision of geometry.back_project, for kernels."""
+    """Return fx, fy, cx, cy (4,) for kernels, in the precision of geometry.back_project."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)

@@ -12,19 +12,19 @@ from framework.data import Bool, Float32, Int32, Int64
 
 Int16 = npt.NDArray[np.int16]
 
-# 3-4 chamfer distance (Borgefors 1986) in thirds of a pixel, at most 8 % from the Euclidean one
+# 3-4 chamfer distance (Borgefors 1986) in thirds of a pixel, within 8 % of the Euclidean distance
 CHAMFER_STEP, CHAMFER_DIAGONAL = np.int16(3), np.int16(4)
-FAR = np.int16(30000)  # 10 000 px; leaves room for two more steps
+FAR = np.int16(30000)  # 10,000 px; two more steps do not overflow
 PX_PER_STEP = np.float32(1) / np.float32(CHAMFER_STEP)
 
 
 class Windows(NamedTuple):
-    """The pixels of N clusters, and the image windows that contain each cluster and its ring."""
+    """Pixels of N clusters, and the image windows of each cluster with its ring."""
 
     pixels: Int32  # (M, 2) (u, v), cluster by cluster
-    firsts: Int64  # (N + 1,) where each cluster begins among them
+    firsts: Int64  # (N + 1,) start of each cluster in `pixels`
     bounds: Int64  # (N, 4) v0 u0 v1 u1 (half open)
-    cells: Int64  # (N + 1,) where each window begins in flat arrays of all windows
+    cells: Int64  # (N + 1,) start of each window in flat arrays of all windows
 
 
 class ThreadSchedule(NamedTuple):
@@ -36,7 +36,7 @@ class ThreadSchedule(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
-    """Return a stable sort of the points by cluster: (members,) indices and (n + 1,) where each cluster begins.
+    """Return a stable sort of the points by cluster: indices (members,) and cluster starts (n + 1,).
 
     Points of no cluster (-1) are omitted.
     """
@@ -57,7 +57,7 @@ def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
 
 @njit(cache=True, nogil=True)
 def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tuple[Int64, Int64]:
-    """Assign clusters to threads by cost; return them in the order of threads, and each thread's start."""
+    """Assign clusters to threads by cost; return the clusters in thread order, and the start of each thread."""
     loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
     for k in longest_first:
         least = 0
@@ -78,7 +78,7 @@ def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tup
 
 @njit(cache=True, nogil=True)
 def bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, bounds: Int64) -> None:
-    """Set bounds (N, 4) v0 u0 v1 u1 (half open) to each cluster's bounding box, grown by its ring, in the image."""
+    """Set bounds (N, 4) v0 u0 v1 u1 (half open) to the bounding box of each cluster and its ring in the image."""
     for k in range(len(widths)):
         if firsts[k] < firsts[k + 1]:
             u0, v0, u1, v1 = bounding_box(pixels[firsts[k] : firsts[k + 1]])
@@ -88,7 +88,7 @@ def bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, 
 
 @njit(cache=True, nogil=True)
 def bounding_box(pixels: Int32) -> tuple[int, int, int, int]:
-    """Return lowest u and v, highest u and v of at least one pixel."""
+    """Return the lowest u and v and the highest u and v of one or more pixels."""
     u0, v0 = pixels[0, 0], pixels[0, 1]
     u1, v1 = u0, v0
     for i in range(len(pixels)):
@@ -105,10 +105,11 @@ def signed_distances(
     windows: Windows, widths: Int64, depth: Float32, schedule: ThreadSchedule, steps: Int16, ring_counts: Int64,
     radii: Float32,
 ) -> None:  # fmt: skip
-    """Set steps (cells,) to each pixel's signed distance, and the number of readings in each ring and the masks' radii.
+    """Set each pixel's signed distance in steps (cells,), the number of readings in each ring, and the masks' radii.
 
     Distances are in thirds of a pixel: above 0 in the mask, to the next reading outside; below 0 in the ring, to the
-    mask; 0 elsewhere. Pixels without a reading are not a border of the mask, as objects often have holes in the depth.
+    mask; 0 elsewhere. Pixels without a reading are not a border of the mask, because objects often have holes in the
+    depth.
     """
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
@@ -126,13 +127,13 @@ def _signed_distances_of(
 ) -> tuple[int, np.float32]:
     """Return the number of readings in the ring and the mask's radius.
 
-    The distances to the mask and to the rest are side by side in one grid with FAR cells around each. A shortest path
-    may make its horizontal steps first, in the row of its source: rows are filled by runs, then two vectorized sweeps
-    add the steps down and up, straight and diagonal.
+    The distances to the mask and to the rest are side by side in one grid, each surrounded by FAR cells. A shortest
+    path may take its horizontal steps first, in the row of its source. So rows are filled by runs. Then two vectorized
+    sweeps add the steps down and up, straight and diagonal.
     """
     v0, u0 = bounds[0], bounds[1]
     rows, columns = bounds[2] - v0, bounds[3] - u0
-    middle = columns + 1  # the FAR cell between the two distances
+    middle = columns + 1  # FAR cell between the two distances
     in_mask, in_rest = np.zeros((rows, columns), np.bool_), np.empty(columns, np.bool_)
     for i in range(len(pixels)):
         in_mask[pixels[i, 1] - v0, pixels[i, 0] - u0] = True
@@ -167,7 +168,7 @@ def _mark_rest(in_mask: Bool, depth: Float32, in_rest: Bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _sign(in_mask: Bool, to_mask: Int16, to_rest: Int16, depth: Float32, ring: np.int16, steps: Int16) -> int:
-    """Combine one row of the two distances; return the number of its readings in the ring."""
+    """Combine one row of the two distances; return the number of readings in the ring."""
     count = np.int32(0)
     for c in range(len(steps)):
         in_ring = (not in_mask[c]) & (to_mask[c] <= ring) & (depth[c] > 0)
@@ -187,7 +188,7 @@ def _highest(steps: Int16) -> np.int16:
 
 @njit(cache=True, nogil=True)
 def _distances_along(sources: Bool, row: Int16) -> None:
-    """Set the distance of every cell to the nearest source of its row, FAR without one."""
+    """Set the distance of every cell to the nearest source of its row, FAR without a source."""
     columns = len(row)
     row[:] = 0
     begin = 0
@@ -221,7 +222,7 @@ def _spread_across(neighbors: Int16, row: Int16, middle: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
-    """Set row to min(row, across + step, before or behind + diagonal), without min() and offsets, to vectorize."""
+    """Set row to min(row, across + step, before or behind + diagonal), vectorized without min() and offsets."""
     for i in range(len(row)):
         diagonal = np.int16((before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL)
         straight = np.int16(across[i] + CHAMFER_STEP)
@@ -234,7 +235,7 @@ def gather(
     windows: Windows, steps: Int16, depth: Float32, pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64,
     schedule: ThreadSchedule, points: Float32, depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    """Set points, as geometry.back_project does, and their depth in the mask."""
+    """Set the points, like geometry.back_project, and their depth in the mask."""
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
@@ -245,7 +246,7 @@ def gather(
                 points[starts[k] : middle], depth_in_mask[starts[k] : middle],
             )  # fmt: skip
             if middle < end:
-                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # every n-th point, over both
+                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # every n-th, over both
                 _gather_ring(
                     bounds, own_steps, depth, pinhole, skipped, nth[k], points[middle:end], depth_in_mask[middle:end]
                 )
@@ -291,7 +292,7 @@ def _back_project(u: int, v: int, z: np.float32, pinhole: Float32, points: Float
 def ramps(
     depth_in_mask: Float32, starts: Int64, widths: Float32, expected_bleed: float, largest: float, log_odds: Float32
 ) -> None:
-    """Set log_odds (S,) to the ramp of each neighborhood, `widths` (N,) px wide, between -largest and largest."""
+    """Set log_odds (S,) to a ramp from -largest to largest over `widths` (N,) px for each neighborhood."""
     zero = np.float32(expected_bleed / (1 - expected_bleed))
     for k in range(len(widths)):
         own = slice(starts[k], starts[k + 1])

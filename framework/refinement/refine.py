@@ -15,10 +15,10 @@ from framework.refinement.refine_kernels import compress, part_starts
 
 
 def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> PointClusters:
-    """Return the refined clusters. Exact clusters, from true masks, stay unchanged, and so do frames without detection.
+    """Return the refined clusters. Exact clusters from ground-truth masks and frames without detection stay unchanged.
 
-    Raises DataError if the refiner does not return PointClusters or returns pixels outside of the image: later stages
-    index the frame with them unchecked.
+    Raises DataError if the refiner does not return PointClusters or returns pixels outside the image. Later stages
+    index the frame with these pixels unchecked.
     """
     if clusters.exact or not clusters.detected:
         return clusters
@@ -30,9 +30,9 @@ def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> Po
 
 
 def keep_points(clusters: PointClusters, kept: Bool) -> PointClusters:
-    """Return the clusters without the points where `kept` (P,) is False.
+    """Return the clusters without the points with `kept` (P,) False.
 
-    Clusters keep their index, scores and classes, so that cluster k is detection k even if it has no points left.
+    Clusters keep their index, scores and classes, so that cluster k is detection k even without points.
     """
     starts = part_starts(kept)
     points_world = np.empty((starts[-1], 3), np.float32)

@@ -12,7 +12,7 @@ PART = 8192  # rows that a thread processes at once
 
 @njit(cache=True, nogil=True)
 def part_starts(kept: Bool) -> Int64:
-    """Return (parts + 1,) the index among the kept rows at which each part of PART rows begins."""
+    """Return the start (parts + 1,) of each part of PART rows among the kept rows."""
     parts = (len(kept) + PART - 1) // PART
     starts = np.zeros(parts + 1, np.int64)
     for part in range(parts):
@@ -28,7 +28,7 @@ def compress(
     points: Float32, pixels: Int32, cluster: Int32, kept: Bool, starts: Int64, kept_points: Float32,
     kept_pixels: Int32, kept_cluster: Int32,
 ) -> None:  # fmt: skip
-    """Copy the kept rows; faster than boolean indexing of three arrays."""
+    """Copy the kept rows. Faster than boolean indexing of three arrays."""
     for part in prange(len(starts) - 1):
         k = starts[part]
         for i in range(part * PART, min((part + 1) * PART, len(kept))):

@@ -1,4 +1,4 @@
-"""The camera pose from 2D-3D matches: P3P in LO-RANSAC with refinement, by pycolmap."""
+"""Camera pose from 2D-3D matches: P3P in LO-RANSAC with refinement, by pycolmap."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64
 from framework.geometry import inverse, nearest_rotation, transform
 
-COLMAP_PIXEL_CENTER = 0.5  # COLMAP's center of the first pixel; ours is at 0
-CONFIDENCE = 0.9999  # of RANSAC
-MAX_DEPTH_ERROR = 0.05  # of the depth, of an inlier
+COLMAP_PIXEL_CENTER = 0.5  # center of the first pixel in COLMAP; it is 0 here
+CONFIDENCE = 0.9999  # confidence of RANSAC
+MAX_DEPTH_ERROR = 0.05  # maximum depth error of an inlier, fraction of its depth
 
 
 @dataclass(frozen=True)
@@ -20,17 +20,17 @@ class AbsolutePose:
     """A camera pose and its inliers."""
 
     T_world_camera: Float64  # (4, 4)
-    inliers: Bool  # (M,) of the matches
+    inliers: Bool  # (M,) True for matches that are inliers
 
 
 @dataclass
 class AbsolutePoseEstimator:
     """Estimator of an `AbsolutePose` from matches; equal matches give equal poses."""
 
-    max_error: float = 4.0  # px, > 0, of the reprojection of an inlier
-    min_inliers: int = 15  # >= 4; wrong matches reach 4 to 8
-    min_inlier_ratio: float = 0.25  # of the matches, in (0, 1]
-    seed: int = 0  # >= 0
+    max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
+    min_inliers: int = 15  # minimum number of inliers, >= 4; wrong matches reach 4 to 8
+    min_inlier_ratio: float = 0.25  # minimum fraction of inliers among the matches, in (0, 1]
+    seed: int = 0  # random seed, >= 0
 
     def __post_init__(self) -> None:
         import pycolmap
@@ -40,7 +40,7 @@ class AbsolutePoseEstimator:
         )
         self._estimation = pycolmap.AbsolutePoseEstimationOptions()
         self._estimation.ransac.max_error = self.max_error
-        self._estimation.ransac.min_inlier_ratio = self.min_inlier_ratio  # bounds the number of trials
+        self._estimation.ransac.min_inlier_ratio = self.min_inlier_ratio  # limits the number of trials
         self._estimation.ransac.confidence = CONFIDENCE
         self._estimation.ransac.random_seed = self.seed
         self._refinement = pycolmap.AbsolutePoseRefinementOptions()
@@ -48,10 +48,10 @@ class AbsolutePoseEstimator:
     def estimate(
         self, camera: Camera, pixels: Float32, points_world: Float32, depth: Float32 | None = None
     ) -> AbsolutePose | None:
-        """Return the pose of `camera`, whose `pixels` (M, 2) show `points_world` (M, 3) at `depth` (M,) m, 0 = unknown.
+        """Return the pose of `camera` from `points_world` (M, 3) at `pixels` (M, 2) with `depth` (M,) m, 0 = unknown.
 
-        None if there are too few inliers. An inlier is finite, in front of the camera, reprojects within `max_error`
-        and agrees with its depth.
+        Returns None if there are too few inliers. An inlier is finite, in front of the camera, reprojects within
+        `max_error` and agrees with its depth.
         """
         import pycolmap
 
@@ -87,7 +87,7 @@ class AbsolutePoseEstimator:
     def _inliers(
         self, camera: Camera, pixels: Float32, points_world: Float32, depth: Float32, T_camera_world: Float64
     ) -> Bool:
-        """Return (M,) which matches agree with the pose; matches that are not finite do not."""
+        """Return an array (M,), True for matches that agree with the pose; non-finite matches are False."""
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             x, y, z = transform(T_camera_world, points_world.astype(np.float64)).T
             u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy

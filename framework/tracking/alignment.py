@@ -2,21 +2,21 @@
 
     E(xi) = sum_i w_i (n_i . (T p_i - q_i))^2 + lambda sum_i v_i (I(pi(T p_i)) - I_frame,i)^2
 
-T = T_view_camera moves the frame's points p_i into the view, which gives each its model point q_i with normal n_i, and
-its model intensity. With Tukey's biweights w_i and v_i, residuals are divided by their expected noise, so both terms
-count standard deviations. Beyond `FAR` a depth's standard deviation is its noise times depth / FAR: errors of
-structured-light cameras at that range cover whole image regions and do not average out. Gauss-Newton steps are twists
-in the view's frame: T <- exp(xi) T.
+T = T_view_camera moves the frame's points p_i into the view. The view gives each point its model point q_i with normal
+n_i, and its model intensity. w_i and v_i are Tukey's biweights. Residuals are divided by their expected noise, so both
+terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its noise times depth / FAR. Errors
+of structured-light cameras at this range cover whole image regions and do not average out. Gauss-Newton steps are
+twists in the view's frame: T <- exp(xi) T.
 
-`LinearWeights` replaces Tukey's weights by those of VoxelHashing's published code, for residuals in m and in [0, 1].
-With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
+`LinearWeights` replaces Tukey's weights by the weights in VoxelHashing's published code, for residuals in m and in
+[0, 1]. With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
 
     w_i = max(0, ((1 - d / max_distance) + (1 - z / max_depth)) / 2)
     v_i = max(0, 1 - |dI| / max_intensity_difference)
 
-The kernels process points in batches of a fixed size: branch-free loops over fields of one array, which the compiler
-vectorizes, and separate loops that only fetch from images. Ignored points have weight 0. Sums are kept in lanes, so
-that vector code needs no reordered additions (fast math) and every compilation rounds alike.
+The kernels process points in batches of a fixed size. Branch-free loops over fields of one array are vectorized by the
+compiler. Separate loops only fetch from images. Ignored points have weight 0. Sums are kept in lanes, so that vector
+code needs no reordered additions (fast math) and every compilation rounds equally.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from framework.tracking.pyramid import PyramidLevel, intrinsics
 
 
 def _matrix_sums() -> npt.NDArray[np.int64]:
-    """Return (6, 6) the index among the sums of each element of the symmetric matrix A."""
+    """Return the index (6, 6) among the sums of each element of the symmetric matrix A."""
     indices = np.empty((6, 6), np.int64)
     for row in range(6):
         columns = (row + np.arange(4)) % 6
@@ -45,7 +45,7 @@ MATRIX_SUMS = _matrix_sums()
 
 
 class ModelView(NamedTuple):
-    """The view of the map that frames are aligned to."""
+    """The target view of the map for the alignment of frames."""
 
     depth: Float32  # (H, W) m, 0 = nothing mapped
     normals: Float32  # (3, H, W) in the view's camera frame
@@ -56,7 +56,7 @@ class ModelView(NamedTuple):
 
 
 class FrameView(NamedTuple):
-    """One pyramid level of the frame. Flat, because parallel kernels take no nested tuples."""
+    """One pyramid level of the frame. Flat, because parallel kernels do not accept nested tuples."""
 
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
@@ -75,9 +75,9 @@ def model_view(view: SurfaceView) -> ModelView:
 
 
 def smoothed(model: ModelView, level: int) -> ModelView:
-    """Return the model for `level` halvings of its resolution: normals averaged over squares of about that size.
+    """Return the model for `level` halvings of its resolution, with normals averaged over squares of about this size.
 
-    A young map is noisy, and noise of a normal acts like a surface that resists motions along the real one.
+    A new map is noisy. Noise of a normal acts like a surface that resists motion along the real surface.
     """
     if level == 0:
         return model
@@ -87,23 +87,23 @@ def smoothed(model: ModelView, level: int) -> ModelView:
 
 
 class Weights(NamedTuple):
-    """The weights of residuals and the gates of correspondences."""
+    """Weights of residuals and gates of correspondences."""
 
-    max_distance: np.float32  # m, of a point from its model point
-    close_distance: np.float32  # m; a reading agrees with the model's depth within this or 3 standard deviations
-    min_normal_dot: np.float32  # cosine between the frame's and the model's normal
-    geometric_scale: np.float32  # standard deviations at which Tukey's weight reaches 0
-    photometric_scale: np.float32  # standard deviations at which Tukey's weight reaches 0
-    intensity_noise: np.float32  # standard deviation of an intensity difference, of [0, 1]
-    color_weight: np.float32  # lambda; 0 = geometry alone
-    depth_weight: np.float32  # 0 = color alone
+    max_distance: np.float32  # maximum distance of a point from its model point, m
+    close_distance: np.float32  # m; maximum depth difference for agreement with the model, or 3 standard deviations
+    min_normal_dot: np.float32  # minimum cosine between the frame's and the model's normal
+    geometric_scale: np.float32  # zero of Tukey's weight for geometric residuals, standard deviations
+    photometric_scale: np.float32  # zero of Tukey's weight for photometric residuals, standard deviations
+    intensity_noise: np.float32  # standard deviation of an intensity difference; intensities are in [0, 1]
+    color_weight: np.float32  # lambda; 0 = geometry only
+    depth_weight: np.float32  # weight of the geometric term; 0 = color only
 
 
 class LinearWeights(NamedTuple):
-    """The maxima of VoxelHashing's weights, which replace Tukey's."""
+    """Limits of VoxelHashing's weights, which replace Tukey's weights."""
 
-    max_depth: np.float32  # m, z_max
-    max_intensity_difference: np.float32  # of [0, 1], at which a weight reaches 0
+    max_depth: np.float32  # maximum depth z_max, m
+    max_intensity_difference: np.float32  # intensity difference with weight 0; intensities are in [0, 1]
 
 
 class NormalEquations(NamedTuple):
@@ -111,11 +111,11 @@ class NormalEquations(NamedTuple):
 
     A: Float64  # (6, 6)
     b: Float64  # (6,)
-    visible: int  # points that fall on a mapped part of the view
-    matched: int  # of these, points with a weight
-    close: int  # of the visible, points whose depth in the view agrees with the model's
-    behind: int  # of the visible, points so far behind the model that it should have hidden them
-    brightness: float  # mean of frame - model intensity: the change of exposure
+    visible: int  # points on a mapped part of the view
+    matched: int  # visible points with a weight
+    close: int  # visible points at a depth that agrees with the model
+    behind: int  # visible points clearly behind the model, which should hide them
+    brightness: float  # mean of frame minus model intensity: the change of exposure
 
 
 def linearize(
@@ -127,7 +127,7 @@ def linearize(
     `model_intensity` (h, w) is the view's intensity at that level's resolution, negative where nothing is mapped.
     """
     sums = np.empty((CHUNKS, TERMS))
-    scale = 1 << round(math.log2(model.depth.shape[1] / model_intensity.shape[1]))  # odd columns are dropped
+    scale = 1 << round(math.log2(model.depth.shape[1] / model_intensity.shape[1]))  # halving drops odd columns
     accumulate(
         FrameView(level.depth, level.intensity, level.normals, *intrinsics(level.camera)), model, model_intensity,
         np.float32(1 / scale), np.ascontiguousarray(T_view_camera[:3, :3], np.float32),

@@ -8,12 +8,12 @@ from numba import njit, prange
 from framework.mapping.voxels.voxel_grid_kernels import device, one_more
 from framework.sensors.noise_models import axial_sigma_single
 
-CHUNKS = 16  # of image rows, summed in order, so that sums do not depend on the number of threads
-BATCH = 160  # points; divides the usual widths
-LANES = 16  # of a sum: point n of a batch is added to lane n % LANES
-ROW = 5  # sums for each of the error's six derivatives: its products with itself, the next three and the error
-SUMS = 6 * ROW + 1  # over points, in lanes: the normal equations, then the change of brightness
-TERMS = SUMS + 6  # of a chunk: its sums, then its six counts
+CHUNKS = 16  # chunks of image rows, summed in order, so that sums do not depend on the number of threads
+BATCH = 160  # points per batch; divides the usual image widths
+LANES = 16  # lanes of a sum; point n of a batch is added to lane n % LANES
+ROW = 5  # sums per derivative of the error: products with itself, the next three derivatives and the error
+SUMS = 6 * ROW + 1  # sums over points, in lanes: the normal equations, then the change of brightness
+TERMS = SUMS + 6  # terms of a chunk: its sums, then its six counts
 # offsets of a batch's point fields: in the frame, in the view, and in the model ...
 DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00, I10, I01, I11 = (
     field * BATCH for field in range(21)
@@ -22,11 +22,11 @@ POINT_FIELDS = 21
 # ... and of its residual terms
 J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in range(10))
 TERM_SIZE = ADDED + SUMS * LANES  # after the fields, the batch's sums by lane
-FAR = 2.0  # m, beyond which errors of depth are correlated
-NEAREST = 0.05  # m in front of the view; nearer points are not projected
+FAR = 2.0  # depth above which depth errors are correlated, m
+NEAREST = 0.05  # minimum depth of projected points in the view, m
 
 
-# Not cv2.blur: the split, and so the rounding, of its running sums depends on other threads that use OpenCV.
+# Not cv2.blur: other threads that use OpenCV change the split of its running sums, and so the rounding.
 @njit(cache=True, nogil=True, parallel=True)
 def smooth_normals(normals, reach, row_sums, smooth):
     """Set smooth (3, H, W) to unit means of normals over squares of side 2 reach + 1, 0 where all are 0."""
@@ -36,7 +36,7 @@ def smooth_normals(normals, reach, row_sums, smooth):
             row_sums[i, v] = np.float32(0.0)
             for d in range(-reach, reach + 1):
                 u0 = max(-d, 0)
-                for n in range(width - abs(d)):  # unsigned indices need no check for wraparound
+                for n in range(width - abs(d)):  # unsigned indices need no wraparound check
                     row_sums[i, v, np.uint64(u0 + n)] += normals[i, v, np.uint64(u0 + d + n)]
     for v in prange(height):
         smooth[:, v] = np.float32(0.0)
@@ -70,7 +70,7 @@ def _tukey(r, scale):
 
 @device
 def _load(frame, v, u0, points):
-    """Copy the batch that begins at pixel (u0, v) into `points`; past the end of the row, depth is 0."""
+    """Copy the batch from pixel (u0, v) on into `points`; the depth is 0 past the end of the row."""
     depth, intensity, normals = frame.depth, frame.intensity, frame.normals
     for n in range(BATCH):
         u = u0 + n
@@ -83,7 +83,7 @@ def _load(frame, v, u0, points):
 
 @device
 def _project(frame, v, u0, model, shape, R, t, points, pixel):
-    """Set a batch's points in the view, m and px, and the flat indices of their pixels (BATCH,), -1 = outside."""
+    """Set a batch's points in the view, m and px, and the flat pixel indices (BATCH,), -1 = outside."""
     fx, fy, cx, cy = frame.fx, frame.fy, frame.cx, frame.cy
     one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
     width = np.int32(shape[1])
@@ -109,7 +109,7 @@ def _project(frame, v, u0, model, shape, R, t, points, pixel):
 
 @device
 def _gather_model(depth, normals, size, pixel, points):
-    """Fetch the model's depth and normal at each point's pixel; depth 0 = none."""
+    """Fetch the model's depth and normal at each point's pixel; depth 0 = no surface."""
     for n in range(BATCH):
         i = pixel[n]
         if i >= 0:
@@ -123,9 +123,9 @@ def _gather_model(depth, normals, size, pixel, points):
 
 @device
 def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
-    """Set point n's term in J: its weight, its error, and the error's derivative by a twist of the view's frame.
+    """Set the term of point n in J: weight, error, and derivative of the error by a twist of the view's frame.
 
-    (gx, gy, gz) is the error's derivative by the point (px, py, pz). Values of points without a weight may be NaN.
+    (gx, gy, gz) is the derivative of the error by the point (px, py, pz). Points without a weight may have NaN values.
     """
     zero = np.float32(0.0)
     weighted = weight > zero
@@ -143,8 +143,8 @@ def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
 def _add_geometry(model, R, weights, linear, points, J):
     """Set the point-to-plane terms of a batch in J; return the counts (visible, matched, close, behind).
 
-    points[NEAR] is set to 1 where a point is within max_distance of its model point, 0 elsewhere. With linear weights,
-    their normals must match, too.
+    points[NEAR] is set to 1 if a point is within max_distance of its model point, otherwise to 0. With linear weights,
+    the normals must also match.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     inv_fx, inv_fy = one / model.fx, one / model.fy
@@ -177,7 +177,7 @@ def _add_geometry(model, R, weights, linear, points, J):
         sigma = noise * max(one, points[DEPTH + n] * inv_far)
         distance = nx * ex + ny * ey + nz * ez
         matches = near & (dot > min_dot)
-        if linear is None:  # numba compiles only the branch for the type of `linear`
+        if linear is None:  # numba compiles only the branch of the type of `linear`
             weight = _tukey(distance / sigma, scale) * strength / (sigma * sigma)
         else:
             nearness = (one - np.sqrt(distance2) / weights.max_distance) + (one - points[DEPTH + n] / linear.max_depth)
@@ -218,7 +218,7 @@ def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
 
 @device
 def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J):
-    """Set the photometric terms of a batch in J, with frame - model intensity; return counts (matched, compared)."""
+    """Set the photometric terms (frame minus model intensity) of a batch in J; return counts (matched, compared)."""
     one, zero = np.float32(1.0), np.float32(0.0)
     noise, scale = weights.intensity_noise, weights.photometric_scale
     strength = weights.color_weight / (noise * noise)
@@ -251,12 +251,12 @@ def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J
 
 @device
 def _multiply(J, a, b, c, d, row):
-    """Sum a batch's products of the derivatives at offset `a`, weighted, with those at a, b, c, d and the error."""
+    """Sum a batch's weighted products of the derivative at offset `a` with a, b, c, d and the error."""
     zero = np.float32(0.0)
     added = ADDED + row * ROW * LANES
     for lane in range(LANES):
         product0 = product1 = product2 = product3 = product_error = zero
-        for step in range(BATCH // LANES):  # the compiler unrolls it and vectorizes the loop over lanes
+        for step in range(BATCH // LANES):  # the compiler unrolls this loop and vectorizes the loop over lanes
             n = step * LANES + lane
             weighted = J[W + n] * J[a + n]
             product0 += weighted * J[a + n]
@@ -273,7 +273,7 @@ def _multiply(J, a, b, c, d, row):
 
 @device
 def _add_products(J, lanes):
-    """Add a batch's w J^T r and w J^T J (its upper triangle and three more elements) to their lanes."""
+    """Add a batch's w J^T r and w J^T J (upper triangle and three more elements) to the lanes."""
     _multiply(J, J0, J1, J2, J3, 0)
     _multiply(J, J1, J2, J3, J4, 1)
     _multiply(J, J2, J3, J4, J5, 2)
@@ -286,7 +286,7 @@ def _add_products(J, lanes):
 
 @device
 def _add_brightness(J, lanes):
-    """Add a batch's change of brightness to its lanes."""
+    """Add a batch's change of brightness to the lanes."""
     for lane in range(LANES):
         change = np.float32(0.0)
         for step in range(BATCH // LANES):
@@ -299,8 +299,8 @@ def _add_brightness(J, lanes):
 def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, linear, brightness, sums):
     """Sum the normal equations over a FrameView by chunks of rows into sums (CHUNKS, TERMS).
 
-    `R`, `t` are T_view_camera. `inverse_scale` is the width of model_intensity over that of the view. `linear` is a
-    LinearWeights, or None for Tukey's weights.
+    `R` and `t` are T_view_camera. `inverse_scale` is the width of model_intensity over the width of the view. `linear`
+    is a LinearWeights, or None for Tukey's weights.
     """
     height, width = frame.depth.shape
     shape, level_shape = model.depth.shape, model_intensity.shape

@@ -1,10 +1,10 @@
-"""Sparse image features with depth: RootSIFT at half resolution, and their matching.
+"""Sparse RootSIFT features with depth at half resolution, and their matching.
 
-SIFT at half resolution matches farther and more blurred views than ORB. At full resolution it is three times slower and
-matches less, because of blur and sensor noise at the finest scale.
+SIFT at half resolution matches farther and more blurred views than ORB. At full resolution SIFT is three times slower
+and finds fewer matches, because of blur and sensor noise at the finest scale.
 
-Descriptors are integers, as in COLMAP: scalar products are then exact in float32 in any order of summation, so that
-matches do not depend on the number of threads.
+Descriptors are integers, as in COLMAP. So scalar products are exact in float32 in any order of summation, and matches
+do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -19,41 +19,41 @@ from framework.config.validation import check_bounds
 from framework.data import Float32, Frame, Int32, UInt8
 
 DESCRIPTOR_LENGTH = 128
-DESCRIPTOR_NORM = 512.0  # of a RootSIFT descriptor before it is rounded: entries then fit into a byte
-FINEST_WIDTH = 400  # px; wider images are halved
-PATCH_RADIUS = 2  # px around a feature that must lie on one surface
-DEPTH_GAP = 0.05  # of the depth: readings of a patch farther apart are of different surfaces
+DESCRIPTOR_NORM = 512.0  # norm of a RootSIFT descriptor before rounding, so that entries fit into a byte
+FINEST_WIDTH = 400  # maximum image width, px; wider images are halved
+PATCH_RADIUS = 2  # radius of the patch around a feature that must lie on one surface, px
+DEPTH_GAP = 0.05  # minimum depth difference between surfaces in a patch, fraction of the depth
 
 
 @dataclass(frozen=True)
 class Features:
     """F image features, strongest first."""
 
-    pixels: Float32  # (F, 2) (u, v), of the full-resolution image
+    pixels: Float32  # (F, 2) (u, v) in the full-resolution image
     depth: Float32  # (F,) m along z, 0 = no reading or at the edge of a surface
-    descriptors: UInt8  # (F, 128) RootSIFT of length 512
+    descriptors: UInt8  # (F, 128) RootSIFT with norm 512
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     def with_depth(self) -> Features:
-        """Return the features that have a depth."""
+        """Return the features with depth."""
         found = self.depth > 0
         return Features(self.pixels[found], self.depth[found], self.descriptors[found])
 
 
 @dataclass
 class FeatureExtractor:
-    """Extractor of `Features` of a frame, independent of the number of threads."""
+    """Extractor of the `Features` of a frame, independent of the number of threads."""
 
-    max_features: int = 800  # >= 1
-    contrast: float = 0.015  # in (0, 1], SIFT's threshold; a lower one finds more and weaker features
+    max_features: int = 800  # maximum number of features, >= 1
+    contrast: float = 0.015  # SIFT's contrast threshold, in (0, 1]; a lower value finds more and weaker features
 
     def __post_init__(self) -> None:
         check_bounds(self, max_features=(1, 100_000), contrast=(1e-6, 1.0))
 
     def extract(self, frame: Frame) -> Features:
-        """Return the features of `frame`, none in an image without texture. Thread-safe."""
+        """Return the features of `frame`; an image without texture has none. Thread-safe."""
         gray, scale = _reduced(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))
         # without precise upscaling, OpenCV's keypoints are off by a quarter of a pixel
         sift = cv2.SIFT.create(self.max_features, contrastThreshold=self.contrast, enable_precise_upscale=True)
@@ -61,7 +61,7 @@ class FeatureExtractor:
         if not keypoints:
             no_descriptors = np.zeros((0, DESCRIPTOR_LENGTH), np.uint8)
             return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), no_descriptors)
-        # ties in strength are broken by position, not by the order in which threads finish
+        # ties in strength are broken by position, not by thread timing
         found = np.array([(-p.response, *p.pt, p.size, p.angle) for p in keypoints], np.float64)
         order = np.lexsort(found.T[::-1])[: self.max_features]
         pixels = ((found[order, 1:3] + 0.5) * scale - 0.5).astype(np.float32)
@@ -70,7 +70,7 @@ class FeatureExtractor:
 
 @dataclass
 class FrameFeatures:
-    """The features of one frame, extracted at their first use."""
+    """The features of one frame, extracted on first use."""
 
     frame: Frame
     extractor: FeatureExtractor
@@ -81,19 +81,19 @@ class FrameFeatures:
 
     @property
     def known(self) -> bool:
-        """Return whether the features are extracted."""
+        """True if the features are extracted."""
         return "found" in self.__dict__
 
 
 def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
-    """Return (M, 2) index pairs of `query` (Q, 128) and `reference` (R, 128) that are mutual nearest neighbors.
+    """Return index pairs (M, 2) of mutual nearest neighbors in `query` (Q, 128) and `reference` (R, 128).
 
-    Pairs whose distance is above `max_ratio` of that to the second nearest are dropped (Lowe 2004).
+    A pair is dropped if its distance is above `max_ratio` times the distance to the second nearest (Lowe 2004).
     """
     if len(query) == 0 or len(reference) < 2:
         return np.zeros((0, 2), np.int32)
     a, b = query.astype(np.float32), reference.astype(np.float32)
-    # OpenCV's product runs in this thread; the threads of BLAS wait for each other when the cores are busy
+    # OpenCV's product runs in this thread; BLAS threads wait for each other on busy cores
     squared = cv2.gemm(a, b, -2, None, 0, flags=cv2.GEMM_2_T)
     squared += (a * a).sum(axis=1)[:, None]
     squared += (b * b).sum(axis=1)
@@ -107,7 +107,7 @@ def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
 
 
 def surface_depth(depth: Float32, pixels: Float32) -> Float32:
-    """Return the median depth (F,) of the patches around `pixels` (F, 2), 0 at edges of surfaces and in holes."""
+    """Return the median depth (F,) of the patches around `pixels` (F, 2), 0 at surface edges and in holes."""
     height, width = depth.shape
     offsets = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
     u, v = np.rint(pixels).astype(np.intp).T
@@ -125,7 +125,7 @@ def surface_depth(depth: Float32, pixels: Float32) -> Float32:
 
 
 def _reduced(gray: UInt8) -> tuple[UInt8, int]:
-    """Return the image, halved until it is at most FINEST_WIDTH wide, and the scale of its pixels."""
+    """Return the image halved to a width of at most FINEST_WIDTH, and the scale of its pixels."""
     scale = 1
     while gray.shape[1] > FINEST_WIDTH:
         height, width = gray.shape[0] // 2, gray.shape[1] // 2
@@ -135,7 +135,7 @@ def _reduced(gray: UInt8) -> tuple[UInt8, int]:
 
 
 def _root_sift(descriptors: Float32) -> UInt8:
-    """Return descriptors whose Euclidean distance is SIFT's Hellinger distance (Arandjelovic and Zisserman 2012)."""
+    """Return RootSIFT: its Euclidean distance is SIFT's Hellinger distance (Arandjelovic and Zisserman 2012)."""
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1)
     rooted: UInt8 = np.minimum(np.rint(DESCRIPTOR_NORM * np.sqrt(descriptors / total)), 255).astype(np.uint8)
     return rooted

@@ -1,7 +1,7 @@
-"""Keyframes: features seen from known poses, for relocalization of a lost camera.
+"""Keyframes with features and known poses for relocalization of a lost camera.
 
-After PTAM (Klein and Murray 2007) and ORB-SLAM (Mur-Artal et al. 2015): a bag of visual words selects candidate
-keyframes for a lost frame; matched features with depth and P3P in RANSAC give its pose.
+After PTAM (Klein and Murray 2007) and ORB-SLAM (Mur-Artal et al. 2015). A bag of visual words selects candidate
+keyframes for a lost frame. Matched features with depth and P3P in RANSAC give its pose.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from framework.tracking.features import DESCRIPTOR_LENGTH, FeatureExtractor, Fea
 FILE_FORMAT = "places 1"  # increment it when the meaning of the arrays changes
 SAVED: Mapping[str, tuple[tuple[int | None, ...], type]] = {
     "poses": ((None, 4, 4), np.float64),  # T_world_camera
-    "counts": ((None,), np.int32),  # points of each keyframe
+    "counts": ((None,), np.int32),  # number of points of each keyframe
     "points_world": ((None, 3), np.float32),  # m, keyframe by keyframe
     "descriptors": ((None, DESCRIPTOR_LENGTH), np.uint8),
 }
-"""Shapes and types of the arrays that keyframes are saved as."""
+"""Shapes and types of the arrays of saved keyframes."""
 
-MIN_RETRY_SEPARATION = 0.25  # of that between keyframes: distance from a frame with too few features
-WORD_BITS = 12  # 4096 visual words; with fewer, places look alike, with more, few words recur
+MIN_RETRY_SEPARATION = 0.25  # minimum separation from a frame with too few features; 1 = keyframe limit
+WORD_BITS = 12  # 4096 visual words; with fewer, views look alike; with more, few words recur
 
 
 @dataclass(frozen=True)
@@ -52,21 +52,21 @@ class Keyframe:
 class Keyframes:
     """A bounded database of keyframes.
 
-    `add` takes every trusted frame and extracts the features of new views in a background thread. All other methods
-    wait for that thread first, so that results do not depend on timing. The cost of `relocalize` does not depend on the
-    number of keyframes, except for comparing their bags of words.
+    Call `add` with every trusted frame. It extracts the features of new views in a background thread. All other methods
+    wait for this thread first, so that results do not depend on timing. The cost of `relocalize` does not depend on the
+    number of keyframes, except for the comparison of bags of words.
     """
 
-    max_keyframes: int = 200  # >= 1; above it, the most redundant one is dropped
-    min_distance: float = 0.25  # m, > 0, between keyframes; distance and angle add up as fractions of their limits
-    min_angle: float = 0.3  # rad, > 0, between keyframes
-    max_features: int = 800  # >= 1, of a frame
-    min_features: int = 30  # >= 4, with depth, of a keyframe
-    candidates: int = 6  # >= 1, keyframes that a lost frame is matched with
-    max_ratio: float = 0.8  # in (0, 1], of a match's distance to that of the second best
-    max_error: float = 4.0  # px, > 0, of the reprojection of an inlier
-    min_inliers: int = 20  # >= 4
-    min_inlier_ratio: float = 0.15  # of the matches, in (0, 1]; low, because candidates may show other places
+    max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is dropped
+    min_distance: float = 0.25  # minimum distance between keyframes, m, > 0; added to the angle, in units of the minima
+    min_angle: float = 0.3  # minimum angle between keyframes, rad, > 0
+    max_features: int = 800  # maximum number of features of a frame, >= 1
+    min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
+    candidates: int = 6  # number of keyframes matched with a lost frame, >= 1
+    max_ratio: float = 0.8  # maximum distance of a match over the distance of the second-best match, in (0, 1]
+    max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
+    min_inliers: int = 20  # minimum number of inliers, >= 4
+    min_inlier_ratio: float = 0.15  # minimum fraction of inliers, in (0, 1]; low, because candidates may not overlap
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -78,12 +78,12 @@ class Keyframes:
         self._estimator = AbsolutePoseEstimator(self.max_error, self.min_inliers, self.min_inlier_ratio, self.seed)
         self._words = VisualWords(self.seed)
         self._keyframes: list[Keyframe] = []
-        self._poses = np.zeros((0, 4, 4))  # of the keyframes
+        self._poses = np.zeros((0, 4, 4))  # poses of the keyframes
         self._barren: Float64 | None = None  # pose of the last frame with too few features
         self._offered: tuple[Float64, Future[Keyframe | None]] | None = None  # pose and keyframe under construction
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for pickling, without the thread."""
+        """Return the state for pickling without the thread."""
         self._settle()
         return vars(self)
 
@@ -92,7 +92,7 @@ class Keyframes:
         return len(self._keyframes)
 
     def saved(self) -> dict[str, Array]:
-        """Return the arrays that `restore` takes, empty without keyframes."""
+        """Return the arrays for `restore`; empty without keyframes."""
         self._settle()
         if not self._keyframes:
             return {}
@@ -104,12 +104,12 @@ class Keyframes:
         }
 
     def restore(self, arrays: Mapping[str, Array]) -> None:
-        """Add the keyframes that another database has `saved`.
+        """Add the `saved` keyframes of another database.
 
-        Raises ConfigError if the arrays are empty, DataError if they are invalid.
+        Raises ConfigError if the arrays are empty, and DataError if they are invalid.
         """
         if not arrays:
-            raise ConfigError("resume_from or localize_in: expected a run with stored keyframes, got one without")
+            raise ConfigError("resume_from or localize_in: expected a run with stored keyframes, got no keyframes")
         if set(arrays) != set(SAVED):
             raise DataError(f"keyframes: expected {', '.join(SAVED)}, got {', '.join(arrays) or 'nothing'}")
         for name, (shape, kind) in SAVED.items():
@@ -118,7 +118,10 @@ class Keyframes:
         points, descriptors = arrays["points_world"], arrays["descriptors"]
         total = len(points) if len(points) == len(descriptors) else -1
         if len(counts) != len(poses) or counts.min(initial=0) < 0 or counts.sum() != total:
-            raise DataError(f"keyframe counts: expected those of the poses and points, got {counts.tolist()!s:.60}")
+            raise DataError(
+                f"keyframe counts: expected {len(poses)} counts for {len(points)} points with {len(descriptors)} "
+                f"descriptors, got {counts.tolist()!s:.60}"
+            )
         self._settle()
         for k, end in enumerate(np.cumsum(counts)):
             check_rigid(f"keyframe {k}", poses[k])
@@ -134,12 +137,12 @@ class Keyframes:
         An exception of that thread is raised by the next method that waits for it.
         """
         if self._offered is not None and self._is_retry(self._offered[0], T_world_camera):
-            return  # too near to that frame, whether it becomes a keyframe or has too few features
+            return  # too near to that frame, even if it has too few features for a keyframe
         if not self.is_new(T_world_camera) or self._is_retry(self._barren, T_world_camera):
             return
         worker = ThreadPoolExecutor(1, "keyframe", lower_priority)
         self._offered = T_world_camera.copy(), worker.submit(self._extracted, frame, T_world_camera.copy())
-        worker.shutdown(wait=False)  # it ends with this frame
+        worker.shutdown(wait=False)  # the thread ends after this frame
 
     def _settle(self) -> None:
         """Wait for the frame under construction. Raises the exception of its thread."""
@@ -156,7 +159,7 @@ class Keyframes:
             self._append(keyframe)
 
     def add_with(self, frame: Frame, features: Features, T_world_camera: Float64) -> bool:
-        """Make `frame` with its features a keyframe if it is new and has enough; return True if it became one."""
+        """Make `frame` a keyframe if its view is new and has enough features; return True if it became a keyframe."""
         features = features.with_depth()
         if len(features) < self.min_features or not self.is_new(T_world_camera):
             return False
@@ -164,12 +167,12 @@ class Keyframes:
         return True
 
     def _extracted(self, frame: Frame, T_world_camera: Float64) -> Keyframe | None:
-        """Return the frame as a keyframe, None if it has too few features."""
+        """Return the frame as a keyframe; None if it has too few features."""
         features = self.extractor.extract(frame).with_depth()
         return self.keyframe(frame, features, T_world_camera) if len(features) >= self.min_features else None
 
     def _append(self, keyframe: Keyframe) -> None:
-        """Add a keyframe; above the limit, drop the older one of the two that are nearest to each other."""
+        """Add a keyframe; above the limit, drop the older keyframe of the nearest pair."""
         self._keyframes.append(keyframe)
         self._poses = np.concatenate([self._poses, keyframe.T_world_camera[None]])
         if len(self._keyframes) > self.max_keyframes:
@@ -188,18 +191,18 @@ class Keyframes:
         return Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag)
 
     def is_new(self, T_world_camera: Float64) -> bool:
-        """Return whether no keyframe is near this pose."""
+        """Return True if no keyframe is near this pose."""
         self._settle()
         return bool((self._separation(self._poses, T_world_camera) >= 1).all())
 
     def _is_retry(self, T_world_other: Float64 | None, T_world_camera: Float64) -> bool:
-        """Return whether a pose is too near to another one, None = none, to extract features again."""
+        """Return True if a pose is too near to another pose (None = none) to extract features again."""
         if T_world_other is None:
             return False
         return bool(self._separation(T_world_other[None], T_world_camera)[0] < MIN_RETRY_SEPARATION)
 
     def relocalize(self, frame: Frame) -> AbsolutePose | None:
-        """Return the pose of `frame`, taken anywhere; None if it is not found."""
+        """Return the pose of `frame` without a prior pose; None if it is not found."""
         features = self.extractor.extract(frame)
         return self.locate(frame, features, self.alike(features))
 
@@ -219,7 +222,7 @@ class Keyframes:
         return [self._keyframes[k] for k in order[: self.candidates]]
 
     def locate(self, frame: Frame, features: Features, keyframes: Sequence[Keyframe]) -> AbsolutePose | None:
-        """Return the pose of `frame` from its matches with all keyframes together; None if they do not determine it."""
+        """Return the pose of `frame` from its joint matches with all keyframes; None if it is not determined."""
         if not keyframes:
             return None
         matches = [match(features.descriptors, keyframe.descriptors, self.max_ratio) for keyframe in keyframes]
@@ -230,27 +233,27 @@ class Keyframes:
         return self._estimator.estimate(frame.camera, features.pixels[query], points_world, features.depth[query])
 
     def _separation(self, poses: Float64, T_world_camera: Float64) -> Float64:
-        """Return (K,) the distance of a pose from others (K, 4, 4); 1 = far enough for a new keyframe."""
+        """Return the separations (K,) of a pose from other poses (K, 4, 4); 1 = far enough for a new keyframe."""
         distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         cosine = (np.einsum("kij,ij->k", poses[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
         return np.asarray(distance / self.min_distance + np.arccos(np.clip(cosine, -1, 1)) / self.min_angle)
 
 
 class VisualWords:
-    """A fixed vocabulary, drawn with `seed`.
+    """A fixed random vocabulary with a `seed`.
 
-    A feature's word is the signs of its descriptor's scalar products with a few random vectors (locality-sensitive
-    hashing, Charikar 2002). Images are compared by tf-idf (Sivic and Zisserman 2003).
+    The word of a feature consists of the signs of its descriptor's scalar products with a few random vectors
+    (locality-sensitive hashing, Charikar 2002). Images are compared by tf-idf (Sivic and Zisserman 2003).
     """
 
     def __init__(self, seed: int) -> None:
-        # as many +1 as -1: each vector is orthogonal to the mean descriptor, and sums of bytes are exact
+        # equal numbers of +1 and -1: each vector is orthogonal to a constant vector, and sums of bytes are exact
         half = np.repeat(np.array([1, -1], np.float32), DESCRIPTOR_LENGTH // 2)
         rng = np.random.default_rng([seed, WORD_BITS])
         self._directions = np.ascontiguousarray(rng.permuted(np.tile(half, (WORD_BITS, 1)), axis=1).T)
 
     def bag(self, descriptors: UInt8) -> Float32:
-        """Return (2^WORD_BITS,) the square root of each word's count."""
+        """Return the square root (2^WORD_BITS,) of each word's count."""
         if len(descriptors) == 0:
             return np.zeros(1 << WORD_BITS, np.float32)
         signs = cv2.gemm(descriptors.astype(np.float32), self._directions, 1, None, 0) > 0
@@ -259,11 +262,11 @@ class VisualWords:
 
 
 def similarity(bag: Float32, bags: Float32) -> Float32:
-    """Return (K,) in [0, 1] the similarity of one bag of words to others (K, 2^WORD_BITS)."""
+    """Return the similarity (K,) in [0, 1] of one bag of words to other bags (K, 2^WORD_BITS)."""
     document_counts = np.count_nonzero(bags, axis=0)
     idf = np.log((1 + len(bags)) / (1 + document_counts)).astype(np.float32)
     if not idf.any():
-        idf[:] = 1  # of one or two images, all may show every word
+        idf[:] = 1  # one or two images may all contain every word
     weighted, query = bags * idf, bag * idf
     norms = np.linalg.norm(weighted, axis=1) * np.linalg.norm(query)
     return np.asarray((weighted * query).sum(axis=1) / np.maximum(norms, 1e-9), np.float32)
@@ -275,7 +278,7 @@ def write_keyframes(path: Path, keyframes: Mapping[str, Array]) -> None:
 
 
 def read_keyframes(path: Path) -> dict[str, Array]:
-    """Return what `write_keyframes` wrote, empty if there is no file. Raises DataError for an invalid file."""
+    """Return the arrays written by `write_keyframes`; empty without a file. Raises DataError for an invalid file."""
     if not is_there(path):
         return {}
     with faults_of(path):

@@ -11,13 +11,13 @@ from framework.data import Camera, Float32, SurfaceView, UInt8
 from framework.sensors.noise_models import GROWTH, LEAST, NEAR
 from framework.tracking.pyramid_kernels import compute_normals, find_distinct, halve, halve_mapped
 
-SAMPLED = 4  # px between the readings whose quantization is examined
-FEWEST_VALUES = 16  # distinct depths for an estimate of the quantization
-COARSE = 2.5  # standard deviations of a structured-light camera's depth, between neighboring values
+SAMPLED = 4  # stride of the depth readings for the quantization estimate, px
+FEWEST_VALUES = 16  # minimum number of distinct depths for the quantization estimate
+COARSE = 2.5  # largest fine step between depth values, standard deviations of a structured-light camera's depth
 
 
 def intrinsics(camera: Camera) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Return fx, fy, cx, cy, px, in single precision, for kernels."""
+    """Return fx, fy, cx, cy, px, in single precision for kernels."""
     return np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx), np.float32(camera.cy)
 
 
@@ -32,9 +32,9 @@ class PyramidLevel:
 
 
 def build_pyramid(camera: Camera, depth: Float32, color: UInt8, finest: float, levels: int) -> list[PyramidLevel]:
-    """Return the image at `finest` times its size and at levels - 1 halvings of that, finest first.
+    """Return the image at `finest` times its size and at levels - 1 further halvings, finest first.
 
-    `finest` is 1 or a power of 1/2. Intensities average all pixels, depths those of one surface.
+    `finest` is 1 or a power of 1/2. Intensities average all pixels. Depths average the pixels of one surface.
     """
     intensity = _intensity(color)
     pyramid: list[PyramidLevel] = []
@@ -53,10 +53,10 @@ def build_pyramid(camera: Camera, depth: Float32, color: UInt8, finest: float, l
 
 
 def is_coarse(depth: Float32, otherwise: bool) -> bool:
-    """Return whether depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as with 8 bits.
+    """Return True if depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as with 8 bits.
 
     Steps are gaps between the values in the nearer half, in standard deviations of a structured-light camera. A Kinect
-    has steps of 1.5 to 1.9 at any distance. `otherwise` is returned if too few values occur.
+    has steps of 1.5 to 1.9 at any distance. Returns `otherwise` if too few values occur.
     """
     values = _distinct(depth[::SAMPLED, ::SAMPLED])
     if len(values) < FEWEST_VALUES:
@@ -89,7 +89,7 @@ def _intensity(color: UInt8) -> Float32:
 
 
 def model_intensities(view: SurfaceView, levels: int) -> list[Float32]:
-    """Return the view's intensity in [0, 1] at its own resolution and halvings of it, -1 where nothing is mapped."""
+    """Return the view's intensity in [0, 1] at its own resolution and at halvings, -1 = unmapped."""
     intensity = _intensity(view.color)
     intensity[view.depth == 0] = -1
     pyramid = [intensity]

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-DEPTH_GAP = 0.05  # of the depth: readings farther apart are of different surfaces and are not averaged
-MIN_MAPPED = np.float32(2.0)  # mapped pixels among four, for their mean to be mapped
+DEPTH_GAP = 0.05  # minimum depth difference between surfaces, fraction of the depth; not averaged across
+MIN_MAPPED = np.float32(2.0)  # minimum number of mapped pixels among four for a mapped mean
 
 
 @njit(cache=True, nogil=True)
 def find_distinct(bits, table, found):
     """Write the distinct positive values of `bits` to `found` and return their count.
 
-    `table` (2^k,) is a hash table, filled with zeros, of more than twice the size of `bits`.
+    `table` (2^k,) is a hash table filled with zeros, more than twice as large as `bits`.
     """
     count = 0
     mask = np.uint64(table.shape[0] - 1)
@@ -32,7 +32,7 @@ def find_distinct(bits, table, found):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve(depth, intensity, half_depth, half_intensity):
-    """Average intensity over 2x2 pixels, and depth over those on the nearest surface."""
+    """Average intensity over 2x2 pixels, and depth over the pixels on the nearest surface."""
     for v in prange(half_depth.shape[0]):
         for u in range(half_depth.shape[1]):
             total = np.float32(0.0)
@@ -58,7 +58,7 @@ def halve(depth, intensity, half_depth, half_intensity):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def compute_normals(depth, intrinsics, normals):
-    """Set normals (3, H, W) from each pixel's four neighbors; 0 at the border and where a neighbor is off the surface.
+    """Set normals (3, H, W) from each pixel's four neighbors; 0 at the border or if a neighbor is off the surface.
 
     The loop over a row has no branches, so that the compiler vectorizes it.
     """
@@ -91,7 +91,7 @@ def compute_normals(depth, intrinsics, normals):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve_mapped(intensity, half):
-    """Average the mapped ones of 2x2 intensities, -1 = too few: a young map has many holes of one pixel."""
+    """Average the mapped intensities of 2x2 pixels, -1 = too few; a new map has many holes of one pixel."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for v in prange(half.shape[0]):
         for u in range(half.shape[1]):

@@ -33,11 +33,11 @@ from framework.interfaces import Detector
 class MaskRCNNDetector(Detector):
     """Mask R-CNN (He et al. 2017) with ResNet-50 or ResNet-101 and a feature pyramid, on the CPU or with CUDA.
 
-    The network is torchvision's or detectron2's, published for COCO and downloaded once, or one that was trained or
-    converted here. The class distribution of a detection is the box head's softmax, renormalized without the
-    background; its score is the probability of its class including the background. After suppression within a class,
-    `agnostic_nms_iou` removes duplicates across classes: an ambiguous object is returned once, with both classes in its
-    distribution. After construction, `weights` is the file, and `domain` the images that it is for.
+    The network is torchvision's or detectron2's published COCO network, downloaded once, or a network trained or
+    converted with this project. The class distribution of a detection is the box head's softmax, renormalized without
+    the background. Its score is the probability of its class, including the background. After suppression within a
+    class, `agnostic_nms_iou` removes duplicates across classes: an ambiguous object is returned once, with both classes
+    in its distribution. After construction, `weights` is the file and `domain` its image domain.
     """
 
     weights: Path = Path("resnet50_fpn_coco")  # published name, or file relative to the working or project folder
@@ -47,8 +47,8 @@ class MaskRCNNDetector(Detector):
     proposals_before_nms: int = 1000  # maximum number of anchors per pyramid level before suppression, >= 1
     proposals: int = 300  # maximum number of region proposals for the box head, >= 1; 1000 as published
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    short_side: int = 0  # short side of the resized image, px, >= 32; 0 = as in training
-    long_side: int = 0  # maximum long side of the resized image, px, >= short_side; 0 = as in training
+    short_side: int = 0  # short side of the resized image, px, >= 32; 0 = training size
+    long_side: int = 0  # maximum long side of the resized image, px, >= short_side; 0 = training proportion
     mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
     half_precision: bool = True  # half precision on CUDA; the CPU uses single precision
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
@@ -113,13 +113,13 @@ class MaskRCNNDetector(Detector):
         height, width = frame.camera.shape
         scale = min(self._short_side / min(height, width), self._long_side / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))
-        # averaging, because linear interpolation would skip pixels; neither shifts pixel centers
+        # area averaging for downscaling, because linear interpolation would skip pixels; neither shifts pixel centers
         resized = cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         image = torch.from_numpy(resized).to(self._device).permute(2, 0, 1)[None]
         return image.contiguous(memory_format=torch.channels_last)
 
     def _mask_grids(self, pyramid: list[Tensor], boxes: Float32, label: Int32) -> Float32:
-        """Return probabilities (N, 28, 28) of being inside the object, over its box."""
+        """Return the probabilities (N, 28, 28) that points of the box are inside the object."""
         logits = self._network.segment(pyramid, self._on_device(boxes))
         own = logits[torch.arange(len(label), device=self._device), self._on_device(label).long()]
         return self._finite(torch.sigmoid(own.float()))

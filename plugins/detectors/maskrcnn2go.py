@@ -1,4 +1,4 @@
-"""Mask R-CNN 2Go: a Mask R-CNN with COCO weights for video on a laptop's CPU."""
+"""Mask R-CNN 2Go with COCO weights, for video on a laptop CPU."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ from framework.files.search_paths import candidates
 from framework.interfaces import Detector
 from framework.vocabulary.label_spaces import COCO
 
-LARGEST_FILE = 2**26  # bytes; the published files have 3 MB
+LARGEST_FILE = 2**26  # maximum file size, bytes; the published files have 3 MB
 SHA256 = {
     "graph.json": "e2b06acc9c26fdd62292100ea2a5495f9fd1bd3607276916bdb8440562f401ef",
     "maskrcnn2go_coco_int8.npz": "a79197eba054bdf4e4b1136a3dffbfea951f442682464357d91b2a1abd0d21c9",
 }
 STRIDE = 16  # px of the resized image per cell of the feature map
-BINS = 6  # of RoIAlign, per side
-PRE_NMS_PROPOSALS = 3000  # best anchors that are decoded, as in the graph
-EXTENT = 1.0  # of its boxes; see framework.detection.masks.boxes
+BINS = 6  # bins of RoIAlign per side
+PRE_NMS_PROPOSALS = 3000  # number of decoded best anchors, as in the graph
+EXTENT = 1.0  # extent of the boxes; see framework.detection.masks.boxes
 
 log = logging.getLogger(__name__)
 
@@ -61,14 +61,14 @@ log = logging.getLogger(__name__)
 class MaskRCNN2Go(Detector):
     """Mask R-CNN 2Go (Facebook, Apache-2.0; COCO 2014 minival mask AP 20.9 as published), on the CPU or with CUDA.
 
-    On x86 CPUs with VNNI (since about 2020) the network computes in its 8-bit integers, in one thread per frame;
-    elsewhere in float with the same weights. The class distribution of a detection is the box head's softmax over 80
-    classes, renormalized without the background; its score is the probability of its class including the background.
-    After suppression within a class, `agnostic_nms_iou` removes duplicates across classes: an ambiguous object does not
-    start two map instances.
+    On x86 CPUs with VNNI (since about 2020) the network computes with 8-bit integers, in one thread per frame. On other
+    devices it computes in float with the same weights. The class distribution of a detection is the box head's softmax
+    over 80 classes, renormalized without the background. Its score is the probability of its class, including the
+    background. After suppression within a class, `agnostic_nms_iou` removes duplicates across classes, so that an
+    ambiguous object does not start two map instances.
     """
 
-    weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # relative to the working or project folder
+    weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # folder, relative to the working or project folder
     score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
     nms_iou: float = 0.3  # box IoU for suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
@@ -109,20 +109,20 @@ class MaskRCNN2Go(Detector):
         boxes = ("cls_score_int8", "bbox_pred_int8")
         self._backbone = network_between(graph, tensors, ("data_NHWC",), outputs, steps)
         self._box_head = network_between(graph, tensors, ("roi_features",), boxes, steps)
-        # always in float: rounding moves mask borders, which costs 0.03 of AP50 and saves 5 ms
+        # always in float: integers save 5 ms, but rounding moves mask borders and costs 0.03 of AP50
         self._mask_head = network_between(graph, tensors, ("_[mask]_pool5",), ("conv5_mask_v1_int8",))
         self._mask_logits = tensors["mask_fcn_logits_w_int8"][:, :, 0, 0], tensors["mask_fcn_logits_b_int8"]
         self._mask_upsampling = tensors["mask_fcn_logits_up_w_int8"], tensors["mask_fcn_logits_up_b_int8"]
 
     def fingerprint(self) -> str:
-        """Include the arithmetic, because integers and float give different digits."""
+        """Include the arithmetic, because integer and float results differ slightly."""
         return f"{fingerprint(self)} {'int8' if self._integers else 'float32'}"
 
     @torch.inference_mode()
     def detect(self, frame: Frame) -> Detections:
         with (
             one_torch_thread() if self._integers else nullcontext()
-        ):  # other threads build the map and process other frames
+        ):  # other threads build the map or process other frames
             return self._detect(frame)
 
     def _detect(self, frame: Frame) -> Detections:
@@ -161,7 +161,7 @@ class MaskRCNN2Go(Detector):
         return roi_align(features, torch.from_numpy(boxes).to(self._device), BINS, 1 / STRIDE)
 
     def _mask_grids(self, pooled: Tensor, label: Int32) -> Float32:
-        """Return probabilities (N, 24, 24) of being inside the object, over its box, from its own class's channel."""
+        """Return the probabilities (N, 24, 24) that points of the box are inside the object of its class."""
         (features,) = self._mask_head(pooled)
         own = torch.from_numpy(label).long().to(self._device)
         weight, bias = self._mask_logits
@@ -173,7 +173,7 @@ class MaskRCNN2Go(Detector):
 
 
 def _find_weights(folder: Path) -> Path:
-    """Return the network's folder; a relative path is searched in the working, then in the project folder."""
+    """Return the network's folder. A relative path is searched in the working folder, then in the project folder."""
     for candidate in candidates(folder):
         if candidate.is_dir():
             return candidate
@@ -182,7 +182,7 @@ def _find_weights(folder: Path) -> Path:
 
 
 def _read_network(folder: Path) -> tuple[list[Operator], dict[str, Tensor], dict[str, float]]:
-    """Return the operators in order, the tensors in float, and the quantization steps of the quantized ones."""
+    """Return the operators in order, the tensors in float, and the steps of the quantized tensors."""
     content = {name: _read_checked(folder / name, sha256) for name, sha256 in SHA256.items()}
     description = json.loads(content["graph.json"])
     quantization: Mapping[str, tuple[float, int]] = description["quant"]

@@ -11,7 +11,7 @@ from framework.vocabulary.label_spaces import COCO
 
 @dataclass
 class NoDetections(Detector):
-    """No detections, for a map of geometry only: measures the cost without instances."""
+    """Detector without detections, for a geometry-only map and for run times without instances."""
 
     def __post_init__(self) -> None:
         self.classes = COCO

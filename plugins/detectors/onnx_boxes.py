@@ -1,4 +1,4 @@
-"""A box detector (YOLO, SSD) from an ONNX file, with masks from depth."""
+"""Box detector (YOLO, SSD) from an ONNX file, with masks from depth."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ WHERE = "yolox_nano.onnx (3.7 MB, COCO, Apache-2.0) is at https://github.com/Meg
 
 @dataclass
 class OnnxBoxes(Detector):
-    """YOLO or SSD in the user's ONNX file, run by onnxruntime; masks come from depth.
+    """YOLO or SSD from an ONNX file, run by onnxruntime, with masks from depth.
 
-    The class distribution of a detection is its normalized class scores times the objectness; its score is the largest
-    of them before normalization. A mask is the connected foreground of its box, see
-    `framework.detection.masks.masks_from_boxes`; a box with too little depth is dropped and counted in
-    `boxes_without_depth`. The defaults are those of Megvii's YOLOX.
+    The class distribution of a detection is its class scores times the objectness, normalized. Its score is the largest
+    of these products before normalization. A mask is the connected foreground of its box, see
+    `framework.detection.masks.masks_from_boxes`. A box with too little depth is dropped and counted in
+    `boxes_without_depth`. The defaults match Megvii's YOLOX.
     """
 
     weights: Path = field(metadata={"where": WHERE})  # ONNX file, relative to the working or project folder
@@ -39,15 +39,15 @@ class OnnxBoxes(Detector):
     nms_iou: float = 0.45  # box IoU for suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
-    input_size: int = 0  # side of the input of a network with variable input size, px; 0 = the network's own
+    input_size: int = 0  # side of the input of a network with variable input size, px; 0 = size in the file
     placement: Placement = Placement.top_left  # position of the image in the input
     padding: int = 114  # gray value of the padding, in [0, 255]
     bgr: bool = True  # channel order: True = BGR, False = RGB
     black_level: float = 0.0  # input of the network for a channel value of 0
     white_level: float = 255.0  # input of the network for a channel value of 255; 1 for networks with inputs in 0..1
     min_foreground_fraction: float = 0.4  # minimum center-weighted fraction of readings in the foreground, in [0, 1]
-    max_slant: float = 85.0  # maximum angle of a surface to the image plane, degrees, in (0, 90)
-    min_readings: float = 0.1  # minimum fraction of the box's pixels with depth, in [0, 1]; others are dropped
+    max_slant: float = 85.0  # maximum angle between surface and image plane, degrees, in (0, 90); steeper = boundary
+    min_readings: float = 0.1  # minimum fraction of the box's pixels with depth, in [0, 1]; other boxes are dropped
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if onnxruntime supports it
     reads = ("color", "depth", "camera")
 
@@ -58,7 +58,7 @@ class OnnxBoxes(Detector):
         self._labels = read_labels(self.label_space)
         self._meaning = to_coco(self._labels)
         self.classes = self._meaning.classes
-        self.boxes_without_depth = 0  # since the detector was built
+        self.boxes_without_depth = 0  # number of boxes dropped since construction
         self._network = ImageNetwork(self)
         decode(self.layout, self._network.outputs_for_black(), self._network.shape, len(self._labels))
 
@@ -82,7 +82,7 @@ class OnnxBoxes(Detector):
         return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
 
     def _report_dropped(self, frame: Frame, found: Bool) -> None:
-        """Count and log dropped boxes: the first time as a warning, then for debugging."""
+        """Count and log dropped boxes, the first time as a warning and then at debug level."""
         missing = int((~found).sum())
         level = logging.DEBUG if self.boxes_without_depth else logging.WARNING
         self.boxes_without_depth += missing

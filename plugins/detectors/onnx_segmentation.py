@@ -1,4 +1,4 @@
-"""An instance segmentation network of the YOLO family in the user's ONNX file."""
+"""Instance segmentation network of the YOLO family from an ONNX file."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ log = logging.getLogger(__name__)
 class OnnxSegmentation(Detector):
     """YOLO-style instance segmentation: boxes, class scores, mask coefficients, prototypes; needs the extra `onnx`.
 
-    The outputs are (1, 4 + C + M, K) or its transpose, and (1, M, h, w) or (1, h, w, M): K candidates, each with a box,
-    C class scores and M coefficients of the prototypes. If suppression is part of the network (exports with `nms=True`,
-    networks without duplicates), the first output is (1, K, 6 + M), with x1 y1 x2 y2, score and label. Boxes are in px
-    of the input or in 0..1. The layout is detected from shapes and from the outputs for a black image, see
-    `framework.detection.segmentation_output`; ambiguous layouts are errors.
+    The network has K candidates, each with a box, C class scores and M coefficients of the prototypes. The outputs are
+    (1, 4 + C + M, K) or its transpose, and (1, M, h, w) or (1, h, w, M). If suppression is part of the network (exports
+    with `nms=True`, networks without duplicates), the first output is (1, K, 6 + M), with x1 y1 x2 y2, score and label.
+    Boxes are in px of the input or in 0..1. The layout is detected from shapes and from the outputs for a black image,
+    see `framework.detection.segmentation_output`. Ambiguous layouts are errors.
 
-    The class distribution of a detection is its normalized class scores; its score is the largest of them before
-    normalization. With suppression in the network the other scores are lost, and the other classes get equal parts of
-    `class_spread` * (1 - score): ambiguous objects contribute less to the map. The other defaults are those of
-    Ultralytics' exports, whose code and weights (AGPL) are not part of this project.
+    The class distribution of a detection is its normalized class scores. Its score is the largest class score before
+    normalization. Suppression in the network discards the other scores. Then the other classes get equal parts of
+    `class_spread` * (1 - score), so that ambiguous objects contribute less to the map. The other defaults match
+    Ultralytics' exports. Ultralytics' code and weights (AGPL) are not part of this project.
     """
 
     weights: Path  # ONNX file, relative to the working or project folder
@@ -40,13 +40,13 @@ class OnnxSegmentation(Detector):
     label_space: str = "coco"  # class names: a label space, or a text file with one name per line
     objectness: bool = False  # objectness before the class scores, as in YOLOv5
     box_format: BoxKind = BoxKind.AUTO  # box format; AUTO = detected
-    class_spread: float = 1.0  # fraction of 1 - score for other classes if suppression is in the network, in [0, 1]
+    class_spread: float = 1.0  # fraction of 1 - score for other classes after suppression in the network, in [0, 1]
     score_threshold: float = 0.1  # minimum score, in (0, 1); low, because weak detections can update instances
     nms_iou: float = 0.45  # box IoU for suppression within a class, in (0, 1]
     agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
     mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
-    input_size: int = 0  # side of the input of a network with variable input size, px; 0 = the network's own
+    input_size: int = 0  # side of the input of a network with variable input size, px; 0 = size in the file
     placement: Placement = Placement.center  # position of the image in the input
     padding: int = 114  # gray value of the padding, in [0, 255]
     bgr: bool = False  # channel order: True = BGR, False = RGB
@@ -95,10 +95,10 @@ class OnnxSegmentation(Detector):
         return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms_iou)
 
     def _log_classes(self) -> None:
-        """Log one-class outputs, and class names in the file that differ from `label_space`."""
+        """Log single-class outputs, and class names in the file that differ from `label_space`."""
         if self._layout.suppressed:
             log.info(
-                "detector.class_spread: %s reports one class per detection; the other classes get %g of the rest",
+                "detector.class_spread: %s reports one class per detection; the other classes get %g of 1 - score",
                 self.weights.name,
                 self.class_spread,
             )

@@ -1,4 +1,4 @@
-"""Objects named by text: boxes by OWLv2, masks by the SAM family or from depth."""
+"""Text-prompted detection with boxes from OWLv2, and masks from the SAM family or from depth."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ from framework.interfaces import Detector
 
 SOMETHING_ELSE = "something else"
 MOST_WORDS = 500
-SIGNIFICANCE, MAX_SLANT, MIN_READINGS = 0.4, 85.0, 0.1  # of masks from depth, as in onnx_boxes
+SIGNIFICANCE, MAX_SLANT, MIN_READINGS = 0.4, 85.0, 0.1  # parameters of masks from depth, as in onnx_boxes
 
 
 @dataclass
 class OpenVocabulary(Detector):
-    """Text-prompted detection with OWLv2's boxes and SAM's, SAM 2's or EdgeTAM's masks; needs the extra `transformers`.
+    """Text-prompted detection with boxes from OWLv2 and masks from SAM, SAM 2 or EdgeTAM; extra `transformers`.
 
-    The classes are the words as written, and `something else`. OWLv2 estimates an independent probability p for each
-    word. The distribution is proportional to the odds p / (1 - p), with the odds of the threshold for `something else`.
-    The score is the largest p. Words that are COCO names are evaluated as these classes; others are not evaluated.
+    The classes are the text queries as written, and `something else`. OWLv2 estimates an independent probability p for
+    each query. The distribution is proportional to the odds p / (1 - p), with the odds of the threshold for `something
+    else`. The score is the largest p. Queries that are COCO names are evaluated as these classes. Other queries are not
+    evaluated.
     """
 
-    text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct names of objects
+    text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct names of the objects
     model: str = "google/owlv2-base-patch16-ensemble"  # OWLv2 model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model id
     mask_model: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2, EdgeTAM: id or folder; "" = masks from depth
@@ -76,7 +77,7 @@ class OpenVocabulary(Detector):
 
 
 def word_distributions(probabilities: Float32, threshold: float) -> Float32:
-    """Return distributions (N, W + 1) over W words and `something else` from independent probabilities (N, W)."""
+    """Return the distributions (N, W + 1) over W queries and `something else` from independent probabilities (N, W)."""
     p = np.clip(probabilities.astype(np.float64), 1e-6, 1 - 1e-6)
     odds = np.hstack([p / (1 - p), np.full((len(p), 1), threshold / (1 - threshold))])
     return np.asarray(odds / odds.sum(axis=1, keepdims=True), np.float32)

@@ -1,4 +1,4 @@
-"""Detections of any other program, from files."""
+"""Detections of other programs from files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from framework.vocabulary.label_spaces import read_labels, to_coco
 
 log = logging.getLogger(__name__)
 
-FRAMES_IN_DOUBT = 30  # first frames without an entry until a warning
+FRAMES_IN_DOUBT = 30  # number of initial frames without an entry before a warning
 
 
 @dataclass
@@ -33,20 +33,20 @@ class Precomputed(Detector):
     """Detections in a COCO result file or a folder of masks, by frame number.
 
     `instancemap detect` and programs for COCO's evaluation write such files. A folder has NNNNNN.png with 16-bit
-    instance ids and NNNNNN.json with [{"id", "class", "score"}] for frame NNNNNN. Both may have `class_probabilities`
-    over their own labels. `label_spaces.yaml` maps labels to COCO names; detections whose best label has none are
-    dropped. A label with only a score s gets the probability 1 - class_spread * (1 - s), at least 1 / classes, and the
-    other classes get equal parts of the rest.
+    instance ids and NNNNNN.json with [{"id", "class", "score"}] for frame NNNNNN. Both formats may contain
+    `class_probabilities` over their own labels. `label_spaces.yaml` maps labels to COCO names. A detection is dropped
+    if its best label has no COCO name. A label with only a score s gets the probability 1 - class_spread * (1 - s), at
+    least 1 / classes. The other classes get equal parts of the rest.
 
-    A frame without an entry has no detections. Raises DataError, because the file belongs to another sequence, if none
-    of the frames up to its last one had an entry.
+    A frame without an entry has no detections. Raises DataError if no frame up to the last frame in the file had an
+    entry, because the file then belongs to another sequence.
     """
 
     path: Path  # COCO result file, or folder of masks
     label_space: str = "coco"  # label space of the file, or a text file with one name per line
     category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id
     score_threshold: float = 0.0  # minimum score of a detection, in [0, 1]
-    class_spread: float = 1.0  # fraction of 1 - score for other classes of detections with label and score only
+    class_spread: float = 1.0  # fraction of 1 - score for other classes of detections without distribution, in [0, 1]
 
     reads = ("index", "camera")
 
@@ -80,7 +80,7 @@ class Precomputed(Detector):
         self._asked: set[int] = set()
 
     def fingerprint(self) -> str:
-        """Include the labels, which may come from a file."""
+        """Include the labels, because they may come from a file."""
         return hashlib.sha256(repr((fingerprint(self), self._labels)).encode()).hexdigest()
 
     def detect(self, frame: Frame) -> Detections:
@@ -100,7 +100,10 @@ class Precomputed(Detector):
         )
 
     def _distributions(self, stored: Sequence[StoredDetection]) -> tuple[Float32, Bool]:
-        """Return (N, C) over COCO names, and (N,) whether the best label means one; set `classes`."""
+        """Return distributions (N, C) over COCO names, and an array (N,), True if the best label has a COCO name.
+
+        Sets `classes`.
+        """
         index = {name: k for k, name in enumerate(self._labels)}
         one_hot = np.eye(len(index), dtype=np.float32)
         given = np.stack([one_hot[index[one.label]] if one.probabilities is None else one.probabilities
@@ -110,7 +113,7 @@ class Precomputed(Detector):
         self.classes = mapping.classes
         rows, known = mapping.apply(given)
         if self.classes == self._labels:
-            rows = given  # normalizing could change the last digit
+            rows = given  # unchanged, because normalizing could change the last digit
         scores = np.array([one.score for one in stored])
         rows[only_label] = spread_rest(rows[only_label], scores[only_label], self.class_spread)
         return rows, known

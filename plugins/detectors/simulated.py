@@ -1,4 +1,4 @@
-"""A detector of adjustable quality: the ground truth, degraded by a seeded model of the errors of real detectors."""
+"""Detector of adjustable quality: ground truth degraded by a seeded model of the errors of real detectors."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ LOOKALIKES = (
 """COCO classes that detectors confuse indoors."""
 
 CLUTTER_CLASSES = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
-"""Classes of detections on things that have no COCO class."""
+"""Classes of detections on things without a COCO class."""
 
-LOOKALIKE_SHARE = 0.8  # fraction of the probability lost by the true class; the other classes get the rest
-EVEN_SHARE = 0.01  # weight of the model's mean in each distribution, which therefore has no zeros, like a softmax
-FALSE_SIZES = (24.0, 160.0)  # px, sides of false detections, log-uniform
-RECURRING_SIZES = (0.2, 1.2)  # m, sides of recurring false detections, log-uniform
-LARGEST_CLUTTER = 0.25  # fraction of the image; larger things, usually walls, are not detected as objects
-LARGEST_ATTACHED = 2.0  # ratio to the object's size; larger things are not detected as a part of it
+LOOKALIKE_SHARE = 0.8  # fraction of the probability lost by the ground-truth class; the other classes get the rest
+EVEN_SHARE = 0.01  # weight of the model's mean in each distribution, to avoid zeros as in a softmax
+FALSE_SIZES = (24.0, 160.0)  # range of the sides of false detections, px, log-uniform
+RECURRING_SIZES = (0.2, 1.2)  # range of the sides of recurring false detections, m, log-uniform
+LARGEST_CLUTTER = 0.25  # maximum size of things detected as objects, fraction of the image; walls are larger
+LARGEST_ATTACHED = 2.0  # maximum size of things detected as part of an object, times the object's size
 INTERVALS = {
     **dict.fromkeys(("clutter_rate", "attach_rate", "merge_rate", "miss_rate", "truncated_miss_rate"), "[0, 1]"),
     **dict.fromkeys(("split_rate", "confusion_consistency", "recurring_fraction"), "[0, 1]"),
@@ -52,11 +52,11 @@ INTERVALS = {
     "false_positives": f"[0, {MOST_DETECTIONS}]",
     "false_positive_score": "(0, 1)",
 }
-"""The bounds of the parameters."""
+"""Bounds of the parameters."""
 
 
 class Draw(IntEnum):
-    """The purpose of a random number, each with its own stream: changing one error does not change others' draws."""
+    """The purpose of a random number. Each purpose has its own stream, so that errors are independent of each other."""
 
     MERGE = 0
     MISS = 1
@@ -74,26 +74,32 @@ class Draw(IntEnum):
 
 @dataclass(frozen=True)
 class Candidate:
-    """An object or a part of one that becomes a detection."""
+    """An object, or a part of an object, that becomes a detection."""
 
     instance: int  # id in the ground truth; negative for a false detection
     part: int  # 0; 1 for the second half of a split object
     class_id: int
     mask: Bool  # (H, W)
-    true_mask: Bool  # (H, W) of the instance; empty for a false detection
+    true_mask: Bool  # (H, W) ground-truth mask of the instance; empty for a false detection
 
 
 @dataclass
 class SimulatedDetector(Detector):
-    """The ground truth with the errors of a mid-quality detector, each one a parameter; all at 0 = the ground truth.
+    """The ground truth with the errors of a mid-quality detector. Each error is a parameter; all 0 = ground truth.
 
-    In this order: things of unknown class are detected as objects (`clutter_rate`); an object includes a touching
-    thing, such as a sink its cupboard (`attach_rate`); touching objects share one mask (`merge_rate`); objects are
-    missed, more often if small (`small_side`) or cut by the image border, some nearly always and others never
-    (`miss_spread`); objects are split in two (`split_rate`); masks are shifted, bleed over the border, wobble along it
-    and are resampled on a coarse grid; the class becomes a distribution around a confusion kernel of similar classes,
-    often the same one for an object (`confusion_consistency`); the score follows mask quality and class certainty;
-    false detections appear, some repeatedly at the same locations (`recurring_fraction`, if poses are known).
+    The errors are applied in this order:
+
+    - Things of unknown class are detected as objects (`clutter_rate`).
+    - An object includes a touching thing, such as the cupboard of a sink (`attach_rate`).
+    - Touching objects share one mask (`merge_rate`).
+    - Objects are missed, more often if small (`small_side`) or cut by the image border. Some objects are missed nearly
+      always and others never (`miss_spread`).
+    - Objects are split in two (`split_rate`).
+    - Masks are shifted, bleed over the border, have a noisy border and are resampled on a coarse grid.
+    - The class becomes a distribution around a confusion kernel of similar classes, often with the same draw for an
+      object (`confusion_consistency`).
+    - The score follows mask quality and class certainty.
+    - False detections appear, some repeatedly at the same locations (`recurring_fraction`, if poses are known).
 
     Errors of an object or location do not average out over a video, as with real detectors. Every number is drawn from
     (seed, purpose, frame, instance), independent of the order of calls. Raises DataError without ground truth.
@@ -163,7 +169,7 @@ class SimulatedDetector(Detector):
         return np.random.default_rng([self.seed, int(draw), *(k & 0xFFFFFFFF for k in key)])
 
     def _clutter(self, things: Mapping[int, Bool]) -> list[Candidate]:
-        """Return the things of unknown class that are detected as objects, the same in all frames."""
+        """Return the things of unknown class detected as objects, equal in all frames."""
         candidates = []
         for instance, mask in things.items():
             random = self._random(Draw.CLUTTER, instance)
@@ -173,7 +179,7 @@ class SimulatedDetector(Detector):
         return candidates
 
     def _things(self, frame: Frame) -> dict[int, Bool]:
-        """Return the masks of at least `min_pixels` of things of unknown class, by id."""
+        """Return the masks of things of unknown class with at least `min_pixels`, by id."""
         assert frame.truth is not None
         names = frame.truth.class_names
         found, areas = np.unique(frame.truth.instance_ids, return_counts=True)
@@ -181,7 +187,7 @@ class SimulatedDetector(Detector):
         return {i: frame.truth.instance_ids == i for i in chosen}
 
     def _attached(self, truth: TrueInstances, things: Mapping[int, Bool], pairs: list[list[int]]) -> list[Candidate]:
-        """Return the instances, largest first, some of them with touching things."""
+        """Return the instances, largest first, some with attached touching things."""
         candidates = {
             i: Candidate(i, 0, c, mask, mask)
             for i, c, mask in zip(truth.ids.tolist(), truth.class_ids.tolist(), truth.masks, strict=True)
@@ -198,7 +204,7 @@ class SimulatedDetector(Detector):
         return list(candidates.values())
 
     def _merge(self, instances: list[Candidate], pairs: list[list[int]], frame: Frame) -> list[Candidate]:
-        """Return the instances with touching pairs merged into the larger one; each merges at most once."""
+        """Return the instances after merging touching pairs into the larger one; each instance merges at most once."""
         candidates = {candidate.instance: candidate for candidate in instances}
         rank = {i: k for k, i in enumerate(candidates)}  # 0 = the largest
         taken: set[int] = set()
@@ -241,7 +247,7 @@ class SimulatedDetector(Detector):
         return halves
 
     def _reshape(self, candidate: Candidate, frame: Frame) -> Candidate:
-        """Return the candidate with a mask as from a network: shifted, bleeding, wobbling, coarse."""
+        """Return the candidate with a network-like mask: shifted, bleeding, noisy and coarse."""
         if not candidate.mask.any():
             return candidate
         random = self._random(Draw.SHAPE, frame.index, candidate.instance, candidate.part)
@@ -249,7 +255,7 @@ class SimulatedDetector(Detector):
         x1, y1, x2, y2 = tight_boxes(candidate.mask[None])[0].astype(int)
         height, width = candidate.mask.shape
         inner = candidate.mask[y1 : y2 + 1, x1 : x2 + 1]
-        # objects continue outside the image, because otherwise masks would shrink away from its border
+        # objects continue outside the image; otherwise masks would shrink away from the image border
         top, bottom, left, right = (margin * (gap > 0) for gap in (y1, height - 1 - y2, x1, width - 1 - x2))
         crop = np.pad(inner.astype(np.uint8), ((top, bottom), (left, right)))
         rest = ((margin - top, margin - bottom), (margin - left, margin - right))
@@ -263,7 +269,7 @@ class SimulatedDetector(Detector):
         return replace(candidate, mask=self._coarsen(_placed(shape, x1 - margin, y1 - margin, (height, width))))
 
     def _coarsen(self, mask: Bool) -> Bool:
-        """Return the mask resampled on a grid of `mask_grid` cells per side over its box, as networks predict it."""
+        """Return the mask resampled on a grid of `mask_grid` cells per side over its box, like a network's mask."""
         if self.mask_grid == 0 or not mask.any():
             return mask
         x1, y1, x2, y2 = tight_boxes(mask[None])[0].astype(int)
@@ -273,7 +279,7 @@ class SimulatedDetector(Detector):
         return np.asarray(paste_masks(grid[None], borders, (mask.shape[0], mask.shape[1]))[0], np.bool_)
 
     def _false_positives(self, frame: Frame) -> list[Candidate]:
-        """Return ellipses with a wobbling border, of any class at any pixel, or of one class at a fixed location.
+        """Return ellipses with a noisy border, of any class at any pixel or of one class at a fixed location.
 
         Visible locations have the same order in all frames.
         """
@@ -300,7 +306,7 @@ class SimulatedDetector(Detector):
         return candidates
 
     def _classify(self, candidate: Candidate, frame: Frame) -> Float64:
-        """Return a distribution (C,) whose mean over frames and objects is the true class's row of the kernel."""
+        """Return a random distribution (C,). Its mean is the kernel's row of the ground-truth class."""
         mean = self._kernel[candidate.class_id]
         random = self._random(Draw.CLASS, frame.index, candidate.instance, candidate.part)
         if random.random() < self.confusion_consistency:
@@ -309,7 +315,7 @@ class SimulatedDetector(Detector):
         return np.asarray((1 - EVEN_SHARE) * drawn + EVEN_SHARE * mean, np.float64)
 
     def _score(self, candidate: Candidate, probabilities: Float64, frame: Frame) -> float:
-        """Return a Beta draw around the mask's IoU with its instance times the largest probability, scaled."""
+        """Return a Beta draw with the mean `score_scale` times mask IoU times largest class probability."""
         mean = self.false_positive_score
         if candidate.true_mask.any():
             union = np.count_nonzero(candidate.mask | candidate.true_mask)
@@ -322,7 +328,7 @@ class SimulatedDetector(Detector):
 
 
 def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
-    """Return (C, C): row t is the mean distribution of an object of class t, with 1 - `confusion` on t itself."""
+    """Return the kernel (C, C). Row t is the mean distribution of class t, with 1 - `confusion` on t itself."""
     index = {name: k for k, name in enumerate(classes)}
     alike = np.zeros((len(classes), len(classes)), np.bool_)
     for group in LOOKALIKES:
@@ -337,21 +343,21 @@ def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
 
 
 def touching_pairs(frame: Frame) -> Int32:
-    """Return the pairs (M, 2) of instance ids, smaller id first, that share a border without a depth step."""
+    """Return the pairs (M, 2) of instance ids with a common border without a depth step, smaller id first."""
     assert frame.truth is not None
     return np.asarray(np.unique(contacts(frame.truth.instance_ids, frame.depth), axis=0), np.int32)
 
 
 def signed_distance(mask: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> Float32:
-    """Return distances (H, W) px of pixel centers to the border of a mask (H, W) of 0 and 1, positive inside."""
+    """Return the distances (H, W) px of pixel centers to the border of a mask (H, W) of 0 and 1, positive inside."""
     inside = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(np.where(mask > 0, inside - 0.5, 0.5 - outside), np.float32)
 
 
 def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: float) -> Float32:
-    """Return Gaussian noise (H, W) of zero mean, unit variance and correlation length `scale` px."""
-    sigma, margin = 2.0, 6  # cells of a coarse grid, where blurring is fast
+    """Return Gaussian noise (H, W) with zero mean, unit variance and a correlation length of `scale` px."""
+    sigma, margin = 2.0, 6  # cells of a coarse grid, for fast blurring
     rows, columns = (int(np.ceil(side * sigma / scale)) + 2 for side in shape)
     white = random.standard_normal((rows + 2 * margin, columns + 2 * margin)).astype(np.float32)
     blurred = cv2.GaussianBlur(white, (2 * margin + 1, 2 * margin + 1), sigma)
@@ -362,15 +368,15 @@ def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: flo
 
 
 def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
-    """Return a Dirichlet draw (C,); with a single positive alpha that class is certain."""
+    """Return a Dirichlet draw (C,); a single positive alpha makes its class certain."""
     weights = random.gamma(alpha)
     return np.asarray(weights / weights.sum(), np.float64) if weights.sum() > 0 else alpha / alpha.sum()
 
 
 def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
-    """Return the mask (H, W) of an ellipse at (x, y), half axes a, b (px), shrunk by `wobble` (H, W) radii."""
+    """Return the mask (H, W) of an ellipse at (x, y) with half axes a, b (px), shrunk by `wobble` (H, W) radii."""
     mask = np.zeros(wobble.shape, np.bool_)
-    reach = max(0.0, 1.0 - float(wobble.min()))  # radii, at most
+    reach = max(0.0, 1.0 - float(wobble.min()))  # maximum radius, in radii
     window = tuple(
         slice(max(0, int(middle - half * reach)), max(0, int(middle + half * reach) + 2))
         for middle, half in ((y, b), (x, a))
@@ -382,7 +388,7 @@ def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
 
 
 def _placed(crop: Bool, x: int, y: int, shape: tuple[int, int]) -> Bool:
-    """Return an empty mask (H, W) with `crop` at (x, y), which may be outside."""
+    """Return an empty mask (H, W) with `crop` at (x, y), possibly outside."""
     image = np.zeros(shape, np.bool_)
     height, width = shape
     top, left = max(0, -y), max(0, -x)

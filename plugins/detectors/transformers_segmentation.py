@@ -1,4 +1,4 @@
-"""Networks of Hugging Face transformers that predict a mask and a class distribution for each of a set of queries."""
+"""Query-based segmentation networks of Hugging Face transformers, with a mask and a class distribution per query."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from framework.files.json_file import read_json
 from framework.interfaces import Detector
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
 
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # if a file has none
-RESAMPLING = {2: "bilinear", 3: "bicubic"}  # Pillow's numbers
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # defaults for files without values
+RESAMPLING = {2: "bilinear", 3: "bicubic"}  # by Pillow's constants
 PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # name of an unnamed class or unused number
 
 
@@ -33,11 +33,11 @@ PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # name of an unnamed 
 class Family:
     """The conventions of a family of architectures."""
 
-    auto_class: str  # of transformers
-    logits: str  # the output with the classes' logits, (1, Q, C or C + 1)
-    masks: str  # the output with the masks' logits, (1, Q, h, w)
+    auto_class: str  # auto class of transformers
+    logits: str  # output with the class logits, (1, Q, C or C + 1)
+    masks: str  # output with the mask logits, (1, Q, h, w)
     any_size: bool  # support for images of any size
-    mask_quality: bool  # multiplication of the score by the mean probability of the mask's pixels, as published
+    mask_quality: bool  # True = the score is multiplied by the mean probability of the mask's pixels, as published
 
 
 UNIVERSAL, INSTANCE = "AutoModelForUniversalSegmentation", "AutoModelForInstanceSegmentation"
@@ -51,7 +51,7 @@ FAMILIES = {
     "detr": Family(UNIVERSAL, "logits", "pred_masks", any_size=True, mask_quality=False),
     "rf_detr": Family(INSTANCE, "logits", "pred_masks", any_size=False, mask_quality=False),
 }
-"""By the `model_type` in a model's config.json."""
+"""Families by the `model_type` in a model's config.json."""
 
 
 @dataclass
@@ -59,22 +59,22 @@ class TransformersSegmentation(Detector):
     """Mask2Former, MaskFormer, EoMT, RF-DETR-Seg or DETR by model id or local folder; needs the extra `transformers`.
 
     A model id that is not in the cache of huggingface_hub is downloaded, unless HF_HUB_OFFLINE=1. Use checkpoints for
-    instance or panoptic segmentation: semantic ones have one mask for all chairs of an image. Labels are mapped to COCO
-    names (framework/vocabulary/label_spaces.yaml); detections of other labels, such as walls, are dropped.
+    instance or panoptic segmentation. Semantic checkpoints have one mask for all chairs of an image. Labels are mapped
+    to COCO names (framework/vocabulary/label_spaces.yaml). Detections of other labels, such as walls, are dropped.
 
     The class distribution of a detection is the softmax over the labels' logits without no-object. For a softmax head,
-    that is its distribution given an object; for independent sigmoids p_c, it is their distribution given that exactly
-    one label is true: P(c) ~ p_c prod_{j != c} (1 - p_j) ~ p_c / (1 - p_c) = exp(logit_c). The score is the probability
-    of the best label, for softmaxes including no-object; the MaskFormers and EoMT multiply it by the mean probability
-    of the mask's pixels, as published.
+    it is the distribution given an object. For independent sigmoids p_c, it is the distribution given that exactly one
+    label is true: P(c) ~ p_c prod_{j != c} (1 - p_j) ~ p_c / (1 - p_c) = exp(logit_c). The score is the probability of
+    the best label, including no-object for a softmax head. MaskFormer, Mask2Former and EoMT multiply the score by the
+    mean probability of the mask's pixels, as published.
     """
 
-    model: str = "facebook/mask2former-swin-tiny-coco-instance"  # model id on huggingface.co, or a folder
+    model: str = "facebook/mask2former-swin-tiny-coco-instance"  # model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model id
     score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
     agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
-    max_detections: int = 100  # maximum number of detections per image, >= 1: the queries with the best class
-    short_side: int = 0  # short side of the resized image, px; 0 = as published
+    max_detections: int = 100  # maximum number of detections per image, >= 1
+    short_side: int = 0  # short side of the resized image, px, >= 32; 0 = as published
     long_side: int = 0  # maximum long side of the resized image, px, >= short_side; 0 if short_side is 0
     mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
     half_precision: bool = True  # half precision on CUDA; the CPU uses single precision
@@ -139,9 +139,10 @@ class TransformersSegmentation(Detector):
 
 
 def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]:
-    """Return distributions over the labels (Q, C), and the probability (Q,) of the best label.
+    """Return the distributions (Q, C) over the labels, and the probability (Q,) of the best label.
 
-    logits (Q, K). K = C + 1: softmaxes, the last for no-object. K = C: independent sigmoids. See the detector.
+    The logits are (Q, K). K = C + 1 means a softmax with no-object as the last label. K = C means independent sigmoids.
+    See the detector.
     """
     if logits.shape[1] not in (labels, labels + 1):
         raise DataError(f"detector.model: expected {labels} class logits (as in config.json), got {logits.shape[1]}")
@@ -157,9 +158,10 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
 
 
 def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int, int]) -> Tensor:
-    """Interpolate mask logits (N, h, w) over the network's input at the pixels of an image of `shape`: (N, H, W).
+    """Return the mask logits (N, H, W) at the pixels of an image of `shape`, interpolated from (N, h, w).
 
-    `covered`: fractions of the input's height and width that the image takes from the upper left; the rest is padding.
+    `covered` holds the fractions of the input's height and width covered by the image, from the upper left. The rest is
+    padding.
     """
     axes = [
         (torch.arange(size, device=grids.device, dtype=torch.float32) + 0.5) * (2 * share / size) - 1
@@ -178,17 +180,17 @@ def mean_probability(mask_logits: Tensor, inside: Tensor) -> Float32:
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Preparation of an image as in the model's preprocessor_config.json.
+    """Preprocessing of an image by the model's preprocessor_config.json.
 
-    Not by transformers' image processors, which require torchvision.
+    It replaces transformers' image processors, because they require torchvision.
     """
 
     size: Mapping[str, int] | None  # as in the file; None = original size
-    divisor: int  # sides are rounded up to a multiple
-    pad_to: tuple[int, int] | None  # (height, width), with black right and below
-    mode: str  # of resampling
-    factor: float  # multiplies 0..255
-    mean: tuple[float, ...]  # RGB, after multiplication
+    divisor: int  # divisor of the sides, which are rounded up
+    pad_to: tuple[int, int] | None  # padded (height, width), black on the right and below
+    mode: str  # interpolation mode
+    factor: float  # factor of the values 0..255
+    mean: tuple[float, ...]  # mean, RGB, after the factor
     std: tuple[float, ...]
 
     @classmethod
@@ -196,15 +198,15 @@ class Preprocessing:
         """Parse the file `where`. Raises DataError for missing or unsupported settings."""
         if content.get("do_split_image"):
             raise DataError(
-                f"{where}: expected an instance model, got one that splits images for semantic segmentation; "
+                f"{where}: expected an instance model, got a model that splits images for semantic segmentation; "
                 "choose another model"
             )
         if content.get("pad_size"):
-            raise DataError(f"{where}: pad_size: expected none, got {content['pad_size']}")
+            raise DataError(f"{where}: pad_size: expected no value, got {content['pad_size']}")
         if content.get("resample", 2) not in RESAMPLING:
             raise DataError(f"{where}: resample: expected one of {[*RESAMPLING]}, got {content['resample']}")
         size = content.get("size") if content.get("do_resize", True) else None
-        if isinstance(size, int):  # as in files before 2023
+        if isinstance(size, int):  # files before 2023
             size = {"shortest_edge": size, "longest_edge": content.get("max_size", size)}
         keys = {key for key, value in (size or {}).items() if value}
         known = ({"shortest_edge", "longest_edge"}, {"max_height", "max_width"}, {"height", "width"})
@@ -238,7 +240,7 @@ class Preprocessing:
         return -(-height // self.divisor) * self.divisor, -(-width // self.divisor) * self.divisor
 
     def __call__(self, color: UInt8, device: torch.device) -> tuple[Tensor, tuple[float, float]]:
-        """Return the input (1, 3, H, W) of an image (h, w, 3), and the fractions of H and W that the image covers."""
+        """Return the input (1, 3, H, W) of an image (h, w, 3), and the fractions of H and W covered by the image."""
         pixels = torch.from_numpy(color).to(device).permute(2, 0, 1)[None].float()
         height, width = self.resized((color.shape[0], color.shape[1]))
         if (height, width) != color.shape[:2]:
@@ -254,7 +256,7 @@ class Preprocessing:
 
 
 def _with_short_side(shape: tuple[int, int], short: int, long: int) -> tuple[int, int]:
-    """Return the shape for these sides with the aspect kept, rounded as in DETR's transforms and thus in training."""
+    """Return the aspect-preserving shape for these sides, rounded as in DETR's transforms and in training."""
     smaller, larger = min(shape), max(shape)
     exact: float = short
     if larger / smaller * short > long:
@@ -265,7 +267,7 @@ def _with_short_side(shape: tuple[int, int], short: int, long: int) -> tuple[int
 
 
 class Checkpoint:
-    """A model on huggingface.co or in a folder; code in the model is never run."""
+    """A model on huggingface.co or in a folder. Code in the model is never run."""
 
     def __init__(self, model: str, revision: str) -> None:
         transformers = imported_transformers()
@@ -281,7 +283,7 @@ class Checkpoint:
         """The names of the model's classes; unnamed classes are NO_CLASS."""
         named = {k: name for k, name in self.config.id2label.items() if not PLACEHOLDER.fullmatch(name)}
         names = [named.get(k, NO_CLASS) for k in range(max(self.config.id2label) + 1)]
-        # RF-DETRs trained on COCO use its annotation ids; their configs have no names, or COCO's without the gaps
+        # RF-DETRs trained on COCO use its annotation ids; their configs have no names, or COCO's names without gaps
         known = {name.lower() for name in names} - {NO_CLASS}
         if self.config.model_type == "rf_detr" and len(names) == len(COCO_BY_ID) and known in (set(COCO), set()):
             return COCO_BY_ID
@@ -296,7 +298,7 @@ class Checkpoint:
         network, loading = read_part(
             "detector.model", self.folder, "the weights", self._auto_class, output_loading_info=True
         )
-        # transformers only warns, and initializes them randomly
+        # transformers only warns, and initializes missing weights randomly
         missing = sorted(set(loading["missing_keys"]) & {name for name, _ in network.named_parameters()})
         if missing:
             raise DataError(

@@ -1,4 +1,4 @@
-"""Any detector with image embeddings of its detections, for text queries."""
+"""Wrapper that adds image embeddings to the detections of any detector, for text queries."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from framework.interfaces import Detector
 
 @dataclass
 class WithEmbeddings(Detector):
-    """Detections of another detector with image embeddings of a CLIP or SigLIP; needs the extra `transformers`."""
+    """Detections of another detector with image embeddings of CLIP or SigLIP; needs the extra `transformers`."""
 
     detector: Detector  # wrapped detector; replace it with detector@detector.detector=NAME
-    model: str = "google/siglip2-base-patch16-224"  # model: id on huggingface.co or folder
+    model: str = "google/siglip2-base-patch16-224"  # CLIP or SigLIP model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model id
     frame_interval: int = 1  # interval between embedded frames, frames, >= 1; 1 = every frame
-    min_score: float = 0.3  # minimum score of an embedded detection, in [0, 1]; weaker ones are wrong too often
+    min_score: float = 0.3  # minimum score of an embedded detection, in [0, 1]; weaker detections are wrong too often
     min_pixels: int = 200  # minimum mask size of an embedded detection, px, >= 1
     context: float = 1.2  # side of the square crop over the longer side of the object's box, >= 1
     background_contrast: float = 0.4  # contrast of the background in the crop, in [0, 1]; 0 = gray, 1 = unchanged
-    batch_size: int = 16  # crops per batch, >= 1
+    batch_size: int = 16  # number of crops per batch, >= 1
     half_precision: bool = True  # half precision on CUDA; the CPU uses single precision
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 

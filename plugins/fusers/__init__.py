@@ -1,1 +1,1 @@
-"""Map fusers: associate clusters with instances and integrate the frame."""
+"""Map fusers, which associate clusters with instances and integrate the frame."""

@@ -15,16 +15,16 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.label_rule import DetectionEvidence, LabeledVoxels, LabelRule, floored_log
 
 RULE = LabelRule(Combine.SUM, logarithmic=True)
-LEAST_LIKELIHOOD = 1e-3  # of an instance: no single score decides
+LEAST_LIKELIHOOD = 1e-3  # minimum likelihood of an instance, so that no single score decides
 
 
 @dataclass
 class BayesianTsdf(MapFuser):
     """Two independent Bayesian recursions per voxel, eqs. (7) and (8), as sums of log-likelihoods.
 
-    The likelihood of the matched instance in eq. (8) is the score of the detection (our reading). The paper does not
-    state that of other instances: it is `instance_floor`, or with `instance_floor=0` the rest of the score divided
-    equally among all other instances and none.
+    The likelihood of the matched instance in eq. (8) is the score of the detection (our interpretation). The paper does
+    not state the likelihood of other instances. Here it is `instance_floor`. With `instance_floor=0` it is 1 - score,
+    divided equally among all other instances and no instance.
     """
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
@@ -55,12 +55,12 @@ class BayesianTsdf(MapFuser):
             self.association.merge(self.scene, matches)
 
     def evidence(self, clusters: PointClusters, instances: int) -> DetectionEvidence:
-        """Return log P(O_u | I_t) of eqs. (7) and (8), of the matched instance relative to any other of `instances`."""
-        if self.instance_floor > 0:  # the score counts at least twice the floor, so that no detection opposes itself
+        """Return log P(O_u | I_t) of eqs. (7) and (8), for the matched instance relative to any other instance."""
+        if self.instance_floor > 0:  # the score counts at least twice the floor: no evidence against its match
             log_odds = np.log(np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor)
         else:
             scores = np.clip(clusters.scores, LEAST_LIKELIHOOD, 1 - LEAST_LIKELIHOOD)
-            log_odds = np.log(scores * max(instances, 1) / (1 - scores))  # the other instances - 1, and none
+            log_odds = np.log(scores * max(instances, 1) / (1 - scores))  # the other instances - 1, and no instance
         return DetectionEvidence(
             instances=np.asarray(log_odds, np.float32),
             classes=floored_log(clusters.class_probabilities, self.class_floor),

@@ -1,4 +1,4 @@
-"""The class-only baseline: class fusion after SemanticFusion, with connected components as instances."""
+"""Class-only baseline: class fusion after SemanticFusion, with connected components as instances."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 class ClassOnlyFusion(MapFuser):
     """Class fusion in voxels, with distributions over classes and background and without data association.
 
-    After SemanticFusion (McCormac et al. 2017) and Pham et al. (WACV 2019), which label every pixel; here distributions
-    come from masks. A pixel has the distribution of the mask with the best score over it, in which the background has
-    the probability that the detector gave to no class. A pixel under no mask is background, unless the detector missed
-    an object. Two touching objects of one class are one instance. Both systems regularize with a CRF; `smoothness` is a
-    Potts model over the mesh, off by default because it did not improve AP50.
+    After SemanticFusion (McCormac et al. 2017) and Pham et al. (WACV 2019). These systems label every pixel; here
+    distributions come from masks. A pixel has the distribution of the mask with the best score over it. In this
+    distribution the background has the probability that the detector assigned to no class. A pixel under no mask is
+    background, unless the detector missed an object. Two touching objects of one class are one instance. Both systems
+    regularize with a CRF. `smoothness` is a Potts model over the mesh, off by default because it did not improve AP50.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
@@ -50,10 +50,10 @@ class ClassOnlyFusion(MapFuser):
             self.scene.labels.update(seen, masks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
-        """Return (N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, for eq. [7], with a floor.
+        """Return log P(O_u = c) / P(O_u = background) (N, C) of a pixel under each mask, for eq. [7], with a floor.
 
-        A score is the probability of the best class, but the distribution excludes the background: their ratio is the
-        probability of all classes together.
+        A score is the probability of the best class, but the distribution excludes the background. So the score divided
+        by the best class's entry is the probability of all classes together.
         """
         p = clusters.class_probabilities.astype(np.float64)
         objects = np.minimum(clusters.scores[:, None] / p.max(axis=1, keepdims=True, initial=1e-6), 1.0)

@@ -1,4 +1,4 @@
-"""Label rules without a distribution: each detection votes for its instance and its best class."""
+"""Label rules without distributions: each detection votes for its instance and its best class."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_f
 
 
 class Vote(Enum):
-    """How a voxel combines the votes for its labels."""
+    """Rule for combining the votes for a voxel's labels."""
 
     COUNT = "count"  # number of detections (Voxblox++, Grinvald et al. 2019)
-    LAST = "last"  # the last detection only; where masks overlap, the later one
-    MAX_SCORE = "max_score"  # the detection with the highest score
+    LAST = "last"  # last detection only; for overlapping masks, the later mask
+    MAX_SCORE = "max_score"  # detection with the highest score
 
 
 RULES = {
@@ -53,7 +53,7 @@ class LabelVote(MapFuser):
         with timer("update"):
             weights = np.ones(len(clusters), np.float32)
             if self.vote is Vote.MAX_SCORE:
-                weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # 0 is no evidence
+                weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # a score of 0 would be no evidence
             evidence = vote_for_best(clusters, weights)
             measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULES[self.vote])
             self.scene.labels.update(seen, measurement)

@@ -1,4 +1,4 @@
-"""The baseline with one volume per object, after Fusion++ and MaskFusion."""
+"""Baseline with one volume per object, after Fusion++ and MaskFusion."""
 
 from __future__ import annotations
 
@@ -19,26 +19,27 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 
 def existence(record: InstanceRecord) -> float:
-    """Return the existence probability of Fusion++: the mean of Beta(1 + frames detected, 1 + other frames in view)."""
+    """Return Fusion++'s existence probability, the mean of Beta(1 + frames detected, 1 + other frames in view)."""
     return (1 + record.observations) / (2 + max(record.visible, record.observations))
 
 
 @dataclass
 class ObjectVolumes(MapFuser):
-    """A TSDF with foreground probabilities for each object, and one of the whole scene.
+    """A TSDF with foreground probabilities for each object, and a TSDF of the whole scene.
 
-    A detection belongs to the object with the largest overlap; several may belong to one, with the union of their
-    masks. The defaults are the rule of Fusion++; that of MaskFusion is `overlap_rule=CLUSTER min_overlap=0.05
-    require_same_class=true`. `framework/baselines/object_map.py` lists differences from the original systems.
+    A detection belongs to the object with the largest overlap. Several detections may belong to one object, with the
+    union of their masks. The defaults are the rule of Fusion++. Set `overlap_rule=CLUSTER min_overlap=0.05
+    require_same_class=true` for the rule of MaskFusion. `framework/baselines/object_map.py` lists differences from the
+    original systems.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     min_overlap: float = 0.2  # minimum overlap of a detection and an object to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.IOU  # denominator of the overlap
-    require_same_class: bool = False  # restriction of matches to the same most likely class
-    create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; any score can update one
-    create_points: int = 50  # minimum size of a detection to create an object, px, >= 1; also of one in view
-    min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; others are removed
+    require_same_class: bool = False  # restriction of matches to the same most likely class, as in MaskFusion
+    create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; updates have no minimum
+    create_points: int = 50  # minimum size of a detection to create an object, px, >= 1; also of an object in view
+    min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; other objects are removed
     min_observations: int = 3  # minimum number of frames with a detection of a confirmed object, >= 1
     min_area: float = 0.01  # minimum surface area of a confirmed object in the mesh, m^2, >= 0
 
@@ -75,7 +76,7 @@ class ObjectVolumes(MapFuser):
         return count_overlaps(points, seen, stride)
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
-        """Match each cluster with the object of the largest overlap, or create one if its score and size suffice."""
+        """Match each cluster with the object of largest overlap, or create an object if score and size suffice."""
         ratios = overlaps.by(self.overlap_rule, self.create_points)
         ratios[~self._agree(clusters, overlaps.instance_ids)] = 0
         instance_ids = np.zeros(len(clusters), np.int32)
@@ -88,14 +89,14 @@ class ObjectVolumes(MapFuser):
         return Matches(frame.index, clusters, overlaps, instance_ids)
 
     def _agree(self, clusters: PointClusters, instance_ids: Int32) -> Bool:
-        """Return (N, M) whether the classes of a cluster and an object allow a match."""
+        """Return an array (N, M), True if the classes of a cluster and an object allow a match."""
         if not self.require_same_class or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.array([self.scene.table.records[k].class_evidence.argmax() for k in instance_ids.tolist()])
         return np.asarray(clusters.class_probabilities.argmax(axis=1)[:, None] == known[None, :])
 
     def _remove_empty(self, instance_ids: Int32) -> None:
-        """Remove new objects without readings in range: without voxels, they are never seen again."""
+        """Remove new objects without readings in range, because objects without voxels are never seen again."""
         for instance_id in set(instance_ids[instance_ids > 0].tolist()):
             if not self.scene.volumes[instance_id].block_count:
                 self.scene.remove(instance_id)
@@ -109,7 +110,7 @@ class ObjectVolumes(MapFuser):
 
 
 def _masks(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> dict[int, Bool]:
-    """Return the union (H, W) of the clusters' masks of each object, by id."""
+    """Return the union (H, W) of the cluster masks of each object, by id."""
     masks: dict[int, Bool] = {}
     for k in np.flatnonzero(instance_ids):
         u, v = clusters.pixels[clusters.cluster == k].T

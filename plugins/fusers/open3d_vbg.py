@@ -1,4 +1,4 @@
-"""The off-the-shelf baseline: Open3D's VoxelBlockGrid with one vote counter per voxel."""
+"""Off-the-shelf baseline: Open3D's VoxelBlockGrid with one vote counter per voxel."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 @dataclass
 class Open3DVoxelBlockGrid(MapFuser):
-    """Open3D's TSDF. The majority of frames labels a voxel; classes of an instance are the product over detections."""
+    """Open3D's TSDF with a majority label per voxel. The classes of an instance are a product over detections."""
 
     tsdf: Tsdf = field(default_factory=Tsdf)
     association: Association = field(default_factory=Association)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    block_resolution: int = 8  # side of a block, voxels, in [2, 64]; 16, Open3D's default, doubles the voxels
+    block_resolution: int = 8  # side of a block, voxels, in [2, 64]; Open3D's default of 16 doubles the voxel count
     max_blocks: int = 200_000  # maximum number of blocks, > 0; 14 KiB each, up to 5.7 GB when Open3D copies the map
     min_weight: float = 1.0  # minimum number of observations of a surface voxel, >= 1; Open3D's default is 3
     class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
@@ -63,7 +63,7 @@ class Open3DVoxelBlockGrid(MapFuser):
 
 
 def _paint(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> Int32:
-    """Return the instance (H, W) at each pixel, 0 = none; where clusters overlap, that of the best score."""
+    """Return the instance (H, W) at each pixel, 0 = none; overlaps go to the cluster with the best score."""
     image = np.zeros(shape, np.int32)
     for k in np.argsort(clusters.scores, kind="stable"):
         if instance_ids[k]:

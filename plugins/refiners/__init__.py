@@ -1,1 +1,1 @@
-"""Cluster refiners: clean the point clusters of one frame."""
+"""Cluster refiners, which clean the point clusters of one frame."""

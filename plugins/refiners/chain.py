@@ -1,4 +1,4 @@
-"""A sequence of refiners."""
+"""Chain of refiners."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Chain(ClusterRefiner):
     `refiner.links.gmm_em=null` removes a link, `refiner@refiner.links.gmm_em=kmeans` replaces it.
     """
 
-    links: Mapping[str, ClusterRefiner]  # refiners by name, at least one
+    links: Mapping[str, ClusterRefiner]  # refiners by name, in order, at least one
 
     def __post_init__(self) -> None:
         if not self.links:

@@ -1,4 +1,4 @@
-"""Cluster refinement by connectivity: a large step in depth separates objects."""
+"""Cluster refinement by connectivity. A large depth step separates objects."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class Connected(ClusterRefiner):
-    """Selection of the largest 3D-connected piece of each cluster, and of pieces at a similar depth.
+    """Selection of the largest 3D-connected component of each cluster, and of components at a similar depth.
 
-    Pieces are those of `largest_component`. A piece is similar if most of its points differ in depth from the nearest
-    kept point by at most the gap plus `max_depth_slope` times the distance across. This removes what is behind an
-    object, such as the carpet between a chair's slats, and keeps parts that occlusion or missing readings separate.
-    All points vote: with the nearest quarter alone, leaves of a plant get lost.
+    Connected components are defined as in `largest_component`. A component is kept if most of its points agree in depth
+    with the nearest kept point. The allowed difference is the gap plus `max_depth_slope` times the lateral distance.
+    This removes background, such as the carpet between a chair's slats. It keeps object parts that are separated by
+    occlusion or missing readings. All points vote, because a vote of the nearest quarter loses leaves of a plant.
     """
 
     max_gap: float = 0.1  # maximum depth step between connected pixels at depth 0, m, >= 0
     gap_per_depth: float = 0.02  # increase of the maximum depth step with depth, m per m, >= 0
-    connection_radius: int = 2  # maximum distance of connected pixels, px, >= 1; 2 bridges single missing readings
-    min_piece_ratio: float = 0.05  # minimum size relative to the largest piece, in [0, 1]; smaller pieces are dropped
-    max_depth_slope: float = 2.0  # maximum depth difference over distance across of two pieces, m per m, >= 0
+    connection_radius: int = 2  # maximum distance between connected pixels, px, >= 1; 2 bridges single missing readings
+    min_piece_ratio: float = 0.05  # minimum size relative to the largest component, in [0, 1]; smaller ones are dropped
+    max_depth_slope: float = 2.0  # maximum depth difference over lateral distance of two components, m per m, >= 0
 
     def __post_init__(self) -> None:
         check_bounds(

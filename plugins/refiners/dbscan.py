@@ -1,4 +1,4 @@
-"""Cluster refinement by density: an object is one dense piece."""
+"""Cluster refinement by density. An object is one dense component."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class Dbscan(ClusterRefiner):
-    """Selection of the largest dense piece of each cluster, of equal ones the first in the image.
+    """Selection of the largest dense component of each cluster; ties go to the first in the image.
 
-    scikit-learn's DBSCAN (Ester, Kriegel, Sander and Xu, "A Density-Based Algorithm for Discovering Clusters in Large
-    Spatial Databases with Noise", KDD 1996) with eps = `eps` + `eps_per_depth` * the cluster's median depth. The piece
-    with the most core points stays, with all points within eps of its core points, also if these border other pieces.
-    A cluster without core points stays unchanged.
+    The refiner runs scikit-learn's DBSCAN (Ester, Kriegel, Sander and Xu, "A Density-Based Algorithm for Discovering
+    Clusters in Large Spatial Databases with Noise", KDD 1996). The radius is eps = `eps` + `eps_per_depth` * the
+    cluster's median depth. The refiner keeps the component with the most core points, and all points within eps of
+    these core points, even if the points border other components. A cluster without core points stays unchanged.
 
     With a `stride` above 1, only the pixels of every `stride`-th row and column are searched for core points, and
-    `min_points` counts these. If that leaves more than `max_points` of a cluster, the stride increases, and each point
-    has the weight of the points it stands for.
+    `min_points` counts these pixels. If more than `max_points` of a cluster remain, the stride increases, and each
+    point is weighted by the number of points that it represents.
     """
 
     eps: float = 0.04  # neighborhood radius at depth 0, m, >= 0.001
-    eps_per_depth: float = 0.01  # increase of the radius with depth, m per m, >= 0, like the spacing of readings
-    min_points: int = 10  # minimum number of neighbors of a core point, itself included, >= 1
+    eps_per_depth: float = 0.01  # increase of the radius with depth, m per m, >= 0
+    min_points: int = 10  # minimum number of neighbors of a core point, including itself, >= 1
     stride: int = 2  # pixel step of the searched points, px, >= 1; 1 = all points
     max_points: int = 20000  # maximum number of searched points of a cluster, >= 100; limits memory
 
@@ -53,7 +53,7 @@ class Dbscan(ClusterRefiner):
         return keep_points(clusters, kept)
 
     def _sampled(self, pixels: Int32) -> tuple[Bool, int]:
-        """Return (P,) the pixels in every `step`-th row and column, and the smallest step that leaves few enough."""
+        """Return an array (P,), True for pixels in every `step`-th row and column, and the smallest sufficient step."""
         for step in range(self.stride, 1 << 16):
             sampled = (pixels[:, 0] % step == 0) & (pixels[:, 1] % step == 0)
             if np.count_nonzero(sampled) <= self.max_points:
@@ -61,7 +61,7 @@ class Dbscan(ClusterRefiner):
         return sampled, step
 
     def _near_largest_piece(self, points: Float32, sampled: Float32, eps: float, weight: float) -> Bool:
-        """Return (P,) which points are within eps of a core point of the largest piece of `sampled` (S, 3)."""
+        """Return an array (P,), True for points near a core point of the largest component of `sampled` (S, 3)."""
         from scipy.spatial import KDTree
         from sklearn.cluster import DBSCAN
 
@@ -71,7 +71,7 @@ class Dbscan(ClusterRefiner):
         core = found.core_sample_indices_
         if len(core) == 0:
             return np.ones(len(points), np.bool_)
-        pieces = found.labels_[core]  # in the order of their first points, so that argmax takes the first of equals
+        pieces = found.labels_[core]  # in the order of their first points, so that ties go to the first
         largest = sampled[core[pieces == np.bincount(pieces).argmax()]]
         distances, _ = KDTree(largest).query(points, distance_upper_bound=np.nextafter(eps, np.inf))
         return np.asarray(distances <= eps)

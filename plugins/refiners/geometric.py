@@ -1,4 +1,4 @@
-"""Cluster refinement by convexity: the geometric segments of Voxblox++."""
+"""Cluster refinement by convexity, with the geometric segments of Voxblox++."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from framework.refinement.segmentation.segment_owners import owned_segments
 class Geometric(ClusterRefiner):
     """Clusters as unions of the convex depth segments covered by a mask.
 
-    Voxblox++ (Grinvald et al., RA-L 2019) cuts the depth image where depth jumps or the surface is concave, and assigns
-    each segment to the mask that covers most of it, if that is more than `min_overlap` of its pixels. A cluster loses
-    its points outside of its segments. With `grow_to_segments` it also gains the segments' pixels outside of the mask,
-    if the cluster's points determine the camera's pose. A mask without a segment loses all points.
+    Voxblox++ (Grinvald et al., RA-L 2019) cuts the depth image at depth jumps and concave creases. It assigns each
+    segment to the mask with the largest overlap, if the mask covers more than `min_overlap` of the segment. A cluster
+    loses its points outside its segments. With `grow_to_segments` it also gains the segments' pixels outside the mask,
+    if the cluster points determine the camera pose. A mask without a segment loses all points.
     """
 
     cell_size: int = 2  # side of the cells of averaged readings, px, >= 1
@@ -30,7 +30,7 @@ class Geometric(ClusterRefiner):
     max_slope: float = 4.0  # maximum slope of a surface, m per m, >= 0.1; steeper = depth jump (4 = 76 degrees)
     max_angle: float = 15.0  # maximum concave angle within a segment, beyond noise, degrees, in (0, 90)
     closing_radius: int = 1  # radius of the morphological closing of edges, cells, >= 0
-    min_segment: int = 100  # minimum size of a segment, px, >= 1; smaller ones are merged with their neighbors
+    min_segment: int = 100  # minimum size of a segment, px, >= 1; smaller segments are merged with their neighbors
     min_overlap: float = 0.8  # minimum fraction of a segment under its mask, in [0, 1)
     grow_to_segments: bool = True  # addition of the segments' pixels outside the mask
 

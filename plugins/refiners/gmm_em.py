@@ -1,4 +1,4 @@
-"""Cluster refinement by a Gaussian mixture: for each mask, with components for its surroundings."""
+"""Cluster refinement by a Gaussian mixture for each mask, with components for its surroundings."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ from framework.refinement.refine import keep_points
 class GmmEm(ClusterRefiner):
     """Removal of background and outliers by a Gaussian mixture of object, background and outliers.
 
-    Eqs. (1) to (4) for each mask: object components start from groups of the mask's points, background components from
-    groups of the points in a ring around it; a uniform component can take outliers. The mask also enters as evidence
-    (our choice: without it, object and background can swap): log-odds for the object fall linearly from `mask_log_odds`
-    inside of the mask to as much against it in the ring. The `structure` of an earlier refiner is neither border nor
-    ring. Clusters with fewer than `min_points` points in the mask or the ring stay unchanged. Without background
-    components, only outliers compete with the object.
+    The refiner applies eqs. (1) to (4) to each mask. Object components start from groups of the mask's points, and
+    background components from groups of the points in a ring around the mask. A uniform component can take outliers.
+
+    The mask also enters as evidence. This is our choice: without it, object and background can swap. Log-odds for the
+    object fall linearly from `mask_log_odds` inside the mask to -`mask_log_odds` in the ring. The `structure` of an
+    earlier refiner is neither border nor ring. Clusters with fewer than `min_points` points in the mask or the ring
+    stay unchanged. Without background components, only outliers compete with the object.
     """
 
     object_components: int = 3  # number of Gaussians of the object, >= 1; about one per visible face
     background_components: int = 6  # number of Gaussians of the background, >= 0; 0 = no ring
-    start_iterations: int = 5  # iterations of k-means at the start, >= 1; 1 = groups of equal size by depth
+    start_iterations: int = 5  # number of initial k-means iterations, >= 1; 1 = groups of equal size by depth
     max_iterations: int = 8  # maximum number of EM iterations, >= 1
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
     std_floor: float = 0.01  # minimum standard deviation of a Gaussian along any axis, m
     outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 1); 0 = no uniform component
     min_posterior: float = 0.5  # minimum posterior of the object for a kept point, in (0, 1)
-    mask_log_odds: float = 4.0  # prior log-odds of the object deep in the mask, nats, >= 0; 0 = mask for the start only
+    mask_log_odds: float = 4.0  # prior log-odds of the object deep in the mask, nats, >= 0; 0 = initialization only
     expected_bleed: float = 0.4  # distance inside the mask with log-odds 0, ring widths, in [0, 1)
     ring: Ring = field(default_factory=Ring)
 

@@ -1,4 +1,4 @@
-"""Cluster refinement by one Gaussian mixture over all masks of a frame: our first reading of the paper."""
+"""Cluster refinement by one Gaussian mixture over all masks of a frame, our first interpretation of the paper."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from framework.refinement.refine import keep_points
 
 
 class ForeignPoints(Enum):
-    """The treatment of points whose most probable Gaussian is of another mask."""
+    """The treatment of points with a most probable Gaussian of another mask."""
 
     MOVE = "they move to that mask's cluster"
     DROP = "they are dropped"
@@ -31,22 +31,22 @@ class ForeignPoints(Enum):
 class GmmFrame(ClusterRefiner):
     """Assignment of the points of a frame's masks to the most probable mask, by hierarchical EM.
 
-    Eqs. (1) to (4) over the points of all masks, section 3.2.2. A pixel in several masks is one point, of the mask with
-    the best score. There is no background and no evidence of the masks beyond the start, so clusters lose points to
-    other clusters only. The paper leaves the hierarchy open: levels, children and their start are our choice (J = 8
-    after Eckart et al., CVPR 2016).
+    The refiner applies eqs. (1) to (4) to the points of all masks, section 3.2.2. A pixel in several masks is one point
+    of the mask with the best score. There is no background, and the masks only initialize the mixture. So clusters lose
+    points only to other clusters. The paper does not specify the hierarchy. Levels, children and initialization are our
+    choice (J = 8 after Eckart et al., CVPR 2016).
     """
 
-    levels: int = 2  # levels of hierarchical EM, >= 1; 1 = flat
-    children: int = 8  # children of a node: 2, 4 or 8
-    gaussians_per_mask: int = 1  # Gaussians of level 1 per mask, >= 1
+    levels: int = 2  # number of levels of hierarchical EM, >= 1; 1 = flat
+    children: int = 8  # number of children of a node: 2, 4 or 8
+    gaussians_per_mask: int = 1  # number of Gaussians of level 1 per mask, >= 1
     initialization: Initialization = Initialization.MASKS  # initial groups of level 1
-    foreign_points: ForeignPoints = ForeignPoints.MOVE  # points of another mask's Gaussian
+    foreign_points: ForeignPoints = ForeignPoints.MOVE  # treatment of points of another mask's Gaussian
     max_iterations: int = 10  # maximum number of EM iterations in a node, >= 1
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
     std_floor: float = 0.005  # minimum standard deviation of a Gaussian along any axis, m
-    min_support: float = 1e-4  # minimum fraction of the frame's points in a Gaussian, in [0, 1); others are dropped
-    min_points: int = 30  # minimum number of points of a refined cluster, >= 1; smaller ones are dropped
+    min_support: float = 1e-4  # minimum fraction of the frame's points in a Gaussian, in [0, 1); smaller = dropped
+    min_points: int = 30  # minimum number of points of a refined cluster, >= 1; smaller clusters are dropped
     max_points: int = 20_000  # maximum number of points of a frame for the fit, >= 100; all points are assigned
 
     def __post_init__(self) -> None:
@@ -82,7 +82,7 @@ class GmmFrame(ClusterRefiner):
 
 
 def best_of_pixels(clusters: PointClusters, shape: tuple[int, int]) -> Bool:
-    """Return (P,) which points are of the cluster with the best score at their pixel; ties: the first cluster."""
+    """Return an array (P,), True for points of the best-scored cluster at their pixel; ties go to the first."""
     rank = np.empty(len(clusters), np.int32)
     rank[np.argsort(-clusters.scores, kind="stable")] = np.arange(len(clusters), dtype=np.int32)
     kept = np.empty(len(clusters.cluster), np.bool_)

@@ -1,4 +1,4 @@
-"""Cluster refinement by a tree of Gaussian mixtures: many small surface patches at low cost."""
+"""Cluster refinement by a tree of Gaussian mixtures, for many small surface patches at low cost."""
 
 from __future__ import annotations
 
@@ -17,25 +17,28 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class GmmTree(ClusterRefiner):
-    """Removal of the points on surface patches outside of the object, by hierarchical EM.
+    """Removal of the points on surface patches outside the object by hierarchical EM.
 
     A tree of mixtures (Eckart et al., CVPR 2016) is fitted to each mask together with the ring around it. Its nodes are
-    surface patches and do not depend on the mask: a point on the wrong side at the first level could not return. The
-    mask enters as evidence: points have the log-odds of `gmm_em`, and a node's object ratio maximizes the likelihood of
-    its points' evidence, with the parent's ratio as prior (our choice). A point stays if its leaves and its own
-    evidence give the object more than `min_posterior`. Outliers at the root are not the object's, those below
-    a node have the node's ratio. Clusters with fewer than `min_points` points in the mask or the ring stay unchanged.
+    surface patches. They do not depend on the mask, because a point on the wrong side at the first level could not
+    return.
+
+    The mask enters as evidence. Points have the log-odds of `gmm_em`. A node's object fraction maximizes the likelihood
+    of its points' evidence, with the parent's fraction as a prior (our choice). A point stays if its leaves and its own
+    evidence give the object a posterior above `min_posterior`. Outliers at the root do not belong to the object.
+    Outliers below a node have the node's fraction. Clusters with fewer than `min_points` points in the mask or the ring
+    stay unchanged.
     """
 
-    levels: int = 2  # levels of the tree, >= 1
-    children: int = 8  # children of a node, >= 2; J of Eckart et al. 2016
+    levels: int = 2  # number of levels of the tree, >= 1
+    children: int = 8  # number of children of a node, >= 2; J of Eckart et al. 2016
     max_iterations: int = 8  # maximum number of EM iterations in a node, >= 1
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
     std_floor: float = 0.01  # minimum standard deviation of a node along any axis, m
     outlier_fraction: float = 0.02  # initial fraction of outliers in a node, in [0, 1)
     min_support: float = 1e-4  # minimum fraction of the tree's points in a node, in [0, 1); other nodes are dropped
     min_node: int = 32  # minimum number of points of a node with children, >= 8
-    parent_points: float = 4.0  # weight of the parent's object ratio as a prior, points, >= 0
+    parent_points: float = 4.0  # weight of the parent's object fraction as a prior, points, >= 0
     min_posterior: float = 0.5  # minimum posterior of the object for a kept point, in (0, 1)
     mask_log_odds: float = 2.0  # prior log-odds of the object deep in the mask, nats, >= 0
     expected_bleed: float = 0.5  # distance inside the mask with log-odds 0, ring widths, in [0, 1)

@@ -1,4 +1,4 @@
-"""Cluster refinement by k-means. In the paper, k-means is the usual start of a mixture, not a refiner."""
+"""Cluster refinement by k-means. In the paper, k-means is the usual initialization of a mixture, not a refiner."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class KMeans(ClusterRefiner):
-    """Removal of the points nearer to a center of the background than to one of the object.
+    """Removal of the points nearer to a background center than to an object center.
 
-    Lloyd's algorithm runs on each mask and the ring around it, as in `gmm_em`. The object's centers start at the means
-    of the mask cut into equal parts by depth, the background's at those of the ring. Clusters with fewer than
-    `min_points` points in the mask or the ring stay unchanged.
+    Lloyd's algorithm runs on each mask and the ring around it, as in `gmm_em`. The object centers start at the means of
+    equal parts of the mask by depth, and the background centers at the means of equal parts of the ring. Clusters with
+    fewer than `min_points` points in the mask or the ring stay unchanged.
     """
 
     object_centers: int = 5  # number of centers of the object, >= 1

@@ -1,4 +1,4 @@
-"""Cluster refinement by connectivity: an object is one connected piece in 3D."""
+"""Cluster refinement by connectivity. An object is one connected component in 3D."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class LargestComponent(ClusterRefiner):
-    """Selection of the largest 3D-connected piece of each cluster, of equal ones the first in the image.
+    """Selection of the largest 3D-connected component of each cluster; ties go to the first in the image.
 
     Points are connected if they are at most `connection_radius` pixels apart and their depths differ by less than
-    `max_gap` + `gap_per_depth` * depth of the nearer one: spacing and noise of readings both grow with depth.
+    `max_gap` + `gap_per_depth` * depth of the nearer point. The spacing and the noise of readings grow with depth.
     """
 
     max_gap: float = 0.03  # maximum depth step between connected pixels at depth 0, m, >= 0
     gap_per_depth: float = 0.02  # increase of the maximum depth step with depth, m per m, >= 0
-    connection_radius: int = 2  # maximum distance of connected pixels, px, >= 1; 2 bridges single missing readings
+    connection_radius: int = 2  # maximum distance between connected pixels, px, >= 1; 2 bridges single missing readings
 
     def __post_init__(self) -> None:
         check_bounds(self, max_gap=(0.0, np.inf), gap_per_depth=(0.0, np.inf), connection_radius=(1, 16))

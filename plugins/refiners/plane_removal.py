@@ -1,4 +1,4 @@
-"""Cluster refinement by structure: floors and walls are not part of an object."""
+"""Cluster refinement by structure. Floors and walls are not part of an object."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ class PlaneRemoval(ClusterRefiner):
     """Removal of the points on the floor, a wall or another plane at the border of the scene.
 
     Planes are found in the depth of the whole frame, without the gravity direction. A plane is structure if it is large
-    (`min_area`, `min_frame_fraction`) and the frame shows nearly nothing behind it (`max_behind_ratio`), unlike a table
-    top or a screen. A cluster keeps a plane if it contains more than `max_cluster_fraction` of the plane's points, as a
-    table that fills the image does. The refined clusters pass the planes on as `structure`, for later refiners.
+    (`min_area`, `min_frame_fraction`) and the frame has few readings behind it (`max_behind_ratio`). Table tops and
+    screens have more readings behind them. A cluster keeps a plane if it contains more than `max_cluster_fraction` of
+    the plane's points, for example a table that fills the image. The refined clusters pass the planes to later refiners
+    as `structure`.
     """
 
-    plane_distance: float = 0.01  # maximum distance to a plane, m, >= 0, plus 3 standard deviations of its noise
+    plane_distance: float = 0.01  # maximum distance to a plane, m, >= 0, in addition to 3 standard deviations of noise
     inverse_depth_noise: float = 0.003  # maximum rms of a plane's inverse depth, 1/m, >= 0: 3 mm at 1 m, 27 mm at 3 m
     min_area: float = 0.8  # minimum visible area of a plane, m^2, >= 0
     min_frame_fraction: float = 0.04  # minimum fraction of the frame's readings on a plane, in [0, 1]
-    max_behind_ratio: float = 0.1  # maximum ratio of readings behind a plane to those on it, >= 0
+    max_behind_ratio: float = 0.1  # maximum ratio of readings behind a plane to readings on the plane, >= 0
     max_tilt: float = 180.0  # maximum angle from the camera's up axis to the normal, degrees, in [0, 180]; 60 = floors
-    max_cluster_fraction: float = 0.5  # maximum fraction of the plane's points in a cluster to remove them, in [0, 1]
+    max_cluster_fraction: float = 0.5  # maximum fraction of the plane's points in a cluster for removal, in [0, 1]
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -49,7 +50,7 @@ class PlaneRemoval(ClusterRefiner):
         return replace(keep_points(clusters, kept), structure=structure)
 
     def structure(self, frame: Frame) -> Planes:
-        """Return the frame's planes that bound the scene."""
+        """Return the frame's planes at the border of the scene."""
         planes = find_planes(frame, self.plane_distance, self.inverse_depth_noise, self.min_area)
         upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera's y axis points down
         large = planes.shares >= self.min_frame_fraction

@@ -1,4 +1,4 @@
-"""Cluster refinement by rank-order clustering: our reading of the paper's "ROC algorithm"."""
+"""Cluster refinement by rank-order clustering, our interpretation of the paper's "ROC algorithm"."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from framework.refinement.refine import keep_points
 
 @dataclass
 class RankOrder(ClusterRefiner):
-    """Selection of the largest rank-order group of each cluster, of equal ones the first in the image.
+    """Selection of the largest rank-order group of each cluster; ties go to the first in the image.
 
-    The paper names an alternative, "ROC algorithm [12]"; its reference list is not available. We read it as rank-order
-    clustering (Zhu, Wen and Sun, "A Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR 2011):
-    points belong together if they have the same neighbors. The distance is the approximation of Otto, Wang and Jain
-    ("Clustering Millions of Faces by Identity", PAMI 2018), eqs. 4 and 5, with O_a(b) the rank of b among the neighbors
-    of a, nearest first, and f_a(i) the neighbor with rank i:
+    The paper names an alternative, "ROC algorithm [12]"; its reference list is not available. We interpret it as
+    rank-order clustering (Zhu, Wen and Sun, "A Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR
+    2011): points belong together if they have the same neighbors. The distance is the approximation of Otto, Wang and
+    Jain ("Clustering Millions of Faces by Identity", PAMI 2018), eqs. 4 and 5. O_a(b) is the rank of b among the
+    neighbors of a, nearest first, and f_a(i) is the neighbor with rank i:
 
         d(a, b) = number of i in 1 .. min(O_a(b), k) for which f_a(i) is not among the k nearest of b (or b itself),
         D(a, b) = (d(a, b) + d(b, a)) / min(O_a(b), O_b(a)).
 
-    Points are linked if D is at most `threshold` and one is among the k nearest of the other; groups are connected
-    components. A cluster of at most k points stays unchanged.
+    Two points are linked if D is at most `threshold` and one point is among the k nearest of the other. Groups are
+    connected components. A cluster of at most k points stays unchanged.
 
-    Only the first point of each block of s x s px takes part, with the smallest s that leaves at most `max_points`. The
-    other points join the group of the nearest of them.
+    Only the first point of each block of s x s px is compared, with the smallest s that leaves at most `max_points`.
+    Each other point joins the group of the nearest compared point.
     """
 
     neighbors: int = 16  # number of nearest neighbors k, >= 2
@@ -58,22 +58,22 @@ class RankOrder(ClusterRefiner):
 
 
 def _firsts_of_blocks(pixels: Int32, max_points: int) -> Int64:
-    """Return the first of the pixels (P, 2) in each block, with the smallest blocks that leave at most `max_points`."""
+    """Return the first pixel of each block of pixels (P, 2), for the smallest blocks with at most `max_points`."""
     u, v = (pixels - pixels.min(axis=0)).T
     side = int(np.ceil(np.sqrt(len(pixels) / max_points)))
     while True:
         columns = u.max() // side + 1
         firsts = np.full(columns * (v.max() // side + 1), -1)
-        firsts[(v // side * columns + u // side)[::-1]] = np.arange(len(pixels))[::-1]  # the last write stays
+        firsts[(v // side * columns + u // side)[::-1]] = np.arange(len(pixels))[::-1]  # the last write is kept
         if np.count_nonzero(firsts >= 0) <= max_points:
             return np.sort(firsts[firsts >= 0])
         side += 1
 
 
 def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int32:
-    """Return (P,) the group of each of the points (P, 3), numbered by their first points."""
+    """Return the group (P,) of each point (P, 3); groups are numbered by their first points."""
     n, k = len(points), neighbors
-    if n <= k:  # all have the same neighbors
+    if n <= k:  # all points have the same neighbors
         return np.zeros(n, np.int32)
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
@@ -86,7 +86,7 @@ def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int3
     np.put_along_axis(ranks, nearest, np.arange(1, k + 1, dtype=np.uint8), axis=1)
 
     def unshared(a: Int64, b: Int64) -> Int64:
-        """d(a, b)."""
+        """Return d(a, b)."""
         up_to_b = np.arange(k) < ranks[a, b][:, None]
         return np.asarray((up_to_b & (ranks[b[:, None], nearest[a]] == absent)).sum(axis=1))
 

@@ -1,1 +1,1 @@
-"""Pose trackers: the camera pose, frame by frame."""
+"""Pose trackers, which estimate the camera pose of each frame."""

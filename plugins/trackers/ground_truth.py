@@ -1,4 +1,4 @@
-"""The true pose: the upper bound of every tracker."""
+"""Ground-truth poses: the upper bound for trackers."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from framework.interfaces import PoseTracker, SceneMap
 
 @dataclass
 class GroundTruth(PoseTracker):
-    """Poses of the sequence; frames without one are skipped."""
+    """Poses of the sequence. Frames without a pose are skipped."""
 
     pose_source = "ground_truth"
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """Return the given pose. Raises NoPoseError for a frame without a pose."""
+        """Return the pose of the sequence. Raises NoPoseError for a frame without a pose."""
         if frame.T_world_camera is None:
-            raise NoPoseError(f"frame {frame.index}: expected a true pose at {frame.timestamp:.3f} s, got none")
+            raise NoPoseError(f"frame {frame.index}: expected a ground-truth pose at {frame.timestamp:.3f} s, got none")
         return Pose(frame.T_world_camera)
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
-        """Do nothing: the true poses are in the map's world."""
+        """Do nothing, because the ground-truth poses are in the world frame of the map."""

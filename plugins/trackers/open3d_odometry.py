@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 
 class Method(Enum):
-    """The error that is minimized."""
+    """The minimized error."""
 
-    POINT_TO_PLANE = "PointToPlane"  # depth alone (KinectFusion)
-    INTENSITY = "Intensity"  # color alone (Steinbruecker et al. 2011)
-    HYBRID = "Hybrid"  # both (Park et al. 2017)
+    POINT_TO_PLANE = "PointToPlane"  # depth only (KinectFusion)
+    INTENSITY = "Intensity"  # color only (Steinbruecker et al. 2011)
+    HYBRID = "Hybrid"  # depth and color (Park et al. 2017)
 
 
 class Reference(Enum):
-    """The image that a frame is aligned to."""
+    """The target of the alignment of a frame."""
 
     PREVIOUS_FRAME = "previous frame"
     MAP = "view of the map from the last pose"
@@ -34,7 +34,7 @@ class Reference(Enum):
 
 @dataclass(frozen=True)
 class _Seen:
-    """A frame as an Open3D image, and its pose."""
+    """A frame as an Open3D image with its pose."""
 
     image: o3d.t.geometry.RGBDImage
     T_world_camera: Float64  # (4, 4)
@@ -42,16 +42,17 @@ class _Seen:
 
 @dataclass
 class Open3dOdometry(PoseTracker):
-    """Open3D's multi-scale RGB-D odometry to a view of the map, or to the previous frame.
+    """Open3D's multi-scale RGB-D odometry to a view of the map or to the previous frame.
 
-    Use POINT_TO_PLANE with the map, HYBRID and INTENSITY with the previous frame: the map's colors are blurred.
+    Use POINT_TO_PLANE with the map. Use HYBRID and INTENSITY with the previous frame, because the map's colors are
+    blurred.
     """
 
     method: Method = Method.POINT_TO_PLANE  # minimized error
     reference: Reference = Reference.MAP  # reference of the alignment
-    iterations_coarse: int = 10  # iterations at 1/4 of the resolution, >= 1
-    iterations_middle: int = 5  # iterations at 1/2 of the resolution, >= 1
-    iterations_fine: int = 3  # iterations at full resolution, >= 1
+    iterations_coarse: int = 10  # number of iterations at 1/4 of the resolution, >= 1
+    iterations_middle: int = 5  # number of iterations at 1/2 of the resolution, >= 1
+    iterations_fine: int = 3  # number of iterations at full resolution, >= 1
     max_depth: float = 5.0  # maximum depth of used readings, m, > 0
     max_distance: float = 0.07  # maximum depth difference of corresponding pixels, m, > 0
     max_translation: float = 0.3  # maximum translation between frames, m, > 0; lost above it
@@ -70,7 +71,7 @@ class Open3dOdometry(PoseTracker):
         self._criteria = [odometry.OdometryConvergenceCriteria(count) for count in iterations]
         self._loss = odometry.OdometryLossParams(depth_outlier_trunc=self.max_distance)
         self._method = getattr(odometry.Method, self.method.value)
-        self._last: _Seen | None = None  # the last trusted frame
+        self._last: _Seen | None = None  # last trusted frame
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         image = _rgbd_image(frame.color, frame.depth)
@@ -96,7 +97,7 @@ class Open3dOdometry(PoseTracker):
     def _aligned(
         self, image: o3d.t.geometry.RGBDImage, reference: o3d.t.geometry.RGBDImage, frame: Frame
     ) -> tuple[Float64, str]:
-        """Return T_last_camera and one line with the reason to reject it, empty if it is trusted."""
+        """Return T_last_camera and a one-line reason for rejection, empty if the pose is trusted."""
         from open3d.t.pipelines import odometry
 
         readings = np.count_nonzero((frame.depth > 0) & (frame.depth <= self.max_depth))
@@ -114,7 +115,7 @@ class Open3dOdometry(PoseTracker):
         if not np.isfinite(T_last_camera).all():
             return np.eye(4), "Open3D's alignment diverged"
         if matched < self.min_matched:
-            return np.eye(4), f"{matched:.0%} of the frame's readings have a correspondence"
+            return np.eye(4), f"only {matched:.0%} of the frame's depth readings have a correspondence"
         step = float(np.linalg.norm(T_last_camera[:3, 3]))
         turn = rotation_angle(T_last_camera[:3, :3])
         if step > self.max_translation or turn > self.max_rotation:
@@ -129,7 +130,7 @@ def _rgbd_image(color: UInt8, depth: Float32) -> o3d.t.geometry.RGBDImage:
 
 
 def _tensor(array: Array) -> o3d.core.Tensor:
-    """Return a copy: Open3D does not keep the array alive."""
+    """Return a copy, because Open3D does not keep the array alive."""
     import open3d as o3d
 
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array)).clone()

@@ -1,4 +1,4 @@
-"""Sparse tracking: image features with depth against a local map of keyframes, poses by pycolmap."""
+"""Sparse tracking of image features with depth against a local map of keyframes, with poses from pycolmap."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from framework.tracking.keyframes import Keyframes
 class PycolmapPnp(PoseTracker):
     """Feature matching with the nearest keyframes, and pycolmap's PnP with RANSAC.
 
-    If that fails, it relocalizes among all keyframes. It does not use the map. The parameters are those of `Keyframes`.
+    If tracking fails, the tracker relocalizes among all keyframes. It does not use the map. See `Keyframes` for the
+    parameters.
     """
 
     max_features: int = 800  # maximum number of features of a frame, >= 1
     min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
-    max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant one is dropped
-    min_distance: float = 0.15  # minimum distance between keyframes, m, > 0; added to the angle as fractions of both
+    max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is dropped
+    min_distance: float = 0.15  # minimum distance between keyframes, m, > 0; added to the angle, in units of the minima
     min_angle: float = 0.2  # minimum angle between keyframes, rad, > 0
     candidates: int = 4  # maximum number of keyframes to match with a frame, >= 1
-    max_ratio: float = 0.8  # maximum ratio of a match's distance to that of the second best match, in (0, 1]
+    max_ratio: float = 0.8  # maximum distance of a match over the distance of the second-best match, in (0, 1]
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
     min_inliers: int = 20  # minimum number of inliers, >= 4; lost below it
     min_inlier_ratio: float = 0.15  # minimum fraction of inliers among the matches, in (0, 1]; lost below it
@@ -34,7 +35,7 @@ class PycolmapPnp(PoseTracker):
 
     def __post_init__(self) -> None:
         self._keyframes = Keyframes(**vars(self))
-        self._T_world_last: Float64 | None = None  # the last trusted pose
+        self._T_world_last: Float64 | None = None  # last trusted pose
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         features = self._keyframes.extractor.extract(frame)
@@ -46,7 +47,7 @@ class PycolmapPnp(PoseTracker):
             found = self._keyframes.locate(frame, features, self._keyframes.alike(features))
         if found is None:
             T_world_last = np.eye(4) if self._T_world_last is None else self._T_world_last
-            reason = f"no keyframe matches {self.min_inliers} of the frame's {len(features)} features"
+            reason = f"fewer than {self.min_inliers} of the frame's {len(features)} features match the keyframes"
             return Pose(T_world_last, lost=True, reason=reason)
         self._T_world_last = found.T_world_camera
         self._keyframes.add_with(frame, features, found.T_world_camera)
@@ -59,7 +60,7 @@ class PycolmapPnp(PoseTracker):
         self._keyframes.restore(keyframes)
 
     def _begin(self, frame: Frame, features: Features) -> Pose:
-        """Define the world by the first frame with enough features."""
+        """Define the world frame by the first frame with enough features."""
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         if not self._keyframes.add_with(frame, features, T_world_camera):
             reason = f"the frame has fewer than {self.min_features} features with depth"

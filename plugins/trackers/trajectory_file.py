@@ -1,4 +1,4 @@
-"""The poses of another SLAM system, from a file."""
+"""Poses of another SLAM system from a file."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ from framework.interfaces import PoseTracker, SceneMap
 
 
 class World(Enum):
-    """The world that the poses are given in."""
+    """The world frame of the poses."""
 
-    FIRST_FRAME = "true pose of the first frame, or the identity"
+    FIRST_FRAME = "ground-truth pose of the first frame, or the identity"
     FILE = "frame of the file"
 
 
 @dataclass
 class TrajectoryFile(PoseTracker):
-    """Poses in a TUM file nearest in time to the frame; frames without one are skipped.
+    """Poses in a TUM file nearest in time to the frame. Frames without a pose are skipped.
 
-    By default the trajectory is moved rigidly so that the first frame with a pose defines the world, as in
-    `PoseTracker`. `world_frame=FILE` keeps the file's world, in which the sequence's true poses are meaningless. Raises
-    DataError, naming file and line, for poses that are not finite or not rigid and for timestamps that do not increase.
+    By default the trajectory is moved rigidly so that the first frame with a pose defines the world frame, as in
+    `PoseTracker`. `world_frame=FILE` keeps the file's world frame. The sequence's ground-truth poses are invalid in the
+    file's world frame. Raises DataError that names the file and the line for poses that are not finite or not rigid,
+    and for timestamps that do not increase.
     """
 
     path: Path  # trajectory in TUM format
@@ -48,13 +49,13 @@ class TrajectoryFile(PoseTracker):
         self._T_world_file: Float64 | None = np.eye(4) if self.world_frame is World.FILE else None
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """Return the pose of the file. Raises NoPoseError for a frame without a pose in the file."""
+        """Return the pose from the file. Raises NoPoseError for a frame without a pose in the file."""
         nearest = int(np.abs(self._timestamps - frame.timestamp).argmin())
         difference = abs(float(self._timestamps[nearest]) - frame.timestamp)
         if difference > self.max_time_difference:
             raise NoPoseError(
                 f"frame {frame.index}: {self.path.name}: expected a pose within tracker.max_time_difference of "
-                f"{frame.timestamp:.3f} s, got the nearest {difference:.3f} s away"
+                f"{frame.timestamp:.3f} s, got the nearest pose {difference:.3f} s away"
             )
         T_file_camera = self._T_file_camera[nearest]
         if self._T_world_file is None:
@@ -63,4 +64,4 @@ class TrajectoryFile(PoseTracker):
         return Pose(self._T_world_file @ T_file_camera)
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
-        """Do nothing: the poses are given in the map's world."""
+        """Do nothing, because the poses are in the world frame of the map."""

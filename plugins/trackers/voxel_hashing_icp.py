@@ -1,4 +1,4 @@
-"""Frame-to-model tracking: alignment of each frame to the view ray-cast from the map, by geometry and color."""
+"""Frame-to-model tracking by alignment of each frame to a ray-cast view of the map, by geometry and color."""
 
 from __future__ import annotations
 
@@ -22,35 +22,35 @@ from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, model_intensities
 
 LEVELS = 3
-CONVERGED = 1e-4  # m and rad; a shorter step ends the finest level, one four times as long the level before, ...
-SAME_POSE = 0.05  # m and rad between alignments with the same result
-SMALLEST = 8  # px, of the sides of the coarsest level
-CHANGED_SCENE = 0.95  # min. agreement of the points not behind the map's surface, where an object was removed
-EXPECTED_AGREEMENT = 0.8  # like min_agreement, at a prediction with a steady motion
-EXPECTED_BEHIND = 0.1  # like max_occluded, at a prediction with a steady motion
-STEADY = 5  # consecutive frames with a correct prediction that make a motion steady
-VISITED = 64  # poses that a lost camera tries, one per frame
-VISITED_SEPARATION = 0.1  # m and rad between them
-RECOVERY_INFORMATION = 2.0  # times min_information that a lost camera needs
+CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; four times as long at each coarser level
+SAME_POSE = 0.05  # maximum difference between equal poses, m and rad
+SMALLEST = 8  # minimum side of the coarsest level, px
+CHANGED_SCENE = 0.95  # minimum agreement of the points not behind the map's surface, if an object was removed
+EXPECTED_AGREEMENT = 0.8  # min_agreement near the prediction of a steady motion
+EXPECTED_BEHIND = 0.1  # max_occluded near the prediction of a steady motion
+STEADY = 5  # minimum number of consecutive frames with a correct prediction in a steady motion
+VISITED = 64  # number of poses that a lost camera tries, one per frame
+VISITED_SEPARATION = 0.1  # minimum separation of these poses, m and rad
+RECOVERY_INFORMATION = 2.0  # factor of min_information for a lost camera
 
 
 class ResidualWeights(Enum):
-    """The weights of residuals (framework/tracking/alignment.py)."""
+    """Weights of residuals (framework/tracking/alignment.py)."""
 
-    TUKEY = "of residuals over their expected noise, for a larger noise at coarse levels; exposure is compensated"
-    LINEAR = "of VoxelHashing's code: the same at all levels, without noise model and compensation of exposure"
+    TUKEY = "weights by residual over expected noise, with larger noise at coarse levels and exposure compensation"
+    LINEAR = "weights of VoxelHashing's code, equal at all levels, without noise model and exposure compensation"
 
 
 class Alignment(NamedTuple):
-    """The result of aligning a frame. Ratios are of the points in view unless stated otherwise."""
+    """Result of the alignment of a frame. Ratios refer to the points in view unless stated otherwise."""
 
     T_world_camera: Float64
     matched: float  # ratio of points with a weight
     agreement: float  # ratio of points that agree with the map
     behind: float  # ratio of points behind the map's surface
-    agreement_in_front: float  # ratio that agrees, of the points not behind the map's surface
-    reason: str  # for rejection, empty if the pose is possible
-    doubt: str  # for which a second source must confirm the pose, empty without one
+    agreement_in_front: float  # ratio of points that agree to points not behind the map's surface
+    reason: str  # reason for rejection, empty if the pose is possible
+    doubt: str  # reason for confirmation by a second source, empty without doubt
 
     @property
     def trusted(self) -> bool:
@@ -61,21 +61,22 @@ class Alignment(NamedTuple):
 class VoxelHashingIcp(PoseTracker):
     """Frame-to-model ICP plus RGB, coarse to fine, with lost detection (after VoxelHashing and ElasticFusion).
 
-    A pose needs agreement with the map: less at the prediction of a steady motion, more elsewhere. Agreement alone does
-    not separate right from wrong poses (docs/guides/trackers.md), so a pose elsewhere needs confirmation by features.
+    A pose needs agreement with the map. Near the prediction of a steady motion, less agreement is sufficient. Agreement
+    alone does not separate correct from wrong poses (docs/guides/trackers.md). So any other pose needs confirmation by
+    features.
 
-    A frame is always lost if too few points match, the step is not plausible, or the points do not determine it. All
-    other checks are ours: min_agreement=0 and max_occluded=1 turn off those of agreement, also after a loss, and
-    relocalize=false those by features.
+    A frame is always lost if too few points match, if the step is implausible, or if the points do not determine the
+    step. All other checks are our additions. min_agreement=0 and max_occluded=1 disable the checks of agreement, also
+    after a loss. relocalize=false disables the checks by features.
     """
 
     residual_weights: ResidualWeights = ResidualWeights.TUKEY  # weights of residuals
     finest_scale: float = 0.5  # scale of the finest level and of the map's view relative to the image, a power of 1/2
-    iterations_coarse: int = 8  # iterations at 1/4 of the finest resolution, >= 0
-    iterations_middle: int = 6  # iterations at 1/2 of the finest resolution, >= 0
-    iterations_fine: int = 4  # iterations at the finest resolution, >= 1
+    iterations_coarse: int = 8  # number of iterations at 1/4 of the finest resolution, >= 0
+    iterations_middle: int = 6  # number of iterations at 1/2 of the finest resolution, >= 0
+    iterations_fine: int = 4  # number of iterations at the finest resolution, >= 1
     max_distance: float = 0.1  # maximum distance of corresponding points, m, > 0
-    close_distance: float = 0.05  # maximum distance in agreement with the map's surface, m, > 0; at least a voxel
+    close_distance: float = 0.05  # maximum distance for agreement with the map's surface, m, > 0; at least a voxel
     min_normal_dot: float = 0.7  # minimum cosine between corresponding normals, in [-1, 1]
     geometric_scale: float = 4.0  # cut-off of distances, standard deviations, > 0 (TUKEY)
     photometric_scale: float = 4.0  # cut-off of intensity differences, standard deviations, > 0 (TUKEY)
@@ -88,11 +89,11 @@ class VoxelHashingIcp(PoseTracker):
     max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
     min_visible: float = 0.05  # minimum fraction of the frame's points in view of the map, in [0, 1]
     min_matched: float = 0.4  # minimum fraction of the points in view with a weight, in [0, 1]
-    min_information: float = 1e-3  # minimum eigenvalue of A relative to the mean, in [0, 1]; doubled while lost
+    min_information: float = 1e-3  # minimum eigenvalue of A over the mean eigenvalue, in [0, 1]; doubled while lost
     min_agreement: float = 0.92  # minimum fraction of the points in view on the map's surface, in [0, 1]; 0 = unchecked
     max_occluded: float = 0.015  # maximum fraction of the points in view behind the surface, in [0, 1]; 1 = unchecked
-    relocalize: bool = True  # relocalization against keyframes and visited poses
-    seed: int = 0  # seed of the relocalization
+    relocalize: bool = True  # relocalization against keyframes and visited poses; False = none
+    seed: int = 0  # seed of the relocalization, >= 0
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -110,16 +111,16 @@ class VoxelHashingIcp(PoseTracker):
             "tracker.color_levels", self.color_levels, f"{LEVELS} if depth_weight is 0",
         )  # fmt: skip
         self._weights = Weights(*(np.float32(getattr(self, name)) for name in Weights._fields))
-        self._T_world_last: Float64 | None = None  # the last trusted pose
+        self._T_world_last: Float64 | None = None  # last trusted pose
         self._T_last_next = np.eye(4)  # motion to the next frame under constant velocity
-        self._lost_frames = 0  # consecutive
-        self._steady_frames = 0  # consecutive, with a correct prediction
+        self._lost_frames = 0  # number of consecutive lost frames
+        self._steady_frames = 0  # number of consecutive frames with a correct prediction
         self._keyframes = Keyframes(seed=self.seed)
         self._visited: deque[Float64] = deque(maxlen=VISITED)
-        self._T_world_doubted: Float64 | None = None  # pose of the last frame if only doubt made it lost
-        self._last: FrameFeatures | None = None  # of the last trusted frame
-        self._stored_scene: SceneMap | None = None  # the map to relocalize in; None once that is done
-        self._coarse_depth = False  # too coarse for normals from neighboring readings
+        self._T_world_doubted: Float64 | None = None  # pose of the last frame if it was lost because of doubt only
+        self._last: FrameFeatures | None = None  # features of the last trusted frame
+        self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
+        self._coarse_depth = False  # True if depth is too coarse for normals from neighboring readings
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         seen = FrameFeatures(frame, self._keyframes.extractor)
@@ -170,7 +171,7 @@ class VoxelHashingIcp(PoseTracker):
         return self._trust(seen, alignment.T_world_camera)
 
     def _align_predicted(self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64) -> Alignment:
-        """Align from the predicted pose; a result near it needs less agreement."""
+        """Align from the predicted pose. A result near the prediction needs less agreement."""
         assert self._T_world_last is not None
         alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
         if not _near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
@@ -185,7 +186,7 @@ class VoxelHashingIcp(PoseTracker):
         return alignment
 
     def _align_lost(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
-        """Align from the last trusted pose, and from the last frame's doubted one."""
+        """Align from the last trusted pose, and from the doubted pose of the last frame."""
         assert self._T_world_last is not None
         alignment = self._align_twice(levels, scene, self._T_world_last)
         if alignment.trusted or self._T_world_doubted is None:
@@ -194,7 +195,7 @@ class VoxelHashingIcp(PoseTracker):
         return alignment if again.reason else again
 
     def _initialize(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
-        """Define the world by the first frame with enough depth."""
+        """Define the world frame by the first frame with enough depth."""
         frame = seen.frame
         if min(frame.camera.shape) * self.finest_scale < SMALLEST * 2 ** (LEVELS - 1):
             raise DataError(
@@ -230,7 +231,7 @@ class VoxelHashingIcp(PoseTracker):
     def _relocalized(
         self, alignment: Alignment, seen: FrameFeatures, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
-        """Return the alignment confirmed or replaced by features; a lost camera also tries a visited pose."""
+        """Return the alignment confirmed or replaced by features. A lost camera also tries a visited pose."""
         if not self.relocalize:
             return alignment
         found = self._pose_from_features(seen)
@@ -246,7 +247,7 @@ class VoxelHashingIcp(PoseTracker):
     def _confirmed(
         self, alignment: Alignment, T_world_found: Float64, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
-        """Return the alignment that a pose from features confirms: a pose with two independent sources is trusted."""
+        """Return the alignment confirmed by a pose from features. A pose with two independent sources is trusted."""
         if alignment.trusted and _near(alignment.T_world_camera, T_world_found, self.max_distance):
             return alignment
         again = self._align(levels, scene, T_world_found, T_world_found)
@@ -260,7 +261,7 @@ class VoxelHashingIcp(PoseTracker):
         return alignment._replace(doubt=alignment.doubt or "features and alignment with the map disagree")
 
     def _pose_from_features(self, seen: FrameFeatures) -> AbsolutePose | None:
-        """Return the pose from features of the last trusted frame and keyframes near it, else of similar keyframes."""
+        """Return the pose from the last trusted frame and nearby keyframes, otherwise from similar keyframes."""
         assert self._T_world_last is not None
         near = self._keyframes.nearest(self._T_world_last)
         if self._last is not None:
@@ -271,19 +272,19 @@ class VoxelHashingIcp(PoseTracker):
         return found
 
     def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
-        """Align from a pose, and again to the view from the result: agreement shows that the frame determines it."""
+        """Align from a pose, and again to the view from the result. Agreement shows that the pose is determined."""
         alignment = self._align(levels, scene, T_world_from, T_world_from)
         if not alignment.trusted or self.min_agreement == 0:
             return alignment
         again = self._align(levels, scene, alignment.T_world_camera, T_world_from)
         if not _near(alignment.T_world_camera, again.T_world_camera, SAME_POSE / 2):
-            return again._replace(doubt="two alignments, the second started at the result of the first, disagree")
+            return again._replace(doubt="a second alignment from the result of the first disagrees")
         return again
 
     def _align(
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
     ) -> Alignment:
-        """Align a frame to the view of the map at T_world_view, coarse to fine; the last pose is T_world_from."""
+        """Align a frame to the view of the map at T_world_view, coarse to fine. The last pose is T_world_from."""
         view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth)
         model, intensities = model_view(view), model_intensities(view, LEVELS)
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
@@ -301,7 +302,7 @@ class VoxelHashingIcp(PoseTracker):
                 T_view_camera = exp_se3(xi) @ T_view_camera
                 if np.abs(xi).max() < CONVERGED * 4**level:
                     break
-        if np.abs(xi).max() >= CONVERGED:  # the counts before such a step do not describe its result
+        if np.abs(xi).max() >= CONVERGED:  # the counts before a long step do not describe its result
             equations = linearize(levels[0], smooth, intensities[0], T_view_camera, weights, brightness, linear)
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially
@@ -319,7 +320,7 @@ class VoxelHashingIcp(PoseTracker):
         return Alignment(T_world_camera, matched, agreement, behind, agreement_in_front, reason, doubt)
 
     def _linear_weights(self, scene: SceneMap) -> LinearWeights | None:
-        """Return the maxima of linear weights, None for Tukey's."""
+        """Return the limits of linear weights, None for Tukey's weights."""
         if self.residual_weights is ResidualWeights.TUKEY:
             return None
         return LinearWeights(np.float32(scene.depth_range[1]), np.float32(self.max_intensity_difference))
@@ -342,7 +343,7 @@ class VoxelHashingIcp(PoseTracker):
         )
 
     def _rejection(self, frame: PyramidLevel, equations: NormalEquations, T_from_camera: Float64) -> str:
-        """Return one line with the reason why this cannot be the pose, empty if it can."""
+        """Return a one-line reason for rejection of the pose, empty if the pose is possible."""
         points = int(np.count_nonzero(frame.depth))
         if points == 0:
             return "the frame has no depth"
@@ -362,12 +363,12 @@ class VoxelHashingIcp(PoseTracker):
 
 
 def _near(T_a: Float64, T_b: Float64, limit: float) -> bool:
-    """Return whether two poses are within `limit` m and rad of each other."""
+    """Return True if two poses are within `limit` m and rad of each other."""
     T_ab = inverse(T_a) @ T_b
     return bool(np.linalg.norm(T_ab[:3, 3]) < limit and rotation_angle(T_ab[:3, :3]) < limit)
 
 
 def _solved(equations: NormalEquations) -> Float64:
-    """Return the Gauss-Newton step; damping keeps undetermined directions at the prediction."""
+    """Return the Gauss-Newton step. Damping keeps undetermined directions at the prediction."""
     damping = 1e-6 * max(float(np.trace(equations.A)), 1e-12) * np.eye(6)
     return np.asarray(np.linalg.solve(equations.A + damping, -equations.b))

@@ -9,4 +9,4 @@ from framework.interfaces import Viewer
 
 @dataclass
 class NoViewer(Viewer):
-    """Viewer that shows nothing."""
+    """Viewer without output."""

@@ -1,4 +1,4 @@
-"""Live view in rerun (https://rerun.io, Apache-2.0 and MIT): in a window, in a browser, or recorded to a file."""
+"""Live view with rerun (https://rerun.io, Apache-2.0 and MIT) in a window, in a browser, or recorded to a file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from framework.live_view.sealed_page import SealedPage
 log = logging.getLogger(__name__)
 
 RECORDING = "recording.rrd"
-FLUSH_S = 0.2  # maximum duration that a killed run loses
+FLUSH_S = 0.2  # maximum duration of data lost by a killed run, s
 
 
 class Mode(Enum):
@@ -42,18 +42,18 @@ class Mode(Enum):
 class RerunViewer(Viewer):
     """Viewer of the camera path, the newest frame with masks and depth, the mesh, object boxes, and stage times.
 
-    If drawing is slower than mapping, pictures are omitted, but no poses, times or lost frames.
+    If drawing is slower than mapping, images are omitted. Poses, times and lost frames are always shown.
     """
 
     mode: Mode = Mode.RECORD  # output of the viewer
-    file: str = ""  # .rrd file; "" = recording.rrd in the run directory for RECORD, else none
+    file: str = ""  # .rrd file; "" = recording.rrd in the run directory for RECORD, none for other modes
     frame_interval: int = 3  # interval between images, frames, >= 1
     mesh_interval: float = 2.0  # minimum interval between mesh snapshots, s, in [0.1, 3600]
     stride: int = 2  # subsampling of the images, px, in [1, 16]
     jpeg_quality: int = 75  # JPEG quality of the images, in [1, 100]
     region_size: float = 1.0  # side of the cubic regions of the mesh, m, in [0.1, 1000]
     min_confidence: float = 0.3  # minimum confidence of displayed objects and labeled detections, in [0, 1]
-    memory_limit: str = "2GB"  # maximum memory of WINDOW and BROWSER; the oldest data are dropped first
+    memory_limit: str = "2GB"  # maximum memory of WINDOW and BROWSER, e.g. 2GB or 25%; oldest data are dropped first
     port: int = 9876  # port of the data, in [1024, 65535]; an open viewer on this port is reused by WINDOW
     web_port: int = 9090  # port of the web page of BROWSER, in [1024, 65535]
 

@@ -65,7 +65,7 @@ def test_mapper_add_unusable_frame_keeps_map_unchanged(room: CornerRoom) -> None
     mapper = Mapper(*STAGES)
     mapper.add(room[0])
     before = mapper.scene.mesh().vertices
-    with pytest.raises(DataError, match=r"frame 1: expected a true pose at .* s, got none"):
+    with pytest.raises(DataError, match=r"frame 1: expected a ground-truth pose at .* s, got none"):
         mapper.add(replace(room[1], T_world_camera=None))
     np.testing.assert_array_equal(mapper.scene.mesh().vertices, before)
     assert not mapper.add(room[2]).lost

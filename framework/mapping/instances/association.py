@@ -1,10 +1,11 @@
 """Data association of a frame's clusters with the instances of the map.
 
-The pixels of a cluster vote for the instances of the map at their positions, which are those of the voxels at the
-measured surface, or those of the ray-cast view, our reading of section 3.3 of the paper. Pairs may match if their
-overlap is large enough, by default over the smaller of the two, so that a part of an object matches the whole. Matching
-is one to one, best IoU first, so that a table does not match the book on it. An unmatched cluster creates a new
-instance.
+The pixels of a cluster vote for the instances of the map at their positions. The instances come from the voxels at the
+measured surface or from the ray-cast view. The ray-cast view is our interpretation of section 3.3 of the paper.
+
+A cluster and an instance may match if their overlap is large enough. By default the overlap is relative to the smaller
+of the two, so that a part of an object matches the whole. Matching is one to one, best IoU first, so that a table does
+not match the book on it. An unmatched cluster creates a new instance.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
-VOTES_ACROSS = 320  # pixels of an image row that vote; more take time without a benefit
+VOTES_ACROSS = 320  # voting pixels per image row; more pixels take time without a benefit
 
 
 class InstanceSource(Enum):
@@ -41,48 +42,48 @@ class InstanceSource(Enum):
 class OverlapRule(Enum):
     """The denominator of an overlap."""
 
-    SMALLER = "size of the smaller of cluster and instance, so that a part of an object matches the whole"
+    SMALLER = "size of the cluster or the instance, the smaller one, so that a part of an object matches the whole"
     IOU = "number of pixels in either"
     CLUSTER = "size of the cluster: a small part of an object matches it, the reverse may not"
 
 
 @dataclass(frozen=True)
 class Overlaps:
-    """The overlap of N clusters with the M instances that the frame sees."""
+    """Overlap of N clusters with the M instances visible in the frame."""
 
     instance_ids: Int32  # (M,) ascending
-    visible: Int32  # (M,) pixels that see each instance
+    visible: Int32  # (M,) pixels of each visible instance
     sizes: Int32  # (N,) pixels of each cluster
-    votes: Int32  # (N, M) pixels of both
-    seen: Int32  # (h, w) the instance at every `stride`-th pixel of every `stride`-th row, 0 = none
+    votes: Int32  # (N, M) pixels shared by a cluster and an instance
+    seen: Int32  # (h, w) instance at every `stride`-th pixel of every `stride`-th row, 0 = none
     stride: int
 
     def by(self, rule: OverlapRule, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the overlaps (N, M) in [0, 1] by a rule; `min_pixels` as in `over_smaller`."""
+        """Return the overlaps (N, M) in [0, 1] by a rule; see `over_smaller` for `min_pixels`."""
         if rule is OverlapRule.CLUSTER:
             return np.asarray(self.votes / np.maximum(self.sizes[:, None], min_pixels))
         return self.over_smaller(min_pixels) if rule is OverlapRule.SMALLER else self.over_union(min_pixels)
 
     def over_union(self, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return IoUs (N, M) in [0, 1] of clusters and visible instances; unions count at least `min_pixels`."""
+        """Return the IoUs (N, M) in [0, 1] of clusters and visible instances; unions count at least `min_pixels`."""
         union = self.sizes[:, None] + self.visible[None, :] - self.votes
         return np.asarray(self.votes / np.maximum(union, min_pixels))
 
     def over_smaller(self, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return shared pixels (N, M) over the smaller of cluster and visible instance, in [0, 1].
+        """Return the shared pixels (N, M) divided by the smaller of cluster and visible instance, in [0, 1].
 
-        The smaller one counts at least `min_pixels`: otherwise a few stray voxels under a cluster would overlap it
-        completely, and match it instead of its own instance.
+        The divisor is at least `min_pixels`. Otherwise a few stray voxels under a cluster would overlap it completely,
+        and match it instead of its own instance.
         """
         return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), min_pixels)
 
 
 def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> Overlaps:
-    """Return the overlaps with `instance_ids` (h, w) at every stride-th pixel, each counted stride^2 times."""
+    """Return the overlaps with `instance_ids` (h, w) at every stride-th pixel; each pixel counts stride^2 times."""
     is_seen = np.zeros(instance_ids.max() + 1, np.bool_)
     find_seen(instance_ids, is_seen)
     seen = np.flatnonzero(is_seen)
-    column = np.full(len(is_seen), len(seen), np.int32)  # of each id in `votes`; the last one = no instance
+    column = np.full(len(is_seen), len(seen), np.int32)  # column of each id in `votes`; the last column = no instance
     column[seen] = np.arange(len(seen), dtype=np.int32)
     by_chunk = np.zeros((CHUNKS, points.cluster_count + 1, len(seen) + 1), np.int32)
     count_votes(points, instance_ids, stride, column, by_chunk)
@@ -98,14 +99,15 @@ def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> 
 
 
 def class_agreement(clusters: Float32, instances: Float32) -> npt.NDArray[np.float64]:
-    """Return the Bhattacharyya coefficients (N, M) of distributions (N, C) and (M, C), in [0, 1], 1 = equal."""
+    """Return the Bhattacharyya coefficients (N, M) in [0, 1] of distributions (N, C) and (M, C); 1 = equal."""
     return np.asarray(np.sqrt(clusters.astype(np.float64)) @ np.sqrt(instances.astype(np.float64)).T)
 
 
 def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int32:
-    """Return the column (N,) of each row in a greedy matching of the `allowed` pairs (N, M), most preferred first.
+    """Return the matched column (N,) of each row, -1 = unmatched.
 
-    -1 = unmatched. Ties go to the smaller column, then to the smaller row.
+    The matching of the `allowed` pairs (N, M) is greedy, largest preference first. Ties go to the smaller column, then
+    to the smaller row.
     """
     match = np.full(len(allowed), -1, np.int32)
     rows, columns = np.nonzero(allowed)
@@ -119,20 +121,20 @@ def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int3
 
 
 def vote_stride(camera: Camera) -> int:
-    """Return the distance of the pixels and rows that vote."""
+    """Return the stride of the voting pixels and rows."""
     return max(1, camera.width // VOTES_ACROSS)
 
 
 class LabeledMap(Protocol):
-    """A map with an instance table and instance labels in its voxels, as association needs it."""
+    """A map with an instance table and with instance labels in its voxels."""
 
     table: InstanceTable
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """Return the most likely instance (ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
 
-        Samples every stride-th reading of every stride-th row of `frame.depth`. Unlike a ray-cast, this cannot see an
-        instance behind a new object.
+        Samples every stride-th depth reading of every stride-th row of `frame.depth`. Unlike ray-casting, the look-up
+        cannot see an instance behind a new object.
         """
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
@@ -144,18 +146,19 @@ class LabeledMap(Protocol):
 
 @dataclass(frozen=True)
 class Matches:
-    """The instances of a frame's N clusters."""
+    """Instances of a frame's N clusters."""
 
     frame_index: int
     clusters: PointClusters
-    overlaps: Overlaps  # with the instances of the map before this frame
-    instance_ids: Int32  # (N,) an old or a new one, 0 = none
+    overlaps: Overlaps  # overlaps with the instances of the map before this frame
+    instance_ids: Int32  # (N,) id of an existing or a new instance, 0 = none
 
 
 def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min_pixels: int) -> None:
     """Update the table with the `class_evidence` (N, C) of the clusters.
 
-    An instance is in view if at least `min_pixels` see it, or if it was detected. A frame without detection is ignored.
+    An instance is in view if at least `min_pixels` pixels show it, or if it was detected. A frame without detection is
+    ignored.
     """
     if not matches.clusters.detected:
         return
@@ -172,7 +175,7 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min
 
 
 def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:
-    """Return the embeddings by cluster, weighted with the scores, of the clusters that have one."""
+    """Return the embeddings by cluster, weighted by score. Clusters without an embedding are omitted."""
     if clusters.embeddings is None:
         return {}
     embedded = np.flatnonzero(clusters.embeddings.any(axis=1) & (clusters.scores > 0))
@@ -181,17 +184,17 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 
 @dataclass
 class Association:
-    """Association of clusters with instances, and merging of instances detected as one."""
+    """Association of clusters with instances, and merging of instances detected as one object."""
 
     association: InstanceSource = InstanceSource.SURFACE_LOOKUP  # source of the compared instances
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
     min_class_agreement: float = 0.0  # minimum Bhattacharyya coefficient of the classes to match, in [0, 1]
-    create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; any score can update one
+    create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; updates have no minimum
     create_points: int = 50  # minimum cluster size to create an instance, px, >= 1; also minimum overlap denominator
     split_instances: bool = True  # new instance for the second of two clusters on one instance; False = none
     merge_overlap: float = 1.0  # minimum overlap of two instances with one cluster to merge, in [0, 1]; 1 = no merging
-    merge_frames: int = 3  # minimum frames with a joint cluster, minus frames with separate ones, to merge, >= 1
+    merge_frames: int = 3  # minimum frames with a joint cluster, minus frames with separate clusters, to merge, >= 1
     merge_agreement: float = 0.1  # minimum Bhattacharyya coefficient of the classes to merge, in [0, 1]
 
     def __post_init__(self) -> None:
@@ -205,10 +208,10 @@ class Association:
             merge_frames=(1, 2**31),
             merge_agreement=(0.0, 1.0),
         )
-        self._merge_votes: Counter[tuple[int, int]] = Counter()  # frames that detect two as one, minus other frames
+        self._merge_votes: Counter[tuple[int, int]] = Counter()  # frames with a joint cluster, minus other frames
 
     def match(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> tuple[PixelLists, Matches]:
-        """Return the clusters over each pixel, and their matches with old and new instances of the map."""
+        """Return the clusters over each pixel, and their matches with existing and new instances of the map."""
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self.look_up(scene, frame, pose, points)
         return points, self.associate(scene.table, overlaps, clusters, frame.index)
@@ -222,7 +225,7 @@ class Association:
         return count_overlaps(points, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
 
     def associate(self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> Matches:
-        """Match each cluster with an instance that overlaps enough, or create one if its score and size suffice."""
+        """Match each cluster with an overlapping instance, or create an instance if score and size suffice."""
         frame_index = table.number_of(frame_index)
         allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
@@ -238,7 +241,7 @@ class Association:
         return Matches(frame_index, clusters, overlaps, instance_ids)
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
-        """Return (N, M) whether the classes of a cluster and an instance allow a match."""
+        """Return an array (N, M), True if the classes of a cluster and an instance allow a match."""
         if self.min_class_agreement == 0 or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.stack([table.class_probabilities(table.records[int(k)]) for k in instance_ids])
@@ -249,7 +252,7 @@ class Association:
         observe(table, matches, class_evidence, self.create_points)
 
     def merge(self, scene: LabeledMap, matches: Matches) -> None:
-        """Merge two instances that are often under one cluster, and rarely detected as two (after Voxblox++)."""
+        """Merge instances that are often under one cluster and rarely detected separately (after Voxblox++)."""
         matched = sorted(set(matches.instance_ids[matches.instance_ids > 0].tolist()))
         self._merge_votes.subtract(combinations(matched, 2))
         for k, row in enumerate(matches.overlaps.over_smaller(self.create_points)):
@@ -261,10 +264,10 @@ class Association:
                 if self._merge_votes[pair] >= self.merge_frames and self._same_class(scene.table, *pair):
                     scene.merge(*pair)
                     self._forget(pair[1])
-                    return  # the overlaps are outdated now; other pairs will be detected again
+                    return  # the overlaps are outdated now; later frames detect other pairs again
 
     def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
-        """Return whether the classes of two instances allow a merge: a book on a table is not the table."""
+        """Return True if the classes of two instances allow a merge. A book on a table is not the table."""
         known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
         return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
 
@@ -273,13 +276,13 @@ class Association:
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the label space of a map, that of its first frame; `known` is () before.
+    """Return the label space of a map, set by its first frame; `known` is () before.
 
-    Raises DataError if a later frame has another one.
+    Raises DataError if a later frame has a different label space.
     """
     if known and known != found:
         raise DataError(
-            f"detector: expected the classes of the map ({len(known)}), got {len(found)} other ones in the "
+            f"detector: expected the {len(known)} classes of the map, got {len(found)} different classes in the "
             "frame's clusters; use one detector, or map all detectors to one label space"
         )
     return found

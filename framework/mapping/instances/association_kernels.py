@@ -22,7 +22,7 @@ def look_up_instances(
 ) -> None:
     """Fill instance_ids (ceil(H / stride), ceil(W / stride)) with the most likely instances of voxels; 0 = none.
 
-    The voxels are the nearest to every stride-th reading of every stride-th row of `depth` (H, W). `view` holds
+    Looks up the nearest voxel to every stride-th depth reading of every stride-th row of `depth` (H, W). `view` holds
     T_world_camera.
     """
     columns = instance_ids.shape[1]
@@ -37,7 +37,7 @@ def look_up_instances(
                 rows[column], voxels[column] = label_row(grid, block), n
                 if rows[column] >= 0:
                     prefetch_element(evidence.labeled, rows[column], n)
-        # separate passes, each of which prefetches the memory of the next one
+        # separate passes; each pass prefetches the memory of the next pass
         for column in range(columns):
             voxel = evidence.labeled[rows[column], voxels[column]] if rows[column] >= 0 else np.int32(-1)
             voxels[column] = voxel
@@ -50,7 +50,7 @@ def look_up_instances(
 
 @njit(cache=True, nogil=True)
 def find_seen(instance_ids, seen):
-    """Mark the instances in instance_ids (h, w) in seen (ids + 1,)."""
+    """Mark the instances of instance_ids (h, w) in seen (ids + 1,)."""
     for instance in instance_ids.flat:
         if instance > 0:
             seen[instance] = True
@@ -58,7 +58,7 @@ def find_seen(instance_ids, seen):
 
 @device
 def _add_run(count, list_id, label, offsets, clusters, column, votes):
-    """Add `count` pixels of a list and an instance to the votes (N + 1, M + 1) of its clusters, and of the last row."""
+    """Add `count` pixels of a list on an instance to the votes (N + 1, M + 1) of its clusters and of the last row."""
     votes[votes.shape[0] - 1, column[label]] += count
     for entry in range(offsets[list_id], offsets[list_id + 1]):
         votes[clusters[entry], column[label]] += count
@@ -68,8 +68,8 @@ def _add_run(count, list_id, label, offsets, clusters, column, votes):
 def count_votes(points, instance_ids, stride, column, votes):
     """Add the number of pixels of each cluster (row) on each instance (column) to votes (CHUNKS, N + 1, M + 1).
 
-    The last row counts all pixels.
-    Counts runs of pixels, because a counter raised for each pixel would wait for its own memory.
+    The last row counts all pixels. The kernel counts runs of pixels: incrementing a counter for each pixel would stall
+    on memory.
     """
     list_ids, offsets, clusters = points.list_ids, points.offsets, points.clusters
     rows = instance_ids.shape[0]

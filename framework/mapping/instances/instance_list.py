@@ -1,4 +1,4 @@
-"""The instances of a map: which are confirmed, and their boxes."""
+"""Instances of a map, their confirmation and their boxes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from framework.mapping.instances.association import agreed_classes
 from framework.mapping.instances.instance_table import InstanceRecord, InstanceTable
 from framework.mapping.storage.map_header import MapHeader
 
-LEAST_VERTICES = 4  # that span a box
+LEAST_VERTICES = 4  # minimum number of vertices that span a box
 
 
 class InstanceClass(Enum):
-    """The source of an instance's class distribution, which the paper leaves open."""
+    """The source of an instance's class distribution. The paper does not specify it."""
 
     DETECTIONS = "the evidence of its detections"
     VOXELS = "the evidence of its voxels, summed"
@@ -28,9 +28,10 @@ class InstanceClass(Enum):
 
 @dataclass(frozen=True)
 class Confirmation:
-    """The conditions for an instance to be in the `mesh` and the `instances` of a map. Until then it is tentative.
+    """Conditions for an instance to be in the `mesh` and the `instances` of a map. Other instances are tentative.
 
-    `min_confidence` is low: unlikely instances rank last and cost little precision; omitted instances are lost.
+    `min_confidence` is low because unlikely instances rank last and cost little precision, while omitted instances are
+    lost.
     """
 
     min_observations: int = 3  # minimum number of frames with a detection of a confirmed instance, >= 1
@@ -46,30 +47,30 @@ class Confirmation:
         return cls(saved.whole("min_observations"), saved.number("min_confidence"), saved.number("min_area"))
 
     def is_met(self, record: InstanceRecord) -> bool:
-        """Return whether an instance meets the conditions, its area aside."""
+        """Return True if an instance meets the conditions, except the area."""
         return record.observations >= self.min_observations and record.confidence >= self.min_confidence
 
     def counts(self, table: InstanceTable) -> Bool:
-        """Return (ids + 1,) whether an instance meets the conditions, its area aside."""
+        """Return an array (ids + 1,), True if an instance meets the conditions, except the area."""
         counts = np.zeros(table.last_id + 1, np.bool_)
         for record in table.records.values():
             counts[record.id] = self.is_met(record)
         return counts
 
     def min_vertices(self, voxel_size: float) -> int:
-        """Return the number of vertices of an instance of `min_area`."""
+        """Return the number of vertices of an instance with `min_area`."""
         return vertices_of_area(self.min_area, voxel_size)
 
     def too_small(self, instance_ids: Int32, voxel_size: float) -> Bool:
-        """Return (V,) whether a vertex belongs to an instance below `min_area`, by the ids (V,) of all vertices."""
+        """Return an array (V,), True if a vertex belongs to an instance below `min_area`; `instance_ids` is (V,)."""
         return np.asarray((np.bincount(instance_ids) < self.min_vertices(voxel_size))[instance_ids])
 
 
 class InstanceTableMap(SceneMap):
     """A map that keeps its instances in a table.
 
-    `mesh` and `instances` have the confirmed instances; `render` has the tentative ones, too. Ids and classes ignore
-    the minimum area, which would take a mesh.
+    `mesh` and `instances` contain the confirmed instances. `render` also contains the tentative instances. Ids and
+    classes ignore the minimum area, because computing the area takes a mesh.
     """
 
     table: InstanceTable
@@ -87,16 +88,16 @@ class InstanceTableMap(SceneMap):
         return {k: (int(evidence[k].argmax()), self.table.records[k].confidence) for k in evidence}
 
     def class_evidence(self) -> dict[int, Float64]:
-        """Return the class evidence (C,) of each confirmed instance, by id: that of its detections."""
+        """Return the class evidence (C,) of each confirmed instance by id, from its detections."""
         confirmed = filter(self.confirmation.is_met, self.table.records.values())
         return {record.id: record.class_evidence for record in confirmed}
 
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Adopt the label space of the first frame. Raises DataError if a later frame has another one."""
+        """Adopt the label space of the first frame. Raises DataError if a later frame has a different label space."""
         self.classes = agreed_classes(self.classes, classes)
 
     def instances(self) -> Mapping[int, Instance]:
-        """Return the instances that have vertices, by id, ascending; boxes are upright if gravity is known."""
+        """Return the instances with vertices by id, ascending; boxes are upright if gravity is known."""
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         class_evidence = self.class_evidence()
         for k, vertices in vertices_by_id(mesh.instance_ids).items():
@@ -120,27 +121,27 @@ class InstanceTableMap(SceneMap):
 def vertices_of_area(area: float, voxel_size: float) -> int:
     """Return the number of vertices of a surface of `area` m^2, at least LEAST_VERTICES.
 
-    A vertex counts voxel_size^2, which is exact if the surface is parallel to the grid. The mesh has one vertex for
-    each voxel that the surface crosses, up to sqrt(3) times as many.
+    A vertex counts voxel_size^2. The area is exact if the surface is parallel to the grid. The mesh has one vertex for
+    each voxel that the surface crosses, so other surfaces have up to sqrt(3) times as many vertices.
     """
     return max(LEAST_VERTICES, round(area / voxel_size**2))
 
 
 def vertices_by_id(instance_ids: Int32) -> dict[int, Int32]:
-    """Return the vertices (M,) of each instance, ascending, from the ids (V,) of all vertices; id 0 is left out."""
+    """Return the vertices (M,) of each instance, ascending, from the ids (V,) of all vertices; id 0 is omitted."""
     order = np.argsort(instance_ids, kind="stable").astype(np.int32)
     ids, starts = np.unique(instance_ids[order], return_index=True)
     return {int(k): vertices for k, vertices in zip(ids, np.split(order, starts[1:]), strict=False) if k > 0}
 
 
 def aligned_box(points: Float32) -> Box:
-    """Return the box along the world's axes around points (M, 3) m."""
+    """Return the axis-aligned box around points (M, 3) m in the world frame."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     return Box((low + high) / 2, high - low, np.eye(3))
 
 
 def box_around(points: Float32, up: Float64 | None) -> Box:
-    """Return the smallest upright box around points (M, 3) m; if `up` is unknown, the one along the points' axes."""
+    """Return the smallest upright box around points (M, 3) m; if `up` is unknown, the box along the points' axes."""
     return oriented_box(points) if up is None else upright_box(points, up)
 
 
@@ -160,7 +161,7 @@ def upright_box(points: Float32, up: Float64) -> Box:
 
 def oriented_box(points: Float32) -> Box:
     """Return the box along the principal axes of the convex hull of points (M, 3) m, which may be coplanar (Open3D)."""
-    import open3d as o3d  # takes half a second and 170 MB, and most maps have gravity
+    import open3d as o3d  # takes half a second and 170 MB; most maps have gravity and do not need it
 
     four = np.resize(points, (max(len(points), 4), 3))  # Qhull needs four; repeated points change nothing
     box = o3d.geometry.OrientedBoundingBox.create_from_points(

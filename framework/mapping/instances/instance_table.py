@@ -1,4 +1,4 @@
-"""The instance table: class evidence, observations and confidence of each instance."""
+"""Instance table: class evidence, observations and confidence of each instance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class FrameSet:
     """A set of frame indices, stored as spans of consecutive frames."""
 
     def __init__(self, spans: Iterable[list[int]] = ()) -> None:
-        self.spans: list[list[int]] = []  # first and last frame of each, ascending, with a gap between any two
+        self.spans: list[list[int]] = []  # first and last frame of each span, ascending, with gaps between spans
         self._count = 0
         for first, last in sorted(spans):
             self._append(first, last)
@@ -35,7 +35,7 @@ class FrameSet:
             self._append(frame, frame)
 
     def _append(self, first: int, last: int) -> None:
-        """Add a span that begins in the last one or after it."""
+        """Add a span that begins within or after the last span."""
         if not self.spans or first > self.spans[-1][1] + 1:
             self.spans.append([first, first - 1])
         self._count += max(last - self.spans[-1][1], 0)
@@ -44,26 +44,26 @@ class FrameSet:
 
 @dataclass
 class InstanceRecord:
-    """The history of one instance. `class_evidence` (C,) is that of its detections, combined by the fuser's rule."""
+    """The history of one instance. `class_evidence` (C,) combines its detections by the fuser's rule."""
 
     id: int
     class_evidence: Float64
     first_frame: int = -1
     last_frame: int = -1
-    observed_in: set[int] = field(default_factory=set)  # frames in which it was detected
-    in_view: FrameSet = field(default_factory=FrameSet)  # frames in which it could have been detected
-    score_sum: float = 0.0  # over its detections
+    observed_in: set[int] = field(default_factory=set)  # frames with a detection
+    in_view: FrameSet = field(default_factory=FrameSet)  # frames with a possible detection
+    score_sum: float = 0.0  # sum over its detections
     detections: int = 0
-    embedding: ObjectEmbedding | None = None  # over its detections with one
+    embedding: ObjectEmbedding | None = None  # sum over its detections with an embedding
 
     @property
     def observations(self) -> int:
-        """Frames in which it was detected, once or more."""
+        """Number of frames with a detection."""
         return len(self.observed_in)
 
     @property
     def visible(self) -> int:
-        """Frames in which it was in view."""
+        """Number of frames in view."""
         return len(self.in_view)
 
     @property
@@ -76,17 +76,18 @@ class InstanceRecord:
 class InstanceTable:
     """The instances of a map by id; ids start at 1 and are never reused.
 
-    Class evidence is combined as in the voxels; it is log-likelihoods if `logarithmic`, otherwise proportional.
+    Class evidence is combined by the rule of the voxels. If `logarithmic`, it is log-likelihoods, otherwise
+    proportional.
     """
 
     def __init__(self, combine: Combine = Combine.SUM, logarithmic: bool = True) -> None:
         self.records: dict[int, InstanceRecord] = {}
         self.last_id = 0
-        self._last_before = -1  # last frame of the previous recordings
-        self._offset = 0  # of the frame indices of this recording
+        self._last_before = -1  # last frame of the previous sequences
+        self._offset = 0  # offset of the frame indices of this sequence
         self.combine = combine
         self.logarithmic = logarithmic
-        self.embedding_space = ""  # of the embeddings of its instances; "" = there are none
+        self.embedding_space = ""  # space of the instances' embeddings; "" = no embeddings
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
         """Create an instance without observations."""
@@ -96,13 +97,13 @@ class InstanceTable:
         return record
 
     def begin_recording(self) -> None:
-        """Start another recording, whose frames may have the indices of previous ones."""
+        """Start another sequence. Its frame indices may repeat those of previous sequences."""
         spans = [span[1] for record in self.records.values() for span in record.in_view.spans[-1:]]
         self._last_before = max([*spans, *(record.last_frame for record in self.records.values())], default=-1)
         self._offset = 0
 
     def number_of(self, frame_index: int) -> int:
-        """Return the index of a frame in this map, offset so that it is above those of previous recordings."""
+        """Return the index of a frame in this map, offset to be above all frames of previous sequences."""
         if frame_index + self._offset <= self._last_before:
             self._offset = self._last_before + 1
         return frame_index + self._offset
@@ -138,11 +139,11 @@ class InstanceTable:
         a.last_frame = max(a.last_frame, b.last_frame)
 
     def class_probabilities(self, record: InstanceRecord) -> Float32:
-        """Return the class distribution (C,) of an instance by its detections."""
+        """Return the class distribution (C,) of an instance from its detections."""
         return self.distribution(record.class_evidence)
 
     def distribution(self, evidence: Float64) -> Float32:
-        """Return the distribution (C,) of class evidence: the normalized likelihood, or the normalized evidence."""
+        """Return the distribution (C,) of class evidence: the normalized likelihood or the normalized evidence."""
         likelihood = np.exp(evidence - evidence.max()) if self.logarithmic else evidence
         total = likelihood.sum()
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)

@@ -15,8 +15,8 @@ from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader
 ARRAYS = ("embedding_ids", "embedding_sums", "embedding_weights", "embedding_counts")
 """Arrays of a map file with embeddings: (M,) int32, (M, D) float64, (M,) float64, (M,) int64."""
 
-SPACE = "embedding_space"  # the key of a saved table with the space of its embeddings
-MOST_WEIGHT = 1e12  # of one object
+SPACE = "embedding_space"  # key of the embedding space in a saved table
+MOST_WEIGHT = 1e12  # maximum weight of one object
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class ObjectEmbedding:
 
     sum: Float64  # (D,)
     weight: float  # > 0, the sum of the weights
-    count: int  # of vectors, >= 1
+    count: int  # number of vectors, >= 1
 
     @classmethod
     def of(cls, embedding: Float32, weight: float) -> ObjectEmbedding:
-        """Return the sum of one unit vector (D,)."""
+        """Return the weighted sum of a single unit vector (D,)."""
         return cls(weight * embedding.astype(np.float64), weight, 1)
 
     def __add__(self, other: ObjectEmbedding) -> ObjectEmbedding:
@@ -42,27 +42,27 @@ class ObjectEmbedding:
 
     @property
     def mean(self) -> Float32:
-        """The unit vector (D,) along the sum; 0 if its vectors cancel out."""
+        """The unit vector (D,) along the sum; 0 if the vectors cancel out."""
         length = float(np.linalg.norm(self.sum))
         return np.asarray(self.sum / length if length > 0 else self.sum, np.float32)
 
     @property
     def spread(self) -> float:
-        """1 - |mean of the unit vectors|, in [0, 1]: 0 = all equal."""
+        """1 - |mean of the unit vectors|, in [0, 1]; 0 = all equal."""
         return float(np.clip(1 - np.linalg.norm(self.sum) / self.weight, 0, 1))
 
 
 def added(known: ObjectEmbedding | None, new: ObjectEmbedding | None) -> ObjectEmbedding | None:
-    """Return the sum of two embeddings, either of which may be missing."""
+    """Return the sum of two embeddings; either may be missing."""
     if known is None or new is None:
         return known or new
     return known + new
 
 
 def agreed_space(known: str, found: str) -> str:
-    """Return the embedding space of a map, that of its first embeddings; `known` is "" before.
+    """Return the embedding space of a map, set by its first embeddings; `known` is "" before.
 
-    Raises DataError if later embeddings are of another space.
+    Raises DataError if later embeddings are from another space.
     """
     if known and known != found:
         raise DataError(
@@ -73,7 +73,7 @@ def agreed_space(known: str, found: str) -> str:
 
 
 def embedding_arrays(embeddings: Mapping[int, ObjectEmbedding]) -> dict[str, Array]:
-    """Return the arrays of a map file for embeddings by id; empty if there are none."""
+    """Return the arrays of a map file for embeddings by id; empty without embeddings."""
     if not embeddings:
         return {}
     values = list(embeddings.values())
@@ -112,10 +112,10 @@ def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, d
         )
     if n and not (counts.min() >= 1 and counts.max() <= LARGEST_COUNT):
         raise DataError(f"embedding_counts: expected at least 1, got {counts.min()}")
-    with np.errstate(over="ignore"):  # of invalid values
+    with np.errstate(over="ignore"):  # invalid values may overflow
         lengths = np.linalg.norm(sums / weights[:, None], axis=1)
     if n and lengths.max() > 1 + 1e-3:
-        raise DataError(f"embedding_sums: expected lengths of at most their weights, got {lengths.max():.4g} of one")
+        raise DataError(f"embedding_sums: expected at most 1 per unit of weight, got {lengths.max():.4g}")
     return space, {
         int(k): ObjectEmbedding(sums[i], float(weights[i]), int(counts[i])) for i, k in enumerate(ids.tolist())
     }

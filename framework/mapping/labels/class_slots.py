@@ -1,12 +1,12 @@
 """Operations on all class slots of a voxel.
 
-The sixteen slots of compact storage are one SIMD vector. LLVM unrolls such a short loop before it can vectorize it, so
+The sixteen slots of compact storage are one SIMD vector. LLVM unrolls such a short loop before it can vectorize it. So
 these intrinsics emit vector instructions, which LLVM maps to any little-endian processor. Exact storage has other types
 and more slots, and uses loops with the same results.
 
-A quantized score is a log-odds (or a vote) times the scale of the label rule, rounded. `cluster_scores` (NO_CLASS + 1,)
-of a cluster hold it for each class in the upper bits, and in the lowest NEW_CLASSES bits which of the named classes it
-is.
+A quantized score is a log-odds (or a vote) times the scale of the label rule, rounded. Each entry of `cluster_scores`
+(NO_CLASS + 1,) holds the score of a class in the upper bits. The lowest NEW_CLASSES bits mark its index among the
+named classes.
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ from numba.extending import intrinsic, overload
 
 from framework.mapping.voxels.voxel_grid_kernels import device
 
-CLASS_SLOTS = 16  # of a voxel in compact storage
-NO_CLASS = 255  # in a free slot; slots are filled from the front
-NEW_CLASSES = 8  # classes that a cluster names: those that it can bring into the slots of a voxel
+CLASS_SLOTS = 16  # class slots of a voxel in compact storage
+NO_CLASS = 255  # class id of a free slot; slots are filled from the front
+NEW_CLASSES = 8  # classes that a cluster names and can add to the slots of a voxel
 ALL_NAMED = (1 << NEW_CLASSES) - 1
 
-_OPTIONS = {"forceinline": True, "error_model": "numpy", "_nrt": False}  # as those of `device`
+_OPTIONS = {"forceinline": True, "error_model": "numpy", "_nrt": False}  # the options of `device`
 
 
 @device
 def add_scores(classes, scores, cluster_scores, limit):
-    """Add the scores of a cluster to the scores (T,) of a voxel's classes (T,), which stay at -limit or above.
+    """Add the scores of a cluster to the scores (T,) of a voxel's classes (T,). Scores stay at -limit or above.
 
-    Returns the bits of the named classes that have a slot, the number of filled slots, and the excess of the largest
-    score over `limit`.
+    Returns the bits of the named classes with a slot, the number of filled slots, and the excess of the largest score
+    over `limit`.
     """
     return _add_scores(classes, scores, cluster_scores, limit)
 
 
 @device
 def most_likely_slot(classes, scores):
-    """Return the slot with the highest score; the smaller class wins a tie."""
+    """Return the slot with the highest score; ties go to the smaller class."""
     return _most_likely_slot(classes, scores)
 
 
 @device
 def least_likely_slot(scores):
-    """Return the first of the slots with the lowest score."""
+    """Return the slot with the lowest score; ties go to the first slot."""
     return _least_likely_slot(scores)
 
 
@@ -111,7 +111,7 @@ class _Slots:
         stored.align = 1
 
     def gather(self, table: Any, indices: Any) -> Any:
-        """Return the entries of a table at the bytes `indices`."""
+        """Return the entries of a table at the byte vector `indices`."""
         found = ir.Constant(_vector(table.type.pointee), ir.Undefined)
         for s in range(CLASS_SLOTS):
             index = self.builder.zext(self.builder.load(self.builder.gep(indices, [_INT32(s)])), _INT32)
@@ -186,7 +186,7 @@ def _least_likely_of_vector(_context: Any, scores: Any) -> Any:
 
 
 def _are_compact(*arrays: Any) -> bool:
-    """Return whether class ids, scores and cluster scores have the types of compact storage, with CLASS_SLOTS slots."""
+    """Return True if class ids, scores and cluster scores have the types and slots of compact storage."""
     kinds = (types.uint8, types.int16, types.int32)
     return all(array.dtype == kind for array, kind in zip(arrays, kinds, strict=False))
 

@@ -1,4 +1,4 @@
-"""Storage and update of the evidence rows, which `label_evidence.py` describes.
+"""Storage and update of the evidence rows of `label_evidence.py`.
 
 In compact storage a labeled voxel takes 80 bytes of slots: 8 for each instance slot and 3 for each class slot. A row
 takes 2 KiB. Only voxels near the surface and under masks are labeled.
@@ -30,25 +30,25 @@ from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-INSTANCE_SLOTS = 4  # of a voxel in compact storage
-RESERVED = 128  # labeled voxels reserved per block of the budget; most blocks have fewer, and the array grows
+INSTANCE_SLOTS = 4  # instance slots of a voxel in compact storage
+RESERVED = 128  # labeled voxels reserved per block of the budget; most blocks have fewer, and the array can grow
 ANY_INSTANCE = np.uint64(2**BITS - 1)
 SLOTS = Evidence._fields[1:]
 
 
 class Storage(Enum):
-    """How many labels a voxel stores."""
+    """Number of labels that a voxel stores."""
 
     COMPACT = "compact"
     EXACT = "exact"
 
 
 class NewVoxels(NamedTuple):
-    """The voxels of A seen blocks that get slots in this frame."""
+    """Voxels of A seen blocks that get slots in this frame."""
 
-    counts: Int32  # (A,)
-    rows: Int32  # (A,) the evidence row of each block
-    starts: Int32  # (A,) the index of its first new voxel among the labeled ones
+    counts: Int32  # (A,) new voxels of each block
+    rows: Int32  # (A,) evidence row of each block
+    starts: Int32  # (A,) index of each block's first new voxel among the labeled voxels
 
 
 class EvidenceRows:
@@ -66,14 +66,14 @@ class EvidenceRows:
         self.storage = storage
         self.score_scale = score_scale
         self.row_count = 0
-        self.voxel_count = 0  # with slots
-        self.evicted = 0  # slots given to another label so far
+        self.voxel_count = 0  # voxels with slots
+        self.evicted = 0  # number of slots reassigned to another label
         self._instance_slots = INSTANCE_SLOTS
         self._class_slots = CLASS_SLOTS
         self._free()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without reserved capacity, which is gigabytes."""
+        """Return the state without reserved capacity, which takes gigabytes."""
         rows = {name: getattr(self, name)[: self.row_count] for name in ("_labeled", "_row_bits")}
         used = {**rows, "_slots": self._slots[: self.voxel_count]}
         return {**vars(self), **used, "evidence": None}
@@ -94,7 +94,7 @@ class EvidenceRows:
         return Evidence(self.evidence.labeled[: self.row_count], **slots)
 
     def fill(self, saved: Evidence) -> None:
-        """Copy the evidence of a saved map, or its own with fewer slots for instances."""
+        """Copy the evidence of a saved map, or its own evidence with fewer instance slots."""
         self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
         self._free()
         self._reserve(len(saved.labeled), len(saved.instance_ids))
@@ -115,9 +115,9 @@ class EvidenceRows:
             self._free()
 
     def update(self, seen: SeenBlocks, measurement: Measurement) -> None:
-        """Update the voxels near the measured surface of the blocks that a frame has seen."""
+        """Update the voxels near the measured surface in the blocks that a frame has updated."""
         if not (measurement.instance_id.any() or len(measurement.clusters)):
-            return  # no evidence for or against any instance, nor for any class
+            return  # no evidence for or against any instance or class
         new = NewVoxels(*np.empty((3, len(seen.blocks)), np.int32))
         evicted = np.empty(len(seen.blocks), np.int32)
         if self.storage is Storage.EXACT:
@@ -133,15 +133,15 @@ class EvidenceRows:
     def merge_instances(self, kept: int, dropped: int) -> None:
         """Combine the evidence for instance `dropped` with that for `kept` in every voxel.
 
-        Rare; it visits the blocks in which the dropped instance was named, and one in 64 of the others.
+        Merging is rare. It visits the blocks that named the dropped instance, and one in 64 of the other blocks.
         """
         row_bits = self._row_bits[: self.row_count]
         merge_instances(self.evidence, row_bits, np.int32(kept), np.int32(dropped), int(self.combine))
 
     def classes_of_instances(self, counts: Bool, classes: int) -> Float64:
-        """Return the evidence (ids + 1, classes) of each instance with counts[id]: the sum over its voxels.
+        """Return the evidence (ids + 1, classes) of each instance with counts[id], summed over its voxels.
 
-        A voxel belongs to its most likely instance among these.
+        A voxel belongs to its most likely instance among the counted instances.
         """
         sums = np.zeros((len(counts), classes), np.int64)
         sum_classes_of_instances(self.in_use(), counts, sums)
@@ -149,7 +149,7 @@ class EvidenceRows:
 
     def _free(self) -> None:
         self._labeled = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))
-        self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS: a voxel of the row may name instance k
+        self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS: a voxel may name instance k
         scores = np.int16 if self.storage is Storage.COMPACT else np.int64
         shapes = self._instance_slots, self._instance_slots, self._class_slots, self._class_slots
         kinds = zip(SLOTS, (np.int32, np.float32, np.uint8, scores), shapes, strict=True)
@@ -161,12 +161,12 @@ class EvidenceRows:
         self.evidence = Evidence(self._labeled, **{name: self._slots[name] for name in SLOTS})
 
     def _free_classes(self) -> UInt8:
-        """Return the class slots of a new voxel: free ones, or in exact storage every class."""
+        """Return the class slots of a new voxel: free slots, or every class in exact storage."""
         named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, NO_CLASS)
         return named.astype(np.uint8)
 
     def _make_room(self, blocks: Int32, new: NewVoxels) -> None:
-        """Reserve slots for new.counts voxels of each of these blocks, and rows for blocks without one; fills `new`."""
+        """Reserve slots for new.counts voxels of each block, and rows for blocks without a row; fills `new`."""
         before = self.row_count
         label_row = self.voxels.grid.label_row
         self._reserve(*number_new(blocks, new.counts, label_row, before, self.voxel_count, new.rows, new.starts))
@@ -174,7 +174,7 @@ class EvidenceRows:
         self._row_bits[before : self.row_count] = 0
 
     def _reserve(self, rows: int, voxels: int) -> None:
-        """Set the number of rows and voxels in use; new ones are uninitialized."""
+        """Set the number of rows and voxels in use; new rows and voxels are uninitialized."""
         if rows > len(self._labeled):
             self._labeled = grown(self._labeled, max(rows, 2 * len(self._labeled)))
             self._row_bits = grown(self._row_bits, len(self._labeled))
@@ -184,7 +184,7 @@ class EvidenceRows:
         self._lay_out()
 
     def _make_room_for_instances(self, new: int) -> None:
-        """Double the slots until every voxel has `new` free ones."""
+        """Double the slots until every voxel has `new` free slots."""
         slots = self._instance_slots
         missing = new - int(fewest_free(self.in_use().instance_ids))
         while missing > 0:

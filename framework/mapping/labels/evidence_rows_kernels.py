@@ -18,18 +18,18 @@ from framework.mapping.voxels.integration_kernels import GROUP
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, device, one_more
 from framework.mapping.voxels.voxel_walk import prefetch_line, prefetch_row
 
-BITS = 64  # of the set of instances of a row or a list: instance k is bit k % BITS
+BITS = 64  # bits of the instance set of a row or a list; instance k is bit k % BITS
 
 
 @device
 def _has_clusters(measurement, list_id):
-    """Return whether a list has any clusters."""
+    """Return True if a list has any clusters."""
     return measurement.offsets[list_id] < measurement.offsets[list_id + 1]
 
 
 @device
 def _label(evidence, row, n, voxel, free_classes):
-    """Give voxel n of a row the slots of index `voxel`."""
+    """Assign the slots at index `voxel` to voxel n of a row."""
     evidence.labeled[row, n] = voxel
     for s in range(evidence.instance_ids.shape[1]):
         evidence.instance_ids[voxel, s] = 0
@@ -41,7 +41,7 @@ def _label(evidence, row, n, voxel, free_classes):
 
 @device
 def _prefetch_slots(evidence, voxel):
-    """Prefetch the slots of a labeled voxel: in compact storage all of them."""
+    """Prefetch the slots of a labeled voxel; in compact storage, all of its slots."""
     size = evidence.instance_ids.strides[0]
     start = np.int64(voxel) * size
     prefetch_line(evidence.instance_ids, start)
@@ -55,7 +55,7 @@ def _instance_bit(instance):
 
 @njit(cache=True, nogil=True)
 def find_list_bits(offsets, clusters, instance_id, list_bits):
-    """Fill list_bits (L,) with the bits of the instances of each list."""
+    """Fill list_bits (L,) with the instance bits of each list."""
     for i in range(list_bits.shape[0]):
         list_bits[i] = 0
         for entry in range(offsets[i], offsets[i + 1]):
@@ -64,9 +64,9 @@ def find_list_bits(offsets, clusters, instance_id, list_bits):
 
 @njit(cache=True, nogil=True, parallel=True)
 def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evicted):
-    """Update the near voxels of the seen blocks that have slots, and the bits of their rows, row_bits (R,).
+    """Update the near voxels with slots in the seen blocks, and the bits of their rows, row_bits (R,).
 
-    Counts the near voxels without slots whose list has clusters in new (A,), and evictions in evicted (A,).
+    Counts near voxels without slots and with clusters in their list in new (A,), and evictions in evicted (A,).
     """
     list_ids = measurement.list_ids.ravel()
     blocks = seen.blocks.shape[0]
@@ -101,7 +101,7 @@ def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evi
 def number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
     """Fill rows (A,) with the row of each block and first_new (A,) with the index of its first new voxel.
 
-    A block without row gets one if it has new (A,) voxels. Returns the numbers of rows and voxels.
+    A block without a row gets a row if it has new (A,) voxels. Returns the numbers of rows and voxels.
     """
     for a in range(blocks.shape[0]):
         rows[a], first_new[a] = row_of[blocks[a]], voxel_count
@@ -114,9 +114,9 @@ def number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_new(grid, seen, evidence, measurement, list_bits, row_bits, new, free_classes, evicted):
-    """Give the `new` voxels of each block their slots and update them, as update_rows().
+    """Assign slots to the `new` voxels of each block and update them like update_rows().
 
-    free_classes (T,) are the class slots of a voxel without evidence; evictions are added to evicted (A,).
+    free_classes (T,) are the class slots of a voxel without evidence. Evictions are added to evicted (A,).
     """
     row_of = grid.label_row  # numba 0.68 loses assignments to an element of a tuple's array within prange
     list_ids = measurement.list_ids.ravel()
@@ -135,7 +135,7 @@ def label_new(grid, seen, evidence, measurement, list_bits, row_bits, new, free_
 
 @njit(cache=True, nogil=True)
 def fewest_free(instance_ids):
-    """Return the smallest number of free slots of a voxel, of instance_ids (L, S)."""
+    """Return the smallest number of free slots of any voxel in instance_ids (L, S)."""
     slots = instance_ids.shape[1]
     fewest = slots
     for ids in instance_ids:
@@ -148,7 +148,7 @@ def fewest_free(instance_ids):
 
 @device
 def _merge_voxel(ids, values, kept, dropped, combine):
-    """Move the evidence of a voxel for instance `dropped`, if there is any, to `kept`."""
+    """Move a voxel's evidence for instance `dropped`, if any, to `kept`."""
     for s in range(len(ids)):
         if ids[s] == dropped:
             value = values[s]
@@ -164,7 +164,7 @@ def _merge_voxel(ids, values, kept, dropped, combine):
 
 @njit(cache=True, nogil=True, parallel=True)
 def merge_instances(evidence, row_bits, kept, dropped, combine):
-    """Merge two instances in the rows whose row_bits (R,) have the dropped one, and set the bit of the kept one."""
+    """Merge two instances in rows with the dropped instance in row_bits (R,), and set the bit of the kept instance."""
     for row in prange(row_bits.shape[0]):
         if row_bits[row] & _instance_bit(dropped):
             row_bits[row] |= _instance_bit(kept)
@@ -175,7 +175,7 @@ def merge_instances(evidence, row_bits, kept, dropped, combine):
 
 @njit(cache=True, nogil=True)
 def sum_classes_of_instances(evidence, counts, sums):
-    """Add the quantized class scores of every labeled voxel to those of its instance, sums (ids + 1, C)."""
+    """Add the quantized class scores of every labeled voxel to the sums (ids + 1, C) of its instance."""
     for voxel in range(evidence.class_ids.shape[0]):
         instance = best_counted_instance(evidence, voxel, counts)
         for s in range(evidence.class_ids.shape[1] if instance > 0 else 0):

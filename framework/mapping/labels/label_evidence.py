@@ -1,22 +1,23 @@
 """Label evidence of the voxels: the likelihood of each instance and class, and its update by a frame.
 
-The paper's rule is the voxel-wise Bayesian update, two independent recursions, eqs. [7] and [8]:
+The paper's rule is a voxel-wise Bayesian update by two independent recursions, eqs. [7] and [8]:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t)
 
-In log space it is a sum of log-likelihoods, from a uniform start. Only ratios matter, so a voxel stores the log-odds of
-each label over the unnamed labels, which no cluster named there. Other rules (counts, latest, most confident) store
-other values and differ in how new evidence is combined with old: `Combine`.
+In log space the update is a sum of log-likelihoods, from a uniform start. Only ratios matter. So a voxel stores the
+log-odds of each label over the unnamed labels, that is, labels that no cluster named there. Other rules (counts,
+latest, most confident) store other values and combine new evidence with old evidence differently; see `Combine`.
 
-Evidence rows: a block has a row once a voxel of it has labels, and each labeled voxel has slots.
+A block has an evidence row once one of its voxels has labels. Each labeled voxel has slots.
 
     grid.label_row[block] ----> labeled[row, n] -------> instance_ids[voxel, :]   instance_value[voxel, :]
        -1 = no row                -1 = no slots          class_ids[voxel, :]      class_value[voxel, :]
-       (B,)                       (R, 512)               (L, S) and (L, T), the best label in slot 0
+       (B,)                       (R, 512)               (L, S) and (L, T), best label in slot 0
 
-Compact storage keeps the most likely labels and evicts the least likely one when another is named; the evidence of an
-evicted or unnamed label is lost. Exact storage has a slot for every class, and as many for instances as needed; tests
-compare compact storage with it. Class evidence is quantized, so that it is small and independent of the order of sums.
+Compact storage keeps the most likely labels and evicts the least likely label when another label is named. The evidence
+of an evicted or unnamed label is lost. Exact storage has a slot for every class and as many instance slots as needed.
+Tests compare compact with exact storage. Class evidence is quantized, so that it is small and independent of the order
+of summation.
 """
 
 from __future__ import annotations
@@ -30,49 +31,49 @@ from framework.data import Bool, Float32, Float64, Int32, UInt8
 from framework.mapping.labels.class_slots import NEW_CLASSES, NO_CLASS
 
 Integers = npt.NDArray[Any]  # of int16, int32 or int64
-MAX_SCORE = 30_000  # largest quantized class score in compact storage; if one exceeds it, all are reduced by the excess
-MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # that one cluster may add there without overflow of int16
+MAX_SCORE = 30_000  # largest quantized class score in compact storage; a larger score reduces all scores by the excess
+MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # largest score that a cluster adds without overflow of int16
 
 
 class Evidence(NamedTuple):
-    """The label evidence of all voxels, as in the diagram above.
+    """Label evidence of all voxels, see the diagram above.
 
-    The slots of a voxel are contiguous, 80 bytes in compact storage, because voxels are visited in any order: the
-    arrays of slots are views of one structured array.
+    Voxels are visited in any order. So the slots of a voxel are contiguous, 80 bytes in compact storage: the arrays of
+    slots are views of one structured array.
     """
 
-    labeled: Int32  # (R, 512) the index of a voxel among those with slots, -1 = it has none
-    instance_ids: Int32  # (L, S), 0 = free slot; all are free if only unmatched clusters had updates
+    labeled: Int32  # (R, 512) index of a voxel among the voxels with slots, -1 = no slots
+    instance_ids: Int32  # (L, S), 0 = free slot; all slots are free if only unmatched clusters updated the voxel
     instance_value: Float32  # (L, S) log-odds over the unnamed instances
     class_ids: UInt8  # (L, T), NO_CLASS = free slot
-    class_value: Integers  # (L, T) quantized scores over the unnamed classes, int16 or in exact storage int64
+    class_value: Integers  # (L, T) quantized scores over the unnamed classes; int16, in exact storage int64
 
 
 class Measurement(NamedTuple):
-    """The evidence of the N clusters of one frame, for C classes."""
+    """Evidence of the N clusters of one frame for C classes."""
 
-    list_ids: Int32  # (H, W) the list of clusters of each pixel, as in PixelLists, 0 = no cluster
+    list_ids: Int32  # (H, W) list of clusters of each pixel, see PixelLists, 0 = no cluster
     offsets: Int32  # (L + 1,) start of each list in `clusters`
-    clusters: Int32  # (offsets[L],) those that update voxels
-    instance_id: Int32  # (N,) the instance that each cluster was associated with, 0 = none
-    instance_log_odds: Float32  # (N,) of that instance over any other
-    absence: np.float32  # log-odds <= 0 of an instance that was matched in this frame, in voxels outside its mask
-    matched: Bool  # (ids + 1,) whether an instance was matched in this frame, by id
-    class_scores: Integers  # (N, NO_CLASS + 1) int32, or int64 in exact storage: pack_class_scores()
-    named_classes: UInt8  # (N, NEW_CLASSES) the best classes of each cluster
+    clusters: Int32  # (offsets[L],) clusters that update voxels
+    instance_id: Int32  # (N,) instance associated with each cluster, 0 = none
+    instance_log_odds: Float32  # (N,) log-odds of that instance over any other instance
+    absence: np.float32  # log-odds, <= 0, of a matched instance in voxels outside its mask
+    matched: Bool  # (ids + 1,) True if an instance was matched in this frame, by id
+    class_scores: Integers  # (N, NO_CLASS + 1) int32, in exact storage int64; see pack_class_scores()
+    named_classes: UInt8  # (N, NEW_CLASSES) best classes of each cluster
     combine: int  # Combine
-    max_score: int  # of a class
+    max_score: int  # maximum score of a class
 
 
 def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8, UInt8]:
-    """Return the evidence (N, C) of clusters relative to their unnamed classes, named_classes and named_bit.
+    """Return the evidence of clusters relative to their unnamed classes, the named classes and their bits.
 
-    A cluster names its NEW_CLASSES best classes if the evidence is log-likelihoods; the mean of the others is that of
-    each unnamed class. Otherwise it names its best class, and has no evidence for others.
+    If the evidence is log-likelihoods, a cluster names its NEW_CLASSES best classes, and each unnamed class has the
+    mean evidence of the others. Otherwise a cluster names its best class, and has no evidence for other classes.
 
     Returns:
-        (N, C) evidence over the unnamed classes; (N, NEW_CLASSES) named classes, of which the first one repeats if
-        there are fewer; (N, NO_CLASS + 1) bit m of the m-th named class, 0 = unnamed.
+        Evidence (N, C) over the unnamed classes; named classes (N, NEW_CLASSES), in which the first class repeats if
+        there are fewer; bits (N, NO_CLASS + 1), bit m for the m-th named class, 0 = unnamed.
     """
     c = evidence.shape[1]
     names = min(c, NEW_CLASSES) if logarithmic else min(c, 1)
@@ -83,7 +84,7 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
         if c > names:
             np.put_along_axis(unnamed, named, 0, axis=1)
             mean = unnamed.sum(axis=1, keepdims=True) / (c - names)
-        else:  # all are named: a term common to all classes is no evidence
+        else:  # all classes are named; a term common to all classes is no evidence
             mean = unnamed.min(axis=1, keepdims=True, initial=1.0)
         relative = evidence - np.log(np.maximum(mean, 1e-6))
     bits = np.zeros((len(evidence), NO_CLASS + 1), np.uint8)
@@ -93,9 +94,9 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
 
 
 def pack_class_scores(relative: Float64, scale: int, named_bit: UInt8, kind: type[np.signedinteger[Any]]) -> Integers:
-    """Return (N, NO_CLASS + 1) evidence (N, C) over the unnamed classes, quantized by `scale`, with the `named_bit`.
+    """Return the evidence over the unnamed classes, quantized by `scale`, packed with `named_bit` (N, NO_CLASS + 1).
 
-    The score is in the upper bits and the named bit in the lowest NEW_CLASSES bits, so that a voxel needs one look-up.
+    The upper bits hold the score and the lowest NEW_CLASSES bits the named bit, so that a voxel needs one look-up.
     """
     packed = named_bit.astype(np.int64)
     packed[:, : relative.shape[1]] += np.rint(relative * scale).astype(np.int64) << NEW_CLASSES

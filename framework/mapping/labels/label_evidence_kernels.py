@@ -19,7 +19,7 @@ from framework.mapping.voxels.voxel_grid_kernels import device
 
 
 class Combine(IntEnum):
-    """How new evidence for a label is combined with the old."""
+    """Rule for combining new evidence for a label with its old evidence."""
 
     SUM = 0
     LARGEST = 1
@@ -32,26 +32,26 @@ SUM, LARGEST, LATEST = (int(combine) for combine in Combine)  # for the kernels
 
 @device
 def label_row(grid, block):
-    """Return the row of a block in Evidence.labeled, -1 if it has none; block -1 = no block."""
+    """Return the row of a block in Evidence.labeled, -1 = no row; block -1 = no block."""
     return grid.label_row[block] if block >= 0 else np.int32(-1)
 
 
 @device
 def labeled_voxel(grid, evidence, block, n):
-    """Return the index of voxel n of a block among the labeled ones, -1 if it has no slots; block -1 = no block."""
+    """Return the index of voxel n of a block among the labeled voxels, -1 = no slots; block -1 = no block."""
     row = label_row(grid, block)
     return evidence.labeled[row, n] if row >= 0 else np.int32(-1)
 
 
 @device
 def best_instance(evidence, voxel):
-    """Return the most likely instance of a labeled voxel, 0 if the unnamed ones are more likely."""
+    """Return the most likely instance of a labeled voxel, 0 if unnamed instances are more likely."""
     return evidence.instance_ids[voxel, 0] if evidence.instance_value[voxel, 0] > 0 else np.int32(0)
 
 
 @device
 def best_counted_instance(evidence, voxel, counts):
-    """Return the most likely instance of a labeled voxel with counts[id], 0 if the unnamed ones are more likely."""
+    """Return the most likely instance with counts[id] of a labeled voxel, 0 if unnamed instances are more likely."""
     best = np.int32(0)
     best_value = np.float32(0.0)
     for s in range(evidence.instance_ids.shape[1]):
@@ -72,7 +72,7 @@ def best_class(evidence, voxel):
 
 @device
 def add_evidence(labels, values, free, label, added, combine, limit):
-    """Combine evidence with the slot of a label, at most `limit`, or give the label the free or least likely slot.
+    """Combine evidence with the slot of a label, up to `limit`, or assign a free or the least likely slot to the label.
 
     Returns 1 if a label was evicted.
     """
@@ -94,7 +94,7 @@ def add_evidence(labels, values, free, label, added, combine, limit):
         if values[s] < values[least]:
             least = s
     if values[least] >= added:
-        return 1  # the new label is itself the least likely
+        return 1  # the new label itself is the least likely
     labels[least] = label
     values[least] = added
     return 1
@@ -102,7 +102,7 @@ def add_evidence(labels, values, free, label, added, combine, limit):
 
 @device
 def best_first(labels, values, free):
-    """Move the most likely label to slot 0; the smaller label wins a tie, so that order does not matter."""
+    """Move the most likely label to slot 0. Ties go to the smaller label, so that order does not matter."""
     best = 0
     for s in range(1, len(labels)):
         if labels[s] == free:  # slots are filled from the front
@@ -116,7 +116,7 @@ def best_first(labels, values, free):
 
 @device
 def best_class_first(classes, scores):
-    """Move the most likely class to slot 0, as best_first()."""
+    """Move the most likely class to slot 0, like best_first()."""
     best = most_likely_slot(classes, scores)
     if best > 0:
         classes[0], classes[best] = classes[best], classes[0]
@@ -128,7 +128,7 @@ def sum_classes(classes, scores, measurement, k):
     """Add the evidence of cluster k to the class slots of a voxel. Returns the number of evictions."""
     limit, cluster_scores = measurement.max_score, measurement.class_scores[k]
     known, filled, excess = add_scores(classes, scores, cluster_scores, limit)
-    for s in range(filled if excess > 0 else 0):  # keeps the differences, and so the most likely class
+    for s in range(filled if excess > 0 else 0):  # keeps the differences and the most likely class
         scores[s] = max(scores[s] - excess, -limit)
     evicted = 0
     rejected = False
@@ -141,7 +141,7 @@ def sum_classes(classes, scores, measurement, k):
             break
         evicted += rejected
         if rejected:
-            continue  # the classes after it have lower scores
+            continue  # later classes have lower scores
         score = cluster_scores[label] >> NEW_CLASSES
         slot = filled
         if filled < len(classes):
@@ -149,7 +149,7 @@ def sum_classes(classes, scores, measurement, k):
         else:
             evicted += 1
             slot = least_likely_slot(scores)
-            rejected = scores[slot] >= score  # the new class is itself the least likely
+            rejected = scores[slot] >= score  # the new class itself is the least likely
         if not rejected:
             classes[slot] = label
             scores[slot] = score
@@ -158,7 +158,7 @@ def sum_classes(classes, scores, measurement, k):
 
 @device
 def update_voxel(evidence, voxel, measurement, list_id):
-    """Apply both recursions to a labeled voxel whose pixel has the list `list_id`. Returns the number of evictions."""
+    """Apply both recursions to a labeled voxel at a pixel with list `list_id`. Returns the number of evictions."""
     start, end = measurement.offsets[list_id], measurement.offsets[list_id + 1]
     ids = evidence.instance_ids[voxel]
     id_values = evidence.instance_value[voxel]
@@ -168,7 +168,7 @@ def update_voxel(evidence, voxel, measurement, list_id):
     evicted = 0
     absent = False
     named = start < end
-    # evidence of absence: an instance that was matched in this frame, but not at this pixel
+    # evidence of absence: the instance was matched in this frame, but not at this pixel
     for s in range(len(ids) if measurement.absence < 0 else 0):
         if ids[s] == 0:  # slots are filled from the front
             break

@@ -28,15 +28,15 @@ from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, remove
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VoxelHashing
 
-OTHER_CLASS = 0.3  # Bhattacharyya coefficient below which two distributions are of different objects
-EXACT_BITS = 16  # factor by which class scores of exact storage are finer
+OTHER_CLASS = 0.3  # largest Bhattacharyya coefficient of the class distributions of different objects
+EXACT_BITS = 16  # resolution of class scores in exact storage over compact storage
 
 
 class LabelRule(NamedTuple):
-    """How the evidence for a label is stored."""
+    """Storage and combination of the evidence for labels."""
 
-    combine: Combine  # how new evidence is combined with old
-    logarithmic: bool  # evidence is log-likelihoods; otherwise it is proportional, as votes are
+    combine: Combine  # rule for combining new evidence with old evidence
+    logarithmic: bool  # True = evidence is log-likelihoods; False = evidence is proportional, such as votes
     score_scale: int = 64  # quantized class score of evidence 1 in compact storage
 
     def quantization(self, storage: Storage) -> int:
@@ -45,24 +45,24 @@ class LabelRule(NamedTuple):
 
 
 class DetectionEvidence(NamedTuple):
-    """The evidence of a frame's N clusters."""
+    """Evidence of a frame's N clusters."""
 
-    instances: Float32  # (N,) for the instance that each is matched with, over any other
-    classes: Float64  # (N, C) for each class
-    absence: float = 0.0  # <= 0, for a matched instance outside its mask
+    instances: Float32  # (N,) evidence for the matched instance of each cluster over any other instance
+    classes: Float64  # (N, C) evidence for each class
+    absence: float = 0.0  # evidence for a matched instance outside its mask, <= 0
 
 
 def floored_log(class_probabilities: Float32, floor: float) -> Float64:
-    """Return (N, C) log P(O_u = c | I_t) of eq. [7], mixed with a share `floor` of the uniform distribution.
+    """Return log P(O_u = c | I_t) (N, C) of eq. [7], mixed with a fraction `floor` of the uniform distribution.
 
-    So no class is ruled out by a zero of the detector.
+    The mixture prevents a zero of the detector from ruling out a class.
     """
     p = class_probabilities.astype(np.float64)
     return np.asarray(np.log((1 - floor) * p + floor / max(p.shape[1], 1)))
 
 
 def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidence:
-    """Return votes with the weights (N,) of the clusters for their instances and their most likely classes."""
+    """Return votes of the clusters, with weights (N,), for their instances and most likely classes."""
     classes = np.zeros(clusters.class_probabilities.shape)
     if len(clusters):
         classes[np.arange(len(clusters)), clusters.class_probabilities.argmax(axis=1)] = weights
@@ -75,11 +75,11 @@ class LabeledVoxels:
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    occlusion_area_ratio: float = 0.25  # maximum area ratio of clusters to give the smaller one the pixels, in [0, 1]
-    support_overlap: float = 0.6  # minimum fraction of an instance covered by a larger mask of another class; 1 = off
+    occlusion_area_ratio: float = 0.25  # maximum area ratio to assign pixels to the smaller cluster, in [0, 1]; 0 = off
+    support_overlap: float = 0.6  # minimum fraction of an instance under a larger mask of another class; 1 = off
     update_unmatched: bool = False  # class updates of voxels by clusters without an instance
     instance_class: InstanceClass = InstanceClass.DETECTIONS  # source of an instance's class
-    storage: Storage = Storage.COMPACT  # COMPACT = top few labels of a voxel, EXACT = all, for comparison
+    storage: Storage = Storage.COMPACT  # labels stored per voxel: COMPACT = top few labels, EXACT = all labels
 
     def __post_init__(self) -> None:
         check_bounds(self, occlusion_area_ratio=(0.0, 1.0), support_overlap=(0.0, 1.0))
@@ -91,11 +91,10 @@ class LabeledVoxels:
         return InstanceMap(volume, labels, rule.logarithmic, self.confirmation, self.instance_class)
 
     def continued(self, scene: SceneMap, rule: LabelRule) -> InstanceMap:
-        """Prepare a stored map for new frames. Raises ConfigError if it has other parameters or another rule."""
+        """Prepare a stored map for new frames. Raises ConfigError if its parameters or its rule differ."""
         if not isinstance(scene, InstanceMap):
             raise ConfigError(
-                f"fuser: expected the type that made the stored {type(scene).__name__}, got another one; choose "
-                "that fuser"
+                f"fuser: expected a stored InstanceMap, got {type(scene).__name__}; choose the fuser that made the map"
             )
         own = self.new_map(rule)
         parameters: dict[str, tuple[object, object]] = {
@@ -124,7 +123,7 @@ class LabeledVoxels:
     def measurement(
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
     ) -> Measurement:
-        """Return the evidence of a frame's clusters for the voxels, by this rule."""
+        """Return the evidence of a frame's clusters for the voxels by this rule."""
         updating = np.ones_like(matches.instance_ids) if self.update_unmatched else matches.instance_ids
         points = keep_on_top(points, updating, self.occlusion_area_ratio)
         supported = self.supported_instances(table, matches)
@@ -152,10 +151,10 @@ class LabeledVoxels:
         )
 
     def supported_instances(self, table: InstanceTable, matches: Matches) -> Bool:
-        """Return (N, ids + 1) whether the object of each cluster supports an instance, as a table supports a book.
+        """Return an array (N, ids + 1), True if a cluster's object supports an instance, as a table supports a book.
 
-        Such an instance is confirmed, is of another class, and most of its visible part is under the cluster, in at
-        most half of the cluster's pixels. A detector's mask of the large object covers it, and is no evidence for its
+        A supported instance is confirmed and of another class. Most of its visible part is under the cluster, in at
+        most half of the cluster's pixels. The mask of the large object covers the instance, but is no evidence for its
         voxels.
         """
         overlaps, clusters = matches.overlaps, matches.clusters
@@ -166,7 +165,7 @@ class LabeledVoxels:
         small = 2 * overlaps.visible <= overlaps.sizes[:, None]
         other = matches.instance_ids[:, None] != overlaps.instance_ids
         under = covered & small & other
-        if not under.any():  # the usual case
+        if not under.any():  # usual case
             return supported
         records = [table.records[int(k)] for k in overlaps.instance_ids]
         counts = np.array([self.confirmation.is_met(record) for record in records])

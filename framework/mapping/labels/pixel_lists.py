@@ -1,7 +1,7 @@
-"""Pixel lists: the clusters over each pixel, as masks overlap.
+"""Pixel lists: the clusters over each pixel of overlapping masks.
 
-Pixels are under few different combinations of clusters. Each combination is one list, and each pixel stores the index
-of its list, so that operations on lists are cheap. For two overlapping masks, clusters 0 and 1:
+There are few different combinations of clusters over a pixel. Each combination is one list, and each pixel stores the
+index of its list, so that operations on lists are cheap. For two overlapping masks, clusters 0 and 1:
 
     masks        list_ids (H, W)      list   clusters    offsets     clusters array
     0 0 .        1 1 0                0      none        0           [0, 0, 1, 1]
@@ -9,7 +9,7 @@ of its list, so that operations on lists are cheap. For two overlapping masks, c
     . 1 1        0 3 3                2      0, 1        1
                                       3      1           3           offsets[4] = 4
 
-The pixels shared by two clusters determine duplicates of one object, and the occlusion order.
+The pixels shared by two clusters determine duplicates of one object and the occlusion order.
 """
 
 from __future__ import annotations
@@ -31,28 +31,28 @@ from framework.mapping.labels.pixel_lists_kernels import (
 
 
 class PixelLists(NamedTuple):
-    """L lists of N clusters; those of list i are clusters[offsets[i] : offsets[i + 1]]."""
+    """L lists of N clusters; the clusters of list i are clusters[offsets[i] : offsets[i + 1]]."""
 
-    list_ids: Int32  # (H, W) the list of each pixel; list 0 is empty
-    pixel_counts: Int32  # (L,) pixels that have each list
+    list_ids: Int32  # (H, W) list of each pixel; list 0 is empty
+    pixel_counts: Int32  # (L,) number of pixels of each list
     offsets: Int32  # (L + 1,)
     clusters: Int32  # (offsets[L],) in the order of the points
     cluster_count: int  # N
 
 
 class ListTree(NamedTuple):
-    """The lists as a tree while they are found: a list is a cluster, its head, before its parent list."""
+    """Tree of the lists during construction. A list is a cluster, its head, followed by its parent list."""
 
     head: Int32  # (capacity,)
     parent: Int32  # (capacity,)
-    child: Int32  # (capacity,) the latest list with this parent, 0 = none
-    sibling: Int32  # (capacity,) the previous list with the same parent, 0 = none
+    child: Int32  # (capacity,) latest list with this parent, 0 = none
+    sibling: Int32  # (capacity,) previous list with the same parent, 0 = none
     pixel_count: Int32  # (capacity,)
-    length: Int32  # (capacity,) clusters
+    length: Int32  # (capacity,) number of clusters
 
 
 def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
-    """Return the clusters over each pixel of the (height, width) image, from the pixels of their points.
+    """Return the clusters over each pixel of an image of `shape` (height, width), from the pixels of their points.
 
     Lists without pixels are empty. Raises DataError if a pixel is outside the image.
     """
@@ -71,10 +71,11 @@ def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> Pix
 
 
 def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> PixelLists:
-    """Return the lists of the clusters with an instance (N,), 0 = none, without clusters below much smaller ones.
+    """Return the lists without clusters below much smaller clusters and without clusters that have no instance.
 
-    Large masks are coarse, and cover small objects on the object: a book on a couch. So a pixel keeps only the clusters
-    that are at most 1 / `area_ratio` times as large as the smallest one there; all, if `area_ratio` is 0.
+    Large masks are coarse and cover small objects, such as a book on a couch. So a pixel keeps only clusters that are
+    at most 1 / `area_ratio` times as large as its smallest cluster. If `area_ratio` is 0, a pixel keeps all clusters.
+    `instance_ids` (N,) holds the instance of each cluster, 0 = none.
     """
     offsets, kept = np.empty_like(points.offsets), np.empty_like(points.clusters)
     keep_smallest(points.pixel_counts, points.offsets, points.clusters, instance_ids, area_ratio, offsets, kept)
@@ -82,7 +83,7 @@ def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> P
 
 
 def remove_supports(points: PixelLists, supported: Bool, seen: Int32, stride: int) -> PixelLists:
-    """Return the lists without clusters at pixels where the map has an instance supported by the cluster's object.
+    """Return the lists without clusters at pixels of instances that the cluster's object supports.
 
     Args:
         points: Lists of clusters at the pixels.

@@ -7,12 +7,12 @@ from numba import njit, prange
 
 from framework.mapping.voxels.voxel_grid_kernels import device
 
-CHUNKS = 16  # of image rows
+CHUNKS = 16  # chunks of image rows
 
 
 @device
 def _are_inside(coordinates, width, height):
-    """Return whether all pixels (2 P,), u and v in turns, are in the image. As unsigned, negative numbers are large."""
+    """Return True if all pixels (2 P,), alternating u and v, are in the image. Unsigned negative numbers are large."""
     right = bottom = np.uint32(0)
     for p in range(coordinates.shape[0] // 2):
         right = max(right, np.uint32(coordinates[2 * p]))
@@ -22,9 +22,9 @@ def _are_inside(coordinates, width, height):
 
 @njit(cache=True, nogil=True)
 def link_points(coordinates, cluster, list_ids, tree):
-    """Fill list_ids (H, W) and the ListTree, with room for a list more than there are points.
+    """Fill list_ids (H, W) and the ListTree, which has room for one more list than there are points.
 
-    The coordinates (2 P,) of the points are u and v in turns. Returns the number of lists, 0 if a point is outside.
+    The coordinates (2 P,) of the points alternate u and v. Returns the number of lists, 0 if a point is outside.
     """
     head, parent, child, sibling, pixel_count, length = tree
     width = list_ids.shape[1]
@@ -35,7 +35,7 @@ def link_points(coordinates, cluster, list_ids, tree):
     pixel_count[0], child[0], length[0] = list_ids.size, 0, 0
     lists = np.int32(1)
     p = cluster.shape[0] - 1
-    while p >= 0:  # a run of points of one cluster, at pixels that have had one list
+    while p >= 0:  # a run of points of one cluster at pixels with the same list
         k, last = cluster[p], p
         if k < 0:
             p -= 1
@@ -66,7 +66,7 @@ def link_points(coordinates, cluster, list_ids, tree):
 
 @njit(cache=True, nogil=True)
 def write_lists(head, parent, offsets, clusters):
-    """Write the clusters of each list into the flat array, from `offsets` on."""
+    """Write the clusters of each list into the flat array at `offsets`."""
     for i in range(offsets.shape[0] - 1):
         list_id = i
         for entry in range(offsets[i], offsets[i + 1]):
@@ -76,7 +76,7 @@ def write_lists(head, parent, offsets, clusters):
 
 @njit(cache=True, nogil=True)
 def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kept_offsets, kept):
-    """Fill kept_offsets (L + 1,) and the first kept_offsets[L] entries of `kept`, which has the length of clusters."""
+    """Fill kept_offsets (L + 1,) and the first kept_offsets[L] entries of `kept`, an array as long as `clusters`."""
     sizes = np.zeros(instance_ids.shape[0], np.float64)
     for i in range(pixel_counts.shape[0]):
         for entry in range(offsets[i], offsets[i + 1]):
@@ -98,9 +98,9 @@ def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kep
 
 @njit(cache=True, nogil=True, parallel=True)
 def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
-    """Fill new_ids (H, W) with replacement[i, column[k]] for pixels of list i where the map has instance k.
+    """Fill new_ids (H, W) with replacement[i, column[k]] for pixels of list i at instance k of the map.
 
-    Counts the pixels that get another list in moved (CHUNKS, lists), which is 0 before.
+    Counts the pixels that get another list in moved (CHUNKS, lists), which must be 0 at first.
     """
     height, width = list_ids.shape
     for chunk in prange(CHUNKS):
@@ -119,10 +119,10 @@ def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
 
 @njit(cache=True, nogil=True)
 def lists_without(offsets, clusters, supported, instances, replacement, origin, ends, kept):
-    """Fill replacement (L, 1 + J) with the list that replaces each one without an instance and at `instances` (J,).
+    """Fill replacement (L, 1 + J) with the list that replaces each list without an instance and at `instances` (J,).
 
-    `origin` gets the list that each new list replaces, `ends` the end of its clusters in `kept`. Returns the number of
-    new lists, and of their clusters.
+    `origin` gets the list that each new list replaces, and `ends` the end of its clusters in `kept`. Returns the
+    numbers of new lists and of their clusters.
     """
     lists = offsets.shape[0] - 1
     new = length = 0

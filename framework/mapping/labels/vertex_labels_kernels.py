@@ -1,4 +1,4 @@
-"""Kernels for color, instance and class of the vertices of the map's mesh."""
+"""Kernels for the color, instance and class of mesh vertices."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from framework.mapping.voxels.voxel_grid_kernels import (
 )
 from framework.mapping.voxels.voxel_walk import voxel_number
 
-CORNERS = 8  # voxels around a vertex
-REACH = 2.0  # voxels; those farther from the surface saw other pixels, and do not vote
-CHUNK = 1024  # vertices that share scratch arrays
+CORNERS = 8  # number of voxels around a vertex
+REACH = 2.0  # voxels; farther voxels were seen by other pixels and do not vote
+CHUNK = 1024  # number of vertices that share scratch arrays
 
 
 @device
 def corner_voxels(grid, vertex, blocks, voxels, weights):
-    """Fill block (-1 = absent), index and trilinear weight, (8,) each, of the voxels around a vertex (3,) m.
+    """Fill the block (-1 = absent), index and trilinear weight, (8,) each, of the voxels around a vertex (3,) m.
 
-    Returns True if any of them has label evidence.
+    Returns True if any voxel has label evidence.
     """
     scale = np.float32(1.0) / grid.voxel_size
     x, y, z = vertex[0] * scale, vertex[1] * scale, vertex[2] * scale
@@ -45,7 +45,7 @@ def corner_voxels(grid, vertex, blocks, voxels, weights):
 
 @device
 def keep_near(grid, blocks, voxels, weights):
-    """Set the weights (8,) of voxels that are unobserved or far from the surface to 0."""
+    """Set the weights (8,) of unobserved voxels and of voxels far from the surface to 0."""
     near = np.float32(REACH) * grid.voxel_size
     for c in range(CORNERS):
         stored = grid.tsdf[blocks[c], voxels[c]] if blocks[c] >= 0 else np.int16(UNSEEN)
@@ -55,7 +55,7 @@ def keep_near(grid, blocks, voxels, weights):
 
 @device
 def majority(labels, weights):
-    """Return the voxel with the largest weight of the majority label; -1 without majority.
+    """Return the voxel with the largest weight of the majority label; -1 without a majority.
 
     The majority label is the entry of `labels` (8,) > 0 with more than half of the total weight.
     """
@@ -77,7 +77,7 @@ def majority(labels, weights):
 
 @device
 def _elect(grid, evidence, counts, blocks, voxels, weights, ids):
-    """Return the instance and class of a vertex by the majority of its corners, 0 and -1 if there is none."""
+    """Return the instance and class of a vertex by the majority of its corners, 0 and -1 without a majority."""
     keep_near(grid, blocks, voxels, weights)
     for c in range(CORNERS):
         voxel = labeled_voxel(grid, evidence, blocks[c], voxels[c]) if weights[c] > 0 else np.int32(-1)
@@ -106,8 +106,9 @@ def color_vertices(color, voxels, colors):
 def label_vertices(grid, evidence, counts, surface, colors, instance_ids, class_ids):
     """Fill colors (V, 3), instance_ids (V,) and class_ids (V,) of the vertices of an UnlabeledMesh.
 
-    The color is that of the nearest voxel. The instance is the majority of the eight surrounding voxels, weighted
-    trilinearly, each with its most likely instance that has counts[id]. Vertices without an instance have no class.
+    The color comes from the nearest voxel. The instance is the majority of the eight surrounding voxels, weighted
+    trilinearly. Each voxel votes for its most likely instance with counts[id]. Vertices without an instance have no
+    class.
     """
     vertices = surface.vertices
     for chunk in prange(-(-len(vertices) // CHUNK)):

@@ -23,14 +23,14 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader, whole
 from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 
-DEFLATE_LEVEL = 1  # of zlib: files are at most a tenth larger than with level 6, in half the time
+DEFLATE_LEVEL = 1  # zlib level; files are at most a tenth larger than at level 6 and take half the time
 
 HEADER = "header"
 LARGEST_HEADER = 2**28  # bytes; an hour with thousands of instances takes about 10 MB
-LARGEST_ID = 2**24  # of an instance
-MOST_EVIDENCE = 1e12  # for a class
-MOST_ARRAYS = 100  # of a file that lists its arrays
-SHARE_OF_MEMORY = 0.5  # of the machine, that a loaded map may take
+LARGEST_ID = 2**24  # largest instance id
+MOST_EVIDENCE = 1e12  # largest evidence for a class
+MOST_ARRAYS = 100  # maximum number of arrays that a file lists
+SHARE_OF_MEMORY = 0.5  # maximum fraction of the machine's memory for a loaded map
 
 
 def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
@@ -48,10 +48,10 @@ def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, 
 
 
 def read_map(path: Path | str, expected_format: object, names: Sequence[str]) -> tuple[MapHeader, dict[str, Any]]:
-    """Return the header and the named arrays of a map file, and its embeddings, if there are any.
+    """Return the header, the named arrays and any embeddings of a map file.
 
     Raises DataError for other files and formats, and for wrong checksums. Array sizes are checked against the file and
-    the memory of the machine before memory is allocated.
+    the memory of the machine before allocation.
     """
     with faults_of(path), _opened(path) as archive:
         header = _header(archive)
@@ -60,14 +60,14 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
             raise DataError(f"expected map format {expected_format}, got {found!r:.60}")
         damaged = archive.testzip()
         if damaged is not None:
-            raise DataError(f"{damaged}: checksum mismatch; the file is damaged")
+            raise DataError(f"{damaged}: expected a matching checksum, got a mismatch; the file is damaged")
         there = set(archive.namelist())
         optional = [name for name in ARRAYS if f"{name}.npy" in there]
         return header, {name: _array(archive, name) for name in dict.fromkeys((*names, *optional))}
 
 
 def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
-    """Return the arrays that the header of a file lists as `names`. Raises DataError as read_map()."""
+    """Return the arrays listed as `names` in the header of a file. Raises DataError like read_map()."""
     with faults_of(path), _opened(path) as archive:
         names = _header(archive).items("names")
     return read_map(path, expected_format, [str(name) for name in names[:MOST_ARRAYS]])[1]
@@ -81,12 +81,12 @@ def read_format(path: Path | str) -> str:
 
 @contextmanager
 def faults_of(path: Path | str) -> Iterator[None]:
-    """Convert errors while a map file is read into a DataError that names the file."""
+    """Convert errors during reading of a map file into a DataError that names the file."""
     try:
         yield
     except InstanceMapError as error:
         raise DataError(f"{path}: {error}; map again") from error
-    except Exception as error:  # zipfile and numpy raise many kinds for damaged archives
+    except Exception as error:  # zipfile and numpy raise many types for damaged archives
         raise DataError(
             f"{path}: expected a map file, got unreadable data ({in_one_line(error)}); map again"
         ) from error
@@ -113,7 +113,7 @@ def _header(archive: zipfile.ZipFile) -> MapHeader:
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Array:
-    """Read an array, if its size in the archive agrees with its shape."""
+    """Read an array if its size in the archive agrees with its shape."""
     info = archive.getinfo(f"{name}.npy")
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
@@ -127,7 +127,7 @@ def _array(archive: zipfile.ZipFile, name: str) -> Array:
 
 
 def machine_memory() -> int:
-    """Return the bytes of memory of this machine, 2^34 if unknown."""
+    """Return the memory of this machine in bytes, 2^34 if unknown."""
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
@@ -135,26 +135,28 @@ def machine_memory() -> int:
 
 
 def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], length: int, prefix: str = "") -> None:
-    """Raise DataError unless the arrays have the types and shapes of the expected ones, with another `length`."""
+    """Raise DataError unless the arrays have the expected types and shapes, except for their `length`."""
     for name, like in expected.items():
         check_array(prefix + name, arrays[prefix + name], (length, *like.shape[1:]), like.dtype)
 
 
 def check_known(name: str, array: Array, known: Iterable[int]) -> None:
-    """Raise DataError unless all values of the array, which kernels use as indices, are known."""
+    """Raise DataError unless all values of the array are known, because kernels use them as indices."""
     unknown = array[~np.isin(array, list(known))]
     if unknown.size:
-        raise DataError(f"{name}: expected values in the map, got {unknown[0]}")
+        raise DataError(f"{name}: expected ids in the map, got {unknown[0]}")
 
 
 def check_numbers(name: str, numbers: Array, count: int) -> None:
-    """Raise DataError unless the array has each of the numbers 0 to `count` - 1 once, and otherwise -1."""
+    """Raise DataError unless the array contains each number from 0 to `count` - 1 once, and otherwise -1."""
     used = numbers[numbers != -1]
     beyond = used[(used < 0) | (used >= count)]
     if beyond.size:
-        raise DataError(f"{name}: expected values in the map, got {beyond[0]}")
+        raise DataError(f"{name}: expected indices in [-1, {count}), got {beyond[0]}")
     if used.size != count or not np.array_equal(np.bincount(used, minlength=count), np.ones(count)):
-        raise DataError(f"{name}: expected each of the {count} numbers once")
+        raise DataError(
+            f"{name}: expected each of {count} indices once, got {used.size} indices, {len(np.unique(used))} distinct"
+        )
 
 
 def check_blocks(coords: Any) -> None:
@@ -168,7 +170,7 @@ def check_blocks(coords: Any) -> None:
 
 
 def plain_table(table: InstanceTable) -> dict[str, Any]:
-    """Return an instance table as JSON values; `table_arrays` has the embeddings."""
+    """Return an instance table as JSON values, without the embeddings in `table_arrays`."""
     space = {SPACE: table.embedding_space} if table_arrays(table) else {}
     return {
         "combine": table.combine.name,
@@ -191,13 +193,13 @@ def _plain_record(record: InstanceRecord) -> dict[str, Any]:
 
 
 def table_arrays(table: InstanceTable) -> dict[str, Array]:
-    """Return the arrays of an instance table: its embeddings, if there are any."""
+    """Return the arrays of an instance table, that is, its embeddings; empty without embeddings."""
     embeddings = {k: record.embedding for k, record in table.records.items() if record.embedding is not None}
     return embedding_arrays(embeddings)
 
 
 def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> InstanceTable:
-    """Return the instance table of a map file with so many classes. Raises DataError if it is invalid."""
+    """Return the instance table of a map file with `classes` classes. Raises DataError if the table is invalid."""
     table = InstanceTable(plain.option("combine", Combine), plain.flag("logarithmic"))
     table.last_id = plain.whole("last_id", 0, LARGEST_ID)
     for entry in plain.parts("instances"):

@@ -1,4 +1,4 @@
-"""The header of a map file: values read by key and validated, because the file is untrusted."""
+"""Header of a map file, with validation of each value because the file is untrusted."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from typing import Any, TypeVar
 
 from framework.errors import DataError
 
-MOST_CLASSES = 10_000  # that a map names; LVIS has 1,200
-LONGEST_NAME = 200  # characters of a class
-LARGEST_COUNT = 2**53  # of frames and evictions: the integers that JSON readers represent exactly
+MOST_CLASSES = 10_000  # maximum number of classes of a map; LVIS has 1,200
+LONGEST_NAME = 200  # maximum length of a class name, characters
+LARGEST_COUNT = 2**53  # maximum number of frames and evictions; JSON readers represent integers up to it exactly
 
 Option = TypeVar("Option", bound=Enum)
 
 
 @dataclass(frozen=True)
 class MapHeader:
-    """An object of the header. Each method reads one key and raises DataError if its value is invalid."""
+    """A JSON object of the header. Each method reads one key and raises DataError if its value is invalid."""
 
     values: Mapping[str, Any]
     name: str = "header"
 
     @classmethod
     def of(cls, found: object, name: str = "header") -> MapHeader:
-        """Return a value that must be an object."""
+        """Return the header object of a value. Raises DataError for other types."""
         if not isinstance(found, dict):
             raise DataError(f"{name}: expected an object, got {found!r:.60}")
         return cls(found, name)
@@ -41,14 +41,14 @@ class MapHeader:
             yield MapHeader.of(found, f"{self.name}.{key}[{k}]")
 
     def items(self, key: str) -> list[Any]:
-        """Return a list of any values."""
+        """Return a list of arbitrary values."""
         found = self._value(key)
         if not isinstance(found, list):
             raise self._fault(key, "a list", found)
         return found
 
     def number(self, key: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> float:
-        """Return a finite number in [low, high], with a tolerance of 1e-6 for rounding to float32."""
+        """Return a finite number in [low, high], with a tolerance of 1e-6 for float32 rounding."""
         found, (low, high) = self._value(key), bounds
         is_number = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
         if not is_number or not low - 1e-6 * abs(low) <= found <= high + 1e-6 * abs(high):
@@ -91,7 +91,7 @@ class MapHeader:
 
 
 def whole(name: str, found: object, low: int = 0, high: int = LARGEST_COUNT) -> int:
-    """Return an integer in [low, high]. Raises DataError with its name for other values."""
+    """Return an integer in [low, high]. Raises DataError that names the key for other values."""
     if isinstance(found, bool) or not isinstance(found, int) or not low <= found <= high:
         raise DataError(f"{name}: expected an integer in [{low}, {high}], got {found!r:.60}")
     return found

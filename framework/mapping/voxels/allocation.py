@@ -1,7 +1,7 @@
-"""Allocation: the blocks that a frame updates, along the truncation bands of its readings and in free space.
+"""Allocation of the blocks that a frame updates, along the truncation bands of its depth readings and in free space.
 
-Candidates are gathered in a fixed number of chunks of image rows, and blocks are numbered serially, so that the map
-does not depend on the number of threads.
+Candidates are gathered in a fixed number of chunks of image rows, and blocks are numbered serially. So the map does
+not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, FARTHEST_BLOCK
 
-MOST_SAMPLES = 4096  # along the band of a reading, half a block apart; 6 by default
-REPEATS = 8  # mean times that a chunk may report a block; it remembers the latest ones
-FEWEST_KEYS = 2**20  # minimum limit of a frame, 8 MB; the budget of the map limits smaller requests
+MOST_SAMPLES = 4096  # maximum samples along the band of a reading, half a block apart; 6 by default
+REPEATS = 8  # maximum mean number of reports of a block by a chunk, which remembers recent blocks
+FEWEST_KEYS = 2**20  # minimum key capacity for a frame, 8 MB; the block budget limits smaller requests
 
 
 class Allocator:
-    """Allocation of the blocks updated by a frame."""
+    """Allocator of the blocks updated by a frame."""
 
     def __init__(self, voxels: VoxelGrid, sensor: Sensor) -> None:
         self.voxels = voxels
@@ -38,7 +38,7 @@ class Allocator:
         return {**vars(self), "_stamp": self._stamp[: self.voxels.block_count]}
 
     def active_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
-        """Allocate and return the blocks (A,) around the measured surface, and existing ones in front of it.
+        """Allocate and return the blocks (A,) around the measured surface, and existing blocks in front of it.
 
         Raises MapFullError if the block budget is reached.
         """
@@ -56,17 +56,17 @@ class Allocator:
         """Allocate and return the blocks (N,), with repeats, along the truncation bands of `depth` (H, W) m.
 
         Raises:
-            MapFullError: the block budget is reached, or a single frame needs more; no memory is allocated then.
-            FrameError: the pose is outside the range of block coordinates.
+            MapFullError: If the block budget is reached, or if a single frame exceeds it; no memory is allocated then.
+            FrameError: If the pose is outside the range of block coordinates.
         """
         return self.voxels.allocate(self._surface_coords(camera, depth, T_world_camera))
 
     def _surface_coords(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
         block_size = BLOCK_SIDE * float(self.voxels.grid.voxel_size)
-        # samples at most a quarter of a block apart at the largest depth
+        # sample spacing of at most a quarter of a block at the largest depth
         footprint = float(self.sensor.max_depth) / camera.fx
         stride = max(1, min(8, int(0.25 * block_size / footprint)))
-        # samples at most half a block apart along the ray of a corner, at the largest depth of the frame
+        # sample spacing of at most half a block along the ray of a corner, at the largest depth of the frame
         farthest = min(float(depth.max()), float(self.sensor.max_depth))
         band = float(self.sensor.truncation) + float(self.sensor.truncation_slope) * farthest
         longest = _longest_ray(camera)

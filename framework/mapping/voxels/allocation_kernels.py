@@ -10,15 +10,15 @@ from framework.mapping.voxels.voxel_grid import REGION_BLOCKS, REGION_SIDE
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, NO_KEY, device, pack_key, unpack_key
 from framework.mapping.voxels.voxel_walk import ray_direction
 
-CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
+CHUNKS = 32  # chunks of image rows; fixed, so that the order of blocks does not depend on the number of threads
 WORD = 64  # bits
-RECENT = 1024  # block keys that a chunk remembers, to report each block about once
-PROBES = 4  # pixels along each side of a block in the image to determine whether the frame sees through it
+RECENT = 1024  # number of block keys that a chunk remembers, to report each block about once
+PROBES = 4  # probed pixels along each side of a block in the image, to detect free space behind it
 
 
 @device
 def _remembered(recent, key):
-    """Return whether the key is in `recent` (RECENT,); add it otherwise."""
+    """Return True if the key is in `recent` (RECENT,); otherwise add it."""
     slot = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(54)
     if recent[slot] == key:
         return True
@@ -28,7 +28,7 @@ def _remembered(recent, key):
 
 @device
 def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
-    """Write the keys of the blocks at `samples` points along the truncation bands of a row of readings to keys[1:].
+    """Write the keys of blocks at `samples` points along the truncation bands of a row of readings to keys[1:].
 
     The loop reads local variables only, so that the compiler vectorizes it.
     """
@@ -54,7 +54,7 @@ def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def surface_blocks(depth, view, sensor, block_size, stride, samples, found, counts):
-    """Write the keys of blocks along the band of every stride-th reading to `found` (CHUNKS, M), by chunk.
+    """Write the keys of blocks along the band of every stride-th depth reading to `found` (CHUNKS, M), by chunk.
 
     Counts (CHUNKS,) above M mean that `found` was too small.
     """
@@ -72,7 +72,7 @@ def surface_blocks(depth, view, sensor, block_size, stride, samples, found, coun
                 readings[column] = depth[row * stride, column * stride]
             _band_keys(readings, row * stride, view, sensor, inverse_size, stride, samples, keys)
             for start in range(0, words * WORD, WORD):
-                word = np.uint64(0)  # bits of the keys that differ from the previous one; the compiler vectorizes it
+                word = np.uint64(0)  # bits of the keys that differ from the previous key; vectorized
                 for i in range(WORD):
                     word |= np.uint64(keys[start + i + 1] != keys[start + i]) << np.uint64(i)
                 while word != np.uint64(0):
@@ -94,7 +94,7 @@ def unpack(keys, coords):
 
 @device
 def _extent(camera, size, margin):
-    """Return half the sides, m, along the camera axes, of the bounding box of a cube in the world."""
+    """Return the half sides, m, along the camera axes of the bounding box of a cube in the world frame."""
     half = np.float32(0.5) * size
     return (
         half * (abs(camera.R[0, 0]) + abs(camera.R[0, 1]) + abs(camera.R[0, 2])) + margin,
@@ -105,7 +105,7 @@ def _extent(camera, size, margin):
 
 @device
 def _bounds(camera, x, y, z, extent, near, far, shape):
-    """Return (visible, z0, z1, u0, u1, v0, v1): depths (m) and pixels, inclusive, of the box around a world point."""
+    """Return (visible, z0, z1, u0, u1, v0, v1): the depths (m) and inclusive pixels of the box around a world point."""
     height, width = shape
     pz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
     z0, z1 = max(pz - extent[2], near), min(pz + extent[2], far)
@@ -128,7 +128,7 @@ def _bounds(camera, x, y, z, extent, near, far, shape):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def solid_blocks_in_view(grid, region_count, block_count, camera, near, far, shape):
-    """Return blocks (N,), depths (N, 2) m and pixels (N, 4) u0, u1, v0, v1 inclusive of blocks with a surface in view.
+    """Return the blocks (N,) with a surface in view, their depths (N, 2) m and inclusive pixels (N, 4) u0, u1, v0, v1.
 
     `camera` holds T_camera_world. Tests every region of the map, and every block of the regions in view.
     """
@@ -166,7 +166,7 @@ def solid_blocks_in_view(grid, region_count, block_count, camera, near, far, sha
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sees_through(depth, sensor, z0, pixels):
-    """Return whether one of some readings in the block's window is behind the front of the block, at depth z0."""
+    """Return True if a probed depth reading in the block's window is behind z0, the depth of the block's front."""
     u0, u1, v0, v1 = pixels
     for row in range(PROBES):
         v = v0 + (v1 - v0) * row // (PROBES - 1)
@@ -179,7 +179,7 @@ def _sees_through(depth, sensor, z0, pixels):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame, active):
-    """Write the blocks `found` (N,) and those that the frame sees through to `active`, each once. Returns their number.
+    """Write the blocks `found` (N,) and the blocks in free space to `active`, each once. Returns their number.
 
     `camera` holds T_camera_world.
     """

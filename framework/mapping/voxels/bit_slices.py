@@ -1,4 +1,4 @@
-"""Slices of a block, 8 x 8 voxels, as the bits of a word: voxel (x, y) is bit 8 y + x.
+"""Slices of a block, 8 x 8 voxels, stored as the bits of a word: voxel (x, y) is bit 8 y + x.
 
 Shifted words compare 64 voxels with their neighbors at once.
 """
@@ -19,7 +19,7 @@ _LAST_COLUMN = np.uint64(0x8080808080808080)
 
 @device
 def count_bits(word):
-    """Return the number of set bits; LLVM compiles this idiom to one instruction."""
+    """Return the number of set bits. LLVM compiles this idiom to one instruction."""
     word -= (word >> ONE) & np.uint64(0x5555555555555555)
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)

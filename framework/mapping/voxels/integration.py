@@ -1,7 +1,7 @@
-"""Integration of depth images: the running averages of the voxels that a frame sees.
+"""Integration of depth images into the running averages of the visible voxels.
 
-The signed distance is projective, along z; its running average is the TSDF of Curless and Levoy (1996). The truncation
-distance widens with depth as the noise of the sensor does, and the weight of an observation falls with depth squared.
+The signed distance is projective, along z. Its running average is the TSDF of Curless and Levoy (1996). The truncation
+distance increases with depth like the sensor noise, and the weight of an observation falls with depth squared.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.voxel_grid import VoxelGrid, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are equidistributed, so rounded averages have no bias
+GOLDEN = 0.6180339887498949  # equidistributed rounding offsets frac(k * GOLDEN) avoid a bias of rounded averages
 
 
 class SeenBlocks(NamedTuple):
-    """The A blocks that a frame has updated, and their voxels near the measured surface; valid until the next frame.
+    """The A blocks updated by a frame and their voxels near the measured surface, valid until the next frame.
 
-    The voxels of a block are contiguous; there are gaps between GROUPs of blocks.
+    The voxels of a block are contiguous. There are gaps between GROUPs of blocks.
     """
 
     blocks: Int32  # (A,) block indices
     near_start: Int64  # (A,) start of the near voxels of each block
-    near_count: Int32  # (A,) their number
-    near_voxel: UInt16  # (512 A,) their indices in the block, ascending
-    near_pixel: Int32  # (512 A,) the index v * width + u of the pixel that sees each of them
+    near_count: Int32  # (A,) number of near voxels of each block
+    near_voxel: UInt16  # (512 A,) index of each near voxel in its block, ascending
+    near_pixel: Int32  # (512 A,) index v * width + u of the pixel of each near voxel
 
 
 def _near_lists(blocks: int) -> tuple[UInt16, Int32]:
-    """Return near_voxel and near_pixel for so many blocks."""
+    """Return near_voxel and near_pixel for a number of blocks."""
     return np.empty(blocks * BLOCK_VOXELS, np.uint16), np.empty(blocks * BLOCK_VOXELS, np.int32)
 
 
 class Integrator:
-    """Integration of frames into a grid."""
+    """Integrator of frames into a grid."""
 
     def __init__(self, voxels: VoxelGrid, sensor: Sensor) -> None:
         self.voxels = voxels
@@ -51,20 +51,20 @@ class Integrator:
         self._near_voxel, self._near_pixel = reserved(voxels.max_blocks, _near_lists)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without buffers of a single frame."""
+        """Return the state without per-frame buffers."""
         return {**vars(self), "_near_voxel": self._near_voxel[:0], "_near_pixel": self._near_pixel[:0]}
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> SeenBlocks:
         """Integrate one frame and return the voxels within near_band m of the measured surface.
 
-        Raises MapFullError if the block budget is reached; the frame is then not integrated.
+        Raises MapFullError if the block budget is reached; in this case the frame is not integrated.
         """
         return self._update(frame, T_world_camera, near_band, self._allocator.active_blocks(frame, T_world_camera))
 
     def integrate_object(self, frame: Frame, T_world_camera: Float64, near_band: float, mask: Bool) -> SeenBlocks:
-        """Integrate into the grid of one object, which grows only where `mask` (H, W) shows the object.
+        """Integrate into the grid of one object. The grid grows only within the object's `mask` (H, W).
 
-        All existing blocks are updated, also by readings outside the mask.
+        All existing blocks are updated, including by depth readings outside the mask.
         """
         depth = np.where(mask, frame.depth, np.float32(0.0))
         self._allocator.allocate(frame.camera, depth, T_world_camera)
@@ -75,7 +75,7 @@ class Integrator:
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
         view = pinhole(frame.camera, inverse(T_world_camera))
         n = len(active) * BLOCK_VOXELS
-        if len(self._near_pixel) < n:  # where reserving costs memory, or after pickling; nothing is copied
+        if len(self._near_pixel) < n:  # if reserving costs memory, or after pickling; copies nothing
             self._near_voxel, self._near_pixel = _near_lists(len(active) * 9 // 8 + 1)
         starts, counts = np.empty(len(active), np.int64), np.empty(len(active), np.int32)
         seen = SeenBlocks(active, starts, counts, self._near_voxel[:n], self._near_pixel[:n])

@@ -20,16 +20,16 @@ from framework.mapping.voxels.voxel_grid_kernels import (
 from framework.mapping.voxels.voxel_walk import prefetch_row
 
 LAYER_VOXELS = BLOCK_SIDE**2
-GROUP = 16  # blocks that one thread updates in a row, whose near voxels are contiguous
+GROUP = 16  # number of successive blocks of one thread, with contiguous near voxels
 FAR = 1e9  # m
-LEAST_BEHIND = 0.02  # of the full weight, at the far end of the truncation band: enough to have been seen
+LEAST_BEHIND = 0.02  # fraction of the full weight at the far end of the truncation band; above 0 to mark voxels as seen
 
 
 @device
 def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
     """Project the voxels of a block, eq. [6]: pixel indices into pixel (512,), depths (m) into scratch[:512].
 
-    Voxels outside the image get pixel 0 and a depth beyond any reading.
+    Voxels outside the image get pixel 0 and a depth larger than any reading.
     """
     zero, half, one = np.float32(0.0), np.float32(0.5), np.float32(1.0)
     seven, three = np.int32(7), np.int32(3)
@@ -66,10 +66,11 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
 def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_band, scratch):
     """Update the running averages of the distances and weights (512,) of a block.
 
-    scratch[:512] holds the depths (m) of the voxels and gets their distances to the measured surface, m; scratch[512:]
-    holds their readings (m) and gets the weights of the new observations in the color averages, 0 = no color.
+    scratch[:512] holds the depths (m) of the voxels and gets their distances to the measured surface, m.
+    scratch[512:] holds their depth readings (m) and gets the weights of the new observations in the color averages,
+    0 = no color.
 
-    Returns the number of voxels that get a color, and of those within near_band m of the measured surface.
+    Returns the number of voxels with a new color, and the number of voxels within near_band m of the surface.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     full2 = sensor.full_weight_depth * sensor.full_weight_depth
@@ -83,8 +84,8 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         band = sensor.truncation + sensor.truncation_slope * d
         sdf = d - scratch[n]
         seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
-        # Behind the surface the weight falls with the distance, because observations from behind contradict it. Only
-        # the far end of the band, which widens with the noise, loses weight: otherwise noise would displace surfaces.
+        # Behind the surface the weight falls with the distance, because observations from behind contradict it. The
+        # band widens with the noise, and only its far end loses weight. Otherwise noise would displace surfaces.
         behind = max(least, min((band + sdf) * ramp, one))
         w_new = max(one, weight_one * behind * min(one, full2 / max(d * d, np.float32(1e-6))))
         w_old = np.float32(weight[n])
@@ -92,7 +93,7 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         stored = np.float32(tsdf[n])
         target = min(sdf, band) * to_units
         value = stored + portion * (target - stored) if w_old > zero else target
-        # rounding near 1 could raise the largest distance to 32768, which would wrap to UNSEEN
+        # rounding near 1 could increase the largest distance to 32768, which would wrap to UNSEEN
         value = max(-most, min(np.floor(value + rounding), most))
         tsdf[n] = np.int16(value) if seen else tsdf[n]
         weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
@@ -107,7 +108,7 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
 
 @device
 def _average_colors(packed, color, pixel, start, rounding, scratch, seen):
-    """Update the running averages of the packed colors (512,) of a block, in the layer that begins at voxel `start`.
+    """Update the running averages of the packed colors (512,) of a block in the layer from voxel `start` on.
 
     `color` holds the RGBA bytes of pixels, `pixel` (512,) the pixels of the voxels, scratch[512:] the weights of the
     new observations, 0 = none. `seen` (64,) is scratch memory.
@@ -134,7 +135,7 @@ def _average_colors(packed, color, pixel, start, rounding, scratch, seen):
 
 @device
 def _is_colored(scratch, start):
-    """Return whether a voxel of the layer that begins at voxel `start` gets a color, by the weights scratch[512:]."""
+    """Return True if a voxel of the layer from `start` on gets a color by the weights scratch[512:]."""
     largest = np.float32(0.0)
     for n in range(LAYER_VOXELS):
         largest = max(largest, scratch[start + n + BLOCK_VOXELS])
@@ -143,9 +144,9 @@ def _is_colored(scratch, start):
 
 @device
 def _list_near(pixel, near_band, near_voxel, near_pixel, entry, scratch):
-    """List the voxels whose distance to the measured surface, scratch[:512], is at most near_band, and their pixels.
+    """List the voxels within near_band of the measured surface by the distances scratch[:512], and their pixels.
 
-    The list begins at `entry`. The comparisons of a layer are bits of a word, which the compiler vectorizes.
+    The list begins at `entry`. The comparisons of a layer are bits of a word, so that the compiler vectorizes them.
     """
     for layer in range(BLOCK_SIDE):
         begin = layer * LAYER_VOXELS
@@ -162,13 +163,13 @@ def _list_near(pixel, near_band, near_voxel, near_pixel, entry, scratch):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def integrate(grid, seen, depth, color, camera, sensor, rounding, near_band):
-    """Update distance, weight and color of the voxels of `seen.blocks` that the depth image sees.
+    """Update distance, weight and color of the voxels of `seen.blocks` that are visible in the depth image.
 
     `seen` gets the voxels within near_band m of the measured surface. `color` (H, W) holds the RGBA bytes of pixels,
-    `camera` T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers.
+    and `camera` holds T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers.
 
-    A block is updated in passes over its 512 voxels that the compiler vectorizes: they have no branches, read images in
-    separate loops, and share one scratch array, so that the compiler can prove that arrays do not overlap.
+    A block is updated in vectorized passes over its 512 voxels. The passes have no branches and read images in separate
+    loops. They share one scratch array, so that the compiler can prove that arrays do not overlap.
     """
     # numba 0.68 loses assignments to an element of a tuple's array within prange
     active, near_start, near_count, near_voxel, near_pixel = seen

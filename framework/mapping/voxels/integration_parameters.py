@@ -1,4 +1,4 @@
-"""The camera and the depth sensor as the kernels use them."""
+"""Camera and depth sensor parameters for the kernels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64
 
-BOUNDS = {  # of the parameters of Tsdf and VoxelHashing
+BOUNDS = {  # bounds of the parameters of Tsdf and VoxelHashing
     "voxel_size": (1e-4, 1.0),
     "truncation": (1e-4, 100.0),
     "truncation_slope": (0.0, 1.0),
@@ -22,12 +22,12 @@ BOUNDS = {  # of the parameters of Tsdf and VoxelHashing
 class Sensor(NamedTuple):
     """The parameters of integration."""
 
-    truncation: np.float32  # m at depth 0
-    truncation_slope: np.float32  # m more for each m of depth
+    truncation: np.float32  # truncation distance at depth 0, m
+    truncation_slope: np.float32  # increase of the truncation distance with depth, m per m
     min_depth: np.float32  # m
     max_depth: np.float32  # m
-    max_weight: np.float32  # observations
-    full_weight_depth: np.float32  # m; a reading weighs min(1, (full_weight_depth / depth)^2)
+    max_weight: np.float32  # maximum weight, observations
+    full_weight_depth: np.float32  # m; a depth reading has weight min(1, (full_weight_depth / depth)^2)
 
     @property
     def max_truncation(self) -> float:
@@ -36,7 +36,7 @@ class Sensor(NamedTuple):
 
     @property
     def depth_range(self) -> tuple[float, float]:
-        """(nearest, farthest) depth, m, that is integrated."""
+        """The (nearest, farthest) integrated depth, m."""
         return float(self.min_depth), float(self.max_depth)
 
 
@@ -52,7 +52,7 @@ class Pinhole(NamedTuple):
 
 
 def pinhole(camera: Camera, T: Float64) -> Pinhole:
-    """Return `camera` with the pose `T`: T_world_camera or T_camera_world, as the kernel needs."""
+    """Return `camera` with the pose `T`, T_world_camera or T_camera_world depending on the kernel."""
     return Pinhole(
         fx=np.float32(camera.fx),
         fy=np.float32(camera.fy),

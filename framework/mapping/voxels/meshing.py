@@ -1,15 +1,16 @@
-"""Surface extraction: the surface of the map as a triangle mesh, by surface nets (Gibson 1998), updated by block.
+"""Extraction of the map's surface as a triangle mesh by surface nets (Gibson 1998), updated by block.
 
-A cell is the cube between eight neighboring voxels. A cell whose corners change sign has one vertex, the mean of the
-zero crossings on its edges; an edge that changes sign joins the vertices of its four cells in a quad. Compared with
-marching cubes, there is no table, there are half the vertices, and triangles have better shapes. Compared with dual
-contouring, the vertices are farther from sharp edges, and closer to the surface if the depth is noisy.
+A cell is the cube between eight neighboring voxels. A cell with a sign change between its corners has one vertex, the
+mean of the zero crossings on its edges. An edge with a sign change joins the vertices of its four cells in a quad.
+Compared with marching cubes, surface nets need no table, have half the vertices, and give better triangle shapes.
+Compared with dual contouring, the vertices are farther from sharp edges, and closer to the surface under depth noise.
 
-Few voxels are near the surface, so the search uses bits, 64 voxels at once; only cells with a vertex are visited one by
-one, and the index of a vertex is the number of bits before its own.
+Few voxels are near the surface, so the search tests 64 voxels at once as bits of a word. Only cells with a vertex are
+visited individually. The index of a vertex is the number of set bits before its own bit.
 
-A block stores 192 bytes of words and 32 of indices between updates. Its vertices are placed again if a voxel of it, or
-of the next blocks that share its cells, changed; the others are copied. The result depends on the grid alone.
+A block stores 192 bytes of words and 32 bytes of indices between updates. Its vertices are placed again if one of its
+voxels changed, or a voxel of the next blocks that share its cells. The other vertices are copied. The result depends
+on the grid alone.
 """
 
 from __future__ import annotations
@@ -31,25 +32,25 @@ from framework.mapping.voxels.meshing_kernels import (
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE
 
-# Largest difference between the corners of a cell, in voxels of distance. Beyond it the cell is on a silhouette,
-# between truncated free space and hidden space. Surfaces reach 1 / cos of the viewing angle, so the bound is wide.
+# Largest difference between the corners of a cell, voxels of distance. Above it the cell is on a silhouette, between
+# truncated free space and hidden space. The bound is wide because surfaces reach 1 / cos of the viewing angle.
 MAX_JUMP = 8.0
 
 
 class UnlabeledMesh(NamedTuple):
     """A mesh without colors and labels."""
 
-    vertices: Float32  # (V, 3) m, world
-    triangles: Int32  # (F, 3), facing the side that was seen
-    voxels: Int32  # (V,) block * 512 + index in the block, of the nearest voxel
+    vertices: Float32  # (V, 3) m, world frame
+    triangles: Int32  # (F, 3), facing the seen side
+    voxels: Int32  # (V,) nearest voxel, as block * 512 + index in the block
 
 
 class SurfaceNets:
-    """The surface of a grid: `changed` marks the blocks that were written, `extract` updates the surface."""
+    """The surface of a grid: `changed` marks written blocks, `extract` updates the surface."""
 
     def __init__(self, voxels: VoxelGrid) -> None:
         self.voxels = voxels
-        # (B + 1, 8) a bit per voxel or cell; the last row is that of an absent block, index -1
+        # (B + 1, 8) one bit per voxel or cell; the last row stands for an absent block, index -1
         self._inside = np.zeros((1, BLOCK_SIDE), np.uint64)
         self._seen = np.zeros((1, BLOCK_SIDE), np.uint64)
         self._cells = np.zeros((1, BLOCK_SIDE), np.uint64)
@@ -58,7 +59,7 @@ class SurfaceNets:
         self._surface = UnlabeledMesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.int32))
 
     def changed(self, blocks: Int32) -> None:
-        """Mark blocks whose voxels were written. Blocks that are new since `extract` are marked anyway."""
+        """Mark blocks with written voxels. Blocks added since `extract` are always marked."""
         known = blocks[blocks < len(self._changed)]
         self._changed[known] = True
 
@@ -92,7 +93,7 @@ class SurfaceNets:
         return self._surface
 
     def _grow(self, count: int) -> None:
-        """Grow the arrays to the blocks of the grid, and mark the new ones."""
+        """Grow the arrays to the blocks of the grid, and mark the new blocks."""
         self._changed = np.concatenate([self._changed, np.ones(count - len(self._changed), np.bool_)])
         if count + 1 > len(self._inside):
             capacity = len(self.voxels.grid.block_coords) + 1

@@ -21,7 +21,7 @@ def _blocks_before(grid, block, out):
 
 @njit(cache=True, nogil=True, parallel=True)
 def pack(tsdf, blocks, inside, seen):
-    """Pack which voxels of the blocks are negative into `inside` (B + 1, 8), and which were seen into `seen`."""
+    """Pack flags of the blocks' negative voxels into `inside` (B + 1, 8), and of the seen voxels into `seen`."""
     for b in prange(len(blocks)):
         block = blocks[b]
         for z in range(BLOCK_SIDE):
@@ -37,7 +37,7 @@ def pack(tsdf, blocks, inside, seen):
 
 @njit(cache=True, nogil=True, parallel=True)
 def mark_stale(grid, changed, stale):
-    """Mark the blocks with a cell that has a corner in a changed block in `stale` (B,)."""
+    """Mark in `stale` (B,) the blocks with a cell corner in a changed block."""
     for b in prange(len(changed)):
         before = np.empty(8, np.int32)
         _blocks_before(grid, changed[b], before)
@@ -48,7 +48,7 @@ def mark_stale(grid, changed, stale):
 
 @device
 def _any_and_all(words, around, z):
-    """Return which cells of slice z have any, and which have all, of their four corners in that slice set."""
+    """Return two words for the cells of slice z: any, and all, of a cell's four corners in the slice are set."""
     up = 4 * (z >> 3)
     z &= 7
     here, block_x = words[around[up], z], words[around[up + 1], z]
@@ -60,7 +60,7 @@ def _any_and_all(words, around, z):
 
 @device
 def _cell_corners(tsdf, around, x, y, z, corners):
-    """Write the stored distances at the corners of a block's cell (x, y, z) to corners (8,)."""
+    """Write the stored distances at the corners of cell (x, y, z) of a block to corners (8,)."""
     for c in range(8):
         i, j, k = x + (c & 1), y + ((c >> 1) & 1), z + (c >> 2)
         corners[c] = tsdf[around[(i >> 3) + 2 * (j >> 3) + 4 * (k >> 3)], voxel_number(i, j, k)]
@@ -68,7 +68,7 @@ def _cell_corners(tsdf, around, x, y, z, corners):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_cells(grid, blocks, inside, seen, most_jump, cells):
-    """Pack which cells of the blocks have a vertex into `cells` (B + 1, 8)."""
+    """Pack flags of the blocks' cells with a vertex into `cells` (B + 1, 8)."""
     tsdf = grid.tsdf
     for b in prange(len(blocks)):
         block = blocks[b]
@@ -107,7 +107,7 @@ def number_slices(cells, starts):
 
 @device
 def _crossing(a, b):
-    """Return (1, fraction) of the zero crossing between distances a and b of different sign, otherwise (0, 0)."""
+    """Return (1, fraction) of the zero crossing between distances a and b of different signs, otherwise (0, 0)."""
     crosses = (a ^ b) < 0
     where = np.float32(a) / np.float32(a - b if crosses else 1)
     return (np.float32(1.0), where) if crosses else (np.float32(0.0), np.float32(0.0))
@@ -115,9 +115,9 @@ def _crossing(a, b):
 
 @device
 def _cell_vertex(corners):
-    """Return (x, y, z), voxels from the first corner: the mean zero crossing of the twelve edges of a cell."""
+    """Return the mean zero crossing (x, y, z) of the twelve edges of a cell, in voxels from the first corner."""
     x = y = z = crossings = np.float32(0.0)
-    for edge in range(4):  # along each axis, at (u, v) of the two others
+    for edge in range(4):  # along each axis, at (u, v) along the other two axes
         u, v = np.float32(edge & 1), np.float32(edge >> 1)
         crosses, where = _crossing(corners[2 * edge], corners[2 * edge + 1])
         x, y, z, crossings = x + where, y + crosses * u, z + crosses * v, crossings + crosses
@@ -131,7 +131,7 @@ def _cell_vertex(corners):
 
 @njit(cache=True, nogil=True, parallel=True)
 def place_vertices(grid, stale, cells, starts, old_starts, old, vertices, voxels):
-    """Place the vertices of the stale blocks, and copy those of the others from the `old` surface."""
+    """Place the vertices of the stale blocks, and copy the other vertices from the `old` surface."""
     tsdf, block_coords, voxel_size = grid.tsdf, grid.block_coords, grid.voxel_size
     half = np.float32(0.5)
     old_vertices, old_voxels = old.vertices, old.voxels
@@ -167,10 +167,10 @@ def place_vertices(grid, stale, cells, starts, old_starts, old, vertices, voxels
 
 @device
 def _find_quads(inside, cells, around, before, z):
-    """Return three words, the edges from the voxels of slice z along x, y and z that have a quad.
+    """Return three words for the edges with a quad along x, y and z from the voxels of slice z.
 
-    They change sign, and their four cells have a vertex. `around` and `before` are the block's neighbors on the
-    positive and on the negative side.
+    An edge has a quad if it changes sign and its four cells have a vertex. `around` and `before` are the block's
+    neighbors on the positive and the negative side.
     """
     block = around[0]
     here = inside[block, z]
@@ -215,7 +215,7 @@ def count_quads(grid, inside, cells, counts):
 
 @device
 def _vertex(cells, starts, before, x, y, z):
-    """Return the index of the vertex of a cell, which may be one cell before the block."""
+    """Return the vertex index of a cell; the cell may be one cell before the block."""
     block = before[(x < 0) + 2 * (y < 0) + 4 * (z < 0)]
     n = np.uint64((y & 7) * 8 + (x & 7))
     return starts[block, z & 7] + count_bits(cells[block, z & 7] & ((ONE << n) - ONE))
@@ -223,7 +223,7 @@ def _vertex(cells, starts, before, x, y, z):
 
 @njit(cache=True, nogil=True, parallel=True)
 def write_triangles(grid, inside, cells, starts, quad_starts, counts, triangles):
-    """Write two triangles for each quad; those of a block start at 2 * quad_starts[block]."""
+    """Write two triangles for each quad. The triangles of a block start at 2 * quad_starts[block]."""
     for block in prange(len(counts)):
         if counts[block] == 0:
             continue
@@ -235,7 +235,7 @@ def write_triangles(grid, inside, cells, starts, quad_starts, counts, triangles)
             edges = _find_quads(inside, cells, around, before, z)
             for axis in range(3):
                 left = edges[axis]
-                # the cells around the edge are one step back along the two other axes, b and c
+                # the cells around the edge are one step back along the other two axes, b and c
                 bx, by, bz = axis == 2, axis == 0, axis == 1
                 cx, cy, cz = axis == 1, axis == 2, axis == 0
                 while left:

@@ -1,13 +1,13 @@
-"""Ray-casting: the view of the map from a camera, by sphere tracing through its blocks, coarse to fine.
+"""Ray-casting of a camera view of the map by sphere tracing through its blocks, coarse to fine.
 
-First, the blocks in view are projected to image tiles, which bounds the depths that the rays of each tile search. Then
-every few pixels a ray skips absent regions and blocks in one step each, advances by the stored distance, and finds the
-surface where the field changes from positive to negative. Between such rays that meet one surface, the depths of the
-pixels are interpolated, and refined on the trilinear field (Newton's method), one image row at a time. Where that
-fails, the pixel gets a full search.
+1. Project the blocks in view to image tiles. This bounds the depths that the rays of each tile search.
+2. Cast a ray every few pixels. The ray skips absent regions and blocks in one step each and advances by the stored
+   distance. The surface is at a change of the field from positive to negative.
+3. If neighboring rays meet one surface, interpolate the depths of the pixels between them. Refine these depths on the
+   trilinear field by Newton's method, one image row at a time. If this fails, run a full search for the pixel.
 
-Interpolation could miss a surface narrower than the distance of the coarse rays. So that distance is kept below the
-size of the map's details; where it is larger, all pixels are searched.
+Interpolation could miss a surface narrower than the spacing of the coarse rays. So the spacing is kept below the size
+of the map's details. All pixels are searched at depths with a larger spacing.
 
 Rays are in voxels: o + z * d with d in voxels per m of depth z.
 """
@@ -38,7 +38,7 @@ MAX_STRIDE = 8  # px between coarse rays
 
 
 def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:
-    """Return the nearest and farthest depths (Y, X) m at which the rays of each tile can meet a block."""
+    """Return the nearest and farthest depths (Y, X) m of blocks along the rays of each tile."""
     tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
     tile_near, tile_far = np.full(tiles, sensor.max_depth), np.full(tiles, sensor.min_depth)
     view = pinhole(camera, inverse(T_world_camera))
@@ -52,14 +52,14 @@ def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camer
 def cast_view(
     voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None
 ) -> tuple[Float32, Float32]:
-    """Return the depth (H, W) m and the normals (H, W, 3), world, of the visible surface; depth 0 = no surface.
+    """Return the depth (H, W) m and the world-frame normals (H, W, 3) of the visible surface; depth 0 = no surface.
 
-    With `readings` (H, W) m, only the surface near the readings or in front of them is searched.
+    With depth `readings` (H, W) m, only the surface near the readings or in front of them is searched.
     """
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
     stride = _stride(camera, float(voxels.grid.voxel_size), float(sensor.max_depth))
-    rays_y, rays_x = (max(1, -(-(side - 1) // stride)) + 1 for side in camera.shape)  # with the last row and column
+    rays_y, rays_x = (max(1, -(-(side - 1) // stride)) + 1 for side in camera.shape)  # with the last row, column
     coarse = np.empty((rays_y, rays_x), np.float32)
     if readings is None:
         limits = np.full(camera.shape, sensor.max_depth)
@@ -75,7 +75,7 @@ def cast_view(
 
 
 def _stride(camera: Camera, voxel_size: float, max_depth: float) -> int:
-    """Return the pixels between coarse rays, a power of 2, that resolve the map's details at any depth."""
+    """Return the spacing of coarse rays in px, a power of 2, that resolves the map's details at any depth."""
     resolved = DETAIL * voxel_size * min(camera.fx, camera.fy) / max_depth
     return 1 << int(np.log2(min(max(resolved, 1.0), MAX_STRIDE)))
 
@@ -92,7 +92,7 @@ def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera
 def render_surface(
     voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None
 ) -> SurfaceView:
-    """Return the view without labels; with `readings` (H, W) m, as `cast_view`.
+    """Return the view without labels; see `cast_view` for `readings` (H, W) m.
 
     Raises DataError if the camera, its pose or the readings are invalid.
     """

@@ -23,18 +23,18 @@ from framework.mapping.voxels.voxel_walk import (
 from framework.sensors.noise_models import axial_sigma_single
 
 TILE = 8  # px; the rays of a tile share blocks in the cache
-REFINEMENTS = 4  # most Newton steps of a ray: one meets a plane, two or three a curved surface
-CONVERGED = 0.2  # voxels; the field is nearly linear, so a shorter step ends within some hundredths of a voxel
-REACH = 3.0  # voxels, largest distance from the start of a refinement to the surface
-DETAIL = 4.0  # most voxels between coarse rays: maps have few details below the truncation band
-MARGIN = 8.0  # voxels that a surface may protrude between the coarse rays that meet it
-STEEPEST = 24.0  # voxels of depth between coarse rays on one surface: a distant floor
-MAX_SHIFT = 10.0  # most voxels between a reading and the surface of the map that it measures
+REFINEMENTS = 4  # maximum Newton steps of a ray; a plane needs one, a curved surface two or three
+CONVERGED = 0.2  # voxels; the field is nearly linear, so the error after a shorter step is a few hundredths of a voxel
+REACH = 3.0  # maximum distance from the start of a refinement to the surface, voxels
+DETAIL = 4.0  # maximum spacing of coarse rays, voxels; maps have few details below the truncation band
+MARGIN = 8.0  # maximum protrusion of a surface between the coarse rays that meet it, voxels
+STEEPEST = 24.0  # maximum depth difference of coarse rays on one surface, voxels; reached by a distant floor
+MAX_SHIFT = 10.0  # maximum distance between a depth reading and the measured surface of the map, voxels
 
 
 @device
 def _ray(view, scale, u, v):
-    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth (m) of one voxel along it."""
+    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth (m) of a voxel along the ray."""
     dx, dy, dz = ray_direction(view, u, v)
     dx, dy, dz = dx * scale, dy * scale, dz * scale
     return (dx, dy, dz), np.float32(1.0) / np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -44,7 +44,7 @@ def _ray(view, scale, u, v):
 def _refined(grid, o, d, step, z, reach, key, region):
     """Return (z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` of depth z, m; z = 0 = none.
 
-    (nx, ny, nz) is the gradient, stored units per voxel. Zeros where the field rises along the ray are back faces.
+    (nx, ny, nz) is the gradient, stored units per voxel. A zero is a back face if the field rises along the ray.
     """
     zero = np.float32(0.0)
     nx = ny = nz = zero
@@ -77,9 +77,9 @@ def _first_surface(grid, o, d, step, near, far, key, region):
     block_side = np.float32(BLOCK_SIDE)
     region_side = np.float32(BLOCK_SIDE * REGION_SIDE)
     inverse_d = inverses(d)
-    # the voxel nearest to a point is the cell of the point shifted by half a voxel
+    # the nearest voxel to a point is the cell of the point shifted by half a voxel
     shifted = (o[0] + half, o[1] + half, o[2] + half)
-    # beyond a border by a thousandth of a voxel, and by more than the rounding of z, or the ray would not advance
+    # a step beyond a border of more than the rounding of z, because otherwise the ray would not advance
     margin = max(np.float32(1e-3) * step, np.float32(2.5e-7) * far)
     z = near
     from_front = False  # the previous voxel was in front of a surface
@@ -110,7 +110,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
 
 @njit(cache=True, nogil=True)
 def bound_tiles(depths, pixels, tile_near, tile_far):
-    """Extend tile_near and tile_far (Y, X) m to the depths of the blocks that the rays of a tile can meet."""
+    """Extend tile_near and tile_far (Y, X) m to the depths of the blocks along the rays of a tile."""
     for n in range(depths.shape[0]):
         u0, u1, v0, v1 = pixels[n]
         for ty in range(v0 // TILE, v1 // TILE + 1):
@@ -121,10 +121,10 @@ def bound_tiles(depths, pixels, tile_near, tile_far):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
-    """Fill depth (m) of every stride-th pixel and of the last row and column of an image by a full search.
+    """Fill the depth (m) of every stride-th pixel and of the last row and column of an image by a full search.
 
-    The image is (H, W), `depth` (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1), 0 = no surface. `view` holds
-    T_world_camera.
+    The image is (H, W), `depth` is (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1), 0 = no surface. `view`
+    holds T_world_camera.
     """
     scale = np.float32(1.0) / grid.voxel_size
     for y in prange(depth.shape[0]):
@@ -143,8 +143,8 @@ def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
 def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near, far, corners):
     """Bound the search in the cells (X,) of pixels between two rows of coarse depths (X + 1,) m, -1 = not searched.
 
-    near and far get the depths, m, between which a cell can show a surface; far 0 = nowhere. corners (4, X) gets the
-    inverse depths of the surface, in the order of the rows, if there is exactly one; otherwise 0.
+    near and far get the depth range, m, of a surface in the cell; far 0 = no surface. corners (4, X) gets the inverse
+    depths of the surface, in row order, if there is exactly one surface; otherwise 0.
     """
     zero, one, none = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
     margin, rise = np.float32(MARGIN) * voxel, np.float32(STEEPEST) * voxel
@@ -199,16 +199,16 @@ def _start_row(corners, b, stride, limits, depth):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, normals):
-    """Fill depth (H, W) m and normals (H, W, 3), world, of the surface that `view` (T_world_camera) sees; 0 = none.
+    """Fill depth (H, W) m and world-frame normals (H, W, 3) of the visible surface; 0 = none.
 
-    `coarse` is the result of cast_coarse() or cast_near(). No pixel is searched beyond its limit (H, W) m. Normals are
-    the gradient of the trilinear field.
+    `view` holds T_world_camera. `coarse` is the result of cast_coarse() or cast_near(). No pixel is searched beyond its
+    limit (H, W) m. Normals are the gradient of the trilinear field.
     """
     height, width = depth.shape
     zero, one = np.float32(0.0), np.float32(1.0)
     voxel = grid.voxel_size
     scale = one / voxel
-    # the depth up to which coarse rays are dense enough to resolve all details
+    # maximum depth at which coarse rays resolve all details
     resolved = np.float32(DETAIL) * voxel * min(view.fx, view.fy) / np.float32(stride)
     cells = coarse.shape[1] - 1
     for y in prange(coarse.shape[0] - 1):
@@ -252,11 +252,12 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
-    """Fill depth as cast_coarse(), starting at the camera's readings (H, W) m.
+    """Fill depth like cast_coarse(), starting at the camera's depth readings (H, W) m.
 
-    No pixel is searched beyond its limit (H, W) m; at limit 0 its depth is -1, because its neighbors may be searched.
-    Readings are noisy, and a wrong pose displaces them. So the search starts at the extrapolation of the two previous
-    rays if the reading agrees with it, otherwise at the reading plus the last displacement.
+    No pixel is searched beyond its limit (H, W) m. At limit 0 the depth is -1, because neighbors may be searched.
+
+    Depth readings are noisy, and a wrong pose displaces them. So the search starts at the extrapolation of the two
+    previous rays if the reading agrees with it. Otherwise it starts at the reading plus the last displacement.
     """
     height, width = readings.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -293,7 +294,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def paint(grid, view, depth, color):
-    """Fill color (H, W, 3) with the color of the map at the surface of `depth` (H, W) m, seen from `view`."""
+    """Fill color (H, W, 3) with the map's color at the surface of `depth` (H, W) m seen from `view`."""
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
     for v in prange(height):
@@ -306,7 +307,7 @@ def paint(grid, view, depth, color):
 
 @device
 def voxel_seen(grid, view, u, v, z, key, region):
-    """Return (block, index, key, region) of the voxel nearest to pixel (u, v) at depth z (m), as find_block()."""
+    """Return (block, index, key, region) of the nearest voxel to pixel (u, v) at depth z (m); see find_block()."""
     scale = np.float32(1.0) / grid.voxel_size
     half = np.float32(0.5)
     x, y, w = seen_point(view, u, v, z)
@@ -319,7 +320,7 @@ def voxel_seen(grid, view, u, v, z, key, region):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label(grid, evidence, view, depth, instance_ids, class_ids):
-    """Fill instance_ids and class_ids (H, W) with the labels of the voxels nearest to the surface at `depth`."""
+    """Fill instance_ids and class_ids (H, W) with the labels of the nearest voxels to the surface at `depth`."""
     height, width = depth.shape
     for v in prange(height):
         key, region = NO_LOOK_UP

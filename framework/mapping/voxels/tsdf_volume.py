@@ -1,4 +1,4 @@
-"""A TSDF volume, with integration, surface extraction, ray-casting and serialization, and its parameters."""
+"""TSDF volume with integration, surface extraction, ray-casting and serialization, and its parameters."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from framework.mapping.voxels.raycasting import render_surface
 from framework.mapping.voxels.voxel_grid import MOST_BLOCKS, VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, find_solid_blocks
 
-BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
+BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # saved arrays of the grid
 NO_BLOCKS = np.zeros(0, np.int32)
 
 
 class TsdfVolume:
-    """Voxels, their integrator, and their surface, updated as blocks change."""
+    """Voxels, their integrator and their surface, updated when blocks change."""
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
         self.sensor = sensor
@@ -53,7 +53,7 @@ class TsdfVolume:
     def integrate(self, frame: Frame, T_world_camera: Float64, near: float) -> SeenBlocks:
         """Integrate one frame and return the voxels within `near` m of the measured surface.
 
-        Raises MapFullError if the block budget is reached; the frame is then not integrated.
+        Raises MapFullError if the block budget is reached; in this case the frame is not integrated.
         """
         seen = self.integrator.integrate(frame, T_world_camera, near)
         self.gravity_estimator.add_frame(T_world_camera, frame.up)
@@ -61,7 +61,7 @@ class TsdfVolume:
         return seen
 
     def changed(self, blocks: Int32 | None = None) -> None:
-        """Invalidate derived data after writing the voxels of `blocks` (A,); None = of any block."""
+        """Invalidate derived data after writing the voxels of `blocks` (A,), None = any blocks."""
         self._mesh = self._gravity = None
         if blocks is None:
             self._nets = None
@@ -69,7 +69,7 @@ class TsdfVolume:
             self._nets.changed(blocks)
 
     def surface(self) -> UnlabeledMesh:
-        """Return the current surface, without labels."""
+        """Return the current surface without labels."""
         self._nets = self._nets or SurfaceNets(self.voxels)
         return self._nets.extract()
 
@@ -106,7 +106,7 @@ class TsdfVolume:
 
     @classmethod
     def load(cls, header: MapHeader, arrays: dict[str, Any], rows: int) -> TsdfVolume:
-        """Return the volume of a map file with `rows` label rows. Raises DataError if it is invalid."""
+        """Return the volume of a map file with `rows` label rows. Raises DataError if the file is invalid."""
         saved = header.part("sensor")
         sensor = Sensor(**{name: np.float32(saved.number(name, BOUNDS[name])) for name in Sensor._fields})
         max_blocks = header.whole("max_blocks", 1, MOST_BLOCKS)
@@ -119,7 +119,7 @@ class TsdfVolume:
         return volume
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Copy the voxels of a map file, whose types and shapes were checked, into an empty volume."""
+        """Copy the voxels of a map file with checked types and shapes into an empty volume."""
         coords = arrays["block_coords"]
         check_blocks(coords)
         self.voxels.allocate(coords)
@@ -184,5 +184,5 @@ class VoxelHashing:
 
     @property
     def near(self) -> float:
-        """Distance from the measured surface, m, within which voxels are labeled."""
+        """Maximum distance of labeled voxels from the measured surface, m."""
         return self.tsdf.label_band * self.tsdf.voxel_size

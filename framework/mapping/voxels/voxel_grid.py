@@ -1,14 +1,14 @@
-"""Voxel hashing: blocks of 8^3 voxels, allocated where surface is seen, found through a hash table.
+"""Voxel hashing: blocks of 8^3 voxels in a hash table, allocated near seen surfaces.
 
 After Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table holds regions
-of 8^3 blocks; a region is a dense table of block indices. Neighboring look-ups along a ray or a row of voxels are in
-the same region, so nearly all of them cost one comparison and one load, and a ray skips unmapped space by region.
+of 8^3 blocks. A region is a dense table of block indices. Neighboring look-ups along a ray or a row of voxels are in
+the same region. So nearly all look-ups cost one comparison and one load, and a ray skips unmapped space by region.
 
 Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory x runs fastest: voxel (x, y, z)
 of a block has the index (z * 8 + y) * 8 + x.
 
-A voxel takes 8 bytes (distance 2, weight 2, color 4), and with the tables of blocks and regions 8.15. Label evidence
-comes on top: see evidence_rows.py.
+A voxel takes 8 bytes (distance 2, weight 2, color 4), and 8.15 bytes including the tables of blocks and regions. Label
+evidence takes additional memory; see evidence_rows.py.
 """
 
 from __future__ import annotations
@@ -29,37 +29,37 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 Element = TypeVar("Element", bound=np.generic)
 Made = TypeVar("Made")
-MOST_BLOCKS = 2**31 // BLOCK_VOXELS  # of a map: voxel indices are 32-bit
+MOST_BLOCKS = 2**31 // BLOCK_VOXELS  # maximum number of blocks of a map; voxel indices are 32-bit
 REGION_SIDE = 8  # blocks
 REGION_BLOCKS = REGION_SIDE**3
-WEIGHT_ONE = 256  # weights are stored in 1/256 of an observation
-TSDF_MAX = 32767  # the stored value of the largest truncation distance
-FIRST_RESERVED = 1024  # blocks or voxels
+WEIGHT_ONE = 256  # stored weight of one observation
+TSDF_MAX = 32767  # stored value of the largest truncation distance
+FIRST_RESERVED = 1024  # initial capacity, blocks or voxels
 
 
 class Grid(NamedTuple):
-    """The arrays of a VoxelGrid, for the kernels. B and S are capacities, of which only the first part is in use."""
+    """The arrays of a VoxelGrid for the kernels. B and S are capacities; only the first entries are in use."""
 
     voxel_size: np.float32  # m
-    tsdf_unit: np.float32  # m, the distance of a stored tsdf of 1
+    tsdf_unit: np.float32  # distance of a stored tsdf of 1, m
     table_keys: npt.NDArray[np.int64]  # (T,) packed region coordinates, NO_KEY = free; T is a power of two
     table_regions: Int32  # (T,) region index
-    region_coords: Int32  # (S, 3) region coordinates; its first block is 8 times that
+    region_coords: Int32  # (S, 3) region coordinates; the first block is at 8 times these
     region_blocks: Int32  # (S, 512) block index, -1 = not allocated
-    block_coords: Int32  # (B, 3) block coordinates; its first voxel is 8 times that
-    neighbors: Int32  # (B, 8) the blocks at +0 or +1 along x (bit 0), y (bit 1), z (bit 2); -1 = not allocated
-    tsdf: npt.NDArray[np.int16]  # (B, 512) signed distance in tsdf_unit, positive in front of the surface; UNSEEN
+    block_coords: Int32  # (B, 3) block coordinates; the first voxel is at 8 times these
+    neighbors: Int32  # (B, 8) blocks at +0 or +1 along x (bit 0), y (bit 1), z (bit 2); -1 = not allocated
+    tsdf: npt.NDArray[np.int16]  # (B, 512) signed distance in tsdf_unit, positive in front of the surface, or UNSEEN
     weight: npt.NDArray[np.uint16]  # (B, 512) in 1/256 observations
     color: npt.NDArray[np.uint32]  # (B, 512) packed, see pack_color()
-    solid: UInt8  # (B,) 1 = a voxel of it is behind a surface; rays skip other blocks
-    label_row: Int32  # (B,) the row of the block in the label evidence, -1 = none
+    solid: UInt8  # (B,) 1 = a voxel is behind a surface; rays skip other blocks
+    label_row: Int32  # (B,) row of the block in the label evidence, -1 = none
 
 
 OF_BLOCKS = Grid._fields[Grid._fields.index("block_coords") :]  # (B, ...)
 
 
 def _free_blocks(count: int) -> dict[str, Any]:
-    """Return the arrays OF_BLOCKS for so many blocks."""
+    """Return the arrays OF_BLOCKS for `count` blocks."""
     return {
         "block_coords": np.empty((count, 3), np.int32),
         "neighbors": np.empty((count, 8), np.int32),
@@ -72,9 +72,9 @@ def _free_blocks(count: int) -> dict[str, Any]:
 
 
 def reserved(most: int, make: Callable[[int], Made]) -> Made:
-    """Return make(most), uninitialized arrays that take no memory until they are written, and never have to grow.
+    """Return make(most): uninitialized arrays that take no memory until written, and never need to grow.
 
-    Where address space is limited (Windows, `ulimit -v`, no overcommit), return make(FIRST_RESERVED), which can grow.
+    With limited address space (Windows, `ulimit -v`, no overcommit), return make(FIRST_RESERVED), which can grow.
     """
     first = min(most, FIRST_RESERVED)
     if resource is None or resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
@@ -103,7 +103,7 @@ class VoxelGrid:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state without reserved capacity, which is gigabytes."""
+        """Return the state without reserved capacity, which takes gigabytes."""
         blocks = {name: getattr(self.grid, name)[: self.block_count] for name in OF_BLOCKS}
         return {**vars(self), "grid": self.grid._replace(**blocks)}
 
@@ -116,9 +116,9 @@ class VoxelGrid:
         return int(grid.table_keys.nbytes + grid.table_regions.nbytes + regions + blocks)
 
     def allocate(self, coords: Int32) -> Int32:
-        """Return the blocks (N,) at `coords` (N, 3); new ones are allocated in the given order.
+        """Return the blocks (N,) at `coords` (N, 3). New blocks are allocated in the given order.
 
-        Raises MapFullError if more than `max_blocks` are needed; those allocated before that stay.
+        Raises MapFullError if more than `max_blocks` are needed; blocks allocated before the error remain.
         """
         done, blocks = 0, np.empty(len(coords), np.int32)
         while True:
@@ -129,13 +129,14 @@ class VoxelGrid:
                 return blocks
             if self.block_count == self.max_blocks:
                 raise MapFullError(
-                    f"the map is full: {self.max_blocks} blocks of {BLOCK_SIDE}^3 voxels "
-                    f"({self.byte_count / 2**20:.0f} MiB); raise fuser.max_blocks or fuser.voxel_size"
+                    f"the map is full: expected at most {self.max_blocks} blocks of {BLOCK_SIDE}^3 voxels "
+                    f"({self.byte_count / 2**20:.0f} MiB), got a request for up to {len(coords) - done} more; "
+                    "raise fuser.max_blocks or fuser.voxel_size"
                 )
             self._grow()
 
     def _grow(self) -> None:
-        """Double each capacity that is used up."""
+        """Double each exhausted capacity."""
         grid = self.grid
         if self.block_count == len(grid.block_coords):
             more = min(max(2 * len(grid.block_coords), FIRST_RESERVED), self.max_blocks)
@@ -155,7 +156,7 @@ class VoxelGrid:
 
 
 def grown(array: npt.NDArray[Element], length: int, zeros: bool = False) -> npt.NDArray[Element]:
-    """Return a copy of `array` with `length` rows; new rows are uninitialized, or zeros."""
+    """Return a copy of `array` with `length` rows. New rows are uninitialized or zeros."""
     longer = (np.zeros if zeros else np.empty)((length, *array.shape[1:]), array.dtype)
     longer[: len(array)] = array
     return longer

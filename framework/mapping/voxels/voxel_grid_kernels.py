@@ -7,29 +7,29 @@ from numba import njit
 
 BLOCK_SIDE = 8  # voxels
 BLOCK_VOXELS = BLOCK_SIDE**3
-UNSEEN = -32768  # the stored distance of an unobserved voxel, so that readers need not load the weight
+UNSEEN = -32768  # stored distance of an unobserved voxel; avoids loading the weight
 NO_KEY = -1
 NO_LOOK_UP = (np.int64(-2), np.int32(-1))  # key and region before the first find_block()
 
-# For functions that kernels call in inner loops. Without reference counts (_nrt), on whose updates threads would wait.
+# Decorator for functions in inner loops of kernels. No reference counts (_nrt), because threads would wait on updates.
 device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
 
 
 @device
 def one_more(count, condition):
-    """Return count + condition as int32; numba would add in 64 bits, of which half as many fit into a vector."""
+    """Return count + condition as int32. Numba would add in 64 bits, which fit half as often into a vector."""
     return np.int32(count + (np.int32(1) if condition else np.int32(0)))
 
 
-_KEY_BITS = 21  # of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
-FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # blocks from the origin along an axis: the range of a map
+_KEY_BITS = 21  # bits of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
+FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # range of a map from the origin along an axis, blocks
 _KEY_OFFSET = FARTHEST_BLOCK
 _KEY_MASK = (1 << _KEY_BITS) - 1
 
 
 @device
 def pack_key(x, y, z):
-    """Return the key, >= 0, of the coordinates of a region or a block."""
+    """Return the key, >= 0, of region or block coordinates."""
     return (
         ((np.int64(x) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
         | ((np.int64(y) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
@@ -56,7 +56,7 @@ def _slot(key, size):
 
 @device
 def find_region(grid, key):
-    """Return the region with this key, -1 = none. Linear probing."""
+    """Return the region with this key by linear probing, -1 = none."""
     size = grid.table_keys.shape[0]
     slot = _slot(key, size)
     while True:
@@ -78,7 +78,7 @@ def child_number(bx, by, bz):
 def find_block(grid, bx, by, bz, last_key, last_region):
     """Return (block, key, region) at block coordinates; block -1 = not allocated.
 
-    `last_key` and `last_region` are those of the previous call, a cache that makes neighboring look-ups cheap.
+    `last_key` and `last_region` come from the previous call. This cache makes neighboring look-ups cheap.
     """
     key = pack_key(bx >> 3, by >> 3, bz >> 3)
     if key != last_key:
@@ -90,7 +90,7 @@ def find_block(grid, bx, by, bz, last_key, last_region):
 
 @njit(cache=True, nogil=True)
 def insert_blocks(grid, coords, start, region_count, block_count, blocks):
-    """Allocate the new blocks of coords[start:], in order, and write the index of each one to blocks (N,).
+    """Allocate the new blocks of coords[start:] in order, and write the index of each block to blocks (N,).
 
     Returns (next, region_count, block_count). If next < len(coords), a capacity was reached: grow and call again.
     """
@@ -149,16 +149,16 @@ def _link_neighbors(grid, block):
             grid.neighbors[before, c] = block
 
 
-# NumPy scalars and casts, because numba computes in 64 bits otherwise: half as many fit into a vector
+# NumPy scalars and casts, because otherwise numba computes in 64 bits and half as many numbers fit into a vector
 _CHANNEL = np.int32(1023)
 _GREEN = np.int32(10)
 _BLUE = np.int32(20)
-COLORED = np.uint32(1 << 30)  # the bit that marks a color
+COLORED = np.uint32(1 << 30)  # marker bit of a color
 
 
 @device
 def pack_color(red, green, blue):
-    """Return the packed color of quarters of a level, 0 to 1020: ten bits per channel, so that averages converge."""
+    """Return the packed color of quarters of a level, 0 to 1020. Ten bits per channel let averages converge."""
     return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
 
 
@@ -175,7 +175,7 @@ def unpack_color(packed):
 
 @device
 def is_solid(tsdf):
-    """Return whether an observed voxel of a block, tsdf (512,), is behind a surface."""
+    """Return True if an observed voxel of a block with distances tsdf (512,) is behind a surface."""
     lowest = np.int16(0)
     for n in range(BLOCK_VOXELS):
         stored = tsdf[n]
@@ -185,7 +185,7 @@ def is_solid(tsdf):
 
 @njit(cache=True, nogil=True)
 def find_solid_blocks(grid, block_count):
-    """Fill grid.solid of the first blocks from their distances."""
+    """Fill grid.solid of the first `block_count` blocks from their distances."""
     for block in range(block_count):
         grid.solid[block] = is_solid(grid.tsdf[block])
 

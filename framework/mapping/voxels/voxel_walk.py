@@ -1,8 +1,8 @@
 """Device functions that read the voxel grid: rays, cell borders, trilinear fields, and memory prefetch.
 
-Functions of a whole image row are in passes that the compiler vectorizes. Look-ups wait for memory and branch,
-arithmetic does not. So one pass gathers the eight corners of each point, with many loads at once, and another does the
-arithmetic for eight pixels at a time. The last axis of their arrays is the pixel.
+Functions for a whole image row work in passes that the compiler vectorizes. Look-ups branch and wait for memory, while
+arithmetic does not. So one pass gathers the eight corners of each point with many concurrent loads. Another pass does
+the arithmetic for eight pixels at a time. The last axis of their arrays is the pixel.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _READ, _L2, _DATA = 0, 2, 1  # arguments of llvm.prefetch: for reading, into the
 
 @device
 def ray_direction(view, u, v):
-    """Return (dx, dy, dz), world, m per m of depth: the ray through pixel (u, v). `view` holds T_world_camera."""
+    """Return the world-frame ray (dx, dy, dz) of pixel (u, v), m per m of depth. `view` holds T_world_camera."""
     ray_x = (np.float32(u) - view.cx) / view.fx
     ray_y = (np.float32(v) - view.cy) / view.fy
     return (
@@ -35,25 +35,25 @@ def ray_direction(view, u, v):
 
 @device
 def seen_point(view, u, v, z):
-    """Return (x, y, z), world, m: the point at depth z (m) of pixel (u, v). `view` holds T_world_camera."""
+    """Return the world point (x, y, z), m, of pixel (u, v) at depth z (m). `view` holds T_world_camera."""
     dx, dy, dz = ray_direction(view, u, v)
     return view.t[0] + z * dx, view.t[1] + z * dy, view.t[2] + z * dz
 
 
 @device
 def _leave_slab(z, start, d, inverse_d, size, inverse_size):
-    """leave_cell() along one axis."""
+    """Compute leave_cell() along one axis."""
     cell = np.floor((start + z * d) * inverse_size)
-    if inverse_d > np.float32(0.0):  # not d: a ray along the slab has inverse_d huge and leaves it far ahead
+    if inverse_d > np.float32(0.0):  # not d: a ray along the slab has a huge inverse_d and leaves the slab far ahead
         cell += np.float32(1.0)
     return (cell * size - start) * inverse_d
 
 
 @device
 def leave_cell(z, start, d, inverse_d, size, inverse_size):
-    """Return the parameter at which the ray start + z * d leaves the grid cell of side `size` that it is in at z.
+    """Return the parameter at the exit of the ray start + z * d from its grid cell at z, with side `size`.
 
-    `start`, `d` and `inverse_d` are triples; `inverse_d` is 1 / d, a huge number where d is 0.
+    `start`, `d` and `inverse_d` are triples. `inverse_d` is 1 / d, a huge number if d is 0.
     """
     exit_x = _leave_slab(z, start[0], d[0], inverse_d[0], size, inverse_size)
     exit_y = _leave_slab(z, start[1], d[1], inverse_d[1], size, inverse_size)
@@ -63,7 +63,7 @@ def leave_cell(z, start, d, inverse_d, size, inverse_size):
 
 @device
 def inverses(d):
-    """Return 1 / d of a triple, with tiny values in place of zeros."""
+    """Return 1 / d of a triple, with tiny values instead of zeros."""
     tiny = np.float32(1e-12)
     x = d[0] if abs(d[0]) > tiny else tiny
     y = d[1] if abs(d[1]) > tiny else tiny
@@ -79,14 +79,14 @@ def voxel_number(i, j, k):
 
 @device
 def _of_neighbor(grid, values, block, neighbor, n, missing):
-    """Return values[neighbor, n] of values (B, 512), `missing` if the block has no such neighbor."""
+    """Return entry n of values (B, 512) of a block's neighbor, `missing` without such a neighbor."""
     there = grid.neighbors[np.uint32(block), np.uint32(neighbor)]
     return values[np.uint32(there), np.uint32(n)] if there >= 0 else missing
 
 
 @device
 def corners(grid, values, block, i, j, k, missing):
-    """Return `values` (B, 512) of the eight voxels (i, j, k) + {0, 1}^3, x fastest; `block` contains (i, j, k)."""
+    """Return the `values` (B, 512) of the eight voxels (i, j, k) + {0, 1}^3, x fastest; `block` contains (i, j, k)."""
     x, y, z = i & 7, j & 7, k & 7
     n = (z * 8 + y) * 8 + x
     here = np.uint32(block)
@@ -120,7 +120,7 @@ def corners(grid, values, block, i, j, k, missing):
 
 @device
 def interpolate(s, fx, fy, fz):
-    """Return (value, d/dx, d/dy, d/dz) between eight corners, x fastest, at the fractions (fx, fy, fz) of a voxel."""
+    """Return (value, d/dx, d/dy, d/dz) between eight corners, x fastest, at fractions (fx, fy, fz) of a voxel."""
     x00, x10, x01, x11 = np.float32(s[0]), np.float32(s[2]), np.float32(s[4]), np.float32(s[6])
     dx00, dx10 = np.float32(s[1]) - x00, np.float32(s[3]) - x10
     dx01, dx11 = np.float32(s[5]) - x01, np.float32(s[7]) - x11
@@ -136,15 +136,16 @@ def interpolate(s, fx, fy, fz):
 
 @device
 def all_seen(s):
-    """Return whether all of eight corners were observed."""
+    """Return True if all eight corners were observed."""
     return min(min(min(s[0], s[1]), min(s[2], s[3])), min(min(s[4], s[5]), min(s[6], s[7]))) != UNSEEN
 
 
 @device
 def trilinear(grid, block, x, y, z):
-    """Return (value, d/dx, d/dy, d/dz, valid): the stored distance and its gradient at (x, y, z), in voxels.
+    """Return (value, d/dx, d/dy, d/dz, valid): the stored distance and its gradient at (x, y, z), voxels.
 
-    `block` contains the voxel at the floor of the point. Valid if all eight voxels around it were observed.
+    `block` contains the voxel at the floor of the point. The result is valid if all eight voxels around the point were
+    observed.
     """
     i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
     s = corners(grid, grid.tsdf, block, i, j, k, np.int16(UNSEEN))
@@ -154,7 +155,7 @@ def trilinear(grid, block, x, y, z):
 
 @device
 def _add_color(red, green, blue, total, packed, weight):
-    """Add a packed color with its weight; a voxel without color has none."""
+    """Add a packed color with its weight. A voxel without color adds nothing."""
     weight = weight if packed & COLORED else np.float32(0.0)
     r, g, b = unpack_color(packed)
     return red + weight * r, green + weight * g, blue + weight * b, total + weight
@@ -162,7 +163,7 @@ def _add_color(red, green, blue, total, packed, weight):
 
 @device
 def blend(p, x1, y1, z1):
-    """Return (red, green, blue) at the fractions (x1, y1, z1) between eight packed colors, of the voxels with color."""
+    """Return (red, green, blue) at fractions (x1, y1, z1) between eight packed colors; ignores voxels without color."""
     one, zero = np.float32(1.0), np.float32(0.0)
     x0, y0, z0 = one - x1, one - y1, one - z1
     r, g, b, total = _add_color(zero, zero, zero, zero, p[0], x0 * y0 * z0)
@@ -179,7 +180,7 @@ def blend(p, x1, y1, z1):
 
 @intrinsic
 def prefetch_line(_typing_context: Any, array: Any, offset: Any) -> Any:
-    """Prefetch the cache line that is `offset` bytes after the first element of an array."""
+    """Prefetch the cache line at `offset` bytes after the first element of an array."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         byte, int32 = ir.IntType(8), ir.IntType(32)
@@ -201,7 +202,7 @@ def prefetch_element(array, row, column):
 
 @device
 def prefetch_row(array, row):
-    """Prefetch array[row], if there is such a row."""
+    """Prefetch array[row] if the row exists."""
     if 0 <= row < array.shape[0]:
         bytes_a_row = array.itemsize * (array.size // array.shape[0])
         for line in range(0, bytes_a_row, CACHE_LINE):
@@ -210,7 +211,7 @@ def prefetch_row(array, row):
 
 @device
 def directions(view, scale, v):
-    """Return the ray of pixel (0, v), voxels per m of depth, and its change per pixel. `scale` is voxels per m."""
+    """Return the ray of pixel (0, v), voxels per m of depth, and its change per pixel; `scale` is in voxels per m."""
     x, y, z = ray_direction(view, 0, v)
     change = scale / view.fx  # the rounding of a difference of two rays would accumulate along the row
     return (x * scale, y * scale, z * scale), (view.R[0, 0] * change, view.R[1, 0] * change, view.R[2, 0] * change)
@@ -218,7 +219,7 @@ def directions(view, scale, v):
 
 @device
 def points_of_row(view, scale, v, depth, points):
-    """Fill points (3, W), voxels, with the points of the pixels of row v at `depth` (W,) m."""
+    """Fill points (3, W), voxels, with the points of row v at `depth` (W,) m."""
     origin, change = directions(view, scale, v)
     tx, ty, tz = view.t[0] * scale, view.t[1] * scale, view.t[2] * scale
     for n in range(depth.shape[0]):
@@ -233,7 +234,7 @@ def points_of_row(view, scale, v, depth, points):
 def gather_corners(grid, values, depth, points, missing, found):
     """Fill found (8, W) with `values` (B, 512) of the eight voxels around each point (3, W).
 
-    They are `missing` if there is no block, or the pixel has no depth.
+    Values are `missing` without a block, or if the pixel has no depth.
     """
     key, region = NO_LOOK_UP
     for n in range(depth.shape[0]):
@@ -259,9 +260,9 @@ def gather_corners(grid, values, depth, points, missing, found):
 def step_to_surface(view, scale, v, found, points, converged, reach, limits, depth, normals):
     """Move each depth (W,) m by one Newton step along its ray to the zero of the trilinear field.
 
-    `found` (8, W) holds the distances around `points` (3, W). depth becomes 0 if the field is unknown, does not fall
-    along the ray, or the zero is farther than `reach` voxels; it is negated if the step is longer than `converged`
-    voxels. normals (3, W) gets the direction of the gradient.
+    `found` (8, W) holds the distances around `points` (3, W). A depth becomes 0 if the field is unknown, if it does not
+    fall along the ray, or if the zero is farther than `reach` voxels. A depth is negated if the step is longer than
+    `converged` voxels. normals (3, W) gets the direction of the gradient.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     origin, change = directions(view, scale, v)

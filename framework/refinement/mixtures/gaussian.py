@@ -1,7 +1,7 @@
-"""Gaussian densities and moments of blocks of points, in vector code: the inner loops of expectation maximization.
+"""Vectorized Gaussian densities and moments of blocks of points: the inner loops of expectation maximization.
 
-The exponential and the eigenvalues are our own: numba does not vectorize NumPy's exp without Intel's SVML, and calls
-LAPACK for each 3x3 matrix.
+The exponential and the eigenvalues have custom implementations. Numba does not vectorize NumPy's exp without Intel's
+SVML, and calls LAPACK for each 3x3 matrix.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from framework.data import Float32, Float64
 
 LOG_2PI = float(np.log(2 * np.pi))
 JACOBI_SWEEPS = 6  # upper limit; 4 suffice for a 3x3 matrix in double precision
-NEGLIGIBLE = 1e-28  # of the squared trace: smaller off-diagonal elements change an eigenvalue in the 14th digit
+NEGLIGIBLE = 1e-28  # of the squared trace; smaller off-diagonal elements change an eigenvalue in the 14th digit
 ABSENT = np.float32(-1e30)  # log density of a component with weight 0; finite, so that differences are finite
-FACTORS = 64  # with up to 10^4 components, their product stays below 1e256
+FACTORS = 64  # factors per logarithm; with up to 10^4 components, the product stays below 1e256
 SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and respect infinities
 
 
@@ -55,16 +55,16 @@ def add_to(values: Float32, summands: Float32) -> None:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to(values: Float32, others: Float32, n: int) -> None:
-    """Set values = max(values, others), of the first n; unlike max(), a comparison vectorizes."""
+    """Set the first n entries of values to max(values, others); unlike max(), a comparison vectorizes."""
     for i in range(n):
         values[i] = others[i] if others[i] > values[i] else values[i]
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _exp(t: np.float32) -> np.float32:
-    """Return exp(t) for t <= 0 with a relative error of 3e-7, as 2^k * 2^r with |r| <= 1/2, which vectorizes.
+    """Return exp(t) for t <= 0 with a relative error of 3e-7, as 2^k * 2^r with |r| <= 1/2, in vectorizable code.
 
-    The result is at least exp(-50) = 2e-22: denormal numbers are slow.
+    The result is at least exp(-50) = 2e-22, because denormal numbers are slow.
     """
     t = max(t, np.float32(-50.0)) * np.float32(1.4426950408889634)
     k = math.floor(t + np.float32(0.5))
@@ -87,7 +87,7 @@ def constant_exponential(log_density: np.float32, largest: Float32, evidence: Fl
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """Set densities = exp(densities - largest) and add them to the evidence, of the first n."""
+    """Set the first n densities to exp(densities - largest) and add them to the evidence."""
     for i in range(n):
         densities[i] = _exp(densities[i] - largest[i])
         evidence[i] += densities[i]
@@ -95,7 +95,7 @@ def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int
 
 @njit(cache=True, nogil=True)
 def log_evidence(largest: Float32, evidence: Float32, n: int) -> float:
-    """Return sum_i largest[i] + log(evidence[i]) of the first n, with one logarithm per FACTORS factors.
+    """Return sum_i largest[i] + log(evidence[i]) over the first n, with one logarithm per FACTORS factors.
 
     A factor is between 1 and 1 + the number of components.
     """
@@ -124,7 +124,7 @@ def _product(values: Float32) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def invert(values: Float32, others: Float32, n: int) -> float:
-    """Set values = 1 / values, of the first n; return the sum of others / values."""
+    """Set the first n values to 1 / values; return the sum of others / values."""
     total = np.float32(0.0)
     for i in range(n):
         values[i] = np.float32(1.0) / values[i]
@@ -134,7 +134,7 @@ def invert(values: Float32, others: Float32, n: int) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: Float32, moment: Float64) -> None:
-    """Add sum_i gamma_i (1, x_i, x_i x_i^T); single precision suffices within a block."""
+    """Add sum_i gamma_i (1, x_i, x_i x_i^T) to the moment. Single precision suffices within a block."""
     zero = np.float32(0.0)
     s, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
     for i in range(len(x)):
@@ -156,7 +156,7 @@ def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: F
 
 @njit(cache=True, nogil=True)
 def add_point(moment: Float64, point: Float32, center: Float64, gamma: float) -> None:
-    """Add gamma * (1, x, x x^T) of the centered point, with the upper triangle of the symmetric matrix."""
+    """Add gamma * (1, x, x x^T) of the centered point, using the upper triangle of the symmetric matrix."""
     x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
     gx, gy, gz = gamma * x, gamma * y, gamma * z
     moment[0] += gamma
@@ -206,7 +206,7 @@ def floor_eigenvalues(Sigma: Float64, floor: float) -> None:
 def set_coefficients(weight: float, mean: Float64, Sigma: Float64, row: Float32) -> None:
     """Set row = log(pi_k / sqrt((2 pi)^3 |Sigma|)), mu_k, and L^-1 of Sigma = L L^T, row by row.
 
-    In single precision, whitening by L^-1 is accurate where entries of Sigma^-1 would cancel.
+    In single precision, whitening by L^-1 is accurate even if entries of Sigma^-1 would cancel.
     """
     if weight <= 0.0:
         row[:] = 0.0

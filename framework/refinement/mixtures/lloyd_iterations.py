@@ -1,4 +1,4 @@
-"""Lloyd's k-means for many point sets in parallel, and starts for it and for expectation maximization.
+"""Lloyd's k-means for many point sets in parallel, and initialization of k-means and expectation maximization.
 
 scikit-learn fits one set per call, which takes far longer for the masks of a frame.
 """
@@ -13,10 +13,10 @@ from framework.refinement.neighborhood import Neighborhoods
 
 
 def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: int) -> tuple[Int32, Float64]:
-    """Return labels (S,) and centers (N, K, 3) after Lloyd's iterations on each set `points[starts[k]:starts[k + 1]]`.
+    """Return the labels (S,) and centers (N, K, 3) of k-means on each set `points[starts[k]:starts[k + 1]]`.
 
-    `centers` (N, K, 3) are the start. It ends if no label changes or after `max_iterations`. A center that loses all
-    its points stays in place; of equally near centers the first is taken.
+    `centers` (N, K, 3) are the initial centers. Iteration ends if no label changes or after `max_iterations`. A center
+    that loses all its points stays in place. Ties go to the first center.
     """
     labels = np.full(len(points), -1, np.int32)
     centers = centers.copy()
@@ -25,21 +25,21 @@ def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: in
 
 
 def nearest_centers(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
-    """Return (S,) the nearest center of set k for each of `points[begins[k]:ends[k]]`; -1 outside of the ranges."""
+    """Return the nearest center (S,) of set k for each of `points[begins[k]:ends[k]]`; -1 outside the ranges."""
     return np.asarray(nearest_all(points, begins, ends, centers), np.int32)
 
 
 def depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
-    """Return (N, groups, 3) means of the points cut into `groups` of equal size by depth: a start for `cluster`.
+    """Return the means (N, groups, 3) of `groups` equal-sized groups of points by depth, to initialize `cluster`.
 
     Depth separates an occluder, the supporting surface and the wall behind. A set with fewer points than groups gives
-    repeated centers, an empty one zeros.
+    repeated centers. An empty set gives zeros.
     """
     return np.asarray(group_depths(points, starts, groups), np.float64)
 
 
 def start_centers(around: Neighborhoods, object_centers: int, background_centers: int) -> Float64:
-    """Return (N, object_centers + background_centers, 3) the `depth_groups` of mask and ring."""
+    """Return the `depth_groups` (N, object_centers + background_centers, 3) of mask and ring."""
     of_ring = around.of_ring
     mask_starts = np.concatenate([[0], np.cumsum(around.mask_counts)])
     ring_starts = np.concatenate([[0], np.cumsum(around.ring_counts)])
@@ -51,11 +51,11 @@ def start_centers(around: Neighborhoods, object_centers: int, background_centers
 def start_labels(
     around: Neighborhoods, log_odds: Float32, object_components: int, background_components: int, iterations: int
 ) -> Int32:
-    """Return (S,) the start component of each point for EM: the object's come first, then the background's.
+    """Return the initial component (S,) of each point for EM: object components first, then background components.
 
-    Up to `iterations` of Lloyd's algorithm group the mask's points with `log_odds` (S,) from 0, and the ring's points,
-    from groups of equal size by depth. The mask's other points start in the nearest group of the ring; without
-    background components they start in the object.
+    Lloyd's algorithm groups the ring's points, and the mask's points with `log_odds` (S,) of at least 0. It starts from
+    groups of equal size by depth and runs up to `iterations`. The mask's other points start in the nearest group of the
+    ring. Without background components they start in the object.
     """
     labels = np.empty(len(around.points_camera), np.int32)
     start_all(

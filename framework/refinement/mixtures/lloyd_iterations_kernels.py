@@ -63,7 +63,7 @@ def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -
 
 @njit(cache=True, nogil=True, parallel=True)
 def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
-    """Return the `depth_groups` of each set, (sets, groups, 3)."""
+    """Return the `depth_groups` (sets, groups, 3) of each set."""
     means = np.zeros((len(starts) - 1, groups, 3))
     for k in prange(len(starts) - 1):
         means[k] = depth_groups_of(points[starts[k] : starts[k + 1]], groups)
@@ -72,7 +72,7 @@ def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
 
 @njit(cache=True, nogil=True)
 def depth_groups_of(points: Float32, groups: int) -> Float64:
-    """Return the `depth_groups` of one set, (groups, 3)."""
+    """Return the `depth_groups` (groups, 3) of one set."""
     n, means = len(points), np.zeros((groups, 3))
     if n == 0:
         return means
@@ -88,13 +88,13 @@ def depth_groups_of(points: Float32, groups: int) -> Float64:
 
 @njit(cache=True, nogil=True)
 def _by_depth(points: Float32) -> Int64:
-    """Return the points' indices by increasing depth, in a stable radix sort; np.argsort takes long to compile."""
+    """Return the points' indices by increasing depth, by a stable radix sort. np.argsort takes long to compile."""
     n = len(points)
     depths = np.empty(n, np.float32)
     for i in range(n):
         depths[i] = points[i, 2]
     bits, keys = depths.view(np.int32), np.empty(n, np.int64)
-    for i in range(n):  # bits of positive numbers sort like the numbers, those of negative ones in reverse
+    for i in range(n):  # bits of positive numbers sort like the numbers; bits of negative numbers sort in reverse
         keys[i] = (np.int64(bits[i]) if bits[i] >= 0 else np.int64(bits[i] ^ np.int32(0x7FFFFFFF))) + (1 << 31)
     order, sorted_ = np.arange(n), np.empty(n, np.int64)
     starts = np.empty(257, np.int64)

@@ -1,6 +1,6 @@
 """Gaussian mixtures with a uniform outlier component, fitted to many point sets in parallel.
 
-Equations of docs/method.md: (1) the mixture, (2) the E-step, (3, 4) the M-step. The uniform component is from
+Equations of docs/method.md: (1) the mixture, (2) the E-step, (3, 4) the M-step. The uniform component follows
 Eckart et al., "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016. scikit-learn's mixture has no uniform
 component and no evidence for single points, and is slower (tests/benchmarks/test_refiners.py).
 """
@@ -22,7 +22,7 @@ from framework.refinement.mixtures.mixture_kernels import (
     improve_all,
 )
 
-BATCH = 16 * BLOCK  # points that a thread takes at once
+BATCH = 16 * BLOCK  # number of points that a thread processes at once
 
 
 def fit(
@@ -31,12 +31,12 @@ def fit(
 ) -> Mixtures:  # fmt: skip
     """Fit a mixture to each point set `points[starts[k]:starts[k + 1]]` by expectation maximization.
 
-    `labels` (S,) in [0, `components`) are certain responsibilities for the first M-step. The uniform component covers
-    the set's bounding box.
+    `labels` (S,) in [0, `components`) are hard responsibilities for the first M-step. The uniform component covers the
+    set's bounding box.
 
-    `prior_log_odds` (S,) is evidence for each point to come from one of the first `own_components`: their densities at
-    point i are multiplied by exp(prior_log_odds[i]) in eq. [2]. The log-likelihood is that of the weighted densities,
-    known up to a constant.
+    `prior_log_odds` (S,) is the evidence of each point for the first `own_components`. Their densities at point i are
+    multiplied by exp(prior_log_odds[i]) in eq. [2]. The log-likelihood uses the weighted densities, so it is known up
+    to a constant.
     """
     n = len(starts) - 1
     shape, odds = (n, components), _zeros_if_none(prior_log_odds, points)
@@ -49,7 +49,7 @@ def fit(
 
 
 def improve(points: Float32, starts: Int64, mixtures: Mixtures, settings: EmSettings) -> None:
-    """Run EM on each point set `points[starts[k]:starts[k + 1]]` from the present components of mixture k, in place."""
+    """Run EM in place on each point set `points[starts[k]:starts[k + 1]]` from the current components of mixture k."""
     improve_all(points, starts, np.zeros(len(points), np.float32), settings, mixtures)
 
 
@@ -57,10 +57,10 @@ def likely_members(
     points: Float32, begins: Int64, ends: Int64, mixtures: Mixtures, *, own_components: int, min_posterior: float,
     prior_log_odds: Float32 | None = None,
 ) -> Bool:  # fmt: skip
-    """Return (S,) which of `points[begins[k]:ends[k]]` have a posterior above `min_posterior` for mixture k's object.
+    """Return an array (S,), True for `points[begins[k]:ends[k]]` with a posterior above `min_posterior` in mixture k.
 
-    The object is the first `own_components` together. A mixture without components claims every point, as there is no
-    evidence against them. Points outside of the ranges are not claimed.
+    The posterior is the probability of the first `own_components`, which form the object. A mixture without components
+    claims every point, because there is no evidence against them. Points outside the ranges are not claimed.
     """
     weights, means, covariances = mixtures.weights, mixtures.means, mixtures.covariances
     rows = coefficients(weights.ravel(), means.reshape(-1, 3), covariances.reshape(-1, 3, 3))
@@ -74,7 +74,7 @@ def likely_members(
 
 
 def blocks_of(begins: Int64, ends: Int64, size: int) -> Blocks:
-    """Split each range of points into blocks of at most `size`."""
+    """Split each range of points into blocks of at most `size` points."""
     counts = -(-(ends - begins) // size)
     owner = np.repeat(np.arange(len(counts)), counts)
     firsts = begins[owner] + size * (np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts))

@@ -25,18 +25,18 @@ from framework.refinement.mixtures.gaussian import (
     set_coefficients,
 )
 
-MIN_SUPPORT = 4.0  # points of a component; with fewer, it has no covariance in 3D and is dropped
-BLOCK = 256  # points that a kernel handles at once, so that their densities stay in the first-level cache
-MARGIN = 1e-3  # nats, more than the rounding error of log densities in single precision
+MIN_SUPPORT = 4.0  # minimum points of a component; with fewer it has no 3D covariance and is dropped
+BLOCK = 256  # points that a kernel processes at once; their densities fit into the L1 cache
+MARGIN = 1e-3  # nats, above the rounding error of log densities in single precision
 
 
 class EmSettings(NamedTuple):
     """The settings of expectation maximization."""
 
     max_iterations: int
-    tolerance: float  # nats per point; EM ends when the mean log-likelihood increases by less
-    variance_floor: float  # m^2, smallest eigenvalue of a covariance
-    outlier_fraction: float  # of the points, at the start; 0 = no uniform component
+    tolerance: float  # minimum increase of the mean log-likelihood to continue EM, nats per point
+    variance_floor: float  # minimum eigenvalue of a covariance, m^2
+    outlier_fraction: float  # initial fraction of outlier points; 0 = no uniform component
 
 
 class Mixtures(NamedTuple):
@@ -46,9 +46,9 @@ class Mixtures(NamedTuple):
     means: Float64  # (N, K, 3) mu_k, m
     covariances: Float64  # (N, K, 3, 3) Sigma_k, m^2
     outlier_weights: Float64  # (N,) pi of the uniform component
-    outlier_densities: Float64  # (N,) its density, 1 / m^3
+    outlier_densities: Float64  # (N,) density of the uniform component, 1 / m^3
     log_likelihoods: Float64  # (N,) mean log p(x) of the points at the last E-step, in nats
-    iterations: Int64  # (N,) EM iterations made
+    iterations: Int64  # (N,) number of EM iterations
 
 
 class Blocks(NamedTuple):
@@ -73,7 +73,7 @@ def fit_all(
 
 @njit(cache=True, nogil=True, parallel=True)
 def improve_all(points: Float32, starts: Int64, odds: Float32, settings: EmSettings, mixtures: Mixtures) -> None:
-    """Run EM on the mixture of each cluster, from its present parameters."""
+    """Run EM on the mixture of each cluster from its current parameters."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             own = slice(starts[k], starts[k + 1])
@@ -101,7 +101,7 @@ def _iterate(
     points: Float32, odds: Float32, own_components: int, center: Float64, settings: EmSettings, mixtures: Mixtures,
     k: int,
 ) -> None:  # fmt: skip
-    """Run EM on mixture k from its present components."""
+    """Run EM on mixture k from its current components."""
     weights, means, covariances = mixtures.weights[k], mixtures.means[k], mixtures.covariances[k]
     outlier_weights, log_likelihoods = mixtures.outlier_weights, mixtures.log_likelihoods
     variance_floor, count, components = settings.variance_floor, len(points), len(weights)
@@ -143,7 +143,7 @@ def _any_left(weights: Float64) -> bool:
 def _expect(
     xyz: Float32, odds: Float32, own_components: int, rows: Float32, log_outlier: np.float32, moments: Float64
 ) -> tuple[float, float]:
-    """Make the E-step [2] and sum the M-step's moments; return sum_i log p(x_i) and the outliers' N_k."""
+    """Run the E-step [2] and sum the M-step's moments; return sum_i log p(x_i) and the outliers' N_k."""
     components = len(rows)
     densities = np.empty((components, BLOCK), np.float32)
     largest, evidence = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
@@ -175,7 +175,7 @@ def _maximize(
     moments: Float64, center: Float64, count: int, variance_floor: float, weights: Float64, means: Float64,
     covariances: Float64,
 ) -> None:  # fmt: skip
-    """Make the M-step [3, 4]."""
+    """Run the M-step [3, 4]."""
     for j in range(len(weights)):
         N_k = moments[j, 0]
         if N_k < MIN_SUPPORT:
@@ -214,7 +214,7 @@ def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64,
 
 @njit(cache=True, nogil=True)
 def coefficients(weights: Float64, means: Float64, covariances: Float64) -> Float32:
-    """Return the rows (M, 10) that `log_densities` takes, for M Gaussians."""
+    """Return the coefficient rows (M, 10) of M Gaussians for `log_densities`."""
     rows = np.zeros((len(weights), 10), np.float32)
     for j in range(len(weights)):
         set_coefficients(weights[j], means[j], covariances[j], rows[j])
@@ -226,7 +226,7 @@ def claim(
     points: Float32, blocks: Blocks, odds: Float32, rows: Float32, log_outliers: Float32, own_components: int,
     min_posterior: float, claimed: Bool,
 ) -> None:  # fmt: skip
-    """Set for each point of the blocks whether own / (own + others) > min_posterior."""
+    """Set `claimed` to True for each point of the blocks with own / (own + others) > min_posterior."""
     for b in prange(len(blocks.sets)):
         k, begin, end = blocks.sets[b], blocks.begins[b], blocks.ends[b]
         absent = True
@@ -246,7 +246,7 @@ def _claim_batch(
     points: Float32, odds: Float32, rows: Float32, log_outlier: np.float32, own_components: int, min_posterior: float,
     claimed: Bool,
 ) -> None:  # fmt: skip
-    """Decide most points without exponentials: a sum of n terms is between its largest term and n times that."""
+    """Decide most points without exponentials: a sum of n terms lies between its largest term and n times this term."""
     components = len(rows)
     log_bound = math.log(min_posterior / (1.0 - min_posterior))
     certain = np.float32(log_bound + math.log(components - own_components + 1.0) + MARGIN)

@@ -1,7 +1,7 @@
 """Hierarchical Gaussian mixtures: trees over many point sets, grown level by level in parallel.
 
-After Eckart, Kim, Troccoli, Kelly and Kautz, "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016: every
-node is a small mixture of its own points, and a point descends to its best child alone. With J children per node, a
+After Eckart, Kim, Troccoli, Kelly and Kautz, "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016. Every
+node is a small mixture of its own points, and a point descends only to its best child. With J children per node, a
 level costs J Gaussians per point; a flat mixture with as many components costs J^level.
 """
 
@@ -21,10 +21,10 @@ from framework.refinement.neighborhood_kernels import grouped
 
 @dataclass(frozen=True)
 class Level:
-    """M nodes of one level, below the Q nodes of the level above; above the first level are the N trees themselves.
+    """M nodes of one level, below the Q nodes of the level above. Above the first level are the N trees.
 
-    The children of node q are the rows `firsts[q]:firsts[q + 1]`. A node without children is a leaf. Weights are ratios
-    of the whole tree: those of a node's children and of their uniform component sum to its own.
+    The children of node q are the rows `firsts[q]:firsts[q + 1]`. A node without children is a leaf. Weights are
+    fractions of the whole tree: a node's weight is the sum over its children and their uniform component.
     """
 
     weights: Float64  # (M,) pi, above 0
@@ -32,19 +32,19 @@ class Level:
     covariances: Float64  # (M, 3, 3) Sigma, m^2
     firsts: Int64  # (Q + 1,)
     outlier_weights: Float64  # (Q,) pi of the uniform component among the children of node q; 0 for a leaf
-    outlier_boxes: Float64  # (Q, 2, 3) m, lowest and highest corner of its box
+    outlier_boxes: Float64  # (Q, 2, 3) m, lowest and highest corner of the uniform component's box
 
     def __len__(self) -> int:
         return len(self.weights)
 
     @property
     def parents(self) -> Int64:
-        """(M,) the parent of each node in the level above, at the first level its tree."""
+        """Parent (M,) of each node in the level above; at the first level, its tree."""
         return np.repeat(np.arange(len(self.firsts) - 1), np.diff(self.firsts))
 
     @property
     def outlier_densities(self) -> Float64:
-        """(Q,) density of the uniform component, 1 / m^3; 0 for a leaf."""
+        """Density (Q,) of the uniform component, 1 / m^3; 0 for a leaf."""
         volumes = np.prod(self.outlier_boxes[:, 1] - self.outlier_boxes[:, 0], axis=1)
         return np.asarray(np.where(volumes > 0, 1.0 / np.where(volumes > 0, volumes, 1.0), 0.0), np.float64)
 
@@ -53,10 +53,10 @@ class Level:
 class MixtureTree:
     """The trees of N point sets."""
 
-    levels: tuple[Level, ...]  # from the coarsest; at least one
+    levels: tuple[Level, ...]  # coarsest first; at least one
 
     def passed(self, k: int, points: Float32, starts: Int64) -> Int64:
-        """Return (S,) the best node of level `k` for each point; -1 = the uniform component is more likely.
+        """Return the best node (S,) of level `k` for each point; -1 = the uniform component is more likely.
 
         `points[starts[q]:starts[q + 1]]` are the points of node q of the level above.
         """
@@ -66,10 +66,10 @@ class MixtureTree:
     def shared(
         self, k: int, points: Float32, starts: Int64, ratios: Float32, outlier_ratios: Float32, log_odds: Float32
     ) -> tuple[Int64, Float32]:
-        """Return `passed`, and (S,) the object's posterior at each point by the densities of this level.
+        """Return `passed`, and the object's posterior (S,) at each point by the densities of this level.
 
-        `ratios` (M,) are the object's parts of the nodes, `outlier_ratios` (Q,) of the uniform components. The object's
-        density is multiplied by exp(`log_odds`) (S,). The posterior of a point at a leaf is 0.
+        `ratios` (M,) are the object's fractions of the nodes, and `outlier_ratios` (Q,) of the uniform components. The
+        object's density is multiplied by exp(`log_odds`) (S,). The posterior of a point at a leaf is 0.
         """
         level = self.levels[k]
         child, posterior = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
@@ -88,12 +88,12 @@ def fit(
 ) -> MixtureTree:  # fmt: skip
     """Grow a tree of at most `levels` levels over each point set `points[starts[k]:starts[k + 1]]`.
 
-    A node with at least `min_points` points gets `children`, fitted to its points by `mixture.fit` from the start of
-    `cut`. Each point then descends to its best child, or stays if the uniform component is more likely. A child with a
-    weight below `min_support` is dropped in favor of its siblings. A set with too few points has no nodes.
+    A node with at least `min_points` points gets `children` children, fitted to its points by `mixture.fit` with the
+    labels of `cut`. Each point then descends to its best child, or stays if the uniform component is more likely. A
+    child with a weight below `min_support` is dropped in favor of its siblings. A set with too few points has no nodes.
     """
     grown: list[Level] = []
-    above = np.ones(len(starts) - 1)  # weights of the nodes that the points are at
+    above = np.ones(len(starts) - 1)  # weights of the points' current nodes
     least_side = 4 * np.sqrt(settings.variance_floor)
     for _ in range(levels):
         chosen = np.nonzero(np.diff(starts) >= max(min_points, 1))[0]
@@ -113,10 +113,10 @@ def fit(
 
 
 def cut(points: Float32, starts: Int64, groups: int) -> Int32:
-    """Return (S,) labels in [0, groups) that cut each set into compact groups: a start for `mixture.fit`.
+    """Return labels (S,) in [0, groups) that cut each set into compact groups, to initialize `mixture.fit`.
 
-    Variance-based bisection: the group with the largest scatter along one axis is cut at its mean. A group is not cut
-    if that leaves too few points for a component.
+    Variance-based bisection cuts the group with the largest scatter along one axis at its mean. A group is not cut if
+    too few points for a component would remain.
     """
     labels = np.zeros(len(points), np.int32)
     cut_all(points, starts, groups, labels)
@@ -124,10 +124,11 @@ def cut(points: Float32, starts: Int64, groups: int) -> Int32:
 
 
 def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: float) -> Float32:
-    """Return (M,) the object's ratio of each node, from the evidence `log_odds[starts[j]:starts[j + 1]]` of its points.
+    """Return the object's fraction (M,) of each node, from evidence `log_odds[starts[j]:starts[j + 1]]` of its points.
 
-    The evidence o_i of a point is its log-likelihood ratio. The ratio rho maximizes sum_i log(rho exp(o_i) + 1 - rho),
-    with `above_points` more points at the parent's ratio `above` (M,): the fixed point of EM over the points' classes.
+    The evidence o_i of a point is its log-likelihood ratio. The fraction rho maximizes sum_i log(rho exp(o_i) + 1 -
+    rho), with `above_points` additional points at the parent's fraction `above` (M,). It is the fixed point of EM over
+    the points' classes.
     """
     ratios = above.astype(np.float32)
     set_own_ratios(log_odds, starts, above_points, ratios)
@@ -135,9 +136,9 @@ def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: f
 
 
 def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, parent_points: float) -> list[Float32]:
-    """Return for each level (M,) the object's ratio of each node, from the log-odds (S,) of the sample's points.
+    """Return the object's fraction (M,) of each node, by level, from the log-odds (S,) of the sample's points.
 
-    The parent's ratio counts as `parent_points` points.
+    The parent's fraction counts as `parent_points` points.
     """
     points, starts = sample.points_camera, sample.starts
     above, ratios = np.full(len(sample), 0.5, np.float32), []
@@ -150,7 +151,7 @@ def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, paren
 
 
 def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: Float32, min_posterior: float) -> Bool:
-    """Return (S,) which of the masks' points have a posterior above `min_posterior` at their deepest level.
+    """Return an array (S,), True for points of the masks with a posterior above `min_posterior` at their deepest level.
 
     `odds` (S,) are the points' own log-odds.
     """
@@ -168,7 +169,7 @@ def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: 
 
 
 def level_below(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
-    """Return the level below nodes with the weights `above` (Q,), of which the `chosen` ones got children."""
+    """Return the level below nodes with weights `above` (Q,). Only the `chosen` nodes have children."""
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
     survivors = np.count_nonzero(kept, axis=1)
     weights = np.where(kept, fitted.weights, 0.0)
@@ -186,7 +187,7 @@ def level_below(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64,
 
 
 def ranges(points: Float32, starts: Int64, chosen: Int64) -> tuple[Float32, Int64]:
-    """Return the points of the chosen sets and where each of them begins."""
+    """Return the points of the chosen sets and the start of each set."""
     counts = np.diff(starts)
     if len(chosen) == len(counts):
         return points, starts

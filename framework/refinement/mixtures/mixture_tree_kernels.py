@@ -9,12 +9,12 @@ from framework.data import Float32, Float64, Int32, Int64
 from framework.refinement.mixtures.gaussian import SIMD, constant_exponential, exponentials, log_densities
 from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT, Blocks
 
-RATIO_ITERATIONS = 20  # of EM over a node's object ratio; where classes are clear, each halves the error
+RATIO_ITERATIONS = 20  # EM iterations for a node's object fraction; with clear classes, each iteration halves the error
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
-    """Split each set of points into groups, along the axes of largest variance."""
+    """Split each set of points into groups along the axes of largest variance."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             _cut_one(points[starts[k] : starts[k + 1]], groups, labels[starts[k] : starts[k + 1]])
@@ -22,7 +22,7 @@ def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
-    """Cut one set. The members of each group are together in `order`, so that a cut only reads its own group."""
+    """Cut one set. The members of each group are contiguous in `order`, so that a cut reads only its own group."""
     n = len(points)
     order, upper = np.arange(n), np.empty(n, np.int64)
     begins, ends = np.zeros(groups, np.int64), np.zeros(groups, np.int64)
@@ -76,7 +76,7 @@ def _measure(points: Float32, members: Int64, mean: Float64, scatter: Float64) -
 
 @njit(cache=True, nogil=True)
 def bounding_boxes(points: Float32, starts: Int64, least_side: float) -> Float64:
-    """Return (N, 2, 3) the bounding box of each set, with sides of at least `least_side`."""
+    """Return the bounding box (N, 2, 3) of each set, with sides of at least `least_side`."""
     boxes = np.zeros((len(starts) - 1, 2, 3))
     for k in range(len(starts) - 1):
         for a in range(3):
@@ -93,7 +93,7 @@ def pass_down(
     points: Float32, log_odds: Float32, blocks: Blocks, rows: Float32, ratios: Float32, firsts: Int64,
     log_outliers: Float32, outlier_ratios: Float32, child: Int64, posterior: Float32,
 ) -> None:  # fmt: skip
-    """Set the child of each point's node with the largest density, and its posterior."""
+    """Set the child with the largest density at each point, and its posterior."""
     for b in prange(len(blocks.sets)):
         q, own = blocks.sets[b], slice(blocks.begins[b], blocks.ends[b])
         children = slice(firsts[q], firsts[q + 1])
@@ -137,7 +137,7 @@ def _pass_block(
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
-    """Replace `best` by j for points whose density is larger."""
+    """Replace `best` by j for points with a larger density."""
     for i in range(len(largest)):
         better = densities[i] > largest[i]
         best[i] = j if better else best[i]
@@ -152,7 +152,7 @@ def _add_scaled(densities: Float32, scale: np.float32, values: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def set_own_ratios(log_odds: Float32, starts: Int64, above_points: float, ratios: Float32) -> None:
-    """Replace the parents' ratios (M,) by the nodes' own."""
+    """Replace the parents' fractions (M,) by the nodes' own fractions."""
     for j in prange(len(starts) - 1):
         if starts[j + 1] > starts[j]:
             odds = np.exp(log_odds[starts[j] : starts[j + 1]])

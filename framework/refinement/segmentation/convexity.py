@@ -1,14 +1,17 @@
-"""Convex segments of a depth image: connected parts without a jump in depth and without a concave crease.
+"""Convex segments of a depth image: connected components without depth jumps or concave creases.
 
-As in Furrer et al., "Incremental Object Database: Building 3D Models from Multiple Partial Observations", IROS 2018, on
-which Voxblox++ (Grinvald et al., "Volumetric Instance-Aware Semantic Mapping and 3D Object Discovery", RA-L 2019)
-builds, after Tateno, Tombari and Navab, "Real-Time and Scalable Incremental Segmentation on Dense SLAM", IROS 2015:
-normals from depth, edges where depth jumps or the surface is concave, closing, connected components. Three choices of
-ours give sharper borders under sensor noise:
+The method computes normals from depth, marks edges at depth jumps and concave surfaces, closes the edges, and labels
+connected components. It follows these papers:
+
+- Tateno, Tombari and Navab, "Real-Time and Scalable Incremental Segmentation on Dense SLAM", IROS 2015
+- Furrer et al., "Incremental Object Database: Building 3D Models from Multiple Partial Observations", IROS 2018
+- Voxblox++: Grinvald et al., "Volumetric Instance-Aware Semantic Mapping and 3D Object Discovery", RA-L 2019
+
+Three changes give sharper borders under sensor noise:
 
 - planes are fitted in inverse depth, which is linear on a plane in space, in cells of a few pixels;
 - at a crease, each cell takes the plane of an adjacent window on its own side (the filter of Kuwahara et al. 1976);
-- pixels at edges join the adjacent segment whose plane predicts their depth best.
+- pixels at edges join the adjacent segment with the best prediction of their depth.
 """
 
 from __future__ import annotations
@@ -32,23 +35,23 @@ from framework.refinement.segmentation.convexity_kernels import (
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits within which a surface is continuous and convex."""
+    """Limits for a continuous and convex surface."""
 
-    noise_factor: float  # standard deviations of depth that count as noise
-    min_noise: float  # m, smallest standard deviation of depth, for quantized readings
-    max_slope: float  # m per m, change of depth over the distance across the line of sight
-    max_angle: float  # rad, of a concave bend, in addition to that of noise
+    noise_factor: float  # depth difference that counts as noise, standard deviations
+    min_noise: float  # minimum standard deviation of depth for quantized readings, m
+    max_slope: float  # maximum change of depth with lateral distance, m per m
+    max_angle: float  # maximum angle of a concave bend in addition to noise, rad
 
 
 def segments(
     depth: Float32, camera: Camera, *, cell: int, window: int, limits: Limits, closing: int, min_pixels: int
 ) -> tuple[Int32, int]:
-    """Return (H, W) the segment of each pixel in [0, count), -1 = none; and the count.
+    """Return the segment (H, W) of each pixel in [0, count), -1 = none, and the count.
 
-    Planes are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px. Gaps of edges up to 2 `closing`
-    cells are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors.
+    Planes are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px. Gaps of up to 2 `closing` cells in
+    edges are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors.
     """
-    slope = np.float32(limits.max_slope * cell * 2 / (camera.fx + camera.fy))  # of depth over depth, a cell
+    slope = np.float32(limits.max_slope * cell * 2 / (camera.fx + camera.fy))  # relative change of depth per cell
     pinhole = np.array(
         [camera.fx / cell, camera.fy / cell, (camera.cx + 0.5) / cell - 0.5, (camera.cy + 0.5) / cell - 0.5], np.float32
     )
@@ -59,18 +62,19 @@ def segments(
     edges = count_edges(planes, pinhole, noise, limits.max_angle, normal_sigma(1.0, window, cell, camera))
     min_cells = max(min_pixels // cell**2, 1)
     labels, count = connected(inverse, _closed(edges, closing), noise, slope, min_cells)
-    for _ in range(2 + 2 * closing):  # as wide as edges are
+    for _ in range(2 + 2 * closing):  # width of an edge
         labels, planes = absorbed(inverse, labels, planes, noise)
-    # poles and legs consist of edges: cells without a segment are connected by depth alone
+    # poles and legs consist of edges, so cells without a segment are connected by depth alone
     rest, rest_count = connected(inverse, (labels >= 0) | (inverse <= 0), noise, slope, min_cells)
     labels = np.where(rest >= 0, rest + count, labels)
     return pixel_labels(depth, inverse, labels, planes, cell, noise, slope), int(count + rest_count)
 
 
 def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> float:
-    """Return the standard deviation (rad) of the angle between two normals fitted at 1 m to `depth_noise` (m).
+    """Return the standard deviation (rad) of the angle between two normals fitted at 1 m under `depth_noise` (m).
 
-    It falls as 1 / z. The slope of a line through M readings has the deviation sigma / (sqrt(M) * rms offset).
+    The deviation falls as 1 / z. The slope of a line through M readings has the deviation sigma / (sqrt(M) * rms
+    offset).
     """
     readings = (cell * (2 * window + 1)) ** 2
     offset = cell * np.sqrt(window * (window + 1) / 3) * 2 / (camera.fx + camera.fy)  # m at 1 m

@@ -10,12 +10,12 @@ from framework.refinement.mixtures.gaussian import SIMD
 from framework.refinement.segmentation.union_find import root, unite
 from framework.sensors.noise_models import axial_sigma, axial_sigma_single
 
-FEWEST_CELLS = 6  # that a plane is fitted to; any three fit
-LEAST_SPREAD = 0.1  # cells^4, least determinant of a window's second moments over its square; a line has 0
-SWITCH = 1.5  # factor by which an adjacent window must fit a cell better than the one around it
-STRIP = 16  # rows of cells that are connected in parallel
+FEWEST_CELLS = 6  # minimum number of cells of a plane fit; any three cells fit a plane exactly
+LEAST_SPREAD = 0.1  # minimum determinant of a window's second moments over its square, cells^4; 0 for a line
+SWITCH = 1.5  # minimum factor by which an adjacent window must fit better than the cell's own window
+STRIP = 16  # number of rows of cells connected in parallel
 
-Noise = tuple[float, float]  # noise_factor and min_noise of the limits, for kernels
+Noise = tuple[float, float]  # (noise_factor, min_noise) of the limits
 
 _axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the caller's fast-math flags
 
@@ -34,7 +34,7 @@ def _noise_at(inverse: float, noise: Noise) -> np.float32:
 
 @njit(cache=True, nogil=True, parallel=True)
 def sum_cells(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
-    """Return (rows, columns) mean inverse depth of each cell's nearest surface, 1 / m; 0 = no reading."""
+    """Return the mean inverse depth (rows, columns) of each cell's nearest surface, 1 / m; 0 = no reading."""
     height, width = depth.shape
     rows, columns = -(-height // cell), -(-width // cell)
     inverse = np.zeros((rows, columns), np.float32)
@@ -64,7 +64,7 @@ def _add_offset(
     own: Float32, other: Float32, gate: Float32, gate_slope: Float32, x: np.float32, y: np.float32, reach: np.float32,
     sums: Float32,
 ) -> None:  # fmt: skip
-    """Add the moments of the cells at one offset (x, y) to those of each cell of a row."""
+    """Add the moments of the cells at one offset (x, y) to the sums of each cell of a row."""
     zero, one = np.float32(0), np.float32(1)
     n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
     for c in range(len(own)):
@@ -86,15 +86,15 @@ def _add_offset(
 
 @njit(cache=True, nogil=True, parallel=True)
 def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -> Float32:
-    """Return (4, rows, columns) a, b, c of inverse depth a x + b y + c around each cell, and its mean squared residual.
+    """Return the fit (4, rows, columns) around each cell: a, b, c of inverse depth a x + b y + c, and the residual.
 
-    The residual is inf where there is no fit.
+    The residual is the mean squared residual, inf without a fit.
     """
     rows, columns = inverse.shape
     fits = np.zeros((4, rows, columns), np.float32)
     for row in prange(rows):
-        r = int(np.int64(row))  # prange counts in unsigned numbers
-        gate, gate_slope = np.zeros(columns, np.float32), np.zeros(columns, np.float32)  # noise, and slope per cell
+        r = int(np.int64(row))  # prange counts in unsigned integers
+        gate, gate_slope = np.zeros(columns, np.float32), np.zeros(columns, np.float32)  # noise and slope per cell
         for c in range(columns):
             if inverse[r, c] > 0:
                 gate[c], gate_slope[c] = _noise_at(inverse[r, c], noise), slope * inverse[r, c]
@@ -135,9 +135,9 @@ def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def best_planes(inverse: Float32, fits: Float32, window: int, min_noise: float) -> Float32:
-    """Return (3, rows, columns) a, b, c of the window that fits each cell best, around it or adjacent to it.
+    """Return the plane a, b, c (3, rows, columns) of the best-fitting window around or adjacent to each cell.
 
-    Within noise, the window around the cell is preferred. c = 0 where no window fits.
+    Within noise, the window around the cell is preferred. c = 0 if no window fits.
     """
     rows, columns = inverse.shape
     planes = fits[:3].copy()
@@ -184,7 +184,7 @@ def _take_better(
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float) -> Bool:
-    """Return (rows, columns) cells without a plane and cells where the surface ends between opposite neighbors."""
+    """Return the edges (rows, columns): cells without a plane, or with a surface border between opposite neighbors."""
     _, rows, columns = planes.shape
     surface = np.empty((9, rows, columns), np.float32)
     for r in prange(rows):
@@ -213,8 +213,8 @@ def _set_surface(
 ) -> None:  # fmt: skip
     """Set the surface (9, columns) of a row.
 
-    Its entries are unit normals (3) away from the camera, distances of the planes, points (3), noise of the distance to
-    a plane, and the least cosine between normals of a flat surface.
+    The entries are unit normals (3) away from the camera, plane distances and points (3). The last two are the noise of
+    the distance to a plane and the minimum cosine between normals of a flat surface.
 
     1 / z = A (u - cx) + B (v - cy) + C is the plane (A fx, B fy, C) . p = 1. Without a plane the point is 0.
     """
@@ -242,15 +242,16 @@ def _set_surface(
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool) -> None:
-    """Mark cells whose two opposite neighbors are too far off each other's plane, or form a concave crease.
+    """Mark a cell if its two opposite neighbors are too far off each other's plane or form a concave crease.
 
-    `spacing` is the distance between the two at 1 m. At a convex edge each may be as far behind the other's plane.
+    `spacing` is the distance between the neighbors at 1 m. At a convex edge, each neighbor may be this far behind the
+    other's plane.
     """
     zero = np.float32(0)
     ax, ay, az, ad, apx, apy, apz, gate, min_cosine = one
     bx, by, bz, bd, bpx, bpy, bpz, _, _ = other
     for c in range(len(edges)):
-        # distance of the other's point in front of one's plane, and the reverse
+        # distance of each neighbor's point in front of the other's plane
         h = ad[c] - (ax[c] * bpx[c] + ay[c] * bpy[c] + az[c] * bpz[c])
         g = bd[c] - (bx[c] * apx[c] + by[c] * apy[c] + bz[c] * apz[c])
         cosine = ax[c] * bx[c] + ay[c] * by[c] + az[c] * bz[c]
@@ -266,7 +267,7 @@ def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool
 def _unite_row(
     inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, r: int, upwards: bool, parents: Int32
 ) -> None:
-    """Unite the cells of row r with those to their left, or above them, where depth does not jump."""
+    """Unite the cells of row r with their left or upper neighbors unless depth jumps."""
     columns = inverse.shape[1]
     step = columns if upwards else 1
     flat_inverse, flat_edges = inverse.ravel(), edges.ravel()
@@ -281,7 +282,7 @@ def _unite_row(
 
 @njit(cache=True, nogil=True, parallel=True)
 def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, min_cells: int) -> tuple[Int32, int]:
-    """Return connected pieces of cells that are no edge: (rows, columns) in [0, count), -1 = edge or too small."""
+    """Return the connected components (rows, columns) of cells in [0, count), -1 = edge or too small, and the count."""
     rows, columns = inverse.shape
     parents = np.arange(rows * columns).astype(np.int32)
     strips = -(-rows // STRIP)
@@ -313,7 +314,7 @@ def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, mi
 
 @njit(cache=True, nogil=True)  # too little work for threads
 def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> tuple[Int32, Float32]:
-    """Grow segments by one cell: free cells join the neighbor whose plane predicts their depth best."""
+    """Grow segments by one cell. A free cell joins the neighbor with the best prediction of its depth."""
     rows, columns = inverse.shape
     new_labels, new_planes = labels.copy(), planes.copy()
     for r in range(rows):
@@ -339,9 +340,9 @@ def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> 
 def pixel_labels(
     depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise: Noise, slope: np.float32
 ) -> Int32:
-    """Return (H, W) the label of that of the nearest cells whose plane predicts the pixel best.
+    """Return the label (H, W) of the nearby cell with the best plane prediction of each pixel.
 
-    Without a prediction, a pixel near its own cell's mean takes that cell's label.
+    Without a prediction, a pixel near the mean of its own cell gets the label of this cell.
     """
     height, width = depth.shape
     rows, columns = labels.shape
@@ -356,7 +357,7 @@ def pixel_labels(
             d = inverse[r, c]
             gate = _noise_at(d, noise)
             label = labels[r, c]
-            alone = True  # inside of a segment there is one label
+            alone = True  # inside a segment there is only one label
             for n in range(9):
                 s, t = r + n // 3 - 1, c + n % 3 - 1
                 inside = 0 <= s < rows and 0 <= t < columns
@@ -390,7 +391,7 @@ def pixel_labels(
 
 @njit(cache=True, nogil=True)
 def _plane_of_cell(planes: Float32, inverse: Float32, r: int, c: int, plane: Float32) -> None:
-    """Set a, b, c of a cell; without a fit, the plane at its depth."""
+    """Set a, b, c of a cell; without a fit, use the plane at its depth."""
     if planes[2, r, c] > 0:
         plane[0], plane[1], plane[2] = planes[0, r, c], planes[1, r, c], planes[2, r, c]
     else:

@@ -1,11 +1,13 @@
-"""The large planes of a depth image, by region growing on a coarse grid of cells.
+"""Large planes of a depth image by region growing on a coarse grid of cells.
 
-As in PEAC (Feng, Taguchi and Kamat, "Fast Plane Extraction in Organized Point Clouds Using Agglomerative Hierarchical
+After PEAC (Feng, Taguchi and Kamat, "Fast Plane Extraction in Organized Point Clouds Using Agglomerative Hierarchical
 Clustering", ICRA 2014) and CAPE (Proenca and Gao, "Fast Cylinder and Plane Extraction from Depth Cameras for Visual
-Odometry", IROS 2018), with fits in inverse depth. At a plane n . p = d the inverse depth is q = 1 / z = m . r, with
-r = ((u - cx) / fx, (v - cy) / fy, 1) and m = n / d. It is linear in the pixel: a fit is a 3x3 system, the moments of a
-union of cells are sums, and the noise of stereo and structured-light sensors, which grows with z^2, is constant.
-Open3D's RANSAC finds one plane at a time, at random, without the image grid.
+Odometry", IROS 2018). Planes are fitted in inverse depth.
+
+On a plane n . p = d the inverse depth is q = 1 / z = m . r, with r = ((u - cx) / fx, (v - cy) / fy, 1) and m = n / d.
+It is linear in the pixel. So a fit is a 3x3 system, and the moments of a union of cells are sums. The noise of stereo
+and structured-light sensors grows with z^2 and is constant in inverse depth. Open3D's RANSAC finds one plane at a time,
+at random, without the image grid.
 """
 
 from __future__ import annotations
@@ -33,33 +35,33 @@ from framework.refinement.segmentation.planes_kernels import (
 
 @dataclass(frozen=True)
 class Planes:
-    """The K planes of one frame, in the order in which they were found."""
+    """The K planes of one frame, in order of detection."""
 
-    m: Float64  # (K, 3) 1/m, normal over distance: a point p in camera coordinates is on plane k where m . p = 1
-    deviations: Float64  # (K,) 1/m, rms of its readings' inverse depth around it, at most the allowed noise
-    areas: Float64  # (K,) m^2, visible
-    shares: Float64  # (K,) of the frame's readings
-    behind: Float64  # (K,) readings behind it over readings on it
+    m: Float64  # (K, 3) 1/m, normal over distance: a point p in camera coordinates is on plane k if m . p = 1
+    deviations: Float64  # (K,) 1/m, rms deviation of the readings' inverse depth, at most the allowed noise
+    areas: Float64  # (K,) visible area, m^2
+    shares: Float64  # (K,) fraction of the frame's readings
+    behind: Float64  # (K,) readings behind the plane over readings on the plane
 
     def __len__(self) -> int:
         return len(self.m)
 
     @property
     def normals(self) -> Float64:
-        """(K, 3) in camera coordinates, unit length, towards the camera."""
+        """Unit normals (K, 3) in camera coordinates, towards the camera."""
         return np.asarray(-self.m / np.linalg.norm(self.m, axis=1, keepdims=True))
 
     def chosen(self, which: Bool) -> Planes:
-        """Return the planes where `which` (K,) is True."""
+        """Return the planes with `which` (K,) True."""
         return Planes(*(values[which] for values in vars(self).values()))
 
 
 def find_planes(frame: Frame, distance: float, noise: float, min_area: float) -> Planes:
-    """Return the planes with a visible area of at least `min_area` m^2, a quarter of it in one piece.
+    """Return the planes with a visible area of at least `min_area` m^2, a quarter of it connected.
 
     A cell of 16x16 px belongs to a plane if the rms of its readings is at most `distance` (m, along the normal) plus
-    `noise` (1/m, of inverse depth: `noise` * z^2 m at depth z). A plane begins at the flattest free cell, grows over
-    neighboring cells and then takes all cells of the frame that lie in it, also on both sides of an occluder.
+    `noise` (1/m, of inverse depth: `noise` * z^2 m at depth z). A plane begins at the flattest free cell and grows over
+    neighboring cells. Then it takes all cells of the frame that lie in the plane, including cells across an occluder.
     """
     height, width = frame.camera.shape
     moments = np.zeros(((height + CELL - 1) // CELL, (width + CELL - 1) // CELL, 10))
@@ -76,7 +78,7 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
 
 
 def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
-    """Return (H, W) 1 + the nearest plane of each reading, 0 = none.
+    """Return 1 + the nearest plane (H, W) of each depth reading, 0 = none.
 
     A reading is on a plane within `distance` (m, along the normal) plus three standard deviations of the plane's noise.
     """
@@ -91,12 +93,13 @@ def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
 
 
 def off_planes(clusters: PointClusters, on_plane: UInt8, planes: int, max_own: float) -> tuple[Bool, Bool]:
-    """Return (P,) which points stay, and (H, W) which pixels are on a plane and not in a cluster that keeps it.
+    """Return a point array (P,), True for points to keep, and a pixel array (H, W), True for structure.
 
-    `on_plane` is the `plane_image`. A cluster loses the planes of which it has at most `max_own` of the readings.
+    `on_plane` is the `plane_image`. A cluster loses a plane if it has at most a fraction `max_own` of the plane's
+    readings. Structure pixels are on a plane, but not in a cluster that keeps the plane.
     """
     structure = on_plane > 0
-    rows = len(clusters) + 1  # the last is for points of no cluster
+    rows = len(clusters) + 1  # the last row is for points of no cluster
     counts = np.zeros((-(-len(clusters.cluster) // PART), rows, planes + 1), np.int64)
     stays = np.ones((rows, planes + 1), np.bool_)
     kept = find_off_planes(clusters.cluster, clusters.pixels, on_plane, max_own, counts, stays, structure)

@@ -10,18 +10,18 @@ from numba import njit, prange
 from framework.data import Bool, Float32, Float64, Int32, Int64, UInt8
 from framework.refinement.refine_kernels import PART
 
-CELL = 16  # px, side of a cell: 9 cm at 3 m and 540 px focal length, smaller than a relevant plane
-STEP = 2  # px between the readings of a cell that are used
-FULL = (CELL // STEP) ** 2  # readings in a whole cell
-REFITS = 3  # passes that collect the cells of a plane again; it hardly moves in the last
-TRIM = 1.5  # times the median deviation of a plane's cells; cells above it are excluded from the fit
-SIGMAS = 3.0  # standard deviations of the noise within which a reading is on its plane
-MAX_PLANES = 32  # more than a frame has large ones
+CELL = 16  # side of a cell, px: 9 cm at 3 m and 540 px focal length, smaller than a relevant plane
+STEP = 2  # stride of the readings used in a cell, px
+FULL = (CELL // STEP) ** 2  # number of readings in a full cell
+REFITS = 3  # number of passes that collect the cells of a plane again; the last pass hardly moves it
+TRIM = 1.5  # maximum deviation of a cell in a fit, times the median deviation of the plane's cells
+SIGMAS = 3.0  # maximum distance of a reading on a plane, standard deviations of the noise
+MAX_PLANES = 32  # maximum number of planes; frames have fewer large planes
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
-    """Set moments (rows, columns, 10): each cell's sums of 1, x, y, x x, x y, y y, q, x q, y q, q q."""
+    """Set moments (rows, columns, 10) to each cell's sums of 1, x, y, x x, x y, y y, q, x q, y q, q q."""
     height, width = depth.shape
     fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
     for row in prange(moments.shape[0]):
@@ -49,9 +49,9 @@ def sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
 
 @njit(cache=True, nogil=True)
 def _solve(moment: Float64, m: Float64) -> bool:
-    """Set m to the least-squares plane of the readings by Cramer's rule; return False if they do not determine it.
+    """Set m to the least-squares plane of the readings by Cramer's rule; return False if it is not determined.
 
-    The normal equations are centered, because x and y of one cell vary by a hundredth of their size.
+    The normal equations are centered, because x and y vary within a cell by only a hundredth of their size.
     """
     n = moment[0]
     if n < 3:
@@ -86,7 +86,7 @@ def _length(m: Float64) -> float:
 
 @njit(cache=True, nogil=True)
 def _lies_in(moment: Float64, m: Float64, distance: float, noise: float) -> bool:
-    """Return whether a cell is on the plane; a point at inverse depth q is |q - m . r| / (|m| q) m off it."""
+    """Return True if a cell is on the plane; a point at inverse depth q is |q - m . r| / (|m| q) m off the plane."""
     return bool(_deviation(moment, m) <= noise + distance * _length(m) * moment[6] / moment[0])
 
 
@@ -100,7 +100,7 @@ def _area(moment: Float64, m: Float64, spacing: float) -> float:
 
 @njit(cache=True, nogil=True)
 def write_flatness(cells: Float64, distance: float, noise: float, flatness: Float64) -> None:
-    """Set the deviation of each cell (C, 10) that is full and flat enough to begin a plane."""
+    """Set the deviation of each cell (C, 10) that is full and flat enough to seed a plane."""
     m = np.zeros(3)
     for i in range(len(cells)):
         if 2 * cells[i, 0] >= FULL and _solve(cells[i], m) and _lies_in(cells[i], m, distance, noise):
@@ -156,7 +156,7 @@ def find_plane_cells(
 def _grow(
     cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, m: Float64, region: Int64
 ) -> int:
-    """Set `region` to the seed's connected cells in one plane and m to that plane; return the number of cells.
+    """Set `region` to the connected cells of the seed in one plane and m to this plane; return the number of cells.
 
     The plane is fitted again with every new cell.
     """
@@ -187,7 +187,7 @@ def _grow(
 
 @njit(cache=True, nogil=True)
 def _collect(cells: Float64, free: Bool, m: Float64, distance: float, noise: float, deviations: Float64) -> None:
-    """Set the deviation of each free cell that lies in the plane, infinity for all others."""
+    """Set the deviation of each free cell that lies in the plane, and infinity for all other cells."""
     slope = distance * _length(m)
     for i in range(len(cells)):
         deviations[i] = np.inf
@@ -199,9 +199,9 @@ def _collect(cells: Float64, free: Bool, m: Float64, distance: float, noise: flo
 
 @njit(cache=True, nogil=True)
 def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> None:
-    """Set m to the plane of its best cells, at least half of them, and `total` to the sum of their moments.
+    """Set m to the plane of its best cells, at least half of the cells, and `total` to the sum of their moments.
 
-    The others are cells across the line where two planes meet, which would tilt the planes towards each other.
+    The other cells are across the intersection of two planes and would tilt the planes towards each other.
     """
     inside, count = np.empty(len(deviations)), 0
     for i in range(len(deviations)):
@@ -224,7 +224,7 @@ def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> N
 
 @njit(cache=True, nogil=True)
 def _order(values: Float64, k: int) -> float:
-    """Return the k-th smallest value; reorders the values (Hoare 1961, "Find"). np.median compiles more slowly."""
+    """Return the k-th smallest value and reorder the values (Hoare 1961, "Find"). np.median compiles more slowly."""
     low, high = 0, len(values) - 1
     while low < high:
         pivot = values[(low + high) // 2]
@@ -248,7 +248,7 @@ def _order(values: Float64, k: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _readings_behind(cells: Float64, m: Float64, deviation: float, distance: float) -> float:
-    """Return the number of readings in cells whose mean is clearly behind the plane."""
+    """Return the number of readings in cells with a mean clearly behind the plane."""
     behind = 0.0
     for i in range(len(cells)):
         n = cells[i, 0]
@@ -265,7 +265,7 @@ def label_points(
     depth: Float32, pinhole: Float32, m: Float32, lengths: Float32, reach: Float32, sigmas: Float32,
     image: UInt8,
 ) -> None:  # fmt: skip
-    """Set image (H, W) to 1 + the nearest plane within reach of each reading."""
+    """Set image (H, W) to 1 + the nearest plane within reach of each depth reading."""
     fx, fy, cx, cy = pinhole
     for v in prange(depth.shape[0]):
         y = np.float32(v - cy) / fy
@@ -284,7 +284,7 @@ def label_points(
 def find_off_planes(
     cluster: Int32, pixels: Int32, on_plane: UInt8, max_own: float, counts: Int64, stays: Bool, structure: Bool
 ) -> Bool:
-    """Return which points are kept, and clear `structure` at kept points on planes."""
+    """Return True for the kept points, and clear `structure` at kept points on planes."""
     labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
     for part in prange(len(counts)):
         own = slice(part * PART, (part + 1) * PART)
@@ -299,7 +299,7 @@ def find_off_planes(
 
 @njit(cache=True, nogil=True)
 def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
-    """Set `stays` by cluster, except the last row, and plane, except column 0 for no plane."""
+    """Set `stays` by cluster (except the last row) and plane (except column 0 for no plane)."""
     parts, rows, columns = counts.shape
     for label in range(1, columns):
         most = max_own * _count(on_plane.ravel(), label)
@@ -312,7 +312,7 @@ def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UInt8, counts: Int64) -> None:
-    """Count points by cluster and plane, in runs of equal ones: a counter per point stalls on its own store."""
+    """Count points by cluster and plane, in runs of equal labels. A counter per point would stall on its store."""
     k, label, count = 0, 0, 0
     for i in range(len(cluster)):
         labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]
@@ -326,7 +326,7 @@ def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UIn
 @njit(cache=True, nogil=True)
 def _count(labels: UInt8, label: int) -> int:
     wanted, count = np.uint8(label), 0
-    for begin in range(0, len(labels), 128):  # counting bytes in a byte vectorizes best
+    for begin in range(0, len(labels), 128):  # a byte counter vectorizes best
         some = np.uint8(0)
         for found in labels[begin : begin + 128]:
             some += np.uint8(found == wanted)

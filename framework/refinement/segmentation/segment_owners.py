@@ -1,6 +1,6 @@
-"""The mask that owns each segment of the depth image, and clusters of the owned segments.
+"""Owner mask of each segment of the depth image, and clusters of the owned segments.
 
-The rule is that of Voxblox++ (Grinvald et al., RA-L 2019).
+The assignment rule follows Voxblox++ (Grinvald et al., RA-L 2019).
 """
 
 from __future__ import annotations
@@ -15,18 +15,21 @@ from framework.geometry import nearest_rotation, transform
 from framework.refinement.refine import keep_points
 from framework.refinement.segmentation.segment_owners_kernels import find_owners, judged
 
-LEAST_SPREAD = 0.02  # m, root of the scatter's second eigenvalue; single precision then moves 5 m by under 0.1 mm
-SAMPLE = 4096  # points, evenly spaced; more change the pose by less than single precision does
-TOLERANCE = 1e-3  # m, of a point from its depth reading
+LEAST_SPREAD = (
+    0.02  # m, minimum root of the scatter's second eigenvalue; single precision then moves 5 m by under 0.1 mm
+)
+SAMPLE = 4096  # number of evenly spaced points; more points change the pose by less than single precision
+TOLERANCE = 1e-3  # maximum distance of a point from its depth reading, m
 
 
 def owned_segments(
     clusters: PointClusters, frame: Frame, labels: Int32, count: int, min_overlap: float, whole_segments: bool
 ) -> PointClusters:
-    """Return the clusters without points outside of their segments; `labels` (H, W) in [0, `count`), -1 = none.
+    """Return the clusters without points outside their segments; `labels` (H, W) in [0, `count`), -1 = none.
 
-    A segment belongs to the mask that covers most of it, if that is more than `min_overlap` of its pixels. With
-    `whole_segments` clusters gain their segments' readings outside of their masks, if the camera's pose is determined.
+    A segment belongs to the mask that covers the most pixels, if they are more than a fraction `min_overlap` of the
+    segment. With `whole_segments` clusters gain their segments' readings outside their masks, if the camera pose is
+    determined.
     """
     owners = find_owners(clusters.pixels, clusters.cluster, len(clusters), labels, count, min_overlap)
     kept, missing, missing_owner = judged(clusters.pixels, clusters.cluster, labels, owners)
@@ -44,11 +47,11 @@ def owned_segments(
 
 
 def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
-    """Return T_world_camera (4, 4) that moves the readings of `frame` at the clusters' pixels to the clusters' points.
+    """Return T_world_camera (4, 4) from the readings of `frame` at the clusters' pixels to the clusters' points.
 
-    The least-squares rigid motion (Arun, Huang and Blostein, "Least-Squares Fitting of Two 3-D Point Sets", PAMI 1987).
-    None if there are too few points or all are on one line, where SciPy's align_vectors only warns. Raises DataError if
-    the points are not from the readings of this frame.
+    The pose is the least-squares rigid motion (Arun, Huang and Blostein, "Least-Squares Fitting of Two 3-D Point Sets",
+    PAMI 1987). Returns None if there are too few points or if all points are on one line. SciPy's align_vectors would
+    only warn. Raises DataError if the points are not from the readings of this frame.
     """
     step = max(len(clusters.pixels) // SAMPLE, 1)
     points_world = clusters.points_world[::step].astype(np.float64)
@@ -71,12 +74,12 @@ def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
 
 
 def points_at(pixels: Int32, frame: Frame, T_world_camera: Float64) -> Float32:
-    """Return (P, 3) the readings of `frame` at `pixels` (P, 2) (u, v) in the world, in the arithmetic of `lift`."""
+    """Return the world points (P, 3) of `frame` at `pixels` (P, 2) (u, v), with the arithmetic of `lift`."""
     return np.asarray(transform(T_world_camera, _readings(pixels, frame)), np.float32)
 
 
 def _readings(pixels: Int32, frame: Frame) -> Float64:
-    """Return (P, 3) m, in the camera frame."""
+    """Return the points (P, 3) m in the camera frame."""
     camera = frame.camera
     z = frame.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64)
     return np.stack([(pixels[:, 0] - camera.cx) / camera.fx * z, (pixels[:, 1] - camera.cy) / camera.fy * z, z], axis=1)

@@ -1,4 +1,4 @@
-"""Union-find for kernels: `parents[cell]` is a cell of the same piece, and a root is its own parent."""
+"""Union-find for kernels: `parents[cell]` is a cell of the same component, and a root is its own parent."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from framework.data import Int32
 
 @njit(cache=True, nogil=True)
 def root(parents: Int32, cell: int) -> int:
-    """Return the root of the cell's piece, with path halving."""
+    """Return the root of the cell's component, with path halving."""
     while parents[cell] != cell:
         parents[cell] = parents[parents[cell]]
         cell = parents[cell]
@@ -18,7 +18,7 @@ def root(parents: Int32, cell: int) -> int:
 
 @njit(cache=True, nogil=True)
 def unite(parents: Int32, a: int, b: int) -> None:
-    """Join the pieces of two cells. The smaller root remains: a piece is named after its first cell."""
+    """Join the components of two cells. The smaller root remains, so that a component is named by its first cell."""
     a, b = root(parents, a), root(parents, b)
     if a < b:
         parents[b] = a

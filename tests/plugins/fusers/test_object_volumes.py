@@ -310,7 +310,7 @@ def test_map_does_not_depend_on_thread_count(frames: list[Frame], tmp_path: Path
 
 def test_full_map_raises(frames: list[Frame]) -> None:
     background = fuse(new_fuser(), frames[0], []).scene.background.voxels.block_count
-    with pytest.raises(MapFullError, match=f"more than {background} blocks in the background and 2 objects"):
+    with pytest.raises(MapFullError, match=f"at most {background} blocks in the background and 2 objects"):
         fuse(new_fuser(max_blocks=background), frames[0], masks_of(frames[0]))
 
 

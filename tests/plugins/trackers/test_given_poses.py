@@ -40,11 +40,11 @@ def poses_of_a_file(folder: Path) -> PoseTracker:
 TRACKERS = pytest.mark.parametrize(
     ("tracker", "first"),
     [
-        (true_poses, "frame 0: expected a true pose at 0.000 s, got none"),
+        (true_poses, "frame 0: expected a ground-truth pose at 0.000 s, got none"),
         (
             poses_of_a_file,
             "frame 0: poses.txt: expected a pose within tracker.max_time_difference of 0.000 s, "
-            "got the nearest 0.033 s away",
+            "got the nearest pose 0.033 s away",
         ),
     ],
 )

@@ -41,7 +41,7 @@ def test_frame_without_pose_raises_with_reason(path: Path) -> None:
         tracker.track(CornerRoom()[3], SCENE)
     why = (
         "frame 3: other_slam.txt: expected a pose within tracker.max_time_difference of 0.100 s, "
-        "got the nearest 0.029 s away"
+        "got the nearest pose 0.029 s away"
     )
     assert str(caught.value) == why
 

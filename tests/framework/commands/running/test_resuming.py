@@ -120,7 +120,7 @@ def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
         (("fuser=object_volumes",), "expected a fuser with support for stored maps, got ObjectVolumes"),
         (
             ("tracker=voxel_hashing_icp",),
-            "resume_from or localize_in: expected a run with stored keyframes, got one without",
+            "resume_from or localize_in: expected a run with stored keyframes, got no keyframes",
         ),
         (("tracker=open3d_odometry",), "expected a tracker that relocalizes in a stored map, got Open3dOdometry"),
     ],

@@ -148,14 +148,14 @@ def test_embeddings_of_other_space_raise() -> None:
     ("array", "value", "fault"),
     [
         ("embedding_ids", np.int32([1, 1]), "embedding_ids: expected unique instances, got duplicates"),
-        ("embedding_ids", np.int32([1, 77]), "embedding_ids: expected values in the map, got 77"),
+        ("embedding_ids", np.int32([1, 77]), "embedding_ids: expected ids in the map, got 77"),
         ("embedding_ids", np.int32([1, 2, 3]), "embedding_sums: expected shape"),
         ("embedding_sums", np.float32([[1, 0], [0, 1]]), "embedding_sums: expected an array"),
         ("embedding_sums", np.float64([1, 0]), r"embedding_sums: expected \(M, D\) with D in \[1, .*\]"),
         (
             "embedding_sums",
             np.float64([[900, 0], [0, 1]]),
-            "embedding_sums: expected lengths of at most their weights, got .* of one",
+            "embedding_sums: expected at most 1 per unit of weight, got ",
         ),
         ("embedding_weights", np.float64([0, 1]), r"embedding_weights: expected values in \(0, 1e\+12\], got .* to"),
         ("embedding_counts", np.int64([0, 1]), "embedding_counts: expected at least 1"),
