@@ -217,7 +217,7 @@ def test_pipeline_error_leaves_no_threads(prefetch: int) -> None:
     before = threading.active_count()
     with pytest.raises(DataError, match="no true pose"):
         pipeline(prefetch, detector=_Blind()).run(CornerRoom(truth=False))
-    with pytest.raises(DataError, match="no true instances"):  # raised in the worker
+    with pytest.raises(DataError, match="expected ground-truth instances"):  # raised in the worker
         pipeline(prefetch).run(CornerRoom(truth=False))
     assert threading.active_count() == before
 

@@ -171,7 +171,7 @@ def test_gravity_contradictory_sensor_is_ignored(caplog: pytest.LogCaptureFixtur
         gravity.add_frame(T, np.array([np.sin(0.4), 0, np.cos(0.4)]))
     assert gravity.sensed() is None
     assert degrees(gravity.estimate(vertices, triangles).up, Z) < 0.1
-    assert caplog.text.count("sensor gravity: expected one direction in the world, got several") == 1
+    assert caplog.text.count("sensor gravity: expected one direction in the world frame, got several") == 1
 
 
 def test_gravity_round_trips_and_invalid_values_raise() -> None:

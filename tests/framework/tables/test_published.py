@@ -17,7 +17,7 @@ def test_published_ap_row_is_converted_from_percent() -> None:
     [known] = [row for row in read_published("table3").rows if row.values is not None]
     assert known.values == pytest.approx({(sequence,): value / 100 for sequence, value in percent.items()})
     assert "Han et al., ICRA 2021" in known.source
-    assert "other classes" in known.remark
+    assert "its classes differ" in known.remark
     assert known.poses == "ground truth"
 
 

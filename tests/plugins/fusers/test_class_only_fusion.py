@@ -267,7 +267,7 @@ def test_different_label_space_raises(frames: list[Frame]) -> None:
     fuse_masks(fuser, frames[0], [], [])
     assert fuser.scene.classes == CLASSES
     clusters = lift(Detections.none(CAMERA.shape, ("chair",)), frames[1], Pose(np.eye(4)))
-    with pytest.raises(DataError, match=r"classes of the map \(2\), got 1 other"):
+    with pytest.raises(DataError, match=r"the 2 classes of the map, got 1 different"):
         fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
 
 

@@ -322,7 +322,7 @@ def test_pixel_outside_image_or_other_classes_raise(frames: list[Frame]) -> None
         DataError, match=r"clusters: expected pixels in the image of .*x.*, got u in \[.*, .*\], v in \[.*, .*\]"
     ):
         fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, pixels=clusters.pixels + 200))
-    with pytest.raises(DataError, match="got 3 other"):
+    with pytest.raises(DataError, match="got 3 different"):
         fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, classes=("a", "b", "c")))
 
 
