@@ -45,7 +45,7 @@ class RunSource:
             return cls(contents, None, "the run mapped a live camera")
         source = cls(contents, video, "")
         if len(contents.poses) and source.frame(0) is None:
-            return cls(contents, None, "the first frame differs from the run's first frame")
+            return cls(contents, None, "the first frame differs from the first frame of the run")
         return source
 
     @property

@@ -1,1 +1,1 @@
-"""Refiner plugin for InstanceMap: refiner=depth_median."""
+"""A refiner for InstanceMap: refiner=depth_median."""

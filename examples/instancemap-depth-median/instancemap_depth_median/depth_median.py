@@ -1,4 +1,4 @@
-"""Cluster refinement by depth: removes points far in front of or behind the median of a cluster."""
+"""Cluster refinement by depth: points far in front of or behind the median of a cluster are dropped."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from instancemap import ClusterRefiner, Frame, PointClusters, check_bounds, keep
 
 @dataclass
 class DepthMedian(ClusterRefiner):
-    """Refiner that keeps the points of each cluster with a depth near the cluster's median.
+    """Keeps the points of each cluster with a depth near the cluster's median.
 
-    A mask that exceeds an object's outline includes background points at different depths. If they are fewer than half
-    of the points, the median is a depth of the object. Clusters keep their index.
+    A mask that bleeds over an object's outline includes points of the background, at other depths. If these are fewer
+    than half of the points, the median is a depth of the object. Clusters keep their index.
     """
 
     reach: float = 0.3  # maximum difference from the median, m, >= 0; half the extent of an object
-    reach_per_depth: float = 0.02  # increase of the maximum difference with depth, m per m, >= 0; for noise
+    reach_per_depth: float = 0.02  # increase of the difference with depth, m per m, >= 0; for noise
 
     def __post_init__(self) -> None:
         check_bounds(self, reach=(0.0, np.inf), reach_per_depth=(0.0, np.inf))

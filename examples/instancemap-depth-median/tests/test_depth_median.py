@@ -1,4 +1,4 @@
-"""Contract tests and unit tests of the refiner depth_median."""
+"""Contract tests of a refiner, and tests of this one."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ def test_report_other_recording_is_detected(stored: Path, command, tmp_path: Pat
     moved = [f"{float(line.split()[0]) + 5:.9f} {line.partition(' ')[2]}" for line in lines]
     (stored / "trajectory.txt").write_text("\n".join(moved) + "\n")
     assert command(stored)[0] == 0
-    assert "the first frame differs from the run's first frame" in texts((stored / "report.html").read_text())
+    assert "the first frame differs from the first frame of the run" in texts((stored / "report.html").read_text())
 
 
 def test_report_invalid_unicode_names_are_escaped(stored: Path, command) -> None:

@@ -84,7 +84,7 @@ def test_detect_errors_are_one_line(tmp_path: Path, overrides: list[str], messag
 
 def test_detect_failing_detector_leaves_no_file(tmp_path: Path) -> None:
     (tmp_path / "found.json").write_text("before")
-    with pytest.raises(DataError, match="no true instances"):
+    with pytest.raises(DataError, match="expected ground-truth instances"):
         write_detections(tmp_path / "found.json", SphereDetector(), CornerRoom(truth=False))
     with pytest.raises(DataError, match="expected usable frames, got none of 1"):
         write_detections(tmp_path / "found.json", SphereDetector(broken_at=0), CornerRoom(frames=1))

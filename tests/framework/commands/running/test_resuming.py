@@ -122,7 +122,7 @@ def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
             ("tracker=voxel_hashing_icp",),
             "resume_from or localize_in: expected a run with stored keyframes, got no keyframes",
         ),
-        (("tracker=open3d_odometry",), "expected a tracker that relocalizes in a stored map, got Open3dOdometry"),
+        (("tracker=open3d_odometry",), "expected a tracker with relocalization in a stored map, got Open3dOdometry"),
     ],
 )
 def test_resume_with_incompatible_config_raises(
