@@ -49,6 +49,14 @@ def skew(v: Float64) -> Float64:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
+def adjoint(T: Float64) -> Float64:
+    """Return the adjoint (6, 6) of a rigid motion: T exp(xi) = exp(Ad xi) T for twists (translation, rotation)."""
+    Ad = np.zeros((6, 6))
+    Ad[:3, :3] = Ad[3:, 3:] = T[:3, :3]
+    Ad[:3, 3:] = skew(T[:3, 3]) @ T[:3, :3]
+    return Ad
+
+
 def exp_se3(xi: Float64) -> Float64:
     """Return the exponential map of SE(3).
 

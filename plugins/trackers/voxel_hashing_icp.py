@@ -20,6 +20,7 @@ from framework.tracking.alignment import LinearWeights, NormalEquations, Weights
 from framework.tracking.features import FrameFeatures
 from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, model_intensities
+from framework.tracking.raw_keyframe import NEW_DISTANCE, KeyframeTerm, RawKeyframe
 
 LEVELS = 3
 CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; four times as long at each coarser level
@@ -92,6 +93,7 @@ class VoxelHashingIcp(PoseTracker):
     min_information: float = 1e-3  # minimum eigenvalue of A over the mean eigenvalue, in [0, 1]; doubled while lost
     min_agreement: float = 0.92  # minimum fraction of the points in view on the map's surface, in [0, 1]; 0 = unchecked
     max_occluded: float = 0.015  # maximum fraction of the points in view behind the surface, in [0, 1]; 1 = unchecked
+    raw_keyframe: bool = True  # alignment to a raw keyframe in addition to the map
     relocalize: bool = True  # relocalization against keyframes and visited poses; False = none
     seed: int = 0  # seed of the relocalization, >= 0
 
@@ -120,6 +122,7 @@ class VoxelHashingIcp(PoseTracker):
         self._T_world_doubted: Float64 | None = None  # pose of the last frame if it was lost because of doubt only
         self._last: FrameFeatures | None = None  # features of the last trusted frame
         self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
+        self._raw_keyframe: RawKeyframe | None = None
         self._coarse_depth = False  # True if depth is too coarse for normals from neighboring readings
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
@@ -146,6 +149,7 @@ class VoxelHashingIcp(PoseTracker):
             return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
         T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
+        self._update_raw_keyframe(levels, alignment.T_world_camera)
         return self._trust(seen, alignment.T_world_camera)
 
     def keyframes(self) -> Mapping[str, Array]:
@@ -208,7 +212,15 @@ class VoxelHashingIcp(PoseTracker):
         if readings < max(self.min_visible, 1 / frame.depth.size):
             few = f"depth within {nearest:g} to {farthest:g} m in {readings:.1%} of the pixels only"
             return Pose(T_world_camera, lost=True, reason=few if frame.depth.any() else "the frame has no depth")
+        self._update_raw_keyframe(self._pyramid(frame), T_world_camera)
         return self._trust(seen, T_world_camera)
+
+    def _update_raw_keyframe(self, levels: list[PyramidLevel], T_world_camera: Float64) -> None:
+        """Replace the raw keyframe if it is missing or too far from a trusted pose."""
+        if not self.raw_keyframe:
+            return
+        if self._raw_keyframe is None or self._raw_keyframe.distance(T_world_camera) > NEW_DISTANCE:
+            self._raw_keyframe = RawKeyframe.of(levels, T_world_camera)
 
     def _is_jump(self, T_last_next: Float64) -> bool:
         step, turn = np.linalg.norm(T_last_next[:3, 3]), rotation_angle(T_last_next[:3, :3])
@@ -290,7 +302,8 @@ class VoxelHashingIcp(PoseTracker):
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
         linear = self._linear_weights(scene)
         T_view_camera = np.eye(4)
-        brightness = 0.0
+        term = KeyframeTerm.at(self._raw_keyframe, T_world_view)
+        brightness = key_brightness = 0.0
         for level in reversed(range(LEVELS)):
             weights, smooth = self._weights_at(level), smoothed(model, level)
             for _ in range(iterations[level]):
@@ -298,7 +311,12 @@ class VoxelHashingIcp(PoseTracker):
                     levels[level], smooth, intensities[level], T_view_camera, weights, brightness, linear
                 )
                 brightness = equations.brightness if linear is None else 0.0
-                xi = _solved(equations)
+                A, b = equations.A, equations.b
+                if term is not None:
+                    own = term.linearized(levels, level, T_view_camera, weights, key_brightness, linear)
+                    key_brightness = own.brightness if linear is None else 0.0
+                    A, b = A + own.A, b + own.b
+                xi = _solved(A, b)
                 T_view_camera = exp_se3(xi) @ T_view_camera
                 if np.abs(xi).max() < CONVERGED * 4**level:
                     break
@@ -368,7 +386,7 @@ def _near(T_a: Float64, T_b: Float64, limit: float) -> bool:
     return bool(np.linalg.norm(T_ab[:3, 3]) < limit and rotation_angle(T_ab[:3, :3]) < limit)
 
 
-def _solved(equations: NormalEquations) -> Float64:
-    """Return the Gauss-Newton step. Damping keeps undetermined directions at the prediction."""
-    damping = 1e-6 * max(float(np.trace(equations.A)), 1e-12) * np.eye(6)
-    return np.asarray(np.linalg.solve(equations.A + damping, -equations.b))
+def _solved(A: Float64, b: Float64) -> Float64:
+    """Return the Gauss-Newton step; damping keeps undetermined directions at the prediction."""
+    damping = 1e-6 * max(float(np.trace(A)), 1e-12) * np.eye(6)
+    return np.asarray(np.linalg.solve(A + damping, -b))

@@ -1,0 +1,86 @@
+"""Raw keyframes: a frame as a second model of the alignment, next to the view of the map.
+
+The map rounds off structure below its voxel size, always to the same side. This biases the alignment by a constant, and
+the map follows the camera: a standing camera drifts. A raw keyframe has no such bias. Its normal equations are added to
+those of the map's view. With T_key_view and its adjoint Ad, a twist xi of the view's frame is Ad xi in the keyframe's:
+
+    A <- A + w Ad^T A_key Ad,    b <- b + w Ad^T b_key
+
+The keyframe is compared at half the finest resolution, where averaged depth is less noisy and the cost is a quarter. At
+the finest level, w = 4 replaces the missing points. Beyond NEW_DISTANCE, w falls to 0 at USED_DISTANCE, so that sparse
+frames are aligned to the map alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.data import Float32, Float64
+from framework.geometry import adjoint, inverse, rotation_angle
+from framework.tracking.alignment import LinearWeights, ModelView, NormalEquations, Weights, linearize, smoothed
+from framework.tracking.pyramid import PyramidLevel, intrinsics
+
+NEW_DISTANCE = 0.1  # m and rad from the keyframe, beyond which a frame replaces it
+USED_DISTANCE = 0.15  # m and rad from the keyframe, at which its weight reaches 0
+FINEST = 1  # halvings of the finest resolution at which frames and the keyframe are compared
+
+
+@dataclass(frozen=True)
+class RawKeyframe:
+    """A frame at its estimated pose, as a model of later frames."""
+
+    T_world_camera: Float64  # (4, 4)
+    models: Sequence[ModelView]  # by level from FINEST on: depth, and normals averaged for the level
+    intensities: Sequence[Float32]  # by level from FINEST on, -1 = no depth
+
+    @classmethod
+    def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64) -> RawKeyframe:
+        """Return the keyframe of an image pyramid, finest level first."""
+        used = levels[FINEST:]
+        model = ModelView(used[0].depth, used[0].normals, *intrinsics(used[0].camera))
+        models = [smoothed(model, halvings) for halvings in range(len(used))]
+        intensities = [np.where(level.depth > 0, level.intensity, np.float32(-1)) for level in used]
+        return cls(T_world_camera, models, intensities)
+
+    def distance(self, T_world_camera: Float64) -> float:
+        """Return the distance of a pose from the keyframe: the larger of translation (m) and rotation (rad)."""
+        T = inverse(self.T_world_camera) @ T_world_camera
+        return max(float(np.linalg.norm(T[:3, 3])), rotation_angle(T[:3, :3]))
+
+
+class KeyframeTerm(NamedTuple):
+    """The keyframe's part of one alignment."""
+
+    keyframe: RawKeyframe
+    T_key_view: Float64
+    Ad: Float64  # (6, 6) adjoint of T_key_view
+    weight: float  # in [0, 1]
+
+    @classmethod
+    def at(cls, keyframe: RawKeyframe | None, T_world_view: Float64) -> KeyframeTerm | None:
+        """Return the term of an alignment that starts at a view; None if the keyframe is too far away."""
+        if keyframe is None:
+            return None
+        distance = keyframe.distance(T_world_view)
+        if distance >= USED_DISTANCE:
+            return None
+        T_key_view = inverse(keyframe.T_world_camera) @ T_world_view
+        weight = min((USED_DISTANCE - distance) / (USED_DISTANCE - NEW_DISTANCE), 1.0)
+        return cls(keyframe, T_key_view, adjoint(T_key_view), weight)
+
+    def linearized(
+        self, levels: Sequence[PyramidLevel], level: int, T_view_camera: Float64, weights: Weights, brightness: float,
+        linear: LinearWeights | None,
+    ) -> NormalEquations:  # fmt: skip
+        """Return the weighted equations of the keyframe, for twists of the view's frame."""
+        compared = max(level, FINEST)
+        own = linearize(
+            levels[compared], self.keyframe.models[compared - FINEST], self.keyframe.intensities[compared - FINEST],
+            self.T_key_view @ T_view_camera, weights, brightness, linear,
+        )  # fmt: skip
+        weight = self.weight * 4 ** (compared - level)
+        return own._replace(A=weight * self.Ad.T @ own.A @ self.Ad, b=weight * self.Ad.T @ own.b)
