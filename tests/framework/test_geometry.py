@@ -145,3 +145,8 @@ def test_interpolate_moves_evenly_between_poses(xi_a: np.ndarray, xi_b: np.ndarr
     np.testing.assert_allclose(third[:3, 3], T_a[:3, 3] + (T_b - T_a)[:3, 3] / 3, atol=1e-12)
     whole = geometry.rotation_angle(T_a[:3, :3].T @ T_b[:3, :3])
     assert geometry.rotation_angle(T_a[:3, :3].T @ third[:3, :3]) == pytest.approx(whole / 3, abs=1e-7)
+
+
+def test_adjoint_moves_twist_through_motion() -> None:
+    T, xi = geometry.exp_se3(np.array([0.3, -0.2, 0.1, 0.4, -0.5, 0.2])), np.array([0.02, 0.01, -0.03, 0.1, 0.05, -0.2])
+    np.testing.assert_allclose(T @ geometry.exp_se3(xi), geometry.exp_se3(geometry.adjoint(T) @ xi) @ T, atol=1e-14)

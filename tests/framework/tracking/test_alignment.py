@@ -35,7 +35,7 @@ def step(
     model, intensities = model_of(scene)
     pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
     equations = linearize(pyramid[level], seen(model), intensities[level], T_view_camera, weights, brightness)
-    return _solved(equations), equations
+    return _solved(equations.A, equations.b), equations
 
 
 def model_of(scene: Scene) -> tuple[ModelView, list[np.ndarray]]:

@@ -3,11 +3,13 @@
 import dataclasses
 import pickle
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from framework.data import Camera, Frame, Pose
+from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError
 from framework.geometry import exp_se3, inverse, rotation_angle
 from framework.interfaces import SceneMap
@@ -50,6 +52,16 @@ def test_known_motion_is_recovered(color_weight: float) -> None:
     worst = max(drift(pose, frame) for pose, frame in zip(poses, frames, strict=True))
     assert worst[0] < 0.004, "a fifth of a voxel"
     assert drift(poses[-1], frames[-1])[1] < 0.003
+
+
+def test_raw_keyframe_stops_drift_of_standing_camera(shared: Path) -> None:
+    """Structure below the voxel size biases the alignment to the map alone."""
+    frame = dataclasses.replace(RgbdFolder(shared / "data" / "redkitchen")[0], T_world_camera=np.eye(4))
+    with_keyframe, alone = (
+        run(VoxelHashingIcp(raw_keyframe=raw_keyframe), [frame] * 60)[0][-1] for raw_keyframe in (True, False)
+    )
+    assert drift(with_keyframe, frame)[0] < 0.001
+    assert drift(alone, frame)[0] > 2 * drift(with_keyframe, frame)[0]
 
 
 def test_color_determines_motion_along_wall() -> None:
@@ -260,7 +272,7 @@ def test_pose_is_accepted_after_correct_final_step() -> None:
 def test_pose_is_lost_after_wrong_final_step(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     assert not any(pose.lost for pose in run(VoxelHashingIcp(**ONE_STEP), frames)[0])
-    monkeypatch.setattr(voxel_hashing_icp, "_solved", lambda _: np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
+    monkeypatch.setattr(voxel_hashing_icp, "_solved", lambda *_: np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
     poses, _ = run(VoxelHashingIcp(**ONE_STEP), frames)
     assert poses[1].lost
     assert "agree with the map" in poses[1].reason
