@@ -140,6 +140,7 @@ def _times(record: Record) -> StageTimes:
 
 def _maps(pictured: Pictured) -> Page:
     heads = [*pictured.rows, "ground truth"]
+    with_frames = len({record.metrics.get("frames") for record in pictured.records}) > 1
     lines = []
     for run in tqdm(pictured.runs, unit=" lines", disable=None, dynamic_ncols=True):
         records = [row.records.get(run) if row else None for row in pictured.rows.values()]
@@ -149,7 +150,8 @@ def _maps(pictured: Pictured) -> Page:
             continue
         truth = _if_readable(_truth, shown[-1].record)
         line = panel_line(maps, truth, panel_size(len(heads)), pictured.choice.zoom)
-        captions = [*map(_caption, maps), f"{line.true_count} instances" if truth else ""]
+        captions = [_caption(one, with_frames) for one in maps]
+        captions.append(f"{line.true_count} instances" if truth else "")
         lines.append(CaptionedLine(pictured.called(run), line, captions))
     if not lines:
         raise DataError("maps: expected a readable map, got none; the log lists the reasons")
@@ -170,13 +172,17 @@ def _truth(record: Record) -> SceneTruth | None:
     return Truth.of(record.dataset).in_world_of(record)
 
 
-def _caption(stored: StoredMap | None) -> str:
+def _caption(stored: StoredMap | None, with_frames: bool) -> str:
+    """Return the caption of a map; the note has the number of frames if it is the same for all maps."""
     if stored is None:
         return ""
     metrics = stored.record.metrics
     ap50 = metrics.get("instances.ap50")
-    caption = f"{metrics.get('frames')} frames, {len(stored.class_names)} instances"
-    return caption if ap50 is None else f"{caption}, AP50 {ap50:.2f}"
+    parts = [f"{metrics.get('frames')} frames"] if with_frames else []
+    parts.append(f"{len(stored.class_names)} instances")
+    if ap50 is not None:
+        parts.append(f"AP50 {ap50:.2f}")
+    return ", ".join(parts)
 
 
 def _if_readable(read: Callable[[Record], Read], record: Record) -> Read | None:
