@@ -72,7 +72,7 @@ def test_run_contents_frames_without_pose_are_lost(directory: Path) -> None:
         ({"_target_": "tests.support.scenes.corner_room.LiveRoom"}, "the run mapped a live camera"),
         (
             {"_target_": "tests.support.scenes.corner_room.CornerRoom", "start": 1},
-            "the first frame differs from the run's first frame",
+            "the first frame differs from the first frame of the run",
         ),
         ({"_target_": "os.system"}, "expected the _target_ of a registered option of"),
         ({"_target_": "tests.support.scenes.corner_room.CornerRoom", "scene": "${oc.env:HOME}"}, "not resolved"),
