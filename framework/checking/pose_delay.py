@@ -17,7 +17,7 @@ from framework.data import Float64
 
 LONGEST_DELAY = 6  # frames, in both directions; one more is tried, to detect an error that is still decreasing
 CLEARLY = 0.75  # maximum ratio to the mean error without delay; real recordings have at least 0.88 for wrong delays
-TELLS = 1 / 640  # fraction of the image width, minimum error difference of a counted pair
+MIN_GAIN = 1 / 640  # fraction of the image width, minimum error difference of a counted pair
 MOST = 0.75  # minimum fraction of improved pairs among the counted pairs
 FEWEST_PAIRS = 5  # minimum number of counted pairs
 
@@ -71,7 +71,7 @@ def find_delay(
     now, (fit, best) = int(means[:, LONGEST_DELAY + 1].argmin()), np.unravel_index(int(means.argmin()), means.shape)
     as_stored, shifted = errors[now, LONGEST_DELAY + 1], errors[fit, best]
     gains = as_stored - shifted
-    counted = np.abs(gains) > TELLS * informative[0].first.camera.width
+    counted = np.abs(gains) > MIN_GAIN * informative[0].first.camera.width
     motion = float(np.median([pair.motion for pair in informative]))
     if (
         abs(delays[best]) > LONGEST_DELAY

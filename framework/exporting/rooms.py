@@ -96,8 +96,8 @@ def _doors(labels: Int32, plan: Plan) -> tuple[Door, ...]:
     doors = []
     every = np.ones((3, 3), np.bool_)
     for a, b in combinations(range(1, int(labels.max()) + 1), 2):
-        beside = (labels == a) & ndimage.binary_dilation(labels == b)
-        lines, count = ndimage.label(beside, every)
+        adjacent = (labels == a) & ndimage.binary_dilation(labels == b)
+        lines, count = ndimage.label(adjacent, every)
         for k in range(1, count + 1):
             rows, columns = np.nonzero(lines == k)
             width = max(np.ptp(rows), np.ptp(columns)) + 1

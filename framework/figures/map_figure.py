@@ -68,9 +68,9 @@ def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) 
         page.text(left + width / 2, top + 1.2, head, ha="center", fontsize=TEXT_PT, color=INK)
     for line in lines:
         foot = top - line.rows * (height + GAP_MM) + GAP_MM
-        beside = {"rotation": 90, "ha": "center", "va": "center"}
+        vertical = {"rotation": 90, "ha": "center", "va": "center"}
         size = TEXT_PT * (top - foot) / max(top - foot, text_width(line.name, TEXT_PT))
-        page.text(LEFT_MM / 2 - 0.2, (top + foot) / 2, line.name, fontsize=size, color=INK, **beside)
+        page.text(LEFT_MM / 2 - 0.2, (top + foot) / 2, line.name, fontsize=size, color=INK, **vertical)
         for left, caption in zip(lefts, line.captions, strict=True):
             page.text(left + width / 2, foot - 1, caption, ha="center", va="top", fontsize=SMALL_PT, color=FAINT_INK)
         overall = [page.axes(left, top - height, width, height) for left in lefts]

@@ -26,7 +26,7 @@ EYE = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)  # assumed camera of a visit:
 SAMPLED = 400  # maximum number of sampled vertices of an object
 BEHIND, BEHIND_SHARE = 0.06, 0.02  # m and m per m of depth: minimum distance of a surface behind free space
 LEAST_SEEN = 0.3  # minimum fraction of an object's vertices observed in the other visit
-BESIDE = 0.05  # m, maximum distance to a vertex of the other map at the same position
+MAX_DISTANCE = 0.05  # m, maximum distance to a vertex of the other map at the same position
 STAYS = 0.9  # prior probability that an object stays from one visit to the next
 CLUTTER = 0.1  # probability of another surface or object at the position of an absent object
 GONE = 0.5  # minimum probability of a vanished object
@@ -173,10 +173,10 @@ def probability_gone(confidence: float, there: Bool, through: Bool, matched: boo
 
 
 def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
-    """Return the object (P,) of the nearest vertex within BESIDE m; 0 = none."""
+    """Return the object (P,) of the nearest vertex within MAX_DISTANCE m; 0 = none."""
     if not len(mesh.vertices):
         return np.zeros(len(points), np.int32)
-    distance, nearest = KDTree(mesh.vertices).query(points, distance_upper_bound=BESIDE)
+    distance, nearest = KDTree(mesh.vertices).query(points, distance_upper_bound=MAX_DISTANCE)
     near = np.isfinite(distance)
     return np.where(near, mesh.instance_ids[np.where(near, nearest, 0)], 0).astype(np.int32)
 

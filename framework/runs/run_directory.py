@@ -165,8 +165,8 @@ class RunRecord:
         log.info("objects: %s%s", counted, rest)
         written = [name for name in ("overview.png", "mesh.ply", "instances.json") if (self.directory / name).exists()]
         if written:  # one line: directories of sweep jobs have long names
-            beside = f", {', '.join(written[1:])}" if written[1:] else ""
-            log.info("%s%s", _from_here(self.directory / written[0]), beside)
+            others = f", {', '.join(written[1:])}" if written[1:] else ""
+            log.info("%s%s", _from_here(self.directory / written[0]), others)
         if error is not None:
             log.warning("partial run (%s): its metrics are in %s", reason(error), PARTIAL_METRICS)
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.data import Float32, Float64
-from framework.geometry import adjoint, inverse, rotation_angle
+from framework.geometry import adjoint, inverse, pose_distance
 from framework.tracking.alignment import LinearWeights, ModelView, NormalEquations, Weights, linearize, smoothed
 from framework.tracking.pyramid import PyramidLevel, intrinsics
 
@@ -46,11 +46,6 @@ class RawKeyframe:
         intensities = [np.where(level.depth > 0, level.intensity, np.float32(-1)) for level in used]
         return cls(T_world_camera, models, intensities)
 
-    def distance(self, T_world_camera: Float64) -> float:
-        """Return the distance of a pose from the keyframe: the larger of translation (m) and rotation (rad)."""
-        T = inverse(self.T_world_camera) @ T_world_camera
-        return max(float(np.linalg.norm(T[:3, 3])), rotation_angle(T[:3, :3]))
-
 
 class KeyframeTerm(NamedTuple):
     """The keyframe's part of one alignment."""
@@ -65,7 +60,7 @@ class KeyframeTerm(NamedTuple):
         """Return the term of an alignment that starts at a view; None if the keyframe is too far away."""
         if keyframe is None:
             return None
-        distance = keyframe.distance(T_world_view)
+        distance = pose_distance(keyframe.T_world_camera, T_world_view)
         if distance >= USED_DISTANCE:
             return None
         T_key_view = inverse(keyframe.T_world_camera) @ T_world_view

@@ -13,7 +13,7 @@ import numpy as np
 from framework.config.validation import check_bounds, require
 from framework.data import Array, Float64, Frame, Pose
 from framework.errors import DataError
-from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
+from framework.geometry import exp_se3, inverse, nearest_rotation, pose_distance, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.tracking.absolute_pose import AbsolutePose
 from framework.tracking.alignment import LinearWeights, NormalEquations, Weights, linearize, model_view, smoothed
@@ -149,7 +149,8 @@ class VoxelHashingIcp(PoseTracker):
             return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
         T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
-        self._update_raw_keyframe(levels, alignment.T_world_camera)
+        if self.raw_keyframe:
+            self._update_raw_keyframe(levels, alignment.T_world_camera)
         return self._trust(seen, alignment.T_world_camera)
 
     def keyframes(self) -> Mapping[str, Array]:
@@ -212,14 +213,14 @@ class VoxelHashingIcp(PoseTracker):
         if readings < max(self.min_visible, 1 / frame.depth.size):
             few = f"depth within {nearest:g} to {farthest:g} m in {readings:.1%} of the pixels only"
             return Pose(T_world_camera, lost=True, reason=few if frame.depth.any() else "the frame has no depth")
-        self._update_raw_keyframe(self._pyramid(frame), T_world_camera)
+        if self.raw_keyframe:
+            self._update_raw_keyframe(self._pyramid(frame), T_world_camera)
         return self._trust(seen, T_world_camera)
 
     def _update_raw_keyframe(self, levels: list[PyramidLevel], T_world_camera: Float64) -> None:
         """Replace the raw keyframe if it is missing or too far from a trusted pose."""
-        if not self.raw_keyframe:
-            return
-        if self._raw_keyframe is None or self._raw_keyframe.distance(T_world_camera) > NEW_DISTANCE:
+        key = self._raw_keyframe
+        if key is None or pose_distance(key.T_world_camera, T_world_camera) > NEW_DISTANCE:
             self._raw_keyframe = RawKeyframe.of(levels, T_world_camera)
 
     def _is_jump(self, T_last_next: Float64) -> bool:
@@ -382,8 +383,7 @@ class VoxelHashingIcp(PoseTracker):
 
 def _near(T_a: Float64, T_b: Float64, limit: float) -> bool:
     """Return True if two poses are within `limit` m and rad of each other."""
-    T_ab = inverse(T_a) @ T_b
-    return bool(np.linalg.norm(T_ab[:3, 3]) < limit and rotation_angle(T_ab[:3, :3]) < limit)
+    return pose_distance(T_a, T_b) < limit
 
 
 def _solved(A: Float64, b: Float64) -> Float64:

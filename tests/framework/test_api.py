@@ -144,7 +144,7 @@ def test_mapper_add_none_raises() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("detector=nobody", "got nobody"),
+        ("detector=unregistered", "got unregistered"),
         ("fuser.voxel_sise=1", "did you mean fuser.voxel_size?"),
         ("fuser.voxel_size=-1", "voxel_size: expected a value in"),
         ("detection_cache=bogus", "detection_cache: expected one of"),

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
-import pty
-import struct
 import sys
-import termios
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +26,7 @@ from framework.rendering.palette import instance_colors
 from framework.runs.instances_file import StoredInstance
 from framework.runs.mesh_file import read_mesh, write_mesh
 from tests.support.scenes.exported_room import Y_UP, ExportedRoom
+from tests.support.terminals import terminal_stderr
 
 TURNED = ExportedRoom(R_world_room=Y_UP, shift=(0.5, -1.25, 2.0))
 TABLE_SIZE, CUBE_SIZE = (1.2, 0.8, 0.75), (0.2, 0.2, 0.2)
@@ -292,17 +288,12 @@ def test_decimated_parts_keep_shape_colors_and_labels(room: UprightRoom) -> None
 
 
 def test_decimation_shows_progress_bar_in_terminal(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
     monkeypatch.delenv("TQDM_DISABLE", raising=False)
-    with os.fdopen(theirs, "w") as terminal:
-        monkeypatch.setattr(sys, "stderr", terminal)
+    with terminal_stderr(100, monkeypatch) as shown:
         parts(room, 400)
-    shown = os.read(ours, 100_000).decode()
-    os.close(ours)
-    assert "decimating room:   0%" in shown
+    assert "decimating room:   0%" in shown[0]
     for one in room.objects:
-        assert f"decimating {one.name}: " in shown
+        assert f"decimating {one.name}: " in shown[0]
 
 
 def test_export_is_deterministic(run: Path, tmp_path: Path) -> None:

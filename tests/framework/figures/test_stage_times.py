@@ -81,9 +81,9 @@ def test_mean_times_growth_ignores_single_slow_frames() -> None:
 
 def test_stage_times_figure_row_without_runs_is_empty() -> None:
     times = MeanTimes.of([run([0], refinement=[1.0], fusion=[2.0])])
-    page = stage_times_figure({"ours": times, "rival": None}, "a note")
+    page = stage_times_figure({"ours": times, "prior": None}, "a note")
     first, second = page.figure.axes
     assert [text.get_text() for text in second.texts] == ["incomplete"]
-    assert (len(second.lines), second.get_title(loc="left")) == (0, "rival")
+    assert (len(second.lines), second.get_title(loc="left")) == (0, "prior")
     assert {"GMM", "1.0 ms", "×1.00"} <= {text.get_text() for text in first.texts}
     assert "map integration" not in {text.get_text() for text in first.texts}

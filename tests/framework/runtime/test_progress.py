@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import io
 import logging
-import os
-import pty
-import struct
 import sys
-import termios
 
 import numpy as np
 import pytest
@@ -18,6 +13,7 @@ from framework.runtime import progress
 from framework.runtime.progress import LONGEST, SIGN_OF_LIFE, Progress
 from framework.runtime.run_log import Journal
 from tests.support.scenes.corner_room import GridFuser
+from tests.support.terminals import terminal_stderr
 
 
 class Clock:
@@ -54,16 +50,10 @@ def test_progress_line_interval_grows_with_time(clock: Clock, monkeypatch: pytes
 def test_progress_bar_is_shown_in_terminal_of_any_width(
     columns: int, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
-    with os.fdopen(theirs, "w") as terminal:
-        monkeypatch.setattr(sys, "stderr", terminal)
-        with Progress(7, " frames") as bar:
-            clock.now += 100
-            assert not bar.line_is_due()
-    shown = os.read(ours, 1000).decode()
-    os.close(ours)
-    assert "0/7" in shown
+    with terminal_stderr(columns, monkeypatch) as shown, Progress(7, " frames") as bar:
+        clock.now += 100
+        assert not bar.line_is_due()
+    assert "0/7" in shown[0]
 
 
 def test_progress_with_tqdm_disable_has_no_lines(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,8 +14,8 @@ from framework.runs.provenance import config_hash
 from framework.tables.experiment_tables import write_tables
 
 AP50 = "instances.ap50"
-ROWS = {"ours": [], "rival": ["refiner=geometric"], "other": ["refiner=identity"]}
-NAMES = {"rival": "Rival (re-implementation)"}
+ROWS = {"ours": [], "prior": ["refiner=geometric"], "other": ["refiner=identity"]}
+NAMES = {"prior": "Prior (re-implementation)"}
 ACROSS = {"average_over": ["seed"], "columns_by": "dataset.scene", "columns": [AP50], "names": NAMES}
 BY = {
     "average_over": ["seed"],
@@ -26,8 +26,8 @@ BY = {
 FIGURES = {  # by row and scene: AP50 of seeds 0 and 1
     ("ours", "011"): (0.6, 0.8),
     ("ours", "016"): (0.5, 0.3),
-    ("rival", "011"): (0.5, 0.7),
-    ("rival", "016"): (0.6, 0.4),
+    ("prior", "011"): (0.5, 0.7),
+    ("prior", "016"): (0.6, 0.4),
     ("other", "011"): (0.2, 0.2),
     ("other", "016"): (0.1, None),  # this run fails
 }
@@ -84,12 +84,12 @@ GOLDEN = """\
 | system                    | poses        | annotation |               011 |               016 |                mean |
 | ------------------------- | ------------ | ---------- | ----------------: | ----------------: | ------------------: |
 | ours                      | ground truth | made up    | **0.700 ± 0.141** |     0.400 ± 0.141 |   **0.550 ± 0.000** |
-| Rival (re-implementation) | ground truth | made up    |     0.600 ± 0.141 | **0.500 ± 0.141** |   **0.550 ± 0.000** |
+| Prior (re-implementation) | ground truth | made up    |     0.600 ± 0.141 | **0.500 ± 0.141** |   **0.550 ± 0.000** |
 | other                     | ground truth | made up    |     0.200 ± 0.000 |    0.100 (1 of 2) | 0.150 (3 of 4 runs) |
 
 | ours minus                | poses        | annotation |    011 |    016 |           mean | pairs |
 | ------------------------- | ------------ | ---------- | -----: | -----: | -------------: | ----: |
-| Rival (re-implementation) | ground truth | made up    | +0.100 | -0.100 | +0.000 ± 0.100 |     4 |
+| Prior (re-implementation) | ground truth | made up    | +0.100 | -0.100 | +0.000 ± 0.100 |     4 |
 | other                     | ground truth | made up    | +0.500 | +0.400 | +0.450 ± 0.050 |     3 |
 
 - Cells: mean ± sample standard deviation over seed. mean: average of the sequences (dataset.scene) with equal \
@@ -97,9 +97,9 @@ weights; its deviation is over the runs with all sequences. Bold: highest value 
 missing: no complete run.
 - Differences are paired by seed, dataset.scene: mean ± standard error over the sequences, after averaging the runs of \
 each. *: the 95% interval of Student's t excludes 0.
-- ours compared with Rival (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
+- ours compared with Prior (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
 - ours compared with other, ground truth: higher in 2 of 2 sequences, lower in 0.
-- Overrides of each row: ours: none; rival: refiner=geometric; other: refiner=identity.
+- Overrides of each row: ours: none; prior: refiner=geometric; other: refiner=identity.
 - Common to all runs: dataset=scenenn, tracker=ground_truth.
 - Label transfer: each ground-truth vertex gets the instance of the nearest map vertex within 5 cm. AP is in [0, 1].
 - Data: dataset=scenenn, annotation made up.
@@ -150,21 +150,21 @@ def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: d
 
 def test_table_compares_rows_of_same_pose_source(sweep: Path) -> None:
     """Better poses make no better system: the base of a tracked row is tracked, too, and so is who it competes with."""
-    for row, value in (("ours", 0.2), ("rival", 0.3)):
+    for row, value in (("ours", 0.2), ("prior", 0.3)):
         run(sweep, row, "011", 0, tracker="icp", **{AP50: value})
     first, second = grids(write_tables(sweep))
     assert [line.split(" | ")[:2] for line in first[2:]] == [
         ["| ours", "ground truth"],
-        ["| Rival (re-implementation)", "ground truth"],
+        ["| Prior (re-implementation)", "ground truth"],
         ["| other", "ground truth"],
         ["| ours", "tracked (icp)"],
-        ["| Rival (re-implementation)", "tracked (icp)"],
+        ["| Prior (re-implementation)", "tracked (icp)"],
     ]
     assert (
         first[-1]
-        == "| Rival (re-implementation) | tracked (icp) | made up | **0.300 (1 of 2)** | missing | **0.300 (1 of 2)** |"
+        == "| Prior (re-implementation) | tracked (icp) | made up | **0.300 (1 of 2)** | missing | **0.300 (1 of 2)** |"
     )
-    assert second[-1] == "| Rival (re-implementation) | tracked (icp) | made up | -0.100 | missing | -0.100 | 1 |"
+    assert second[-1] == "| Prior (re-implementation) | tracked (icp) | made up | -0.100 | missing | -0.100 | 1 |"
 
 
 def test_tracked_row_without_tracked_baseline_is_not_compared(sweep: Path) -> None:
@@ -194,12 +194,17 @@ def test_table_separates_other_data_and_annotations(
     run(sweep, "ours", "078", 0, **{AP50: 0.9}, **changed)
     run(sweep, "other", "078", 0, **{AP50: 0.8}, **changed)
     first, second = grids(write_tables(sweep))
-    rival, another = f"| Rival (re-implementation), {usual}", f"| other, {other}"
-    assert {line.split(" | ")[0] for line in first[2:]} == {f"| ours, {usual}", rival, f"| ours, {other}", another}
+    prior, another = f"| Prior (re-implementation), {usual}", f"| other, {other}"
+    assert {line.split(" | ")[0] for line in first[2:]} == {
+        f"| ours, {usual}",
+        prior,
+        f"| ours, {other}",
+        another,
+    }
     assert [line.split(" | ")[1:] for line in second[2:] if line.startswith(another)] == [
         ["ground truth", annotation, "missing", "missing", "+0.100", "+0.100", "1 |"]
     ]
-    assert len([line for line in second if line.startswith(rival)]) == 1
+    assert len([line for line in second if line.startswith(prior)]) == 1
 
 
 def test_table_csv_has_one_full_precision_line_per_run(sweep: Path) -> None:
@@ -224,20 +229,25 @@ def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
     assert first[7] == "| | other | ground truth | made up | 0.100 (1 of 2) | – | 0.100 (1 of 2) |"
     assert first[8] == "| mean | ours | ground truth | made up | **0.550 ± 0.000** | – | **0.550 ± 0.000** |"
     assert second[0] == "| minus ours | pairs | sofa | television | AP50 |"
-    assert second[2] == "| Rival (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
+    assert second[2] == "| Prior (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
 
 def test_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
     """The tracked row with the most sequences has fewer than those with given poses, and wins all the same."""
     experiment(sweep, BY)
-    for row, scene, value in (("ours", "011", 0.2), ("rival", "011", 0.3), ("other", "078", 0.9), ("ours", "016", 0.2)):
+    for row, scene, value in (
+        ("ours", "011", 0.2),
+        ("prior", "011", 0.3),
+        ("other", "078", 0.9),
+        ("ours", "016", 0.2),
+    ):
         run(sweep, row, scene, 0, tracker="icp", **{AP50: value})
-    run(sweep, "rival", "016", 0, tracker="icp", **{AP50: 0.1})
+    run(sweep, "prior", "016", 0, tracker="icp", **{AP50: 0.1})
     run(sweep, "ours", "078", 0, **{AP50: 0.9})
     first, _ = grids(write_tables(sweep))
     cells = {tuple(line.split(" | ")[1:3]): line.split(" | ")[-1] for line in first[-6:]}
     assert cells["ours", "tracked (icp)"] == "**0.200 (2 of 3)** |"
-    assert cells["Rival (re-implementation)", "tracked (icp)"] == "**0.200 (2 of 3)** |"
+    assert cells["Prior (re-implementation)", "tracked (icp)"] == "**0.200 (2 of 3)** |"
     assert cells["other", "tracked (icp)"] == "0.900 (1 of 3) |"
 
 

@@ -281,9 +281,9 @@ def test_missing_model_offline_raises_with_advice(monkeypatch, variable):
     monkeypatch.setenv(variable, "1")
     with pytest.raises(
         DataError,
-        match=rf"expected a local folder with {variable} set, got nobody/nothing; unset {variable} or give a folder",
+        match=rf"expected a local folder with {variable} set, got someone/missing; unset {variable} or give a folder",
     ) as caught:
-        built("nobody/nothing")
+        built("someone/missing")
     assert one_line(caught)
 
 

@@ -1,4 +1,4 @@
-"""The rival with one volume an object, on boxes that a perfect camera sees under masks as bad as a test wants them."""
+"""The baseline with one volume per object, on boxes seen by a perfect camera and detector."""
 
 from __future__ import annotations
 

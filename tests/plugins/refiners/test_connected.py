@@ -44,10 +44,10 @@ def test_occluder_does_not_split_object() -> None:
     assert (kept(LargestComponent(), ~pole, depth) == (U >= 24)).all()
 
 
-@pytest.mark.parametrize("beside", [4.5, 1.5])
-def test_depth_step_ends_object(beside: float) -> None:
-    """A wall behind the couch, or a table before it, that the mask has caught."""
-    depth = np.where(U < 6, beside, 3.0)
+@pytest.mark.parametrize("neighbor_depth", [4.5, 1.5])
+def test_depth_step_ends_object(neighbor_depth: float) -> None:
+    """The mask includes a wall behind the object or a table in front of it."""
+    depth = np.where(U < 6, neighbor_depth, 3.0)
     assert (kept(Connected(), np.ones(depth.shape, np.bool_), depth) == (U >= 6)).all()
 
 

@@ -185,7 +185,7 @@ FAULTY_OPTIONS = {
         "_target_: plugins.detectors.simulated.SimulatedDetector\nmin_pixels: many\nseed: ${seed}\n",
         "min_pixels: Value 'many' of type 'str' could not be converted to Integer",
     ),
-    "no_option": ("defaults: [nobody, _self_]\n", "detector: expected one of"),
+    "no_option": ("defaults: [unregistered, _self_]\n", "detector: expected one of"),
 }
 
 

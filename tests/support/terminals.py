@@ -1,0 +1,33 @@
+"""What a process writes to a terminal."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import struct
+import sys
+import termios
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+
+@contextmanager
+def terminal_stderr(columns: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Connect stderr to a terminal of a width. The list has one element, the text, when the context ends."""
+    shown: list[str] = []
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    with os.fdopen(theirs, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        yield shown
+    parts = []
+    try:
+        while part := os.read(ours, 4096):
+            parts.append(part)
+    except OSError:  # Linux reports the closed side of a pseudoterminal as an input/output error
+        pass
+    os.close(ours)
+    shown.append(b"".join(parts).decode())
