@@ -165,7 +165,7 @@ class Mapper(Map):
         viewer.begin(self.scene, "frames from Python", Path())
         finalize(self, viewer.end)  # when the mapper is deleted, or at exit
         self._camera: Camera | None = None  # camera of the last frame
-        self._T_world_camera: Float64 | None = None  # pose of the last frame that is not lost
+        self._T_world_color: Float64 | None = None  # pose of the color image of the last frame that is not lost
         self._frames = 0  # number of calls of `add`
 
     def add(
@@ -176,6 +176,7 @@ class Mapper(Map):
         camera: Camera | None = None,
         timestamp: float | None = None,
         up: Float64 | None = None,
+        depth_timestamp: float | None = None,
     ) -> FrameResult:
         """Detect, track, refine and fuse the next frame of a video. A lost frame is not fused.
 
@@ -184,8 +185,9 @@ class Mapper(Map):
             depth: (H, W) float32, m along z; 0 = no reading.
             pose: (4, 4) T_world_camera; None = unknown.
             camera: The camera; None = the camera of the last frame.
-            timestamp: Time of the frame, s; None = 30 frames per second.
+            timestamp: Time of the color image, s; None = 30 frames per second.
             up: (3,) unit vector opposite to gravity in the camera frame; None = unknown.
+            depth_timestamp: Time of the depth image, s; None = the time of the color image.
 
         Returns:
             The pose of the frame, and the new and removed objects.
@@ -210,7 +212,7 @@ class Mapper(Map):
                         "fx, fy, cx, cy)"
                     )
                 time = self._frames / FRAME_RATE if timestamp is None else timestamp
-                frame = Frame(self._frames, time, color, depth, camera, pose, up=up)
+                frame = Frame(self._frames, time, color, depth, camera, pose, up=up, depth_timestamp=depth_timestamp)
             self._camera = frame.camera
             self._frames += 1
             self._journal.timings.clear()  # unused here; would grow without limit for a live camera
@@ -219,7 +221,7 @@ class Mapper(Map):
             found = self._map(frame)
             if found.lost:
                 return FrameResult(found.T_world_camera, lost=True, reason=found.reason)
-            self._T_world_camera = found.T_world_camera
+            self._T_world_color = self.pipeline.T_world_color
             now = self.scene.instance_ids()
         return FrameResult(found.T_world_camera, new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)))
 
@@ -245,7 +247,7 @@ class Mapper(Map):
             u: The column of the pixel.
             v: The row of the pixel.
             camera: The camera; None = the camera of the last frame.
-            T_world_camera: The pose (4, 4); None = the pose of the last frame that is not lost.
+            T_world_camera: The pose (4, 4); None = the pose of the color image of the last frame that is not lost.
 
         Returns:
             The object; None = no object.
@@ -254,7 +256,7 @@ class Mapper(Map):
             DataError: The pixel is outside of the image, or no frame is mapped yet.
         """
         camera = camera or self._camera
-        T_world_camera = self._T_world_camera if T_world_camera is None else T_world_camera
+        T_world_camera = self._T_world_color if T_world_camera is None else T_world_camera
         if camera is None or T_world_camera is None:
             raise DataError("Mapper.at_pixel: expected a mapped frame, got none; call add first")
         return super().at_pixel(u, v, camera, T_world_camera)

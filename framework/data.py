@@ -23,7 +23,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from numbers import Integral, Real
-from typing import cast
+from typing import ClassVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -111,6 +111,7 @@ class FrameTruth:
 
     instance_ids: Int32 = field(repr=False)  # (H, W)
     class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
+    of_depth: ClassVar[bool] = False  # True = at the pose of the depth image, False = of the color image
 
     def __post_init__(self) -> None:
         check_array("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
@@ -126,6 +127,8 @@ class DeferredTruth(FrameTruth):
 
     Each access raises the errors of `render`. It raises DataError if `render` does not return int32 of `shape`.
     """
+
+    of_depth = True
 
     def __init__(
         self,
@@ -167,6 +170,8 @@ class Frame:
     T_world_camera: Float64 | None = None  # (4, 4) ground truth
     truth: FrameTruth | None = None
     up: Float64 | None = None  # (3,) unit vector opposite to measured gravity, camera frame; None = no sensor
+    color_timestamp: float | None = None  # s, of the color image; None = timestamp
+    depth_timestamp: float | None = None  # s, of the depth image; None = timestamp
 
     def __post_init__(self) -> None:
         index, camera = cast(object, self.index), cast(object, self.camera)  # the caller may pass any type
@@ -175,8 +180,10 @@ class Frame:
         where = f"frame {self.index}: "
         if not isinstance(camera, Camera):
             raise DataError(f"{where}camera: expected a Camera, got {type(camera).__name__}")
-        if not isinstance(self.timestamp, int | float | np.integer | np.floating) or not math.isfinite(self.timestamp):
-            raise DataError(f"{where}timestamp: expected a finite number of seconds, got {self.timestamp!r}")
+        times = {"timestamp": self.timestamp, "color_timestamp": self.color_time, "depth_timestamp": self.depth_time}
+        for name, time in times.items():
+            if not isinstance(time, int | float | np.integer | np.floating) or not math.isfinite(time):
+                raise DataError(f"{where}{name}: expected a finite number of seconds, got {time!r}")
         check_array(where + "color", self.color, (*self.camera.shape, 3), np.uint8)
         check_array(where + "depth", self.depth, self.camera.shape, np.float32)
         if self.depth.size and self.depth.min() < 0:
@@ -195,6 +202,16 @@ class Frame:
         if self.truth is not None and self.truth.shape != self.camera.shape:
             raise DataError(f"{where}truth.instance_ids: expected shape {self.camera.shape}, got {self.truth.shape}")
 
+    @property
+    def color_time(self) -> float:
+        """Timestamp of the color image, s."""
+        return self.timestamp if self.color_timestamp is None else self.color_timestamp
+
+    @property
+    def depth_time(self) -> float:
+        """Timestamp of the depth image, s."""
+        return self.timestamp if self.depth_timestamp is None else self.depth_timestamp
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -206,6 +223,20 @@ class Pose:
 
     def __post_init__(self) -> None:
         check_rigid("Pose.T_world_camera", self.T_world_camera)
+
+
+@dataclass(frozen=True)
+class DelayEstimate:
+    """An estimate of the delay between color and depth."""
+
+    seconds: float  # time from depth to color with equal timestamps, s
+    deviation: float  # standard deviation, s; infinite = unknown
+    frames: int  # number of compared frames
+
+    @property
+    def known(self) -> bool:
+        """True if there is an estimate, which may be inaccurate."""
+        return math.isfinite(self.deviation)
 
 
 @dataclass(frozen=True)

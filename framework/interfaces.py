@@ -73,6 +73,13 @@ class RGBDVideo(ABC):
         """Return the ground-truth instances visible in the selected frames; None = no annotation."""
         return None
 
+    def constant_color_delay(self) -> float | None:
+        """Return the time from depth to color with equal timestamps, s; None = unknown, to be estimated.
+
+        The true time of a color image is its timestamp plus this delay, on the clock of the depth images.
+        """
+        return 0.0
+
 
 class RGBDSequence(RGBDVideo):
     """A recorded or rendered RGB-D sequence with random access.

@@ -12,7 +12,7 @@ from itertools import count
 from pathlib import Path
 from typing import cast
 
-from framework.data import Array, Detections, Frame, Pose
+from framework.data import Array, Detections, Float64, Frame, Pose
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.interfaces import (
@@ -33,6 +33,7 @@ from framework.runtime.cpu_budget import CoreSharing, parallel_kernels_are_threa
 from framework.runtime.frame_stream import FrameStream, Turns, map_ahead, stream_of
 from framework.runtime.run_log import Journal, RunResult, StageTime
 from framework.runtime.signals import Interruption, signals_deferred
+from framework.tracking.color_to_depth import ColorToDepth
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +64,8 @@ class Pipeline:
         if self.prefetch < 0:
             raise ConfigError(f"Pipeline.prefetch: expected at least 0 frames, got {self.prefetch}; set it to 0")
         self.viewer = GuardedViewer(self.viewer)
+        self.color_to_depth = ColorToDepth(delay=None)
+        self.T_world_color: Float64 | None = None  # pose of the last frame's color camera
 
     def run(self, video: RGBDVideo) -> RunResult:
         """Map `video` frame by frame.
@@ -99,6 +102,7 @@ class Pipeline:
             frames = "its frames" if frames_expected is None else f"the {frames_expected} frames"
             raise DataError(f"{video.name}: expected ground-truth poses, got none for {frames}; {WITHOUT_POSES}")
         warn_outside_domain(self.detector, video)
+        self.color_to_depth = ColorToDepth(video.constant_color_delay())
         journal = Journal(self.fuser.scene, frames_expected, self.tracker.pose_source)
         with (
             watched(self.viewer, self.fuser.scene, video.name, directory),
@@ -118,7 +122,7 @@ class Pipeline:
                 journal.stopped_by = None  # the normal end; a second signal raises another Interrupted
         elif journal.frames_in_map == 0 or self.fuser.scene.statistics.voxels == 0:
             raise DataError(f"{video.name}: {self.empty_map_reason(journal)}")
-        return replace(journal.result(), keyframes=keyframes)
+        return replace(journal.result(), keyframes=keyframes, color_delay=self.color_to_depth.estimate)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
         """Return the keyframes of the tracker. An error of the last frame is raised only now, and ends the run."""
@@ -239,14 +243,15 @@ class Pipeline:
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
         """Track, lift, refine and fuse one frame. Raises FrameError if it is unusable."""
         with journal.timed(frame.index, "tracking"):
-            pose = self.tracker.track(frame, self.fuser.scene)
-        if not isinstance(cast(object, pose), Pose):
-            raise DataError(f"frame {frame.index}: expected a Pose from the tracker, got {type(pose).__name__}")
+            pose = self.tracker.track(self.color_to_depth.predicted(frame), self.fuser.scene)
+            if not isinstance(cast(object, pose), Pose):
+                raise DataError(f"frame {frame.index}: expected a Pose from the tracker, got {type(pose).__name__}")
+            frame, self.T_world_color, color_pixels = self.color_to_depth.tracked(frame, pose)
         journal.frame_tracked(frame, pose)
         if pose.lost:
             return pose
         with journal.timed(frame.index, "lifting"):
-            clusters = lift(detections, frame, pose)
+            clusters = lift(detections, frame, pose, color_pixels)
         with journal.timed(frame.index, "refinement"):
             clusters = refine(self.refiner, clusters, frame)
         journal.frames_in_map += 1

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from framework.checking import Finding, Verdict, pose_fit, registration
+from framework.checking.color_timing import check_color_delay
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_delay import delayed, find_delay
 from framework.checking.pose_fit import PLAUSIBLE, USUAL_SCALES, PoseJudgment
@@ -97,6 +98,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     motion_finding = _check_motion(steps, len(neighbors), sequence.camera.width)
     findings += [*judgment.findings, registration_finding, motion_finding, _check_sharpness(frames)]
     findings += _check_times(sequence)
+    findings.append(check_color_delay(sequence, matcher))
     camera = sequence.camera
     summary = (
         f"{sequence.name}: {count} frames of {camera.width}x{camera.height} px, fx {camera.fx:.4g} px; "
@@ -158,6 +160,9 @@ class DelayedDepth(RGBDSequence):
     def __post_init__(self) -> None:
         self.camera: Camera = self.sequence.camera
         self.name = self.sequence.name
+
+    def constant_color_delay(self) -> float | None:
+        return self.sequence.constant_color_delay()
 
     def __len__(self) -> int:
         return len(self.sequence)

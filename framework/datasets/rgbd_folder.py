@@ -5,13 +5,14 @@
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw
+    timestamps.txt      optional; color depth, one line per frame: timestamps of the two images, s
     gravity.txt         optional; x y z, one line per frame: up in the camera, from a sensor; nan nan nan = unknown
     instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class = a
                                             COCO name, or null = unknown
 
 The files of a frame have the same number in their names. Numbers may start at any value and have gaps. Names with
-timestamps, such as 1305031102.175304.png, are invalid. Line k of poses.txt and gravity.txt belongs to the k-th frame in
-ascending order. Comments and empty lines are not counted.
+timestamps, such as 1305031102.175304.png, are invalid. Line k of poses.txt, timestamps.txt and gravity.txt belongs to
+the k-th frame in ascending order. Comments and empty lines are not counted.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from framework.data import Float64, FrameTruth, Int32, SceneTruth
+from framework.data import FrameTruth, Int32, SceneTruth
 from framework.datasets.calibration.camera_json import read_camera
 from framework.datasets.frames.numbered_images import numbered_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording, StoredImages
@@ -33,7 +34,7 @@ from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_trut
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import is_there
 from framework.files.image_files import read_uint16
-from framework.files.number_lines import read_gravity
+from framework.files.number_lines import read_gravity, read_image_times
 from framework.files.tum_trajectory import TumLine, read_tum_lines
 
 LARGEST_ID = 2**16 - 1  # of an instance, because instance images are uint16
@@ -64,11 +65,13 @@ class RgbdFolder(Recording):
         self._class_names, self._instances = self._read_instances(color)
         lines = _read_optional(self.folder / "poses.txt", read_tum_lines, "poses", len(color))
         ups = _read_optional(self.folder / "gravity.txt", read_gravity, "directions", len(color))
+        times = _read_optional(self.folder / "timestamps.txt", read_image_times, "timestamps", len(color))
         self._has_poses = lines is not None
         frames = []
         for k, number in enumerate(color):
             images = StoredImages.of_files(color[number], depth[number])
-            frames.append(_recorded(images, k, lines[k] if lines else None, ups[k] if ups else None))
+            frame = _recorded(images, k, lines[k] if lines else None, times[k] if times else None)
+            frames.append(replace(frame, up=ups[k] if ups else None))
         return Contents(camera, path, depth_scale, frames, distortion)
 
     def truth_in(self, index: int) -> FrameTruth | None:
@@ -116,10 +119,16 @@ class RgbdFolder(Recording):
         return class_names, list(images.values())
 
 
-def _recorded(images: StoredImages, index: int, line: TumLine | None, up: Float64 | None) -> RecordedFrame:
+def _recorded(
+    images: StoredImages, index: int, line: TumLine | None, times: tuple[float, float] | None
+) -> RecordedFrame:
+    """Return a frame with its pose and the timestamps of its images. Without a pose, it has the timestamp of color."""
+    color, depth = times or (None, None)
     if line is None:
-        return RecordedFrame(images, index / FRAME_RATE, up=up)
-    return replace(RecordedFrame.posed(images, line.timestamp, line.pose), up=up)
+        frame = RecordedFrame(images, index / FRAME_RATE if color is None else color)
+    else:
+        frame = RecordedFrame.posed(images, line.timestamp, line.pose)
+    return replace(frame, color_timestamp=color, depth_timestamp=depth)
 
 
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:

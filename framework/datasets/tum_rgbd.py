@@ -17,7 +17,7 @@ import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -97,7 +97,8 @@ class TumRgbd(Recording):
         frames = []
         for i, j in pairs:
             images, time = StoredImages.of_files(color[i].path, depth[j].path), color[i].timestamp
-            frames.append(RecordedFrame.posed(images, time, partial(truth.at, time)))
+            recorded = RecordedFrame.posed(images, time, partial(truth.at, time))
+            frames.append(replace(recorded, color_timestamp=time, depth_timestamp=depth[j].timestamp))
         return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None)
 
     def _stored_camera(self) -> tuple[StoredCamera, Path | str]:

@@ -21,6 +21,7 @@ from framework.geometry import nearest_rigid
 SHOWN = 60  # maximum number of characters of a file in an error message
 COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is NaN in Microsoft's C library
 GRAVITY_COLUMNS = "x y z"
+IMAGE_TIME_COLUMNS = "color depth"
 SHORTEST, LONGEST = 1e-6, 1e6  # limits of the length of a direction, in any unit
 
 _NO_NUMBER = re.compile(r"[+-]?(1\.#\w+|nan\(\w+\))", re.ASCII | re.IGNORECASE)
@@ -66,6 +67,31 @@ def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for up in ups:
             file.write("nan nan nan\n" if up is None else " ".join(f"{value:.9f}" for value in up) + "\n")
+
+
+def read_image_times(path: Path) -> list[tuple[float, float]]:
+    """Read the timestamps of each frame, s: `color depth` per line. Empty lines, and comments after `#`, are skipped.
+
+    Raises DataError.
+    """
+    words = [(n, COMMENT.sub("", line).split()) for n, line in enumerate(read_lines(path), start=1)]
+    times = []
+    for n, found in words:
+        if not found:
+            continue
+        color, depth = numbers(f"{path}, line {n}", found, 2, IMAGE_TIME_COLUMNS)
+        if not (math.isfinite(color) and math.isfinite(depth)):
+            raise DataError(f"{path}, line {n}: expected finite timestamps, got {' '.join(found)!r}")
+        times.append((color, depth))
+    return times
+
+
+def write_image_times(path: Path, times: Sequence[tuple[float, float]]) -> None:
+    """Write the timestamps of color and depth of each frame, s, in the format of `read_image_times`."""
+    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(f"# {IMAGE_TIME_COLUMNS}\n")
+        for color, depth in times:
+            file.write(f"{color:.9f} {depth:.9f}\n")
 
 
 def _direction(where: str, words: Sequence[str]) -> Float64 | None:

@@ -18,7 +18,7 @@ from framework.datasets.calibration.color_registration import ColorRegistration
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
 from framework.files.json_file import write_json
-from framework.files.number_lines import write_gravity
+from framework.files.number_lines import write_gravity, write_image_times
 from framework.files.tum_trajectory import write_tum
 from framework.importing.depth_resampling import upsampled
 from framework.importing.phones.image_rotation import QUARTER, Turn
@@ -62,6 +62,7 @@ class Written:
     timestamps: list[float] = field(default_factory=list)  # s, of the written frames
     poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of these frames; empty without poses
     errors: list[str] = field(default_factory=list)  # message of each skipped frame
+    depth_timestamps: list[float | None] = field(default_factory=list)  # s; None = the timestamp of color
     ups: list[Float64 | None] = field(default_factory=list)  # (3,) up in the camera before rotation; None = unknown
 
     def __str__(self) -> str:
@@ -78,7 +79,7 @@ def check_new(directory: Path) -> None:
 
 
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
-    """Write the frames, their poses and up directions, and finally camera.json.
+    """Write the frames, their poses, timestamps and up directions, and finally camera.json.
 
     Unusable frames are skipped. Raises DataError if `directory` is not empty, no frame is usable, or a file cannot be
     written.
@@ -104,12 +105,17 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
         written.timestamps.append(frame.timestamp)
         if frame.T_world_camera is not None:
             written.poses.append(turn.pose(frame.T_world_camera))
+        written.depth_timestamps.append(frame.depth_timestamp)
         written.ups.append(frame.up)
     if camera is None:
         reason = f"first error: {written.errors[0]}" if written.errors else "the recording has no frames"
         raise DataError(f"expected usable frames, got none; {reason}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
+    if any(time is not None for time in written.depth_timestamps):
+        pairs = zip(written.timestamps, written.depth_timestamps, strict=True)
+        times = [(color, color if depth is None else depth) for color, depth in pairs]
+        write_image_times(directory / "timestamps.txt", times)
     if any(up is not None for up in written.ups):
         ups = [None if up is None else turn.R_turned_camera @ up for up in written.ups]
         write_gravity(directory / "gravity.txt", ups)

@@ -33,6 +33,7 @@ class DeviceFrame:
     confidence: UInt8 | None = None  # (h, w), of the depth, from UNSURE to SURE; None = unknown
     T_world_camera: Float64 | None = None  # (4, 4), None = unknown
     up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = unknown
+    depth_timestamp: float | None = None  # s, of the depth image, if `timestamp` is of color; None = the same
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.timestamp):

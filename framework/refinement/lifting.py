@@ -6,14 +6,16 @@ from typing import cast
 
 import numpy as np
 
-from framework.data import Detections, Frame, PointClusters, Pose
+from framework.data import Detections, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
-from framework.refinement.lifting_kernels import count_readings, gather_readings
+from framework.refinement.lifting_kernels import count_readings, gather_readings, move_masks
 
 
-def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
+def lift(detections: Detections, frame: Frame, pose: Pose, color_pixels: Int32 | None = None) -> PointClusters:
     """Return each mask's pixels with a depth reading as points in the world frame.
 
+    `color_pixels` (H, W) is the flat index of the color pixel at each depth reading, -1 = none; None = the same pixel.
+    It does not apply to exact masks of the depth image.
     Masks may overlap. A mask without depth readings gives an empty cluster, so that cluster k is detection k. Raises
     DataError if the mask size differs from the frame size or if `detections` has another type.
     """
@@ -22,14 +24,19 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
     height, width = frame.depth.shape
     if detections.masks.shape[1:] != (height, width):
         raise DataError(f"frame {frame.index}: expected masks of {(height, width)}, got {detections.masks.shape[1:]}")
+    masks = detections.masks
+    of_depth = detections.exact and frame.truth is not None and frame.truth.of_depth
+    if color_pixels is not None and not of_depth:
+        masks = np.empty_like(masks)
+        move_masks(detections.masks, color_pixels, masks)
     starts = np.zeros(len(detections) * height + 1, np.int64)  # first point of each row of each mask
-    count_readings(detections.masks, frame.depth, starts)
+    count_readings(masks, frame.depth, starts)
     np.cumsum(starts, out=starts)
     points_world = np.empty((starts[-1], 3), np.float32)
     pixels = np.empty((starts[-1], 2), np.int32)
     cluster = np.empty(starts[-1], np.int32)
     camera = (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy)
-    gather_readings(detections.masks, frame.depth, camera, pose.T_world_camera, starts, points_world, pixels, cluster)
+    gather_readings(masks, frame.depth, camera, pose.T_world_camera, starts, points_world, pixels, cluster)
     return PointClusters(
         points_world=points_world,
         pixels=pixels,

@@ -8,6 +8,18 @@ from framework.data import Bool, Float32, Float64, Int32, Int64
 
 
 @njit(cache=True, nogil=True, parallel=True)
+def move_masks(masks: Bool, color_pixels: Int32, moved: Bool) -> None:
+    """Set moved (N, H, W) to the masks (N, H, W) at the flat indices color_pixels (H, W), False for -1."""
+    count, height, width = masks.shape
+    for v in prange(height):
+        for k in range(count):
+            mask = masks[k].ravel()
+            for u in range(width):
+                index = color_pixels[v, u]
+                moved[k, v, u] = mask[index] if index >= 0 else False
+
+
+@njit(cache=True, nogil=True, parallel=True)
 def count_readings(masks: Bool, depth: Float32, counts: Int64) -> None:
     """Set counts[1:] (N * H,) to the number of depth readings in each row of each mask."""
     height = depth.shape[0]

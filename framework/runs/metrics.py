@@ -34,7 +34,10 @@ TRUTH = "truth_sha256"  # key of the hash of the ground truth
 
 
 def run_metrics(result: RunResult) -> Metrics:
-    """Return counts, speed, stage times and map size. For live video, add dropped frames and latency."""
+    """Return counts, speed, stage times, map size and the estimated color delay.
+
+    For live video, add dropped frames and latency.
+    """
     metrics: Metrics = {
         "frames": result.frames,
         "frames_lost": result.frames_lost,
@@ -48,6 +51,9 @@ def run_metrics(result: RunResult) -> Metrics:
         milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
         metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None
         metrics[f"stage_ms.{stage}.p95"] = float(np.percentile(milliseconds, 95)) if milliseconds else None
+    if result.color_delay is not None and result.color_delay.known:
+        metrics["color_delay_s"] = result.color_delay.seconds
+        metrics["color_delay_deviation_s"] = result.color_delay.deviation
     if result.live is not None:
         latencies = 1e3 * np.array(result.live.latencies)
         metrics["frames_dropped"] = result.live.frames_dropped

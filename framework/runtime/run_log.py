@@ -14,7 +14,7 @@ from typing import get_args
 import numpy as np
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from framework.data import Array, Float64, Frame, Pose
+from framework.data import Array, DelayEstimate, Float64, Frame, Pose
 from framework.errors import FrameError, NoPoseError
 from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
 from framework.runtime.progress import Progress
@@ -71,6 +71,7 @@ class RunResult:
     pose_source: str = PoseTracker.pose_source
     live: LiveFigures | None = None  # None = a recording
     keyframes: Mapping[str, Array] = field(default_factory=dict)  # of the tracker
+    color_delay: DelayEstimate | None = None  # None = given, not estimated
 
     @property
     def frames_lost(self) -> int:

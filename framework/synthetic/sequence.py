@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from framework.config.validation import require
 from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, SceneTruth
+from framework.datasets.frames.conventions import AUTO, LONGEST_COLOR_DELAY, color_delay_of
 from framework.datasets.frames.sequence_reader import TO_THE_END, check_selection, choose_frames
 from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.detection.domain import RENDERED_ROOMS
@@ -40,6 +42,8 @@ class Synthetic(RGBDSequence):
     height: int = 480  # height of the images, px
     noise: float = 1.0  # scale of the sensor noise; 0 = none, 1 = Kinect v1
     max_depth: float = 6.0  # range of the sensor, m
+    simulated_color_delay: float = 0.0  # time from depth to color, with equal timestamps, s, in [-0.2, 0.2]
+    color_delay: str = AUTO  # this time as known by the pipeline, s, in [-0.2, 0.2]; AUTO = estimated
     start: int = 0  # index of the first frame
     stop: int = TO_THE_END  # index after the last frame; -1 = to the end
     stride: int = 1  # step between frames; 1 = every frame
@@ -59,6 +63,9 @@ class Synthetic(RGBDSequence):
             raise ConfigError(f"dataset.noise: expected 0 (exact) or a positive value, got {self.noise}")
         if not self.max_depth > 0:
             raise ConfigError(f"dataset.max_depth: expected a value > 0 m, got {self.max_depth}")
+        delay, limit = self.simulated_color_delay, LONGEST_COLOR_DELAY
+        require(abs(delay) <= limit, "dataset.simulated_color_delay", delay, f"a value in [-{limit:g}, {limit:g}] s")
+        color_delay_of(self.color_delay)
         check_truth_voxel(self.ground_truth_spacing)
         self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride, self.frame_fraction, self.seed)
         self.name = self.scene
@@ -83,20 +90,25 @@ class Synthetic(RGBDSequence):
     def __len__(self) -> int:
         return len(self._chosen)
 
+    def constant_color_delay(self) -> float | None:
+        return color_delay_of(self.color_delay)
+
     def __getitem__(self, k: int) -> Frame:
         index = self._chosen[k]
         T_world_camera = self.path.pose(index)
-        picture = self._renderer.render(self.camera, T_world_camera)
+        picture = seen = self._renderer.render(self.camera, T_world_camera)
+        if self.simulated_color_delay:
+            seen = self._renderer.render(self.camera, self.path.pose(index + self.simulated_color_delay * FRAME_RATE))
         rng = np.random.default_rng([self.seed, self._stream, index])
         depth = self._sensor.measure(picture.depth, picture.incidence, self.camera, rng)
         return Frame(
             index=index,
             timestamp=index / FRAME_RATE,
-            color=noisy_color(picture.color, self.noise, rng),
+            color=noisy_color(seen.color, self.noise, rng),
             depth=depth,
             camera=self.camera,
             T_world_camera=T_world_camera,
-            truth=FrameTruth(picture.instance_ids, self.class_names),
+            truth=FrameTruth(seen.instance_ids, self.class_names),
         )
 
     def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:

@@ -15,6 +15,7 @@ from framework.config.validation import check_bounds
 from framework.data import Frame, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
 from framework.datasets.calibration.undistortion import Distortion
+from framework.datasets.frames.conventions import AUTO, color_delay_of
 from framework.errors import DataError, FrameError, in_one_line
 from framework.interfaces import FrameReader, LiveVideo
 
@@ -35,12 +36,17 @@ class DepthCamera(LiveVideo):
     height: int = 480  # height of the color image, px, in [64, 4096]
     fps: int = 30  # frame rate, Hz, in [1, 300]; size and rate must be a mode of the device
     max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
+    color_delay: str = AUTO  # time from depth to color with equal timestamps, s, in [-0.2, 0.2]; AUTO = estimated
 
     def __post_init__(self) -> None:
         check_bounds(self, width=(64, 4096), height=(64, 4096), fps=(1, 300))
         check_max_depth(self.max_depth)
+        color_delay_of(self.color_delay)
         self.name = "_".join(filter(None, (self.brand.lower(), self.serial)))
         self.errors: tuple[type[Exception], ...] = (RuntimeError,)  # errors of the library
+
+    def constant_color_delay(self) -> float | None:
+        return color_delay_of(self.color_delay)
 
     @abstractmethod
     def start(self) -> None:
@@ -61,6 +67,10 @@ class DepthCamera(LiveVideo):
     @abstractmethod
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         """Return copies of color (H, W, 3), RGB, and the registered depth (H, W); None = missing."""
+
+    def depth_after_color(self, images: Any) -> float | None:
+        """Return the time from the color to the depth image by the device's clock, s; None = unknown."""
+        return None
 
     def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:
         """Return the lens distortion, or None without distortion. Unsupported models are logged and ignored."""
@@ -105,7 +115,11 @@ class DepthCamera(LiveVideo):
                 f"frame {number}: expected color and depth, got no {'color' if color is None else 'depth'}"
             )
         color = calibration.color(color, f"frame {number}: color")
-        return Frame(number, timestamp, color, calibration.depth(depth, f"frame {number}: depth"), calibration.camera)
+        depth_after = self.depth_after_color(images)
+        return Frame(
+            number, timestamp, color, calibration.depth(depth, f"frame {number}: depth"), calibration.camera,
+            depth_timestamp=None if depth_after is None else timestamp + depth_after,
+        )  # fmt: skip
 
 
 def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images | None]:

@@ -57,6 +57,12 @@ class Orbbec(DepthCamera):
         distortion = self.distortion(coefficients, lens.model, self._brown_conrady)
         return Calibration(camera, self.name, MILLIMETERS / depth.get_depth_scale(), self.max_depth, distortion)
 
+    def depth_after_color(self, images: Any) -> float | None:
+        color, depth = images.get_color_frame(), images.get_depth_frame()
+        if color is None or depth is None:
+            return None
+        return float(depth.get_timestamp_us() - color.get_timestamp_us()) / 1e6
+
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         registered = self._align.process(images)
         both = registered.as_frame_set() if registered is not None else None

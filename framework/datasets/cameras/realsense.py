@@ -44,6 +44,12 @@ class RealSense(DepthCamera):
         distortion = self.distortion(found.coeffs, found.model, self._rs.distortion.brown_conrady)
         return Calibration(camera, self.name, 1 / unit, self.max_depth, distortion)
 
+    def depth_after_color(self, images: Any) -> float | None:
+        color, depth = images.get_color_frame(), images.get_depth_frame()
+        if not color or not depth or color.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain():
+            return None
+        return float(depth.get_timestamp() - color.get_timestamp()) / 1000  # from ms
+
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         registered = self._align.process(images)
         color, depth = registered.get_color_frame(), registered.get_depth_frame()

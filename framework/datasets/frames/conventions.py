@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -17,6 +18,8 @@ from framework.geometry import inverse
 
 COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # depth units per meter; most sensors have 1000
 LONGEST_DELAY = 1000  # frames
+AUTO = "AUTO"  # value of `dataset.color_delay`: estimated
+LONGEST_COLOR_DELAY = 0.2  # s
 
 
 class PoseKind(Enum):
@@ -81,6 +84,19 @@ class PoseReading:
             T = inverse(T)
         T[:3, :3] = T[:3, :3] @ self.camera_axes.R_axes_camera
         return T
+
+
+def color_delay_of(parameter: str) -> float | None:
+    """Return the value of `dataset.color_delay` in s; None = AUTO. Raises ConfigError for other values."""
+    if parameter == AUTO:
+        return None
+    try:
+        delay = float(parameter)
+    except ValueError:
+        delay = math.nan
+    limit = LONGEST_COLOR_DELAY
+    require(abs(delay) <= limit, "dataset.color_delay", parameter, f"{AUTO} or a value in [-{limit:g}, {limit:g}] s")
+    return delay
 
 
 @dataclass(frozen=True)

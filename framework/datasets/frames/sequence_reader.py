@@ -28,7 +28,13 @@ from framework.data import (
 )
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
 from framework.datasets.calibration.undistortion import Distortion
-from framework.datasets.frames.conventions import DepthReading, PoseReading
+from framework.datasets.frames.conventions import (
+    AUTO,
+    LONGEST_COLOR_DELAY,
+    DepthReading,
+    PoseReading,
+    color_delay_of,
+)
 from framework.datasets.ground_truth.labeled_mesh import unseen
 from framework.datasets.ground_truth.named_truth import KEY, NamedTruth, read_named_truth
 from framework.errors import ConfigError, DataError, FrameError
@@ -69,6 +75,8 @@ class RecordedFrame:
     T_world_camera: Float64 | None = None  # (4, 4), None = unknown
     error: str = ""  # reason of an unusable frame; "" = usable
     up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = unknown
+    color_timestamp: float | None = None  # s, of the color image; None = timestamp
+    depth_timestamp: float | None = None  # s, of the depth image; None = timestamp
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
@@ -112,10 +120,12 @@ class Recording(RGBDSequence):
     ground_truth: Path | None = None  # labeled mesh or run directory for the evaluation; None = the recording's own
     pose_reading: PoseReading = field(default_factory=PoseReading)
     depth_reading: DepthReading = field(default_factory=DepthReading)
+    color_delay: str = AUTO  # time from depth to color with equal timestamps, s, in [-0.2, 0.2]; AUTO = estimated
 
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.frame_fraction)
         check_max_depth(self.max_depth)
+        color_delay_of(self.color_delay)
         self.root = folder_of(Path(self.root))
         self.folder = self.root / self.scene
         if not self.folder.is_dir():
@@ -126,7 +136,8 @@ class Recording(RGBDSequence):
         stored = self.open()
         depth_scale = self.depth_reading.depth_scale or stored.depth_scale
         posed = [_posed(frame, self.pose_reading) for frame in delay_poses(stored.frames, self.pose_reading.pose_delay)]
-        frames = delay_depth(_in_order_of_time(self.name, posed), self.depth_reading.depth_delay)
+        ordered = _in_order_of_time(self.name, _with_plausible_image_times(self.name, posed))
+        frames = delay_depth(ordered, self.depth_reading.depth_delay)
         self.contents = replace(stored, frames=frames, depth_scale=depth_scale)
         self.camera = stored.camera
         self.calibration = Calibration(
@@ -145,6 +156,9 @@ class Recording(RGBDSequence):
     def truth_in(self, index: int) -> FrameTruth | None:
         """Return the recording's own ground-truth instances in stored frame `index`, or None if they are unknown."""
         return None
+
+    def constant_color_delay(self) -> float | None:
+        return color_delay_of(self.color_delay)
 
     def own_scene_truth(self) -> SceneTruth | None:
         """Return the recording's own ground-truth instances in the world frame of its poses.
@@ -190,6 +204,8 @@ class Recording(RGBDSequence):
             T_world_camera=recorded.T_world_camera,
             truth=self._frame_truth(index),
             up=recorded.up,
+            color_timestamp=recorded.color_timestamp,
+            depth_timestamp=recorded.depth_timestamp,
         )
 
     def metric_depth(self, index: int) -> Float32:
@@ -248,11 +264,31 @@ def delay_depth(frames: Sequence[RecordedFrame], delay: int) -> Sequence[Recorde
     for frame, other in _with_later(frames, delay):
         if other:
             images = replace(frame.images, depth_name=other.images.depth_name, depth=other.images.depth)
-            moved.append(replace(frame, images=images))
+            moved.append(without_image_times(replace(frame, images=images)) if delay else frame)
         else:
             error = frame.error or f"expected a depth image at an offset of {delay} frames, got none"
             moved.append(replace(frame, error=error))
     return moved
+
+
+def without_image_times(frame: RecordedFrame) -> RecordedFrame:
+    """Return the frame without separate timestamps of color and depth."""
+    return replace(frame, color_timestamp=None, depth_timestamp=None)
+
+
+def _with_plausible_image_times(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
+    """Return the frames, without separate timestamps of color and depth if some are implausible."""
+    offsets = [
+        frame.color_timestamp - frame.depth_timestamp
+        for frame in frames
+        if frame.color_timestamp is not None and frame.depth_timestamp is not None
+    ]
+    largest = max(offsets, key=abs, default=0.0)
+    if abs(largest) <= LONGEST_COLOR_DELAY:
+        return frames
+    message = "%s: expected timestamps of color and depth within %g s of each other, got %.6g s; not used"
+    log.warning(message, name, LONGEST_COLOR_DELAY, largest)
+    return [without_image_times(frame) for frame in frames]
 
 
 def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[RecordedFrame, RecordedFrame | None]]:
@@ -279,7 +315,7 @@ def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[Re
     if all(a < b for a, b in pairwise(times)):
         return frames
     log.warning("%s: expected increasing timestamps; using a frame rate of %g Hz", name, FRAME_RATE)
-    return [replace(recorded, timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
+    return [replace(without_image_times(recorded), timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
 
 
 def check_selection(start: int, stop: int, stride: int, frame_fraction: float = 1.0) -> None:

@@ -17,7 +17,7 @@ Frames are in the depth camera (640x480); color (1296x968) is registered to it.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +101,9 @@ def _sens_contents(path: Path) -> Contents:
     frames = []
     for frame in file.frames:
         images = registered_images(frame.images, registration)
-        frames.append(RecordedFrame.posed(images, frame.depth_time / MICROSECONDS, frame.camera_to_world.pose))
+        color_time, depth_time = frame.color_time / MICROSECONDS, frame.depth_time / MICROSECONDS
+        recorded = RecordedFrame.posed(images, depth_time, frame.camera_to_world.pose)
+        frames.append(replace(recorded, color_timestamp=color_time, depth_timestamp=depth_time))
     lost = range(len(frames), header.frames)
     if lost:
         log.warning("%s: the last %d of %d frames are missing: %s", path, len(lost), header.frames, file.cut)

@@ -131,26 +131,26 @@ def _is_frame(word: str) -> bool:
     return word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1
 
 
-def read_timestamps(path: Path) -> Mapping[int, float]:
-    """Return the depth timestamp (s) of each image, by image number.
+def read_timestamps(path: Path) -> Mapping[int, tuple[float, float]]:
+    """Return the timestamps of color and depth (s) of each image, by image number.
 
     Raises DataError that names the file and the line for an invalid line or a repeated image number.
     """
-    times: dict[int, float] = {}
+    times: dict[int, tuple[float, float]] = {}
     for n, line in enumerate(read_lines(path), start=1):
         words = line.split()
         if not words:
             continue
         try:
-            image, _color, depth = int(words[0]), *map(float, words[1:])
+            image, color, depth = int(words[0]), *map(float, words[1:])
         except ValueError as error:
             expected = f"expected `number color_us depth_us`, got {line[:SHOWN]!r}"
             raise DataError(f"{path}, line {n}: {expected}") from error
-        if not math.isfinite(depth):
-            raise DataError(f"{path}, line {n}: expected a finite timestamp, got {words[2]}")
+        if not (math.isfinite(color) and math.isfinite(depth)):
+            raise DataError(f"{path}, line {n}: expected finite timestamps, got {words[1]} {words[2]}")
         if image in times:
             raise DataError(f"{path}, line {n}: expected unique image numbers, got {image} twice")
-        times[image] = depth / MICROSECONDS
+        times[image] = color / MICROSECONDS, depth / MICROSECONDS
     return times
 
 

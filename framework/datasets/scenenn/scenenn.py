@@ -72,21 +72,26 @@ class SceneNN(LabeledRecording):
         times = _optional_times(self.folder / "timestamp.txt", list(images))
         self.load_mesh([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
         self.annotation = self.release or _named_release(self.root) if self.mesh else ""
-        frames = [_recorded(pair, k - 1, poses, times.get(k, (k - 1) / FRAME_RATE)) for k, pair in images.items()]
+        frames = [_recorded(pair, k - 1, poses, times.get(k)) for k, pair in images.items()]
         fx, fy, cx, cy = read_intrinsics(self.root / "intrinsic" / f"{self.sensor}.ini")
         camera = Camera(*first_size(colors.values(), read_color), fx, fy, cx, cy)
         return Contents(camera, "the first color image", DEPTH_SCALE, frames)
 
 
-def _recorded(images: StoredImages, pose_id: int, poses: TrajectoryLog | None, timestamp: float) -> RecordedFrame:
+def _recorded(
+    images: StoredImages, pose_id: int, poses: TrajectoryLog | None, times: tuple[float, float] | None
+) -> RecordedFrame:
+    """Return a frame with its timestamps of color and depth (s); None = unknown."""
+    color, depth = times or (None, None)
+    timestamp = pose_id / FRAME_RATE if depth is None else depth
     T_world_camera = poses.poses.get(pose_id) if poses else None
     if poses is None or T_world_camera is not None:
-        return RecordedFrame(images, timestamp, T_world_camera)
+        return RecordedFrame(images, timestamp, T_world_camera, color_timestamp=color, depth_timestamp=depth)
     why = poses.unusable.get(pose_id, "expected a pose in trajectory.log, got none")
     return RecordedFrame(images, timestamp, error=f"{images.color_name}: {why}")
 
 
-def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:
+def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[float, float]]:
     """Return the timestamps (s) of all images, or no timestamps if some are missing, so that clocks are not mixed."""
     if not is_there(path):
         return {}

@@ -76,6 +76,7 @@ class Pair:
     color: int
     depth: int
     timestamp: float  # s, of color
+    depth_timestamp: float  # s
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class Device:
         return DeviceFrame(
             name=where,
             timestamp=pair.timestamp,
+            depth_timestamp=pair.depth_timestamp,
             camera=self.camera,
             color=color_of(f"{where}: {color.topic}", self.bag.decoded(color)),
             depth=metric,
@@ -138,7 +140,7 @@ def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> l
     # the indices of first occurrences are sorted to restore the recording order
     colors, depths = (sorted(np.unique(times, return_index=True)[1].tolist()) for times in (color_times, depth_times))
     pairs = associate([color_times[i] for i in colors], [depth_times[j] for j in depths], APART)
-    return [Pair(colors[i], depths[j], color_times[colors[i]]) for i, j in pairs]
+    return [Pair(colors[i], depths[j], color_times[colors[i]], depth_times[depths[j]]) for i, j in pairs]
 
 
 def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:

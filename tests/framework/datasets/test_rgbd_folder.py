@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from framework.datasets.frames.conventions import DepthReading
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError, FrameError
 
@@ -518,3 +519,49 @@ def test_invalid_gravity_file_raises(folder, content, output):
     (folder / "gravity.txt").write_text(content)
     with pytest.raises(DataError, match=output):
         RgbdFolder(folder)
+
+
+def test_rgbd_folder_timestamps_file_gives_times_of_both_images(folder):
+    (folder / "timestamps.txt").write_text("# color depth\n" + "".join(f"{k}.25 {k}.26\n" for k in range(FRAMES)))
+    frame = RgbdFolder(folder)[2]
+    assert (frame.timestamp, frame.color_time, frame.depth_time) == (0.2, 2.25, 2.26)
+    (folder / "poses.txt").unlink()
+    assert RgbdFolder(folder)[2].timestamp == 2.25
+    (folder / "timestamps.txt").unlink()
+    frame = RgbdFolder(folder)[2]
+    assert frame.color_time == frame.depth_time == frame.timestamp
+
+
+@pytest.mark.parametrize(
+    ("content", "output"),
+    [
+        ("1 1\n" * 3, r"timestamps\.txt: expected one line per frame, got 3 timestamps for 4 frames in color/"),
+        ("1 1\n" * 3 + "1\n", r"timestamps\.txt, line 4: expected 2 numbers \(color depth\), got 1"),
+        ("1 1\n" * 3 + "nan 1\n", r"timestamps\.txt, line 4: expected finite timestamps, got 'nan 1'"),
+    ],
+)
+def test_rgbd_folder_invalid_timestamps_file_raises(folder, content, output):
+    (folder / "timestamps.txt").write_text(content)
+    with pytest.raises(DataError, match=output):
+        RgbdFolder(folder)
+
+
+def test_rgbd_folder_times_far_apart_are_not_used(folder, caplog):
+    (folder / "timestamps.txt").write_text("".join(f"{k} {k + 9}\n" for k in range(FRAMES)))
+    frame = RgbdFolder(folder)[1]
+    assert frame.color_time == frame.depth_time == frame.timestamp
+    assert "expected timestamps of color and depth within 0.2 s of each other, got -9 s; not used" in caplog.text
+
+
+def test_recording_depth_delay_drops_times_of_images(folder):
+    (folder / "timestamps.txt").write_text("".join(f"{k}.25 {k}.26\n" for k in range(FRAMES)))
+    frame = RgbdFolder(folder, depth_reading=DepthReading(depth_delay=1))[0]
+    assert frame.color_time == frame.depth_time == frame.timestamp
+
+
+def test_recording_color_delay_is_given_or_estimated(folder):
+    assert RgbdFolder(folder).constant_color_delay() is None
+    assert RgbdFolder(folder, color_delay="0.02").constant_color_delay() == 0.02
+    for wrong in ("0.3", "soon", "nan"):
+        with pytest.raises(ConfigError, match=r"dataset\.color_delay: expected AUTO or a value in \[-0\.2, 0\.2\] s"):
+            RgbdFolder(folder, color_delay=wrong)

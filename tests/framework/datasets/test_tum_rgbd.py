@@ -304,3 +304,9 @@ def test_image_size_mismatch_raises(folder: Path) -> None:
 def test_time_tolerance_out_of_range_raises(folder: Path, value: float) -> None:
     with pytest.raises(ConfigError, match=r"dataset\.max_time_difference: expected a value in \(0, 1\] s"):
         TumRgbd(folder, max_time_difference=value)
+
+
+def test_tum_rgbd_frame_has_times_of_both_images(folder: Path) -> None:
+    frame = TumRgbd(folder)[1]
+    assert frame.timestamp == frame.color_time == color_time(1)
+    assert frame.depth_time == pytest.approx(color_time(1) + DEPTH_DELAY, abs=1e-6)

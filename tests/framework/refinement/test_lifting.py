@@ -49,3 +49,23 @@ def test_lift_mask_size_mismatch_raises(room: CornerRoom) -> None:
     one = np.ones((1, 1), np.float32)
     with pytest.raises(DataError, match=r"frame 0: expected masks of \(72, 96\), got \(1, 1\)"):
         lift(Detections(masks, np.zeros((1, 4), np.float32), one[0], one, ("a",)), frame, Pose(np.eye(4)))
+
+
+def test_lift_reads_masks_at_color_pixels(room: CornerRoom) -> None:
+    """The pixel map shifts masks by 5 px; -1 belongs to no mask."""
+    frame = room[3]
+    height, width = frame.camera.shape
+    masks = np.zeros((2, height, width), np.bool_)
+    masks[0, 20:30, 40:50] = True
+    masks[1, :, :10] = True
+    half = np.full((2, 2), 0.5, np.float32)
+    detections = Detections(masks, np.zeros((2, 4), np.float32), np.ones(2, np.float32), half, ("a", "b"))
+    color_pixels = np.full((height, width), -1, np.int32)
+    color_pixels[:, 5:] = np.arange(height * width).reshape(height, width)[:, :-5]
+    clusters = lift(detections, frame, Pose(pose_at(3)), color_pixels)
+    expected = np.zeros_like(masks)
+    expected[:, :, 5:] = masks[:, :, :-5]
+    expected &= frame.depth > 0
+    found = np.zeros_like(masks)
+    found[clusters.cluster, clusters.pixels[:, 1], clusters.pixels[:, 0]] = True
+    np.testing.assert_array_equal(found, expected)

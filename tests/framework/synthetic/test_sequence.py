@@ -189,3 +189,14 @@ def test_scene_truth_lies_on_exact_surface(exact):
 def test_synthetic_parameter_out_of_range_raises(values, name):
     with pytest.raises(ConfigError, match=name):
         Synthetic(**values)
+
+
+def test_synthetic_simulated_color_delay_moves_color_and_truth():
+    """Two frames are 1/30 s apart, so a delay of 1/30 s shows the color of the next frame."""
+    plain = Synthetic(seed=1, noise=0.0, **SMALL)
+    late = Synthetic(seed=1, noise=0.0, simulated_color_delay=1 / 30, **SMALL)
+    np.testing.assert_array_equal(late[3].depth, plain[3].depth)
+    np.testing.assert_array_equal(late[3].color, plain[4].color)
+    np.testing.assert_array_equal(late[3].truth.instance_ids, plain[4].truth.instance_ids)
+    assert late.constant_color_delay() is None
+    assert Synthetic(seed=1, color_delay="0.01", **SMALL).constant_color_delay() == 0.01

@@ -16,6 +16,7 @@ from tests.support.scenes.corner_room import CAMERA, CornerRoom
 
 UNIT = 0.00025  # m, of the stored depth
 SERIAL = "0123456789"
+DEPTH_AFTER_COLOR_US = 4000  # time from the color to the depth image, microseconds
 
 
 @dataclass
@@ -66,7 +67,8 @@ class _Images:
     def get_depth_frame(self) -> SimpleNamespace | None:
         if self.k == self.camera.without_depth:
             return None
-        return _image(np.round(CornerRoom()[self.k].depth / UNIT).astype(np.uint16), 0 if self.registered else 5)
+        shift = 0 if self.registered else 5
+        return _image(np.round(CornerRoom()[self.k].depth / UNIT).astype(np.uint16), shift, DEPTH_AFTER_COLOR_US)
 
     def of_color(self) -> _Images:
         self.camera.registered += 1
@@ -76,13 +78,19 @@ class _Images:
         return self
 
 
-def _image(pixels: np.ndarray, shift: int = 0) -> SimpleNamespace:
+def _image(pixels: np.ndarray, shift: int = 0, time_us: int = 0) -> SimpleNamespace:
     """An image, moved by so many pixels where it is of another camera than the color."""
     pixels = np.roll(pixels, shift, axis=1)
     pixels.setflags(write=False)  # it is the library's
     height, width = pixels.shape[:2]
     return SimpleNamespace(
-        get_data=lambda: pixels, get_width=lambda: width, get_height=lambda: height, get_depth_scale=lambda: 1000 * UNIT
+        get_data=lambda: pixels,
+        get_width=lambda: width,
+        get_height=lambda: height,
+        get_depth_scale=lambda: 1000 * UNIT,
+        get_frame_timestamp_domain=lambda: "hardware",
+        get_timestamp=lambda: 1e-3 * time_us,  # ms
+        get_timestamp_us=lambda: time_us,
     )
 
 

@@ -74,7 +74,11 @@ def test_convert_oni_color_and_depth_keep_own_timestamps(tmp_path, monkeypatch, 
     deliver(monkeypatch, 3)
     convert_oni.convert(source, tmp_path / "011")
     assert (tmp_path / "011/timestamp.txt").read_text() == "1 7 0\n2 1007 1000\n3 2007 2000\n"
-    assert read_timestamps(tmp_path / "011/timestamp.txt") == {1: 0.0, 2: 0.001, 3: 0.002}
+    assert read_timestamps(tmp_path / "011/timestamp.txt") == {
+        1: (0.000007, 0.0),
+        2: (0.001007, 0.001),
+        3: (0.002007, 0.002),
+    }
 
 
 def test_convert_oni_skipped_images_are_counted(tmp_path, monkeypatch, capsys, source):

@@ -20,7 +20,14 @@ from framework.datasets.cameras.realsense import RealSense
 from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import LiveVideo
 from tests.support.scenes.corner_room import CAMERA, CornerRoom
-from tests.support.scenes.fake_cameras import SERIAL, UNIT, FakeCamera, orbbec_module, realsense_module
+from tests.support.scenes.fake_cameras import (
+    DEPTH_AFTER_COLOR_US,
+    SERIAL,
+    UNIT,
+    FakeCamera,
+    orbbec_module,
+    realsense_module,
+)
 
 
 @dataclass(frozen=True)
@@ -189,3 +196,9 @@ def test_orbbec_waits_for_first_depth_frame(monkeypatch: pytest.MonkeyPatch) -> 
 def test_camera_parameter_out_of_range_raises(brand: Brand, parameter: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match=next(iter(parameter))):
         brand.video(**parameter)
+
+
+def test_camera_frame_has_time_of_depth_image(brand: Brand, device: FakeCamera) -> None:
+    [frame] = sent(brand.video(), 1)
+    assert frame.color_time == frame.timestamp
+    assert frame.depth_time - frame.color_time == pytest.approx(1e-6 * DEPTH_AFTER_COLOR_US, abs=1e-6)

@@ -350,3 +350,12 @@ def test_inverted_header_or_frame_byte_is_read_or_raises(tmp_path: Path) -> None
     content = sens(shots(1))
     for k in range(12 + 15 + 256 + 36 + 96):
         check(read_all, path, content[:k] + bytes([content[k] ^ 0xFF]) + content[k + 1 :])
+
+
+def test_scannet_sens_file_gives_times_of_both_images(tmp_path: Path) -> None:
+    frames = shots()
+    for k, frame in enumerate(frames):
+        frame.times = (100_000 * k, 100_000 * k + 5_000)
+    as_sens(tmp_path / SCENE, frames)
+    frame = ScanNet(tmp_path, SCENE)[1]
+    assert (frame.timestamp, frame.color_time, frame.depth_time) == (0.105, 0.1, 0.105)

@@ -218,3 +218,11 @@ def test_sensor_selects_intrinsics_file(root: Path) -> None:
         SceneNN(root, "016", sensor=SceneNNSensor.KINECT2)
     write_intrinsics(root / "intrinsic" / "kinect2.ini", Camera(32, 24, 29.0, 28.0, 16.0, 12.0))
     assert SceneNN(root, "016", sensor=SceneNNSensor.KINECT2).camera.fx == 29.0
+
+
+def test_scenenn_timestamp_file_gives_times_of_both_images(root: Path) -> None:
+    times = {k: 7 + k / 10 for k in range(1, FRAMES + 1)}
+    write_timestamps(root / "016" / "timestamp.txt", times, {k: time - 0.01 for k, time in times.items()})
+    frame = SceneNN(root, "016")[0]
+    assert (frame.timestamp, frame.depth_time) == (7.1, 7.1)
+    assert frame.color_time == pytest.approx(7.09)

@@ -527,3 +527,16 @@ def test_missing_package_error_names_extra(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(ConfigError, match=r"rosbags: expected an installed package \(it reads ROS bags\), got none"):
         open_source(tmp_path / "a.bag")
+
+
+def test_ros_bag_import_writes_times_of_both_images(tmp_path: Path) -> None:
+    bag = BagWriter()
+    for k in range(COUNT):
+        color, depth = seen(k)
+        bag.add_image(time_of(k), "/camera/color/image_raw", color, "rgb8")
+        bag.add_image(time_of(k) + 0.004, "/camera/depth_registered/image", millimeters(depth), "16UC1")
+    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM)
+    imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    frame = RgbdFolder(tmp_path / "out")[1]
+    assert frame.color_time == pytest.approx(time_of(1), abs=1e-6)
+    assert frame.depth_time - frame.color_time == pytest.approx(0.004, abs=1e-6)

@@ -1,0 +1,182 @@
+"""Estimation of the delay between color and depth, from edges and the camera's motion.
+
+Depth edges of a frame, moved by the camera's motion over a time d, coincide with color edges if d is the time between
+the two images. For each compared frame k, the delay d_k has the largest mean color gradient at the moved depth edges.
+Its error in px is constant. An inaccurate registration adds a constant offset o (px). With the mean image motion v_k
+(px / s) of the edges and its direction n_k:
+
+    |v_k| d_k = |v_k| d + n_k . o + noise
+
+Robust regression (Tukey's biweight) over the compared frames gives the delay d. Its standard deviation is a jackknife
+over blocks of frames, because errors of nearby frames are correlated. Slow frames are not compared. A camera that turns
+to one side at a constant rate does not determine d, and the standard deviation is then large.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from framework.data import DelayEstimate, Float32, Float64, Frame
+from framework.geometry import back_project, pose_distance, project
+from framework.tracking.color_delay_kernels import find_edges, mean_gradients
+from framework.tracking.pyramid import intrinsics
+
+TESTED_DELAYS = np.linspace(-0.1, 0.1, 41)  # s
+HISTORY = 7  # number of successive frames with known motion; the frame in the middle is compared
+MAX_STEP = 0.2  # s, maximum time between successive frames
+WIDTH = 320  # px, width of the compared images
+MAX_GRADIENT = 200.0  # Sobel units; stronger gradients are clipped, so that lamps do not dominate
+MIN_EDGES, MAX_EDGES = 100, 1500  # number of edge points of a compared frame
+MIN_SPEED = 0.125  # minimum image motion of a compared frame, image widths per s
+EVERY, MANY, EVERY_LATER = 1, 60, 8  # every frame is compared, after 60 comparisons every 8th frame
+MIN_COMPARISONS = 16  # minimum number of compared frames for an estimate
+BLOCKS = 8  # number of blocks of the jackknife
+MAX_DEVIATION = 0.002  # s, maximum standard deviation of a usable estimate ...
+MAX_RELATIVE_DEVIATION = 0.2  # ... or, if larger, the maximum as a fraction of the estimate
+CUT_OFF = 4.685  # standard deviations with weight 0 in Tukey's biweight
+ITERATIONS = 10  # of the robust regression
+
+
+UNKNOWN = DelayEstimate(0.0, np.inf, 0)
+
+
+def is_usable(estimate: DelayEstimate) -> bool:
+    """Return True if the estimate is accurate enough to register color by it."""
+    return estimate.deviation <= max(MAX_DEVIATION, MAX_RELATIVE_DEVIATION * abs(estimate.seconds))
+
+
+class _Tracked(NamedTuple):
+    frame: Frame
+    T_world_camera: Float64
+    number: int  # of the tracked frame
+
+
+class DelayEstimator:
+    """Online estimation of the delay of color."""
+
+    def __init__(self) -> None:
+        self.estimate = UNKNOWN
+        self._recent: deque[_Tracked] = deque(maxlen=HISTORY)
+        self._number = 0
+        self._comparisons: list[tuple[float, float, float]] = []  # delay, s, and mean image motion, px / s
+        self._strengths = np.zeros(len(TESTED_DELAYS))  # sum over the compared frames
+
+    def add(self, frame: Frame, T_world_camera: Float64) -> bool:
+        """Add a frame that follows the previous one. Return True if the estimate has changed."""
+        if self._recent and not 0 < frame.depth_time - self._recent[-1].frame.depth_time <= MAX_STEP:
+            self.interrupt()
+        self._recent.append(_Tracked(frame, T_world_camera, self._number))
+        self._number += 1
+        every = EVERY if len(self._comparisons) < MANY else EVERY_LATER
+        if len(self._recent) < HISTORY or self._recent[HISTORY // 2].number % every or not self._compare():
+            return False
+        if len(self._comparisons) >= MIN_COMPARISONS:
+            start = float(TESTED_DELAYS[self._strengths.argmax()])
+            self.estimate = regress(np.array(self._comparisons), start)
+        return True
+
+    def interrupt(self) -> None:
+        """Forget the recent frames, because the motion to the next frame is unknown."""
+        self._recent.clear()
+
+    def _compare(self) -> bool:
+        """Compare color and depth of the frame in the middle. Return False if it is slow or has too few edges."""
+        before, (frame, T_world_camera, _), after = (self._recent[HISTORY // 2 + k] for k in (-1, 0, 1))
+        camera = frame.camera
+        seconds = after.frame.depth_time - before.frame.depth_time
+        least = MIN_SPEED * camera.width  # px / s
+        if pose_distance(before.T_world_camera, after.T_world_camera) * camera.fx < least * seconds:
+            return False
+        points = edge_points(frame)
+        if len(points) < MIN_EDGES:
+            return False
+        times = np.array([one.frame.depth_time for one in self._recent])
+        poses = np.array([one.T_world_camera for one in self._recent])
+        at = np.concatenate([frame.color_time + TESTED_DELAYS, [before.frame.depth_time, after.frame.depth_time]])
+        moved = np.linalg.inv(poses_at(times, poses, at)) @ T_world_camera  # T_color_depth at each time
+        motion = [project(camera, points @ T[:3, :3].T + T[:3, 3]) for T in moved[-2:]]
+        velocity = (motion[1] - motion[0]).mean(axis=0) / seconds
+        if np.hypot(*velocity) < least:
+            return False
+        gradient, scale = normalized_gradient(frame)
+        strengths = np.empty(len(TESTED_DELAYS))
+        transforms = np.ascontiguousarray(moved[:-2, :3], np.float32)
+        mean_gradients(points, transforms, intrinsics(camera), np.float32(scale), gradient, strengths)
+        self._strengths += strengths
+        best = int(strengths.argmax())
+        if not 0 < best < len(TESTED_DELAYS) - 1:
+            return False
+        low, high, next_ = strengths[best - 1 : best + 2]
+        vertex = (low - next_) / (low - 2 * high + next_) / 2
+        delay = TESTED_DELAYS[best] + vertex * (TESTED_DELAYS[1] - TESTED_DELAYS[0])
+        self._comparisons.append((float(delay), float(velocity[0]), float(velocity[1])))
+        return True
+
+
+def edge_points(frame: Frame) -> Float32:
+    """Return points (P, 3), m, on depth edges in the camera frame, P <= MAX_EDGES."""
+    edges = np.empty((frame.depth.size // 8, 3), np.float32)
+    edges = edges[: find_edges(frame.depth, edges)]
+    edges = edges[:: len(edges) // MAX_EDGES + 1]
+    return back_project(frame.camera, np.ascontiguousarray(edges[:, :2]), np.ascontiguousarray(edges[:, 2]))
+
+
+def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
+    """Return the smoothed color gradient (h, WIDTH) with mean 0 and standard deviation 1, and its scale."""
+    scale = min(WIDTH / frame.camera.width, 1.0)
+    gray = cv2.resize(
+        cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
+    )
+    gradient = cv2.magnitude(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
+    gradient = cv2.GaussianBlur(np.minimum(gradient, np.float32(MAX_GRADIENT)), (0, 0), 1.0)
+    deviation = max(float(gradient.std()), 1e-6)
+    return np.asarray((gradient - gradient.mean()) / np.float32(deviation), np.float32), scale
+
+
+def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
+    """Return the poses (A, 4, 4) at the times (A,), s, from poses (P, 4, 4) at increasing times (P,), s.
+
+    Translation is linear and rotation spherical linear between neighboring poses, and beyond the first and the last.
+    """
+    k = np.clip(np.searchsorted(times, at) - 1, 0, len(times) - 2)
+    fractions = (at - times[k]) / (times[k + 1] - times[k])
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    steps = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec()
+    found = np.tile(np.eye(4), (len(at), 1, 1))
+    found[:, :3, :3] = R[k] @ Rotation.from_rotvec(fractions[:, None] * steps[k]).as_matrix()
+    found[:, :3, 3] = t[k] + fractions[:, None] * (t[k + 1] - t[k])
+    return found
+
+
+def regress(comparisons: Float64, start: float) -> DelayEstimate:
+    """Return the estimate of the delay from comparisons (K, 3): delay, s, and image motion (x, y), px / s.
+
+    The regression starts at a delay of `start` s without an offset.
+    """
+    delays, speeds = comparisons[:, 0], np.hypot(comparisons[:, 1], comparisons[:, 2])
+    shifts = speeds * delays  # px
+    X = np.column_stack([speeds, comparisons[:, 1:] / speeds[:, None]])
+    solution = np.array([start, 0.0, 0.0])
+    for _ in range(ITERATIONS):
+        residuals = shifts - X @ solution
+        scale = max(1.4826 * float(np.median(np.abs(residuals))), 0.1)
+        weights = np.maximum(1 - (residuals / (CUT_OFF * scale)) ** 2, 0) ** 2
+        solution = _solution(X, shifts, weights)
+    without = []  # delays without one of the blocks
+    for block in np.array_split(np.arange(len(delays)), BLOCKS):
+        rest = weights.copy()
+        rest[block] = 0
+        without.append(_solution(X, shifts, rest)[0])
+    deviation = float(np.sqrt((BLOCKS - 1) * np.var(without)))
+    return DelayEstimate(float(solution[0]), deviation, len(delays))
+
+
+def _solution(X: Float64, y: Float64, weights: Float64) -> Float64:
+    """Return the weighted least-squares solution, the smallest one if it is not unique."""
+    root = np.sqrt(weights)
+    return np.asarray(np.linalg.lstsq(X * root[:, None], y * root, rcond=None)[0])

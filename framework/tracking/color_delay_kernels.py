@@ -1,0 +1,105 @@
+"""Kernels of color_delay.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+DEPTH_STEP = 0.05  # fraction of the depth; a larger step is an edge
+REACH = 4  # px, maximum width of the missing depth at an edge
+ROWS = 2  # step between the searched rows, px
+
+
+@njit(cache=True, nogil=True)
+def find_edges(depth, edges):
+    """Write (u, v, z) of the pixels on the nearer side of depth steps to edges (N, 3). Return their number, <= N."""
+    height, width = depth.shape
+    count = 0
+    for v in range(REACH, height - REACH, ROWS):
+        for u in range(REACH, width - REACH):
+            z = depth[v, u]
+            if z <= np.float32(0.0):
+                continue
+            behind = z * np.float32(1.0 + DEPTH_STEP)
+            found = False
+            for direction in range(4):
+                du, dv = (
+                    (1, 0) if direction == 0 else (-1, 0) if direction == 1 else (0, 1) if direction == 2 else (0, -1)
+                )
+                for k in range(1, REACH + 1):
+                    neighbor = depth[v + k * dv, u + k * du]
+                    if neighbor > np.float32(0.0):
+                        found = found or neighbor > behind
+                        break
+            if found and count < edges.shape[0]:
+                edges[count, 0], edges[count, 1], edges[count, 2] = u, v, z
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def mean_gradients(points, transforms, intrinsics, scale, gradient, means):
+    """Set means (D,) to the mean gradient at the points (P, 3), m, moved by each of the transforms (D, 3, 4).
+
+    `gradient` (h, w) is at `scale` times the resolution of the intrinsics (fx, fy, cx, cy). Points outside of the image
+    are ignored.
+    """
+    fx, fy, cx, cy = intrinsics
+    half, one = np.float32(0.5), np.float32(1.0)
+    height, width = gradient.shape
+    for d in prange(transforms.shape[0]):
+        T = transforms[d]
+        total = 0.0
+        count = 0
+        for n in range(points.shape[0]):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            px = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+            py = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+            pz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            if pz < np.float32(0.05):
+                continue
+            u = (fx * px / pz + cx + half) * scale - half
+            v = (fy * py / pz + cy + half) * scale - half
+            column, row = np.int32(np.floor(u)), np.int32(np.floor(v))
+            if column < 0 or row < 0 or column + 1 >= width or row + 1 >= height:
+                continue
+            a, b = u - np.float32(column), v - np.float32(row)
+            top = gradient[row, column] * (one - a) + gradient[row, column + 1] * a
+            low = gradient[row + 1, column] * (one - a) + gradient[row + 1, column + 1] * a
+            total += top * (one - b) + low * b
+            count += 1
+        means[d] = total / max(count, 1)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def register(color, depth, otherwise, intrinsics, T_color_depth, registered, pixels):
+    """Set registered (H, W, 3) to the color at each pixel of `depth`, and pixels (H, W) to its flat index.
+
+    The index is -1 outside of the color image and without a reading. The color there is that of the nearest pixel, for
+    a depth of `otherwise` m. Colors are interpolated bilinearly.
+    """
+    fx, fy, cx, cy = intrinsics
+    T = T_color_depth
+    height, width = depth.shape
+    one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
+    right, bottom = np.float32(width - 1), np.float32(height - 1)
+    for v in prange(height):
+        y = (np.float32(v) - cy) / fy
+        for u in range(width):
+            z = depth[v, u]
+            measured = z > zero
+            z = z if measured else otherwise
+            x = (np.float32(u) - cx) / fx
+            px = (T[0, 0] * x + T[0, 1] * y + T[0, 2]) * z + T[0, 3]
+            py = (T[1, 0] * x + T[1, 1] * y + T[1, 2]) * z + T[1, 3]
+            pz = max((T[2, 0] * x + T[2, 1] * y + T[2, 2]) * z + T[2, 3], np.float32(0.05))
+            s, t = fx * px / pz + cx, fy * py / pz + cy
+            inside = (s > -half) & (t > -half) & (s < right + half) & (t < bottom + half)
+            s, t = min(max(s, zero), right), min(max(t, zero), bottom)
+            pixels[v, u] = np.int32(t + half) * width + np.int32(s + half) if inside and measured else -1
+            column, row = min(np.int32(s), width - 2), min(np.int32(t), height - 2)
+            a, b = s - np.float32(column), t - np.float32(row)
+            for i in range(3):
+                top = np.float32(color[row, column, i]) * (one - a) + np.float32(color[row, column + 1, i]) * a
+                low = np.float32(color[row + 1, column, i]) * (one - a) + np.float32(color[row + 1, column + 1, i]) * a
+                registered[v, u, i] = np.uint8(top * (one - b) + low * b + half)

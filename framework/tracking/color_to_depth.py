@@ -1,0 +1,118 @@
+"""Registration of color to depth that show different times, by the motion of the camera.
+
+Color is taken dt = t_color + delay - t_depth after depth, with the timestamps t_color and t_depth of the images and a
+constant delay. With the last two poses, at the times t_last and t_depth, and constant velocity:
+
+    T_world_color = interpolate(T_world_last, T_world_camera, 1 + dt / (t_depth - t_last))
+
+Each depth reading is projected to the color image from there. Depth is not resampled.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.data import DelayEstimate, Float64, Frame, Int32, Pose
+from framework.geometry import interpolate, inverse, rotation_angle
+from framework.tracking.color_delay import DelayEstimator, is_usable
+from framework.tracking.color_delay_kernels import register
+from framework.tracking.pyramid import intrinsics
+
+MAX_STEP = 0.2  # s, maximum time between two poses for a velocity
+MIN_SHIFT = 0.5  # px, minimum image motion between color and depth for a registration
+NEAR = 1.0  # m, depth of the points for this image motion
+STRIDE = 8  # px, step between the depth readings for their median
+
+log = logging.getLogger(__name__)
+
+
+class RegisteredFrame(NamedTuple):
+    """A frame with color registered to depth."""
+
+    frame: Frame  # with the color at each depth pixel
+    T_world_color: Float64  # (4, 4) pose of the color camera
+    color_pixels: Int32 | None = (
+        None  # (H, W) flat index of the color pixel at each depth reading, -1 = none; None = same
+    )
+
+
+class ColorToDepth:
+    """Registration of color to depth, with a given or an estimated delay.
+
+    Without a velocity (at the start, and after lost frames) and for motion below MIN_SHIFT, frames are not changed.
+    """
+
+    def __init__(self, delay: float | None) -> None:
+        """Set the delay of color, s. None = estimated."""
+        self._estimator = DelayEstimator() if delay is None else None
+        self._usable = False  # True once the estimate was accurate enough
+        self._given = 0.0 if delay is None else delay
+        self._last: tuple[float, Float64] | None = None  # time, s, and pose of the last frame
+        self._step: tuple[float, Float64] | None = None  # time, s, and motion T_last_next of the last step
+
+    @property
+    def estimate(self) -> DelayEstimate | None:
+        """The estimated delay, None if the delay is given."""
+        return None if self._estimator is None else self._estimator.estimate
+
+    @property
+    def delay(self) -> float:
+        """The delay in use, s; 0 until it is known."""
+        return self._given if self._estimator is None or not self._usable else self._estimator.estimate.seconds
+
+    def predicted(self, frame: Frame) -> Frame:
+        """Return the frame with color registered by the last velocity, for tracking."""
+        if self._last is None or self._step is None or not 0 < frame.depth_time - self._last[0] <= MAX_STEP:
+            return frame
+        return self._registered(frame, np.eye(4), *self._step).frame
+
+    def tracked(self, frame: Frame, pose: Pose) -> RegisteredFrame:
+        """Return the frame with color registered by the motion to its pose, and take the pose for later frames."""
+        if pose.lost:
+            self._last = self._step = None
+            if self._estimator is not None:
+                self._estimator.interrupt()
+            return RegisteredFrame(frame, pose.T_world_camera)
+        last, self._last = self._last, (frame.depth_time, pose.T_world_camera)
+        self._step = None
+        if last is not None and 0 < frame.depth_time - last[0] <= MAX_STEP:
+            self._step = frame.depth_time - last[0], inverse(last[1]) @ pose.T_world_camera
+        if self._estimator is not None:
+            self._estimator.add(frame, pose.T_world_camera)
+            self._use(frame, self._estimator.estimate)
+        if self._step is None:
+            return RegisteredFrame(frame, pose.T_world_camera)
+        return self._registered(frame, pose.T_world_camera, *self._step)
+
+    def _use(self, frame: Frame, estimate: DelayEstimate) -> None:
+        """Use the estimate from its first accurate value on, and log this value."""
+        if self._usable or not is_usable(estimate):
+            return
+        self._usable = True
+        message = "frame %d: color is %.1f ms after depth with equal timestamps (standard deviation %.1f ms)"
+        log.info(message, frame.index, 1e3 * estimate.seconds, 1e3 * estimate.deviation)
+
+    def _registered(
+        self, frame: Frame, T_world_camera: Float64, seconds: float, T_last_next: Float64
+    ) -> RegisteredFrame:
+        """Return the registered frame for the motion of a step of this duration."""
+        dt = frame.color_time + self.delay - frame.depth_time
+        if dt == 0.0:
+            return RegisteredFrame(frame, T_world_camera)
+        T_depth_color = inverse(T_last_next) @ interpolate(np.eye(4), T_last_next, 1 + dt / seconds)
+        T_world_color = T_world_camera @ T_depth_color
+        camera = frame.camera
+        shift = camera.fx * (rotation_angle(T_depth_color[:3, :3]) + math.hypot(*T_depth_color[:3, 3]) / NEAR)
+        readings = frame.depth[::STRIDE, ::STRIDE]
+        readings = readings[readings > 0]
+        if shift < MIN_SHIFT or not len(readings) or min(camera.shape) < 2:
+            return RegisteredFrame(frame, T_world_color)
+        color, pixels = np.empty_like(frame.color), np.empty(camera.shape, np.int32)
+        T_color_depth = np.ascontiguousarray(inverse(T_depth_color)[:3], np.float32)
+        register(frame.color, frame.depth, np.median(readings), intrinsics(camera), T_color_depth, color, pixels)
+        return RegisteredFrame(replace(frame, color=color), T_world_color, pixels)

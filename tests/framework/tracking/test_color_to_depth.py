@@ -1,0 +1,140 @@
+"""Tests of the registration of color to depth by the camera's motion."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.data import Camera, Float64, Frame, Pose
+from framework.geometry import inverse
+from framework.tracking.color_delay_kernels import register
+from framework.tracking.color_to_depth import ColorToDepth
+from framework.tracking.pyramid import intrinsics
+from tests.framework.tracking.test_color_delay import delayed_frames
+from tests.support.scenes.analytic_scene import CAMERA, Scene
+
+SCENE = Scene([(np.array([0.0, 0.0, -1.0]), -2.0)], [(np.array([0.1, 0.0, 1.3]), 0.3)])
+
+
+def moving(t: float) -> Float64:
+    """Return the pose of a camera with constant velocity: 0.3 m/s and 0.8 rad/s."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0.3 * t, 0.7 * t, 0.2 * t]).as_matrix()
+    T[:3, 3] = [0.3 * t, 0, 0]
+    return T
+
+
+def frame_at(t: float, delay: float, index: int = 0) -> Frame:
+    """Return a frame whose color was taken `delay` s after depth."""
+    depth, _, _ = SCENE.render(CAMERA, moving(t))
+    _, color, _ = SCENE.render(CAMERA, moving(t + delay))
+    return Frame(index, t, color, depth, CAMERA)
+
+
+def error(frame: Frame, expected: np.ndarray) -> float:
+    """Return the mean color difference without the border, where color is outside of the image."""
+    inner = np.s_[12:-12, 12:-12]
+    return float(np.abs(frame.color[inner].astype(float) - expected[inner]).mean())
+
+
+@pytest.mark.parametrize("delay", [-0.03, 0.02, 0.04])
+def test_color_to_depth_registers_color_at_constant_velocity(delay: float) -> None:
+    registration = ColorToDepth(delay)
+    frames = [frame_at(k / 30, delay, k) for k in range(3)]
+    for frame in frames[:2]:
+        registration.tracked(frame, Pose(moving(frame.timestamp)))
+    _, expected, _ = SCENE.render(CAMERA, moving(frames[2].timestamp))
+    predicted = registration.predicted(frames[2])
+    found = registration.tracked(frames[2], Pose(moving(frames[2].timestamp)))
+    before = error(frames[2], expected)
+    assert before > 3
+    assert error(predicted, expected) < before / 5
+    assert error(found.frame, expected) < before / 5
+    assert found.frame.depth is frames[2].depth
+    np.testing.assert_allclose(found.T_world_color, moving(frames[2].timestamp + delay), atol=2e-4)
+
+
+def test_color_to_depth_pixels_refer_to_color_image() -> None:
+    delay = 0.04
+    registration = ColorToDepth(delay)
+    for k in range(3):
+        frame = frame_at(k / 30, delay, k)
+        found = registration.tracked(frame, Pose(moving(k / 30)))
+    assert found.color_pixels is not None
+    depth, _, _ = SCENE.render(CAMERA, moving(2 / 30))
+    T_color_depth = inverse(moving(2 / 30 + delay)) @ moving(2 / 30)
+    v, u = 60, 40
+    point = depth[v, u] * np.array([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1])
+    x, y, z = T_color_depth[:3, :3] @ point + T_color_depth[:3, 3]
+    expected = CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy
+    row, column = divmod(int(found.color_pixels[v, u]), CAMERA.width)
+    assert abs(column - expected[0]) < 0.6
+    assert abs(row - expected[1]) < 0.6
+
+
+def test_color_to_depth_timestamps_add_to_delay() -> None:
+    """Color 12 ms after depth: a delay of 20 ms, and a timestamp 8 ms before the one of depth."""
+    registration = ColorToDepth(0.02)
+    for k in range(3):
+        frame = replace(frame_at(k / 30, 0.012, k), color_timestamp=k / 30 - 0.008, depth_timestamp=k / 30)
+        found = registration.tracked(frame, Pose(moving(k / 30)))
+    np.testing.assert_allclose(found.T_world_color, moving(2 / 30 + 0.012), atol=2e-4)
+
+
+def test_color_to_depth_without_delay_keeps_frame() -> None:
+    registration = ColorToDepth(0.0)
+    for k in range(3):
+        frame = frame_at(k / 30, 0, k)
+        assert registration.predicted(frame) is frame
+        found = registration.tracked(frame, Pose(moving(k / 30)))
+        assert found.frame is frame
+        assert found.color_pixels is None
+        np.testing.assert_array_equal(found.T_world_color, moving(k / 30))
+
+
+def test_color_to_depth_lost_frame_restarts_velocity() -> None:
+    registration = ColorToDepth(0.04)
+    for k in range(3):
+        registration.tracked(frame_at(k / 30, 0.04, k), Pose(moving(k / 30)))
+    lost = frame_at(3 / 30, 0.04, 3)
+    assert registration.tracked(lost, Pose(moving(2 / 30), lost=True)).frame is lost
+    later = frame_at(4 / 30, 0.04, 4)
+    assert registration.predicted(later) is later
+    assert registration.tracked(later, Pose(moving(4 / 30))).frame is later
+
+
+def test_color_to_depth_slow_camera_keeps_frame() -> None:
+    registration = ColorToDepth(0.04)
+    for k in range(3):
+        frame = replace(frame_at(0, 0, k), timestamp=k / 30)
+        found = registration.tracked(frame, Pose(moving(1e-4 * k)))
+        assert found.frame is frame
+
+
+def test_color_to_depth_estimated_delay_is_used_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+    registration = ColorToDepth(None)
+    with caplog.at_level(logging.INFO):
+        for frame, pose in delayed_frames(0.03):
+            found = registration.tracked(frame, Pose(pose))
+    assert registration.delay == pytest.approx(0.03, abs=0.002)
+    assert found.color_pixels is not None
+    assert len(caplog.messages) == 1
+    assert "ms after depth with equal timestamps" in caplog.messages[0]
+
+
+def test_register_identity_returns_same_image() -> None:
+    rng = np.random.default_rng(0)
+    camera = Camera(40, 30, 35.0, 35.0, 19.5, 14.5)
+    color = rng.integers(0, 256, (30, 40, 3), np.uint8)
+    depth = rng.uniform(1, 2, (30, 40)).astype(np.float32)
+    depth[3, 4] = 0
+    registered, pixels = np.empty_like(color), np.empty((30, 40), np.int32)
+    register(color, depth, np.float32(1.5), intrinsics(camera), np.eye(4, dtype=np.float32)[:3], registered, pixels)
+    np.testing.assert_array_equal(registered, color)
+    expected = np.arange(1200, dtype=np.int32).reshape(30, 40)
+    expected[3, 4] = -1
+    np.testing.assert_array_equal(pixels, expected)
