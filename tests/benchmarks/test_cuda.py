@@ -130,7 +130,7 @@ def run(detector: Any, frames: Sequence[Frame]) -> tuple[list[float], list[Detec
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_cuda_detector(
+def test_cuda_detector_speed_and_agreement(
     benchmark: BenchmarkFixture, images: Callable[[str], list[Frame]], tables_of_detectors: tuple[Table, Table],
     shared: Path, tmp_path: Path, name: str,
 ) -> None:  # fmt: skip
@@ -159,7 +159,7 @@ def test_cuda_detector(
             agreement.rows.append([name, setting, *Agreement.of(expected[:n], found[:n]).cells()])
 
 
-def test_cuda_slam(benchmark: BenchmarkFixture, shared: Path, tables: list[Table]) -> None:
+def test_cuda_slam_speed(benchmark: BenchmarkFixture, shared: Path, tables: list[Table]) -> None:
     """Our loop on the CPU and Open3D's on both devices, on the same frames in turns."""
     kitchen = red_kitchen(shared, LAST)
     ours = SlamLoop(VoxelHashingIcp(), assemble(BayesianTsdf, voxel_size=VOXEL_SIZE))

@@ -39,19 +39,19 @@ def ellipses() -> Detections:
 
 
 @pytest.mark.parametrize("reads", [("color",), FRAME_FIELDS], ids=["color", "everything"])
-def test_frame_hash_speed(benchmark: BenchmarkFixture, reads: tuple[str, ...]) -> None:
+def test_detection_cache_frame_hash_speed(benchmark: BenchmarkFixture, reads: tuple[str, ...]) -> None:
     benchmark(frame_hash, noise(), reads)
 
 
-def test_detection_pack_speed(benchmark: BenchmarkFixture) -> None:
+def test_detection_cache_pack_speed(benchmark: BenchmarkFixture) -> None:
     benchmark.extra_info["bytes"] = len(benchmark(pack, ellipses()))
 
 
-def test_detection_unpack_speed(benchmark: BenchmarkFixture) -> None:
+def test_detection_cache_unpack_speed(benchmark: BenchmarkFixture) -> None:
     benchmark(unpack, pack(ellipses()), COCO)
 
 
-def test_second_run_reads_all_detections_from_cache(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
+def test_detection_cache_second_run_detects_nothing(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
     """A network on a real video, then the same video again, from the cache."""
     data = shared / "data" / "redkitchen"
     if not data.is_dir():

@@ -152,7 +152,9 @@ def table(tables: list[Table]) -> Table:
 
 
 @pytest.mark.parametrize("name", [*registered.names("detector"), *RANDOM])
-def test_detectors(benchmark: BenchmarkFixture, table: Table, frames: list[Frame], tmp_path: Path, name: str) -> None:
+def test_detectors_time_and_memory(
+    benchmark: BenchmarkFixture, table: Table, frames: list[Frame], tmp_path: Path, name: str
+) -> None:
     option, made = RANDOM.get(name, (name, None))
     overrides = made(tmp_path) if made else []
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:

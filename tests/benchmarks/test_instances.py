@@ -30,7 +30,7 @@ def mapped() -> tuple[BayesianTsdf, Frame, Pose, PointClusters]:
     return fuser, frame, pose, clusters
 
 
-def test_associate_ten_masks(benchmark, mapped) -> None:
+def test_associate_ten_masks_speed(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
 
     def associate() -> None:
@@ -43,7 +43,7 @@ def test_associate_ten_masks(benchmark, mapped) -> None:
     assert len(fuser.scene.table.records) == MASKS
 
 
-def test_write_labels_of_ten_masks(benchmark, mapped) -> None:
+def test_write_labels_of_ten_masks_speed(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
     points = list_points_by_pixel(clusters, frame.depth.shape)
     overlaps = fuser.association.look_up(fuser.scene, frame, pose, points)
@@ -58,6 +58,6 @@ def test_write_labels_of_ten_masks(benchmark, mapped) -> None:
     benchmark(write_labels)
 
 
-def test_fuse_ten_masks(benchmark, mapped) -> None:
+def test_fuse_ten_masks_speed(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
     benchmark(fuser.fuse, frame, pose, clusters)

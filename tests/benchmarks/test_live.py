@@ -34,7 +34,9 @@ def resident(process: subprocess.Popen[str]) -> int:
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux for the memory of a process")
-def test_live_folder(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, tables: list[Table]) -> None:
+def test_live_folder_latency_and_drops(
+    benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, tables: list[Table]
+) -> None:
     source, watched, place = shared / "data" / "redkitchen", tmp_path / "watched", tmp_path / "run"
     if not source.is_dir():
         pytest.skip(f"{source} is not there")

@@ -45,7 +45,7 @@ def kitchen() -> tuple[BayesianTsdf, Iterator[Frame]]:
     return fuser, frames
 
 
-def test_slam_mesh_update(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
+def test_slam_mesh_update_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
     """The mesh after one more frame."""
     fuser, frames = kitchen
     fuser.scene.mesh()
@@ -53,14 +53,14 @@ def test_slam_mesh_update(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame
     note(benchmark, "update after one frame", len(fuser.scene.mesh().triangles))
 
 
-def test_slam_mesh_full(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
+def test_slam_mesh_full_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
     """The whole mesh with colors and labels."""
     scene = kitchen[0].scene
     benchmark.pedantic(scene.mesh, setup=scene.volume.changed, rounds=20, warmup_rounds=1)
     note(benchmark, "full", len(scene.mesh().triangles))
 
 
-def test_slam_mesh_open3d(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
+def test_slam_mesh_open3d_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
     """Open3D's marching cubes on the same distances, with colors and without labels."""
     volume = open3d_volume(kitchen[0].scene)
     mesh = benchmark.pedantic(volume.extract_triangle_mesh, (0.5,), rounds=5, warmup_rounds=1)

@@ -76,7 +76,7 @@ def default_chain() -> Chain:
     ],
     ids=lambda r: type(r).__name__,
 )
-def test_refine_ten_masks(benchmark, refiner: ClusterRefiner):
+def test_refine_ten_masks_speed(benchmark, refiner: ClusterRefiner):
     clusters, frame = ten_masks()
     refiner.refine(clusters, frame)
     refined = benchmark(refiner.refine, clusters, frame)
@@ -87,7 +87,7 @@ def test_refine_ten_masks(benchmark, refiner: ClusterRefiner):
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_em_agrees_with_scikit_learn_and_is_faster(benchmark):
+def test_gmm_em_agrees_with_scikit_learn_and_is_faster(benchmark):
     """The same points, start and number of iterations: log-likelihoods agree, times are compared."""
     iterations, components = 8, 8
     clusters, frame = ten_masks()
@@ -132,7 +132,7 @@ def test_em_agrees_with_scikit_learn_and_is_faster(benchmark):
 
 
 @pytest.mark.parametrize(("levels", "components"), [(2, 64), (3, 512)])
-def test_tree_fit_is_faster_than_flat_mixture(benchmark, levels: int, components: int):
+def test_gmm_tree_fit_is_faster_than_flat_mixture(benchmark, levels: int, components: int):
     """As many Gaussians, the same kind of start, iterations and points, of ten masks at once: who is faster."""
     clusters, frame = ten_masks()
     sample = surroundings(clusters, frame, Ring()).sampled(10_000)

@@ -6,7 +6,7 @@ from framework.geometry import back_project, inverse, project, transform
 from tests.benchmarks.room_row import CAMERA, FRAMES_A_ROOM, LENGTH, OBJECTS, RoomRow, pose_at
 
 
-def test_frames_repeat_after_one_room() -> None:
+def test_room_row_frames_repeat_after_one_room() -> None:
     walk = RoomRow(FRAMES_A_ROOM + 100)
     now, later = walk[80], walk[80 + FRAMES_A_ROOM]
     np.testing.assert_allclose(now.depth, later.depth, atol=1e-4)
@@ -19,7 +19,7 @@ def test_frames_repeat_after_one_room() -> None:
     np.testing.assert_allclose(step, (LENGTH, 0, 0), atol=1e-9)
 
 
-def test_nearby_frames_show_same_surface() -> None:
+def test_room_row_nearby_frames_show_same_surface() -> None:
     """What one frame measures lies where the next one sees it, but for what is hidden."""
     walk = RoomRow(100)
     one, other = walk[60], walk[64]

@@ -61,7 +61,7 @@ def compiled() -> None:
 
 @pytest.mark.parametrize("voxel_size", VOXEL_SIZES, ids=lambda size: f"{100 * size:.0f}cm")
 @pytest.mark.parametrize("name", ["redkitchen", "synthetic room"], ids=lambda name: name.replace(" ", "_"))
-def test_slam_compared_with_open3d(benchmark, recordings, tables, name: str, voxel_size: float) -> None:
+def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: str, voxel_size: float) -> None:
     """pytest-benchmark's own figures are of our loop with lifting; the setup of a round gives the frame to Open3D."""
     recording = recordings[name]
     duel = Duel(
@@ -120,7 +120,7 @@ def test_slam_compared_with_open3d(benchmark, recordings, tables, name: str, vox
     )
 
 
-def test_slam_long_walk(benchmark, tables) -> None:
+def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
     """2,000 frames through eight rooms that are all alike: the last third costs what the first did, none is late.
 
     From frame 1300 on, five whole rooms from the start, a second loop begins the walk in turns with the first: it sees
@@ -231,7 +231,7 @@ ACCURACY = {("redkitchen", "voxel_hashing_icp"): "ATE <= 25", ("room without noi
 
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("video", ["redkitchen", "room without noise"])
-def test_slam_trajectory(benchmark, walks, trajectories, video: str, tracker: str) -> None:
+def test_slam_trajectory_error(benchmark, walks, trajectories, video: str, tracker: str) -> None:
     """Tracking and mapping, without labels."""
     frames = walks[video]
     slam = TRACKERS[tracker](frames[0])

@@ -125,7 +125,7 @@ def with_nan(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
     return array
 
 
-def test_valid_data_objects_are_accepted() -> None:
+def test_data_objects_accept_valid_values() -> None:
     assert len(detections()) == len(clusters()) == 2
     assert len(Detections.none((3, 4), ("chair",))) == 0
     frame()
@@ -189,7 +189,7 @@ def test_valid_data_objects_are_accepted() -> None:
         (mesh, {"triangles": [[0, 1, 2]]}, "triangles: expected an array of int32, got list"),
     ],
 )
-def test_invalid_data_objects_raise_one_line_error(
+def test_data_objects_invalid_values_raise_one_line_error(
     make: Callable[..., object], changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(DataError, match=message) as caught:

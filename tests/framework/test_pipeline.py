@@ -316,7 +316,7 @@ def working_threads() -> int:
 
 
 @PREFETCH
-def test_ctrl_c_ends_pipeline_after_current_frame(room: CornerRoom, prefetch: int) -> None:
+def test_pipeline_ctrl_c_ends_after_current_frame(room: CornerRoom, prefetch: int) -> None:
     handler, threads = signal.getsignal(signal.SIGINT), working_threads()
     result = pipeline(prefetch, tracker=PressesCtrlC()).run(room)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
@@ -325,7 +325,7 @@ def test_ctrl_c_ends_pipeline_after_current_frame(room: CornerRoom, prefetch: in
     assert working_threads() == threads
 
 
-def test_second_ctrl_c_ends_pipeline_immediately(room: CornerRoom) -> None:
+def test_pipeline_second_ctrl_c_ends_immediately(room: CornerRoom) -> None:
     result = pipeline(tracker=PressesCtrlC(times=2)).run(room)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
     assert len(mapped(result).vertices) == 3
@@ -473,7 +473,7 @@ def test_viewer_end_is_called_once_for_any_end(room: CornerRoom, stages: dict[st
 
 @PREFETCH
 @pytest.mark.parametrize("verb", ["show", "skip", "end"])
-def test_failing_viewer_does_not_affect_run(
+def test_viewer_failure_does_not_affect_run(
     verb: str, prefetch: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> None:

@@ -259,7 +259,7 @@ def test_build_inside_hydra_application_ignores_its_options(tmp_path: Path) -> N
         assert detector() == Probe(Path("w.bin"))
 
 
-def test_conflicting_plugins_package_is_reported(tmp_path: Path) -> None:
+def test_registry_reports_conflicting_plugins_package(tmp_path: Path) -> None:
     (tmp_path / "plugins").mkdir()
     (tmp_path / "plugins" / "__init__.py").write_text("print('imported')\n")
     line = [sys.executable, "-m", "framework", "plugins"]

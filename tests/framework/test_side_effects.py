@@ -212,7 +212,7 @@ print(numba.threading_layer(), stages.fuser.scene.statistics.voxels)
 """
 
 
-def test_detection_without_thread_safe_layer_is_single_threaded() -> None:
+def test_pipeline_without_thread_safe_layer_gives_same_map() -> None:
     found = {}
     for layer in ("omp", "workqueue"):
         done = subprocess.run(

@@ -44,7 +44,7 @@ NEEDY = {  # by option: the first parameter that only the user knows
 
 
 @pytest.mark.parametrize(("stage", "name"), NEEDY)
-def test_missing_required_parameter_or_file_raises(stage: str, name: str) -> None:
+def test_option_missing_required_parameter_or_file_raises(stage: str, name: str) -> None:
     key = f"{stage}.{NEEDY[stage, name]}"
     with pytest.raises(ConfigError, match=rf"expected a value for .*, got none; set .*{key}"):
         registered.built(stage, name)

@@ -48,7 +48,7 @@ def test_default_detector_depends_on_dataset(dataset: str, main: str) -> None:
 
 @pytest.mark.parametrize("dataset", ["synthetic", "rgbd_folder"])
 @pytest.mark.parametrize("detector", ["none", "maskrcnn2go", "mask_rcnn_rooms"])
-def test_explicit_detector_overrides_default(dataset: str, detector: str) -> None:
+def test_default_detector_is_overridden_by_explicit_one(dataset: str, detector: str) -> None:
     for order in ([0, 1], [1, 0]):
         words = [f"dataset={dataset}", f"detector={detector}"]
         assert chosen(*(words[k] for k in order))["detector"] == detector
@@ -67,7 +67,7 @@ def test_experiment_detector_overrides_dataset_not_command_line(experiment: str)
     assert chosen(f"experiment={experiment}", "detector=none")["detector"] == "none"
 
 
-def test_external_dataset_has_default_detector(tmp_path: Path) -> None:
+def test_default_detector_of_external_dataset_is_set(tmp_path: Path) -> None:
     """And one that inherits the rendered rooms inherits their detector."""
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "theirs.yaml").write_text("_target_: theirs.Theirs\n")
@@ -82,11 +82,11 @@ def test_default_dataset_is_desk() -> None:
     assert chosen() == {"dataset": "desk", "detector": "maskrcnn2go"}
 
 
-def test_config_without_dataset_uses_photo_detector() -> None:
+def test_default_detector_without_dataset_is_for_photos() -> None:
     assert composed("~dataset").detector == registered.composed("detector", "maskrcnn2go").detector
 
 
-def test_dataset_sweep_jobs_have_own_default_detector() -> None:
+def test_default_detector_depends_on_dataset_of_sweep_job() -> None:
     """The launcher composes each job from the sweep's own config and the job's overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()

@@ -48,7 +48,7 @@ def test_documented_command_line_is_parsed(command: str, monkeypatch: pytest.Mon
         importlib.import_module(main.module_of(command.split()[3])).main()
 
 
-def test_all_documented_commands_and_scripts_are_tested() -> None:
+def test_documented_commands_and_scripts_are_all_tested() -> None:
     """Every line of a console but those of other programs, such as viewers, and every script."""
     make = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
     looked_at = {*COMMANDS, *RUNNABLE, *PARSED, *BENCHMARKS, *(f"make {target}" for target in make), OWN_PLUGIN}

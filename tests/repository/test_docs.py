@@ -90,7 +90,7 @@ def test_configuration_reference_has_all_parameters(built: Path) -> None:
     assert "seed of all random numbers of a run" in (built / "configuration.html").read_text()
 
 
-def test_plugins_and_parameters_in_pages_exist(built: Path) -> None:
+def test_page_plugins_and_parameters_exist(built: Path) -> None:
     """`fuser=NAME` and `fuser.parameter`, in prose and commands: the configuration reference has them."""
     text = "\n".join(PAGES.values())
     for stage in GROUPS:

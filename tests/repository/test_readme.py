@@ -212,7 +212,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_runnable_commands_write_expected_files(ran: Path) -> None:
+def test_documented_commands_write_expected_files(ran: Path) -> None:
     assert set(RUNNABLE) - {DEFAULTS} <= set(LINES)
     assert not [name for name in LEFT_BEHIND if not (ran / name).exists()]
     assert len(list((ran / "outputs" / "table3_map").glob("*/metrics.json"))) == 3

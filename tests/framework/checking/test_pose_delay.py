@@ -70,28 +70,28 @@ def test_pose_delay_is_found_without_residual_error(frames: int) -> None:
     assert delay.finding(1, 0.1).setting == f"dataset.pose_delay={1 + frames}"
 
 
-def test_correct_poses_with_noisy_points_have_no_delay() -> None:
+def test_pose_delay_of_correct_poses_and_noisy_points_is_none() -> None:
     for noise in (0.0, 1.0, 5.0):
         assert found(trembling_walk(), 0, noise) is None
 
 
 @pytest.mark.parametrize("frames", [-2, 1, 3])
-def test_uniform_motion_has_no_detectable_delay(frames: int) -> None:
+def test_pose_delay_in_uniform_motion_is_undetectable(frames: int) -> None:
     assert found(even_walk(), frames, 0.5) is None
 
 
-def test_delay_beyond_search_range_is_not_reported() -> None:
+def test_pose_delay_beyond_search_range_is_not_reported() -> None:
     for frames in (LONGEST_DELAY + 1, LONGEST_DELAY + 2):
         assert found(trembling_walk(), frames) is None
 
 
-def test_unrelated_poses_have_no_delay() -> None:
+def test_pose_delay_of_unrelated_poses_is_none() -> None:
     """Whichever delay fits them least badly."""
     other = [exp_se3(np.array([0, 0, 0, 0, 0, 0.5 * k])) for k in range(FRAMES)]
     assert find_delay(pairs_of(trembling_walk(), other), other, AS_IT_IS) is None
 
 
-def test_pairs_without_neighboring_poses_are_skipped() -> None:
+def test_pose_delay_skips_pairs_without_neighboring_poses() -> None:
     poses = trembling_walk()
     stored = late(poses, 2)
     pairs = pairs_of(poses, stored)
@@ -113,7 +113,7 @@ def test_pose_delay_is_found_in_fitting_axes() -> None:
     assert delay.frames == 3
 
 
-def test_delayed_pairs_have_matching_poses() -> None:
+def test_delayed_returns_pairs_with_matching_poses() -> None:
     poses = trembling_walk()
     stored = late(poses, -2)
     for pair in pairs_of(poses, stored):

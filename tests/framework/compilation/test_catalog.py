@@ -28,7 +28,7 @@ LINES = [line for line in catalog.LIST.read_text().splitlines() if line and not 
 
 
 @pytest.mark.parametrize("kernel", listed(DEFAULT, OTHERS), ids=lambda kernel: f"{kernel.module}.{kernel.name}")
-def test_listed_kernels_exist(kernel: Kernel) -> None:
+def test_kernel_catalog_contains_only_existing_kernels(kernel: Kernel) -> None:
     assert isinstance(kernel.dispatcher, Dispatcher)
     assert line_of(kernel.dispatcher, kernel.signature) in LINES
     assert len(kernel.signature) == kernel.dispatcher.py_func.__code__.co_argcount
@@ -48,7 +48,7 @@ def test_kernel_signature_text_round_trip_is_exact() -> None:
 
 
 @pytest.mark.acceptance
-def test_runs_call_only_listed_kernels() -> None:
+def test_kernel_catalog_contains_all_called_kernels() -> None:
     """The demo, a room, each other refiner, fuser and tracker: `python -m tests.support.kernel_calls` updates it."""
     if missing := [kernel for kernel in listed(DEFAULT, OTHERS) if not kernel.is_compiled()]:
         compile_all(missing)  # as `make test` does
@@ -109,7 +109,9 @@ def test_kernel_is_recompiled_after_callee_change(small: Path) -> None:
     assert not kernel.is_compiled()
 
 
-def test_index_with_renamed_class_is_deleted(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernel_index_with_renamed_class_is_deleted(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "kernel_types.py").write_text("from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    x: int\n")
     (tmp_path / "kernel_caller.py").write_text(PAIRS)
     monkeypatch.delitem(sys.modules, "kernel_types", raising=False)

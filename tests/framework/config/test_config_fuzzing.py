@@ -80,13 +80,13 @@ def line_of(option: Path, content: bytes) -> str:
     return line
 
 
-def test_undamaged_option_is_composed(option: Path) -> None:
+def test_config_option_undamaged_is_composed(option: Path) -> None:
     assert "/nowhere/results.json: cannot be read" in line_of(option, OPTION)
 
 
 @settings(max_examples=EXAMPLES // 2, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 @given(content=damaged(OPTION, TOKENS))
-def test_damaged_option_is_built_or_raises_one_line(content: bytes, option: Path) -> None:
+def test_config_option_damaged_builds_or_raises_one_line_error(content: bytes, option: Path) -> None:
     line_of(option, content)
 
 
@@ -104,13 +104,13 @@ def test_damaged_option_is_built_or_raises_one_line(content: bytes, option: Path
     ],
     ids=range(8),
 )
-def test_invalid_option_file_raises_one_line_with_path(content: str, message: str, option: Path) -> None:
+def test_config_option_invalid_file_error_is_one_line_with_path(content: str, message: str, option: Path) -> None:
     line = line_of(option, content.encode(errors="surrogateescape"))
     assert message in line
     assert line.startswith(str(option))
 
 
-def test_option_linked_to_device_raises(option: Path) -> None:
+def test_config_option_linked_to_device_raises(option: Path) -> None:
     option.symlink_to("/dev/zero")
     with pytest.raises(InstanceMapError, match="detector: expected one of"):
         composed("~dataset", "detector=mine")

@@ -98,7 +98,7 @@ def test_openni_1_recording_without_end_is_truncated(
     assert {images.count for images in contents.streams.values()} == {count}
 
 
-def test_recording_without_images_raises_one_line(originals: Path, tmp_path: Path) -> None:
+def test_openni_1_without_images_raises_one_line_error(originals: Path, tmp_path: Path) -> None:
     path = originals / "oni/no_images.oni"
     with pytest.raises(DataError) as caught:
         convert(path, tmp_path / "out")
@@ -142,7 +142,7 @@ def test_openni_1_recording_is_converted_and_mapped(
 # 7-Scenes
 
 
-def test_published_seven_scenes_frame_matches_files(originals: Path) -> None:
+def test_seven_scenes_published_frame_matches_files(originals: Path) -> None:
     sequence = SevenScenes(originals / "seven_scenes", scene=KITCHEN)
     assert (len(sequence), sequence.name, sequence.camera) == (3, "redkitchen-seq-01", COLOR_CAMERA)
     assert sequence.camera.shape == VGA
@@ -289,7 +289,7 @@ def around_the_gap(originals: Path, folder: Path) -> TumRgbd:
     return TumRgbd(target)
 
 
-def test_frames_in_motion_capture_gap_are_skipped(
+def test_tum_frames_in_motion_capture_gap_are_skipped(
     originals: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     sequence = around_the_gap(originals, tmp_path)
@@ -310,7 +310,7 @@ def test_frames_in_motion_capture_gap_are_skipped(
         np.testing.assert_allclose(ours.pose.T_world_camera[:3, 3], theirs.pose.T_world_camera[:3, 3], atol=0.01)
 
 
-def test_run_inside_motion_capture_gap_raises_one_line(originals: Path, tmp_path: Path) -> None:
+def test_tum_run_in_motion_capture_gap_raises_one_line_error(originals: Path, tmp_path: Path) -> None:
     sequence = around_the_gap(originals, tmp_path)
     first = [recorded.timestamp for recorded in sequence.contents.frames].index(GAP[0])
     alone = TumRgbd(sequence.folder, start=first, stop=first + 1)

@@ -49,7 +49,7 @@ def all_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
     return back_project(camera, np.stack([u, v], 1).astype(np.int32), depth[v, u])
 
 
-def test_frame_matches_files(folder: Path) -> None:
+def test_seven_scenes_frame_matches_files(folder: Path) -> None:
     sequence = SevenScenes(folder.parents[1], scene="chess/seq-01")
     assert (len(sequence), sequence.name, sequence.camera) == (FRAMES, "chess-seq-01", COLOR_CAMERA)
     frame = sequence[2]
@@ -76,7 +76,7 @@ def test_seven_scenes_recording_is_mapped(folder: Path) -> None:
         np.testing.assert_allclose(z[seen], 2, atol=1e-5)
 
 
-def test_registered_depth_matches_color_camera_projection() -> None:
+def test_seven_scenes_registered_depth_matches_projection() -> None:
     """Each reading's own point, projected into the color camera, lies within half a pixel of where it went."""
     raw = np.zeros(DEPTH_CAMERA.shape, np.uint16)
     raw[20::40, 20::40] = 800 + 10 * np.arange(12 * 16).reshape(12, 16)  # far apart, all different
@@ -92,7 +92,7 @@ def test_registered_depth_matches_color_camera_projection() -> None:
         assert abs(rows[0] - v) <= 0.501
 
 
-def test_registration_keeps_nearest_depth_and_holes() -> None:
+def test_seven_scenes_registration_keeps_nearest_and_holes() -> None:
     raw = np.full(DEPTH_CAMERA.shape, 4000, np.uint16)
     raw[:, 300:340] = 1000
     raw[:100] = 65535
@@ -111,7 +111,7 @@ def test_registration_keeps_nearest_depth_and_holes() -> None:
     assert gap == pytest.approx(529 * 0.025 * (1 / 1 - 1 / 4), abs=1.5)
 
 
-def test_rounded_rotation_is_made_rigid(folder: Path) -> None:
+def test_seven_scenes_rounded_rotation_is_made_rigid(folder: Path) -> None:
     rounded = np.round(pose_at(1), 3)
     write_pose(folder, 1, rounded)
     T = SevenScenes(folder)[1].T_world_camera
@@ -133,24 +133,24 @@ def test_rounded_rotation_is_made_rigid(folder: Path) -> None:
         ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", "pose.txt: pose: expected the last row 0 0 0 1"),
     ],
 )
-def test_invalid_pose_raises_for_its_frame(folder: Path, text: str | None, message: str) -> None:
+def test_seven_scenes_invalid_pose_raises_for_its_frame(folder: Path, text: str | None, message: str) -> None:
     path = folder / "frame-000001.pose.txt"
     path.unlink() if text is None else path.write_text(text)
     assert re.search(rf"frame-000001\.{message}", fault_of(SevenScenes(folder), 1))
 
 
 @pytest.mark.parametrize("name", ["color", "depth"])
-def test_missing_image_raises_for_its_frame(folder: Path, name: str) -> None:
+def test_seven_scenes_missing_image_raises_for_its_frame(folder: Path, name: str) -> None:
     (folder / f"frame-000002.{name}.png").unlink()
     assert f"frame-000002.{name}.png: cannot be read" in fault_of(SevenScenes(folder), 2)
 
 
-def test_folder_without_frames_error_gives_scene_example(folder: Path) -> None:
+def test_seven_scenes_empty_folder_error_gives_scene_example(folder: Path) -> None:
     with pytest.raises(DataError, match=r"expected frame-000000\.color\.png .*; set dataset\.scene .* chess/seq-01"):
         SevenScenes(folder.parents[1], scene="chess")
 
 
-def test_image_size_mismatch_raises(folder: Path) -> None:
+def test_seven_scenes_image_size_mismatch_raises(folder: Path) -> None:
     write_color(folder / "frame-000001.color.png", (1, 2, 3), (240, 320))
     assert "expected 640x480 px as in the camera of 7-Scenes, got 320x240 px" in fault_of(SevenScenes(folder), 1)
     write_depth(folder / "frame-000000.depth.png", 1, (240, 320))

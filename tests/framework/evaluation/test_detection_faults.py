@@ -96,7 +96,7 @@ def test_detection_faults_summarize_objects_over_frames() -> None:
     assert table["correct class"] == pytest.approx(8 / 9)
 
 
-def test_overlaps_match_whole_image_counts() -> None:
+def test_detection_faults_overlaps_match_whole_image_counts() -> None:
     rng = np.random.default_rng(0)
     ids = rng.integers(0, 5, SHAPE).astype(np.int32) * 7
     masks = rng.random((4, *SHAPE)) < 0.3

@@ -107,7 +107,7 @@ def test_ap_requires_class_match_except_agnostic_ap():
     assert "instances.ap50.table" not in result.metrics()
 
 
-def test_class_absent_from_scene_lowers_precision_without_ap():
+def test_evaluate_absent_class_lowers_precision_without_ap():
     truth = scene([(1, 100), (0, 100)], {1: "chair"})
     metrics = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("chair", 0.9), 6: ("tv", 1.0)}), truth).metrics()
     assert metrics["instances.ap50"] == 1.0
@@ -118,7 +118,7 @@ def test_class_absent_from_scene_lowers_precision_without_ap():
 @pytest.mark.parametrize(
     ("class_name", "points"), [(None, 150), ("chair", 99)], ids=["class not known", "under 100 points"]
 )
-def test_match_with_ignored_instance_is_not_counted(class_name, points):
+def test_evaluate_does_not_count_match_with_ignored_instance(class_name, points):
     truth = scene([(1, 100), (2, points)], {1: "chair", 2: class_name})
     metrics = evaluate(
         prediction(truth, [(5, 100), (6, points)], {5: ("chair", 0.5), 6: ("chair", 0.9)}), truth
@@ -128,7 +128,7 @@ def test_match_with_ignored_instance_is_not_counted(class_name, points):
     assert metrics["instances.true_count"] == 1
 
 
-def test_prediction_mostly_on_unknown_instances_is_ignored():
+def test_evaluate_ignores_prediction_on_unknown_instances():
     """It covers several unknown instances, none of them well: IoU 0.2 with each, yet all of it is unknown."""
     runs = [(1, 100)] + [(k, 120) for k in range(2, 8)]
     truth = scene(runs, {1: "chair"} | dict.fromkeys(range(2, 8)))
@@ -139,7 +139,7 @@ def test_prediction_mostly_on_unknown_instances_is_ignored():
     assert (score.ignored, score.false_positives) == (0, 1), "exactly half of it is unknown: wrong"
 
 
-def test_prediction_of_unannotated_class_is_ignored():
+def test_evaluate_ignores_prediction_of_unannotated_class():
     """A right chair, and a right keyboard where only chairs and beds are labeled; a wrong bed stays wrong."""
     truth = replace(scene([(1, 100), (0, 300)], {1: "chair"}), classes=("chair", "bed"))
     found = [(1, 100), (2, 100), (0, 100), (3, 100)]
@@ -152,7 +152,7 @@ def test_prediction_of_unannotated_class_is_ignored():
     assert called_otherwise.metrics()["instances.ap50_agnostic"] == 1.0, "the object is found, by whatever name"
 
 
-def test_prediction_with_evaluated_match_is_not_ignored():
+def test_evaluate_keeps_prediction_with_evaluated_match():
     """At IoU 0.25 the prediction finds its truth although more of it lies on an unknown instance."""
     truth = scene([(1, 100), (2, 150)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 250)], {5: ("chair", 0.5)}), truth)
@@ -160,7 +160,7 @@ def test_prediction_with_evaluated_match_is_not_ignored():
     assert result.by_class[0.5]["chair"].ignored == 1
 
 
-def test_predictions_without_near_points_are_false_positives():
+def test_evaluate_distant_prediction_is_false_positive():
     truth = scene([(1, 100)], {1: "chair"})
     claims = {5: ("chair", 0.5), 6: ("chair", 0.9), 7: ("chair", 0.8)}
     near = prediction(truth, [(5, 100)], claims)
@@ -174,7 +174,7 @@ def test_predictions_without_near_points_are_false_positives():
 
 
 @pytest.mark.parametrize(("distance", "iou"), [(0.049, 1.0), (0.051, 0.0)])
-def test_labels_are_transferred_within_5_cm(distance, iou):
+def test_label_transfer_is_limited_to_5_cm(distance, iou):
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     moved = replace(moved, points_world=moved.points_world + np.float32([0, distance, 0]))
@@ -192,7 +192,7 @@ def test_label_transfer_uses_nearest_background_vertex():
     assert evaluate(with_background, truth).best_ious == {1: 0.6}
 
 
-def test_transfer_to_map_counts_map_vertices():
+def test_label_transfer_to_map_counts_map_vertices():
     """Ten points of background are under the instance, and the map has two vertices at each of them."""
     truth = scene([(1, 100), (0, 100)], {1: "chair"})
     dense = prediction(truth, [(5, 110)], {5: ("chair", 1.0)})
@@ -218,7 +218,7 @@ def test_evaluate_empty_map_or_truth_is_handled():
     assert evaluate(empty, truth, transfer=Transfer.TO_MAP).metrics()["instances.ap50"] == 0.0
 
 
-def test_inconsistent_predictions_raise():
+def test_evaluate_inconsistent_predictions_raise():
     truth = scene([(1, 100)], {1: "chair"})
     with pytest.raises(DataError, match="expected labels in `ids`, got 6"):
         prediction(truth, [(6, 10)], {5: ("chair", 1.0)})
@@ -245,7 +245,7 @@ def test_label_transfer_tie_is_independent_of_order():
     assert len(results) == 1
 
 
-def test_unknown_instance_match_is_ignored_only_above_threshold():
+def test_evaluate_ignores_unknown_match_only_above_threshold():
     """40 of its 100 points on an unknown instance of 40: IoU 0.4, enough at 0.25 and not at 0.5."""
     truth = scene([(1, 100), (2, 40), (0, 60)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("chair", 0.5), 6: ("chair", 0.9)}), truth)
@@ -253,7 +253,7 @@ def test_unknown_instance_match_is_ignored_only_above_threshold():
     assert result.by_class[0.5]["chair"].false_positives == 1
 
 
-def test_three_predictions_on_two_chairs_match_manual_result():
+def test_evaluate_three_predictions_match_manual_result():
     """All as confident: 11 with 70 of 120 points (IoU 7/12), 12 with the other 50 (5/12), 13 with the second chair.
 
     At 0.5: right, wrong, right; precision 1, 1/2, 2/3; AP (1 + 2/3) / 2 = 5/6; F1 4/5; PQ (7/12 + 1) / 2.5 = 19/30.
@@ -269,7 +269,7 @@ def test_three_predictions_on_two_chairs_match_manual_result():
         assert metrics[f"instances.{name}"] == pytest.approx(value), name
 
 
-def test_equal_confidences_are_ranked_by_id():
+def test_evaluate_ranks_equal_confidences_by_id():
     """As above, but for 11 and 12: wrong, right, right at 0.5, AP 2/3. At 0.25 the small piece takes the chair: 5/6."""
     truth = scene([(1, 120), (2, 100)], {1: "chair", 2: "chair"})
     claims = {11: ("chair", 0.9), 12: ("chair", 0.9), 13: ("chair", 0.9)}
@@ -278,7 +278,7 @@ def test_equal_confidences_are_ranked_by_id():
     assert result.ap(0.25) == pytest.approx(5 / 6)
 
 
-def test_metrics_by_class_match_manual_result():
+def test_evaluate_metrics_by_class_match_manual_result():
     """Two chairs: one with IoU 3/4, one missed. A bed found with 3/5 behind a wrong one. A table that nobody found."""
     truth = scene(
         [(1, 100), (2, 100), (3, 150), (4, 100), (0, 200)], {1: "chair", 2: "chair", 3: "bed", 4: "dining table"}
@@ -313,7 +313,7 @@ def test_metrics_by_class_match_manual_result():
     assert not [name for name in metrics if name.endswith(".tv")]
 
 
-def test_transfers_differ_with_vertex_density():
+def test_label_transfers_differ_with_vertex_density():
     """80 of the chair's 100 points and 20 of the wall. The map has three vertices on each of the chair's, one else.
 
     To the truth: 80 / (100 + 20) = 2/3, a match at 4 of the 10 thresholds. To the map: 240 / (300 + 20) = 3/4, at 6.
@@ -335,7 +335,7 @@ def test_transfers_differ_with_vertex_density():
 
 
 @pytest.mark.parametrize("transfer", Transfer)
-def test_transfer_distance_limit_is_inclusive(transfer):
+def test_label_transfer_distance_limit_is_inclusive(transfer):
     """Distances that floats hold exactly: 5/64 m as the hypotenuse of 3/64 and 4/64."""
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})

@@ -108,7 +108,7 @@ def test_exported_scene_contains_all_objects_in_place(run: Path, tmp_path: Path)
         assert found.area == pytest.approx(original.area, rel=1e-4)
 
 
-def test_triangles_between_objects_belong_to_room(room: UprightRoom) -> None:
+def test_export_triangles_between_objects_belong_to_room(room: UprightRoom) -> None:
     ids = np.where(room.mesh.vertices[:, 0] > 2.02, 1, 2).astype(np.int32)
     mesh = replace(room.mesh, instance_ids=ids)
     box = room.objects[0].box
@@ -158,7 +158,7 @@ def test_glb_colors_are_linear_with_16_bits(room: UprightRoom) -> None:
 
 
 @pytest.mark.parametrize("coloring", [Coloring.INSTANCE, Coloring.CLASS])
-def test_export_coloring_by_instance_or_class(coloring: Coloring, tmp_path: Path) -> None:
+def test_export_colors_one_object_uniformly(coloring: Coloring, tmp_path: Path) -> None:
     two = ExportedRoom(things={"cube": [(1, 1, 0, 1.2, 1.2, 0.2)], "other": [(2, 2, 0, 2.2, 2.2, 0.2)]})
     run = two.write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
@@ -263,7 +263,7 @@ def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom)
         np.testing.assert_allclose(np.linalg.norm(part.vertex_normals, axis=1), 1, atol=1e-5)
 
 
-def test_small_fragments_belong_to_room_instead_of_object(tmp_path: Path) -> None:
+def test_export_small_fragments_belong_to_room_not_object(tmp_path: Path) -> None:
     """Labels leak through edges of depth; a leg is no speck."""
     table = [(0.8, 1.0, 0.7, 2.0, 1.8, 0.75), (0.8, 1.0, 0, 0.85, 1.05, 0.65)]
     speck = (3.5, 2.5, 0.9, 3.51, 2.51, 0.91)
@@ -276,7 +276,7 @@ def test_small_fragments_belong_to_room_instead_of_object(tmp_path: Path) -> Non
     assert len(read_mesh(whole).triangles) == len(read_mesh(run / "mesh.ply").triangles)
 
 
-def test_decimated_parts_keep_shape_colors_and_labels(room: UprightRoom) -> None:
+def test_export_decimated_parts_keep_shape_colors_and_labels(room: UprightRoom) -> None:
     fewer = parts(room, 400)
     assert 200 < sum(len(part.mesh.triangles) for part in fewer) <= 420
     for full, part in zip(parts(room), fewer, strict=True):
@@ -287,7 +287,7 @@ def test_decimated_parts_keep_shape_colors_and_labels(room: UprightRoom) -> None
     assert decimated(room.mesh, len(room.mesh.triangles)) is room.mesh
 
 
-def test_decimation_shows_progress_bar_in_terminal(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_decimation_shows_progress_bar_in_terminal(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TQDM_DISABLE", raising=False)
     with terminal_stderr(100, monkeypatch) as shown:
         parts(room, 400)
@@ -350,7 +350,7 @@ def test_exported_instance_colors_match_overview(tmp_path: Path) -> None:
                 np.testing.assert_array_equal(np.unique(colors, axis=0), [expected[key]])
 
 
-def test_export_object_with_three_vertices(tmp_path: Path) -> None:
+def test_export_object_with_three_vertices_is_written(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     mesh = read_mesh(run / "mesh.ply")
     ids = np.where(mesh.instance_ids == 2, 0, mesh.instance_ids).astype(np.int32)

@@ -57,7 +57,7 @@ def test_raycast_page_colorbar_is_in_meters() -> None:
     assert bar.get_ylim() == (1.0, 2.0), "unmapped pixels have no depth"
 
 
-def test_raycast_texts_are_on_the_page() -> None:
+def test_raycast_page_contains_texts() -> None:
     page = raycast_page(wall(1e3), NAMES, CENTERS, "a long note " * 30)
     renderer = FigureCanvasAgg(page.figure).get_renderer()
     width, height = page.figure.bbox.size

@@ -37,13 +37,13 @@ def test_jpeg_pixels_match_opencv(parameters: tuple[int, int]) -> None:
     np.testing.assert_array_equal(decode_color("x", data.tobytes()), cv2.imdecode(data, cv2.IMREAD_COLOR_RGB))
 
 
-def test_gray_jpeg_has_three_equal_channels() -> None:
+def test_jpeg_gray_has_three_equal_channels() -> None:
     gray = cv2.imencode(".jpg", PICTURE[..., 0])[1]
     np.testing.assert_array_equal(decode_color("x", gray.tobytes()), cv2.imdecode(gray, cv2.IMREAD_COLOR_RGB))
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
-def test_truncated_jpeg_with_end_marker_raises(share: float) -> None:
+def test_jpeg_truncated_with_end_marker_raises(share: float) -> None:
     """OpenCV gives a picture that is gray from the cut on."""
     data = JPEG[: int(share * len(JPEG))] + END
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
@@ -65,7 +65,7 @@ def test_jpeg_with_corrupt_block_raises() -> None:
     assert seen >= 36, "noise may be valid code by chance: a JPEG has no checksums"
 
 
-def test_animated_png_raises() -> None:
+def test_png_animated_raises() -> None:
     """OpenCV takes another of its pictures than Pillow does."""
     pictures = [Image.new("RGB", (8, 6), color) for color in ("red", "lime", "blue")]
     written = io.BytesIO()

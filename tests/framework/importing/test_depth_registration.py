@@ -25,7 +25,7 @@ def loops(registration: DepthRegistration, depth: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(found), found, 0)
 
 
-def test_registration_matches_reference_loops() -> None:
+def test_depth_registration_matches_reference_loops() -> None:
     rng = np.random.default_rng(0)
     small = DepthRegistration(DEPTH.scaled(0.1), COLOR.scaled(0.1), T_COLOR_DEPTH)
     depth = rng.choice([0, 0.3, 1, 2.5], small.depth.shape).astype(np.float32)
@@ -34,7 +34,7 @@ def test_registration_matches_reference_loops() -> None:
     np.testing.assert_allclose(found, loops(small, depth), rtol=1e-6)
 
 
-def test_registered_room_matches_target_camera_view() -> None:
+def test_depth_registration_of_room_matches_target_view() -> None:
     registration = DepthRegistration(DEPTH, COLOR, T_COLOR_DEPTH)
     target = registration.target
     assert target.fx <= FINEST * DEPTH.fx + 1
@@ -49,7 +49,7 @@ def test_registered_room_matches_target_camera_view() -> None:
     assert np.median(np.abs(wrong - truth)[wrong > 0]) > 2 * np.median(error)
 
 
-def test_registration_keeps_nearer_of_two_surfaces() -> None:
+def test_depth_registration_keeps_nearer_of_two_surfaces() -> None:
     camera = Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
     shifted = np.eye(4)
     shifted[0, 3] = 0.5
@@ -60,7 +60,7 @@ def test_registration_keeps_nearer_of_two_surfaces() -> None:
     assert (found[:, 18:26] == 1).all()
 
 
-def test_points_behind_camera_are_dropped() -> None:
+def test_depth_registration_drops_points_behind_camera() -> None:
     camera = Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
     behind = np.eye(4)
     behind[2, 3] = -3.0

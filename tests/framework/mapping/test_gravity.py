@@ -112,7 +112,7 @@ def test_floor_height_of_unseen_floor_is_none() -> None:
     assert floor_height(*rectangle(np.zeros(3), Y, Z), Z) is None
 
 
-def test_faces_have_triangle_normals_and_areas() -> None:
+def test_gravity_faces_have_triangle_normals_and_areas() -> None:
     vertices = np.float32([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 0]])
     normals, areas, centers = faces(vertices, np.int32([[0, 1, 2], [0, 3, 1]]))  # the second has no area
     np.testing.assert_allclose(normals, [[0, 0, 1]])
@@ -209,7 +209,7 @@ def test_upright_box_recovers_rotated_box(seed: int) -> None:
     assert (within <= box.extent / 2 + 1e-4).all()
 
 
-def test_box_around_degenerate_points_is_valid() -> None:
+def test_upright_box_of_degenerate_points_is_valid() -> None:
     for points in (np.zeros((1, 3)), np.array([[0, 0, 0], [1, 0, 0]]), np.array([[0, 0, 0], [0, 0, 2]])):
         box = box_around(points.astype(np.float32), Z)
         assert np.isfinite(box.center).all()

@@ -68,7 +68,7 @@ def expected(found: list, kind: Kind) -> list[str]:
     return sorted(change.name for change in found if change.kind is kind)
 
 
-def test_office_contains_expected_objects() -> None:
+def test_changes_office_contains_expected_objects() -> None:
     names = office().class_names
     assert (names[CHAIR], names[TABLE]) == ("chair", "dining table")
 
@@ -149,7 +149,7 @@ def test_look_for_separates_surface_from_free_space(before: Visit) -> None:
     assert not np.logical_or(*look_for(before, outside)).any(), "what is behind walls is not known"
 
 
-def test_visit_without_poses_raises(before: Visit) -> None:
+def test_changes_visit_without_poses_raises(before: Visit) -> None:
     with pytest.raises(DataError, match="visit: expected at least one pose"):
         Visit(before.scene, np.zeros((0, 4, 4)))
 

@@ -79,7 +79,7 @@ def test_thread_schedule_balances_costs():
         assert max(loads) <= sum(costs) / threads + max(costs, default=0), "Graham's bound"
 
 
-def test_structure_pixels_are_excluded_from_ring_and_border():
+def test_neighborhood_excludes_structure_from_ring_and_border():
     """As if it had no reading, except for the clusters' own points."""
     masks, frame = random_scene(0)
     structure = np.random.default_rng(1).random((40, 60)) < 0.5
@@ -199,6 +199,6 @@ def test_neighborhood_without_clusters_or_depth_is_empty():
     assert around.mask_counts.tolist() == around.ring_counts.tolist() == [0, 0]
 
 
-def test_ring_out_of_range_raises() -> None:
+def test_neighborhood_ring_out_of_range_raises() -> None:
     with pytest.raises(ConfigError, match=r"Ring\.max_ring: expected a value in \[20, 80\], got 12"):
         Ring(min_ring=20)

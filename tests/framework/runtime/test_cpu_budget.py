@@ -42,13 +42,13 @@ def pass_frames(sharing: CoreSharing, passes: Callable[[float], None], ahead: fl
             passes(mapping / numba.get_num_threads())
 
 
-def test_core_sharing_splits_equal_load_evenly(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+def test_cpu_budget_splits_equal_load_evenly(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
     assert sharing.cores_ahead() == sharing.cores // 2  # nothing is known yet
     pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
     assert sharing.cores_ahead() == sharing.cores // 2
 
 
-def test_core_sharing_assigns_all_cores_to_loaded_side(
+def test_cpu_budget_assigns_all_cores_to_loaded_side(
     sharing: CoreSharing, thread_time: Callable[[float], None]
 ) -> None:
     pass_frames(sharing, thread_time, ahead=0.1, mapping=1.0)  # as without a network: a frame is read
@@ -64,26 +64,26 @@ def test_core_sharing_assigns_all_cores_to_loaded_side(
         assert numba.get_num_threads() == 1
 
 
-def test_core_sharing_divides_share_among_workers(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+def test_cpu_budget_is_divided_among_workers(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=20.0, mapping=1.0)
     with sharing.ahead(workers=2):
         assert numba.get_num_threads() == max(sharing.cores // 2, 1)
 
 
-def test_core_sharing_ignores_single_slow_frame(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+def test_cpu_budget_ignores_single_slow_frame(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
     with sharing.mapping():
         thread_time(100.0)  # kernels are compiled
     assert sharing.cores_ahead() == sharing.cores // 2
 
 
-def test_core_sharing_restores_thread_count_after_exception(sharing: CoreSharing) -> None:
+def test_cpu_budget_restores_thread_count_after_exception(sharing: CoreSharing) -> None:
     with pytest.raises(RuntimeError, match="lost"), sharing.mapping():
         raise RuntimeError("lost")
     assert numba.get_num_threads() == sharing.cores
 
 
-def test_core_sharing_is_thread_safe() -> None:
+def test_cpu_budget_is_thread_safe() -> None:
     sharing = CoreSharing()
 
     def side(around: Callable[[], object]) -> None:

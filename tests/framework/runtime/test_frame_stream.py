@@ -113,7 +113,7 @@ def test_live_frames_exit_closes_device() -> None:
     assert threading.active_count() == before
 
 
-def test_stream_of_unsupported_video_raises() -> None:
+def test_frame_stream_of_unsupported_video_raises() -> None:
     class Neither(RGBDVideo):
         name = "neither"
 
@@ -122,7 +122,7 @@ def test_stream_of_unsupported_video_raises() -> None:
 
 
 @PREFETCH
-def test_slow_live_video_is_mapped_without_drops(prefetch: int) -> None:
+def test_live_video_at_slow_rate_is_mapped_without_drops(prefetch: int) -> None:
     threads, video = working_threads(), LiveRoom(unreadable=2)
     result = pipeline(prefetch).run(video)
     assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
@@ -144,7 +144,7 @@ def test_live_video_detects_every_nth_mapped_frame(prefetch: int) -> None:
 
 
 @PREFETCH
-def test_fast_live_video_drops_and_counts_frames(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_live_video_at_fast_rate_drops_and_counts_frames(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
     video = LiveRoom(frames_sent=60, period_s=SLOW_S / 6)
     result = pipeline(prefetch, fuser=GridFuser(slow_s=SLOW_S)).run(video)
     assert result.live is not None
@@ -188,7 +188,7 @@ def test_recorded_run_has_no_live_metrics(room: CornerRoom) -> None:
 
 
 @PREFETCH
-def test_ctrl_c_ends_live_video_normally(prefetch: int) -> None:
+def test_live_video_ctrl_c_ends_normally(prefetch: int) -> None:
     video, threads = LiveRoom(frames_sent=1000), working_threads()
     result = pipeline(prefetch, tracker=PressesCtrlC(at=0)).run(video)
     assert result.stopped_by is None
@@ -197,7 +197,7 @@ def test_ctrl_c_ends_live_video_normally(prefetch: int) -> None:
     assert working_threads() == threads
 
 
-def test_second_ctrl_c_interrupts_live_video() -> None:
+def test_live_video_second_ctrl_c_interrupts_frame() -> None:
     """In the middle of a frame: what is left is not whole."""
     video = LiveRoom(frames_sent=1000)
     result = pipeline(tracker=PressesCtrlC(at=2, times=2)).run(video)
@@ -206,7 +206,7 @@ def test_second_ctrl_c_interrupts_live_video() -> None:
     assert video.closed
 
 
-def test_ctrl_c_before_first_live_frame_raises() -> None:
+def test_live_video_ctrl_c_before_first_frame_raises() -> None:
     """The worker waits for a first frame that never comes."""
 
     @dataclass
@@ -221,7 +221,7 @@ def test_ctrl_c_before_first_live_frame_raises() -> None:
         pipeline().run(Silent())
 
 
-def test_failed_live_video_keeps_partial_map() -> None:
+def test_live_video_failure_keeps_partial_map() -> None:
     result = pipeline().run_to_any_end(LiveRoom(fails_after=3))
     assert isinstance(result.stopped_by, DataError)
     assert result.frames == 3

@@ -22,7 +22,9 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", ENDING)
-def test_first_signal_is_deferred_and_second_raises(number: signal.Signals, capfd: pytest.CaptureFixture[str]) -> None:
+def test_signals_deferred_first_waits_and_second_raises(
+    number: signal.Signals, capfd: pytest.CaptureFixture[str]
+) -> None:
     signal.signal(number, signal.SIG_DFL)
     with signals_deferred(*ENDING) as interruption:
         interruption.check()
@@ -52,7 +54,7 @@ def nobody_else_handles_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def test_nested_signals_deferred_returns_outer_context() -> None:
+def test_signals_deferred_nested_returns_outer_context() -> None:
     with signals_deferred(signal.SIGINT, signal.SIGTERM) as outer:
         with signals_deferred(signal.SIGINT) as inner:
             assert inner is outer
@@ -62,7 +64,7 @@ def test_nested_signals_deferred_returns_outer_context() -> None:
         assert later.asked is None
 
 
-def test_existing_signal_handlers_are_kept() -> None:
+def test_signals_deferred_keeps_existing_handlers() -> None:
     """Scripts start what is in the background with Ctrl-C ignored; submitit handles SIGTERM in its jobs."""
     heard: list[int] = []
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -7,7 +7,7 @@ from numba import njit
 from framework.sensors.noise_models import axial_sigma, axial_sigma_at_angle, axial_sigma_single
 
 
-def test_noise_rounding_is_independent_of_caller() -> None:
+def test_depth_noise_rounding_is_independent_of_caller() -> None:
     """Without its own setting, numba would inherit fast math from the first calling kernel."""
 
     @njit(fastmath=True)

@@ -38,7 +38,7 @@ def classes_of(pieces) -> Counter:
     return Counter(piece.class_name for piece in pieces)
 
 
-def test_scenes_have_unique_names_and_repeated_classes() -> None:
+def test_benchmark_scenes_have_unique_names_and_class_repeats() -> None:
     assert list(SCENES) == ROOMS
     assert not any(name.isdigit() for name in SCENES), "a number would be taken for a sequence of SceneNN"
     promised = Counter(name for spec in SCENES.values() for name in spec.holds)
@@ -48,7 +48,7 @@ def test_scenes_have_unique_names_and_repeated_classes() -> None:
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.acceptance) for seed in SEEDS[1:])])
 @pytest.mark.parametrize("name", ROOMS)
-def test_scene_has_declared_objects(name: str, seed: int) -> None:
+def test_benchmark_scene_has_declared_objects(name: str, seed: int) -> None:
     rng = np.random.default_rng([seed, ROOMS.index(name)])
     found = classes_of(piece for make in SCENES[name].groups for piece in make(rng).pieces)
     assert all(found[class_name] >= least for class_name, least in SCENES[name].holds.items())
@@ -100,7 +100,7 @@ def test_row_groups_place_identical_pieces_in_contact(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("make", [laid_table_group, lambda rng: desk_row(rng, 1)], ids=["table", "desk"])
-def test_chairs_are_pushed_under_tables_without_intersection(make, seed: int) -> None:
+def test_benchmark_chairs_under_tables_do_not_intersect(make, seed: int) -> None:
     table, *others = make(np.random.default_rng(seed)).pieces
     chairs = [piece for piece in others if piece.class_name == "chair"]
     under = [chair for chair in chairs if gap(chair, table) < 0]

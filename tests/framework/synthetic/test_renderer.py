@@ -33,7 +33,7 @@ def scene(*solids):
     return assemble(objects)
 
 
-def test_rendered_depth_of_slanted_plane_is_exact():
+def test_renderer_depth_of_slanted_plane_is_exact():
     wall = panel(60.0, 60.0, 5.0).moved(z=-30).turned("x", 0.5).turned("z", 0.4)
     renderer = Renderer(scene(wall), [globe(np.array([0.0, 2.0, 0.0]), 0.1, (1, 1, 1))])
     T = look(np.array([0.3, 2.0, 0.2]), -1.9, -0.2, 0.1)
@@ -128,7 +128,7 @@ def light_along(renderer, rays):
     return light, cosines
 
 
-def test_rendered_image_matches_per_ray_shading():
+def test_renderer_image_matches_per_ray_shading():
     renderer = furnished()
     T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
     picture = renderer.render(CAMERA, T)
@@ -167,7 +167,7 @@ def test_rendered_image_matches_per_ray_shading():
     np.testing.assert_array_equal(cast_ids(renderer.surfaces, renderer.caster, CAMERA, T), picture.instance_ids)
 
 
-def test_material_table_changes_only_colors():
+def test_renderer_material_table_changes_only_colors():
     renderer = furnished()
     T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
     table = renderer.surfaces.material_table.copy()

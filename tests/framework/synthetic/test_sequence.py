@@ -63,7 +63,7 @@ def test_synthetic_frames_are_independent_of_order_and_threads(bedroom):
     assert one_by_one == at_once
 
 
-def test_frame_fraction_skips_frames_without_changing_others(bedroom):
+def test_synthetic_frame_fraction_keeps_remaining_frames(bedroom):
     share = Synthetic(seed=1, frame_fraction=0.1, **SMALL)
     assert len(share) == 24
     indices = [share[k].index for k in (0, 9, 23)]
@@ -154,7 +154,7 @@ def test_walk_keeps_distance_from_walls_and_furniture(bedroom, exact):
                 assert np.linalg.norm(outside, axis=1).min() >= 0.5, piece.kind
 
 
-def test_scene_truth_lies_on_exact_surface(exact):
+def test_synthetic_scene_truth_lies_on_exact_surface(exact):
     truth = Synthetic(seed=1, noise=0.0, kind=RoomKind.KITCHEN, width=160, height=120, stride=60).scene_truth()
     assert truth.class_names == exact.class_names
     import open3d as o3d

@@ -219,7 +219,7 @@ def test_table_on_other_data_has_no_published_numbers(
     assert "- Published numbers are for the real SceneNN data (sequences=scenenn) and omitted" in text
 
 
-def test_published_row_without_column_values_is_only_named(sweep: Path) -> None:
+def test_table_published_row_without_values_is_only_named(sweep: Path) -> None:
     """The paper's own is known in Hz, not here by stage, and it has no word about lost frames."""
     of_dataset(sweep, "scenenn")
     for columns, named in ((["stage_ms.refinement.median"], True), (["frames_lost"], False)):
@@ -230,7 +230,7 @@ def test_published_row_without_column_values_is_only_named(sweep: Path) -> None:
         assert ("not looked up: the paper (DDNS 2020" in text) is named
 
 
-def test_split_row_is_compared_with_matching_baseline(tmp_path: Path) -> None:
+def test_table_split_row_is_compared_with_matching_baseline(tmp_path: Path) -> None:
     """Rows that the command line split in two: voxels of one size are compared with each other."""
     root = tmp_path / "x"
     root.mkdir()

@@ -167,7 +167,7 @@ def test_table_compares_rows_of_same_pose_source(sweep: Path) -> None:
     assert second[-1] == "| Prior (re-implementation) | tracked (icp) | made up | -0.100 | missing | -0.100 | 1 |"
 
 
-def test_tracked_row_without_tracked_baseline_is_not_compared(sweep: Path) -> None:
+def test_table_tracked_row_needs_tracked_baseline(sweep: Path) -> None:
     for path in sweep.glob("*row=other*/metrics.json"):
         path.unlink()
     run(sweep, "other", "078", 0, tracker="icp", **{AP50: 0.9})
@@ -232,7 +232,7 @@ def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
     assert second[2] == "| Prior (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
 
-def test_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
+def test_table_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
     """The tracked row with the most sequences has fewer than those with given poses, and wins all the same."""
     experiment(sweep, BY)
     for row, scene, value in (
@@ -252,7 +252,7 @@ def test_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
 
 
 @pytest.mark.parametrize("table", [ACROSS, BY])
-def test_bold_mean_is_among_equal_run_counts(sweep: Path, table: dict[str, Any]) -> None:
+def test_table_bold_mean_is_among_equal_run_counts(sweep: Path, table: dict[str, Any]) -> None:
     """A mean of fewer runs says so, also where no sequence is missing."""
     experiment(sweep, table)
     for path in sweep.glob("*row=other,seed=1*/metrics.json"):

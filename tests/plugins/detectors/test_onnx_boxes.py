@@ -80,7 +80,7 @@ def tiny(folder, layout, **parameters):
 
 
 @pytest.mark.parametrize("layout", OutputLayout)
-def test_known_network_detects_cup_in_each_layout(tmp_path, layout):
+def test_onnx_boxes_known_network_detects_cup_in_each_layout(tmp_path, layout):
     detector = tiny(tmp_path, layout)
     assert detector.classes == ("cup", "chair")  # COCO's order
     found = detector.detect(frame())
@@ -92,7 +92,7 @@ def test_known_network_detects_cup_in_each_layout(tmp_path, layout):
 
 
 @pytest.mark.parametrize("placement", Placement)
-def test_image_placement_is_inverted(tmp_path, placement):
+def test_onnx_boxes_image_placement_is_inverted(tmp_path, placement):
     """The input is taller than the image: the box is the cup's own in each placement."""
     top, scale = {Placement.top_left: (0, 0.5), Placement.center: (20, 0.5), Placement.stretch: (0, 5 / 6)}[placement]
     box = np.array([BOX[0], BOX[1] / 0.5 * scale + top, BOX[2], BOX[3] / 0.5 * scale + top])
@@ -118,7 +118,7 @@ def test_image_placement_is_inverted(tmp_path, placement):
     np.testing.assert_array_equal(mask, expected)
 
 
-def test_box_without_depth_is_dropped_and_logged_once(tmp_path, caplog):
+def test_onnx_boxes_without_depth_are_dropped_and_logged_once(tmp_path, caplog):
     caplog.set_level("WARNING")
     detector = tiny(tmp_path, OutputLayout.yolo)
     blind = replace(frame(7), depth=np.zeros((120, 160), np.float32))
@@ -129,7 +129,7 @@ def test_box_without_depth_is_dropped_and_logged_once(tmp_path, caplog):
     assert caplog.messages == ["frame 7: dropped 1 of 1 boxes with too little depth for a mask, 1 so far"]
 
 
-def test_nms_keeps_better_of_overlapping_boxes(tmp_path):
+def test_onnx_boxes_nms_keeps_better_of_overlapping_boxes(tmp_path):
     boxes = np.stack([center_size(BOX), center_size(BOX) + 0.5])
     rows = np.concatenate([boxes, [[0.2, 0.6, 0.0], [0.5, 0.4, 0.0]]], axis=1)
     labels = tmp_path / "labels.txt"
@@ -146,7 +146,7 @@ def test_nms_keeps_better_of_overlapping_boxes(tmp_path):
     np.testing.assert_allclose(OnnxBoxes(**parameters, agnostic_nms_iou=1.0).detect(frame()).scores, [0.6, 0.5])
 
 
-def test_unsupported_network_shape_or_label_raises(tmp_path):
+def test_onnx_boxes_unsupported_network_shape_or_label_raises(tmp_path):
     weights = constant_network(tmp_path / "n.onnx", (1, 3, *SHAPE), {"y": np.zeros((1, 6, 9))})
     with pytest.raises(DataError, match="84 columns"):
         OnnxBoxes(weights=weights, sha256="", layout=OutputLayout.yolo, device="cpu")
@@ -173,7 +173,7 @@ def test_unsupported_network_shape_or_label_raises(tmp_path):
         {"device": "tpu"},
     ],
 )
-def test_invalid_parameter_raises(parameters, tmp_path):
+def test_onnx_boxes_invalid_parameter_raises(parameters, tmp_path):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         OnnxBoxes(weights=tmp_path / "absent.onnx", **parameters)
@@ -223,13 +223,13 @@ def test_yolox_nano_output_matches_opencv(shared, nano):
     np.testing.assert_allclose(found, reference.forward(), atol=1e-3)
 
 
-def test_config_defaults_fit_yolox_nano(shared, nano):
+def test_onnx_boxes_config_defaults_fit_yolox_nano(shared, nano):
     detector = registered.built("detector", "onnx_boxes", "device=cpu", f"detector.weights={shared / WEIGHTS}")
     assert detector.classes == nano.classes == COCO
     found = detector.detect(shared_frame(shared, "redkitchen", 0))
     np.testing.assert_array_equal(found.scores, nano.detect(shared_frame(shared, "redkitchen", 0)).scores)
 
 
-def test_missing_weights_parameter_raises_with_url():
+def test_onnx_boxes_missing_weights_parameter_raises_with_url():
     with pytest.raises(ConfigError, match=r"got none; set detector\.weights=\.\.\.; yolox_nano\.onnx .* https://"):
         registered.built("detector", "onnx_boxes")

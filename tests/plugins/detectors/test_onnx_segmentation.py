@@ -57,7 +57,7 @@ class TestContract(DetectorContract):
 
 
 @pytest.mark.parametrize(("objectness", "transposed"), [(False, False), (True, True)])
-def test_known_network_gives_expected_boxes_scores_and_masks(tmp_path, objectness, transposed):
+def test_onnx_segmentation_known_network_gives_expected_output(tmp_path, objectness, transposed):
     check_cup_and_chair(tiny(tmp_path, objectness, transposed).detect(frame()))
 
 
@@ -72,7 +72,7 @@ def check_cup_and_chair(found):
     np.testing.assert_allclose(found.class_probabilities, [[6 / 7, 1 / 7], [1 / 9, 8 / 9]], rtol=1e-5)
 
 
-def test_tensorflow_export_with_channels_last_is_decoded(tmp_path):
+def test_onnx_segmentation_channels_last_export_is_decoded(tmp_path):
     table, prototypes = outputs().values()
     table[:, :4] /= SIZE
     (tmp_path / "labels.txt").write_text("\n".join(LABELS))
@@ -83,7 +83,7 @@ def test_tensorflow_export_with_channels_last_is_decoded(tmp_path):
     check_cup_and_chair(detector.detect(frame()))
 
 
-def test_tflite_file_error_names_converter(tmp_path):
+def test_onnx_segmentation_tflite_file_error_names_converter(tmp_path):
     with pytest.raises(ConfigError, match=r"detector\.weights: expected an ONNX file; .* tf2onnx .*n\.tflite"):
         OnnxSegmentation(weights=tmp_path / "n.tflite", device="cpu")
 
@@ -100,7 +100,7 @@ def suppressed(folder, **parameters):
 
 
 @pytest.mark.parametrize(("spread", "expected"), [(1.0, [0.6, 0.5]), (0.5, [0.8, 0.7]), (0.0, [1.0, 1.0])])
-def test_single_class_output_spreads_remaining_probability(tmp_path, spread, expected, caplog):
+def test_onnx_segmentation_single_class_spreads_remaining_mass(tmp_path, spread, expected, caplog):
     """A score of 0.4 is less than the even share of two classes, with spread 1."""
     with caplog.at_level("INFO"):
         found = suppressed(tmp_path, class_spread=spread).detect(frame())
@@ -113,7 +113,7 @@ def test_single_class_output_spreads_remaining_probability(tmp_path, spread, exp
     np.testing.assert_allclose(found.class_probabilities.sum(axis=1), 1)
 
 
-def test_different_class_names_in_file_are_logged(tmp_path, caplog):
+def test_onnx_segmentation_different_class_names_are_logged(tmp_path, caplog):
     tiny(tmp_path)
     assert not caplog.text
     model = onnx.load(tmp_path / "tiny.onnx")
@@ -138,7 +138,7 @@ def test_different_class_names_in_file_are_logged(tmp_path, caplog):
         ({"more": np.zeros((1, 2))}, r"got output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
     ],
 )
-def test_unsupported_network_shape_raises(tmp_path, changed, message):
+def test_onnx_segmentation_unsupported_network_shape_raises(tmp_path, changed, message):
     (tmp_path / "labels.txt").write_text("\n".join(LABELS))
     weights = constant_network(tmp_path / "n.onnx", (1, 3, SIZE, SIZE), {**outputs(), **changed})
     with pytest.raises(DataError, match=message):
@@ -159,7 +159,7 @@ def test_unsupported_network_shape_raises(tmp_path, changed, message):
         {"device": "tpu"},
     ],
 )
-def test_invalid_parameter_raises(tmp_path, parameters):
+def test_onnx_segmentation_invalid_parameter_raises(tmp_path, parameters):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         OnnxSegmentation(**{"weights": tmp_path / "absent.onnx", **parameters})
@@ -191,7 +191,7 @@ def expected(yolo, photographs):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_yolo_detections_agree_in_all_layouts(tmp_path, yolo, photographs, expected, layout):
+def test_onnx_segmentation_yolo_agrees_in_all_layouts(tmp_path, yolo, photographs, expected, layout):
     detector = OnnxSegmentation(weights=rewritten(yolo, layout, tmp_path / "n.onnx"), device="cpu")
     assert detector._layout.suppressed == ("suppressed" in layout or "best rows" in layout)
     for photograph, wanted in zip(photographs, expected, strict=True):

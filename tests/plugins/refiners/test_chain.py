@@ -41,13 +41,13 @@ def line() -> tuple[Frame, PointClusters]:
     return frame, PointClusters(points, pixels, np.zeros(8, np.int32), ones, ones[0], ("chair",))
 
 
-def test_links_refine_in_sequence() -> None:
+def test_chain_links_refine_in_sequence() -> None:
     frame, clusters = line()
     left = Chain({"first": Halving(), "second": Halving()}).refine(clusters, frame)
     assert left.points_world.tolist() == clusters.points_world[::4].tolist()
 
 
-def test_link_with_pixels_outside_image_raises() -> None:
+def test_chain_link_with_pixels_outside_image_raises() -> None:
     class MadeUp(LargestComponent):
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
             return replace(clusters, pixels=clusters.pixels - 9)
@@ -77,7 +77,7 @@ def test_link_with_pixels_outside_image_raises() -> None:
         ),
     ],
 )
-def test_overrides_set_remove_replace_and_add_links(overrides: list[str], links: dict[str, type]) -> None:
+def test_chain_overrides_set_remove_replace_and_add_links(overrides: list[str], links: dict[str, type]) -> None:
     chain = registered.built("refiner", "chain", *overrides)
     found = {name: type(link) for name, link in chain.links.items()}
     assert found == links
@@ -94,11 +94,11 @@ def test_overrides_set_remove_replace_and_add_links(overrides: list[str], links:
         (["refiner.links=3"], "expected plugins by name, got 3|Could not|merge"),
     ],
 )
-def test_error_names_link(overrides: list[str], message: str) -> None:
+def test_chain_error_names_link(overrides: list[str], message: str) -> None:
     with pytest.raises(Exception, match=message):
         registered.built("refiner", "chain", *overrides)
 
 
-def test_empty_chain_raises_with_advice() -> None:
+def test_chain_without_links_raises_with_advice() -> None:
     with pytest.raises(ConfigError, match="refiner=identity"):
         Chain({})

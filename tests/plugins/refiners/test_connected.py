@@ -36,7 +36,7 @@ def kept(refiner: Connected | LargestComponent, mask: Bool, depth: Float32) -> B
     return image
 
 
-def test_occluder_does_not_split_object() -> None:
+def test_connected_occluder_does_not_split_object() -> None:
     """A couch at 3 m, a pole at 2 m before it that the mask leaves out: LargestComponent loses the smaller half."""
     pole = (U >= 20) & (U < 24)
     depth = np.where(pole, 2.0, 3.0)
@@ -45,24 +45,24 @@ def test_occluder_does_not_split_object() -> None:
 
 
 @pytest.mark.parametrize("neighbor_depth", [4.5, 1.5])
-def test_depth_step_ends_object(neighbor_depth: float) -> None:
+def test_connected_object_ends_at_depth_step(neighbor_depth: float) -> None:
     """The mask includes a wall behind the object or a table in front of it."""
     depth = np.where(U < 6, neighbor_depth, 3.0)
     assert (kept(Connected(), np.ones(depth.shape, np.bool_), depth) == (U >= 6)).all()
 
 
-def test_missing_depth_does_not_split_object() -> None:
+def test_connected_missing_depth_does_not_split_object() -> None:
     depth = np.where((U >= 20) & (U < 26), 0.0, 3.0)
     assert (kept(Connected(), depth > 0, depth) == (depth > 0)).all()
 
 
-def test_background_between_slats_is_removed() -> None:
+def test_connected_removes_background_between_slats() -> None:
     slat = U % 8 < 4
     depth = np.where(slat, 1.5, 2.5)
     assert (kept(Connected(), np.ones(depth.shape, np.bool_), depth) == slat).all()
 
 
-def test_slanted_surface_continues_behind_occluder() -> None:
+def test_connected_keeps_slanted_surface_behind_occluder() -> None:
     """At 0.8 m of depth a meter aside; at 4 m aside it would be a step."""
     x = (U - CAMERA.cx) / CAMERA.fx
     slanted = 2.0 / (1 - 0.8 * x)  # z = 2 + 0.8 x z

@@ -54,7 +54,7 @@ def test_dbscan_keeps_largest_component_with_border(seed):
     assert 0 < right.sum() < len(points)
 
 
-def test_eps_grows_with_depth():
+def test_dbscan_eps_grows_with_depth():
     """Points 5 cm apart on a line at 2 m."""
     line = np.stack([np.arange(20) * 0.05, np.zeros(20), np.full(20, 2.0)], axis=1)
     line[12:, 0] += 0.06
@@ -63,7 +63,7 @@ def test_eps_grows_with_depth():
         assert len(refined.pixels) == kept, slope
 
 
-def test_skipped_points_follow_sampled_points():
+def test_dbscan_skipped_points_follow_sampled_points():
     """Two plates of different size; with a stride the pixels between follow those near them."""
     v, u = np.mgrid[:60, :90]
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.3)], axis=-1).reshape(-1, 3)
@@ -74,7 +74,7 @@ def test_skipped_points_follow_sampled_points():
         assert len(refined.pixels) == 60 * 50
 
 
-def test_sampled_points_are_weighted_for_skipped_points():
+def test_dbscan_weights_sampled_points_for_skipped_points():
     """Of a plate of 5400 points at most 600 are searched: every third row and column, each point for nine."""
     v, u = np.mgrid[:60, :90]
     plate = np.stack([u * 0.01, v * 0.01, 0 * u + 2.0], axis=-1).reshape(-1, 3)
@@ -84,7 +84,7 @@ def test_sampled_points_are_weighted_for_skipped_points():
         assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, "each has at most 5 within eps"
 
 
-def test_first_of_two_equal_components_stays():
+def test_dbscan_first_of_two_equal_components_stays():
     rng = np.random.default_rng(0)
     ball = rng.normal(0, 0.01, (50, 3))
     for offset in (1.0, -1.0):
@@ -94,12 +94,12 @@ def test_first_of_two_equal_components_stays():
         np.testing.assert_array_equal(refined.pixels[:, 0], np.arange(50))
 
 
-def test_sparse_cluster_is_unchanged():
+def test_dbscan_sparse_cluster_is_unchanged():
     spread = np.arange(60).reshape(20, 3) * 1.0
     assert len(Dbscan().refine(clusters_of(spread), FRAME).pixels) == 20
 
 
-def test_degenerate_clusters_are_valid():
+def test_dbscan_degenerate_clusters_are_valid():
     same = np.zeros((500, 3))
     one = np.array([[1.0, 2.0, 3.0]])
     none = np.zeros((0, 3))
@@ -111,7 +111,7 @@ def test_degenerate_clusters_are_valid():
     assert len(Dbscan(eps=0.001, eps_per_depth=0, min_points=1, stride=1).refine(clusters_of(far), FRAME).pixels) == 1
 
 
-def test_unassigned_points_stay():
+def test_dbscan_unassigned_points_stay():
     clusters = clusters_of(blobs(0))
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, 0).astype(np.int32)
     refined = Dbscan(stride=1).refine(replace(clusters, cluster=cluster), FRAME)
@@ -119,7 +119,7 @@ def test_unassigned_points_stay():
     assert 0 < (refined.cluster == 0).sum() < (cluster == 0).sum()
 
 
-def test_result_does_not_depend_on_thread_count():
+def test_dbscan_does_not_depend_on_thread_count():
     clusters = clusters_of(*(blobs(seed) for seed in range(5)))
     np.testing.assert_array_equal(*by_one_thread_and_two(lambda: Dbscan().refine(clusters, FRAME).points_world))
 
@@ -133,6 +133,6 @@ def test_result_does_not_depend_on_thread_count():
         ({"stride": 0}, "Dbscan.stride"),
     ],
 )
-def test_invalid_parameter_raises(parameters, message):
+def test_dbscan_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         Dbscan(**parameters)

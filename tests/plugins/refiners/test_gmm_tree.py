@@ -73,7 +73,7 @@ def test_gmm_tree_removes_mask_bleed(px, levels):
     assert before[mask].all(), "there was something to take away"
 
 
-def test_mask_log_odds_decide_in_one_plane():
+def test_gmm_tree_mask_log_odds_decide_in_one_plane():
     """Object and wall in one plane: geometry says nothing, and the mask alone decides, to where its log-odds are 0."""
     depth = np.full(CAMERA.shape, 2.0, np.float32)
     frame = frame_of(depth)
@@ -85,7 +85,7 @@ def test_mask_log_odds_decide_in_one_plane():
     assert len(GmmTree(mask_log_odds=0.0).refine(clusters, frame).pixels) == 0, "without evidence nobody's: a draw"
 
 
-def test_masks_are_refined_independently():
+def test_gmm_tree_refines_masks_independently():
     depth, ids = room()
     frame = frame_of(depth)
     wall = np.zeros_like(ids, bool)
@@ -97,7 +97,7 @@ def test_masks_are_refined_independently():
     assert (both.cluster != 1).all()
 
 
-def test_cluster_with_too_few_points_is_unchanged():
+def test_gmm_tree_cluster_with_too_few_points_is_unchanged():
     depth, ids = room()
     frame = frame_of(depth)
     tiny = np.zeros((1, *CAMERA.shape), bool)
@@ -111,7 +111,7 @@ def test_cluster_with_too_few_points_is_unchanged():
     assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), "a tree without a node"
 
 
-def test_unassigned_points_stay():
+def test_gmm_tree_unassigned_points_stay():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids > 0, 8)[None], frame)
@@ -121,7 +121,7 @@ def test_unassigned_points_stay():
     assert (GmmTree().refine(PointClusters(*arrays), frame).cluster == -1).sum() == (cluster == -1).sum()
 
 
-def test_result_does_not_depend_on_thread_count():
+def test_gmm_tree_does_not_depend_on_thread_count():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(np.stack([bleeding(ids > 0, 8), ids > 0]), frame)
@@ -137,6 +137,6 @@ def test_result_does_not_depend_on_thread_count():
         ({"min_support": 1.0}, "GmmTree.min_support"),
     ],
 )
-def test_invalid_parameter_raises(parameters, message):
+def test_gmm_tree_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         GmmTree(**parameters)

@@ -66,7 +66,7 @@ def masks_of(clusters: PointClusters) -> np.ndarray:
 
 
 @pytest.mark.parametrize("pitch", [0.0, PITCH, 0.6])
-def test_box_on_floor_keeps_sides_above_plane_distance(pitch):
+def test_plane_removal_keeps_box_above_plane_distance(pitch):
     frame, ids = scene(BOX, pitch=pitch)
     [left] = masks_of(PlaneRemoval(plane_distance=0.02).refine(lifted(frame, bleeding(ids == 1)), frame))
     np.testing.assert_array_equal(left, (ids == 1) & (heights(frame, pitch) > 0.02))
@@ -80,7 +80,7 @@ def test_structure_mask_marks_floor_and_walls():
     assert refined.structure[ids == 0].mean() > 0.99
 
 
-def test_sensor_noise_widens_plane_distance():
+def test_plane_removal_sensor_noise_widens_plane_distance():
     """A Kinect at 3 m: 99 % of the floor and the wall leave, and the box stays from 6 cm above the floor."""
     frame, ids = scene(BOX, noise=0.002)
     bled = bleeding(ids == 1)
@@ -89,7 +89,7 @@ def test_sensor_noise_widens_plane_distance():
     assert left[(ids == 1) & (heights(frame) > 0.06)].all()
 
 
-def test_table_top_stays():
+def test_plane_removal_keeps_table_top():
     """A table that fills the lower half of the image; what it hides of the floor and the room is behind its top."""
     table = (-1.2, 0.45, 0.9), (1.2, 0.5, 2.2)
     frame, ids = scene(table, BOX)
@@ -99,7 +99,7 @@ def test_table_top_stays():
         np.testing.assert_array_equal(left, bleeding(mask, 4) & (ids > 0))
 
 
-def test_plane_stays_in_cluster_with_largest_fraction():
+def test_plane_removal_keeps_plane_in_cluster_of_most_points():
     """A table top that hides all: nothing is behind it, so that only the share that a cluster holds can tell."""
     frame, ids = scene(((-9.0, 0.5, -9.0), (9.0, 0.6, 9.0)), ((-0.1, 0.3, 0.4), (0.1, 0.5, 0.6)), pitch=0.9)
     assert (ids > 0).all()
@@ -118,7 +118,7 @@ def test_plane_stays_in_cluster_with_largest_fraction():
 
 
 @pytest.mark.parametrize(("share", "unchanged"), [(0.4, False), (0.6, True)])
-def test_cluster_fraction_counts_all_parts_of_plane(share, unchanged):
+def test_plane_removal_cluster_fraction_counts_all_parts(share, unchanged):
     """A wall seen between posts, in a mask that ends in the middle of it and is longer than what a thread counts."""
     post = np.arange(320) // 32 % 2 == 1
     depth = np.where(post, 1.5, 2.0) * np.ones(CAMERA.shape)
@@ -129,7 +129,7 @@ def test_cluster_fraction_counts_all_parts_of_plane(share, unchanged):
     np.testing.assert_array_equal(left, mask & (post | unchanged))
 
 
-def test_screen_near_wall_keeps_front_and_loses_wall():
+def test_plane_removal_keeps_screen_and_removes_wall_behind():
     """8 cm before the wall, 1.2 m x 0.7 m, in Kinect noise; even with planes this small: the wall is behind it."""
     screen = (-0.6, -0.4, 3.85), (0.6, 0.3, 3.92)
     for noise, kept, dropped in ((0.0, 1.0, 1.0), (0.001, 0.99, 0.99)):
@@ -141,7 +141,7 @@ def test_screen_near_wall_keeps_front_and_loses_wall():
             assert 1 - left[bled & (ids == 0)].mean() >= dropped
 
 
-def test_wall_with_small_opening_is_structure():
+def test_plane_removal_wall_with_small_opening_is_structure():
     """With a twentieth of the wall open it is structure, with a third of it it could be the side of a cupboard."""
     for width, dropped in ((12, True), (100, False)):
         frame, _ = scene(BOX)
@@ -154,7 +154,7 @@ def test_wall_with_small_opening_is_structure():
         assert is_wall.any() == dropped, width
 
 
-def test_max_tilt_limits_removal_to_floor():
+def test_plane_removal_max_tilt_limits_removal_to_floor():
     """With a tilt of 60 degrees the wall counts no longer, the floor does."""
     frame, ids = scene(BOX)
     mask = np.ones(CAMERA.shape, bool)
@@ -171,7 +171,7 @@ def test_max_tilt_limits_removal_to_floor():
     assert ids.any()
 
 
-def test_frame_without_planes_is_unchanged():
+def test_plane_removal_without_planes_changes_nothing():
     rng = np.random.default_rng(0)
     depth = rng.uniform(1, 3, CAMERA.shape).astype(np.float32)
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth, CAMERA)
@@ -179,7 +179,7 @@ def test_frame_without_planes_is_unchanged():
     np.testing.assert_array_equal(PlaneRemoval().refine(clusters, frame).pixels, clusters.pixels)
 
 
-def test_small_plane_is_not_structure():
+def test_plane_removal_small_plane_is_not_structure():
     """Of 0.5 m^2, or of a twentieth of the frame, when more is asked."""
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1))
@@ -187,7 +187,7 @@ def test_small_plane_is_not_structure():
         assert len(strict.refine(clusters, frame).pixels) == len(clusters.pixels)
 
 
-def test_unassigned_points_stay():
+def test_plane_removal_unassigned_points_stay():
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1), np.zeros_like(ids, bool))
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, clusters.cluster).astype(np.int32)
@@ -206,6 +206,6 @@ def test_unassigned_points_stay():
         ({"max_tilt": 200.0}, "PlaneRemoval.max_tilt"),
     ],
 )
-def test_invalid_parameter_raises(parameters, message):
+def test_plane_removal_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         PlaneRemoval(**parameters)

@@ -91,7 +91,7 @@ def test_gmm_em_removes_mask_bleed(px):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_refiner_only_shrinks_and_keeps_point_data(make):
+def test_shrinking_refiner_only_shrinks_and_keeps_point_data(make):
     depth, ids = room()
     depth[100:110, 150:160] = 0
     frame = frame_of(depth)
@@ -112,7 +112,7 @@ def test_refiner_only_shrinks_and_keeps_point_data(make):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_clusters_are_refined_independently_in_any_order(make):
+def test_shrinking_refiner_does_not_depend_on_cluster_order(make):
     depth, ids = room()
     frame = frame_of(depth)
     masks = np.stack([bleeding(ids == 1, 8), bleeding(ids == 2, 3)])
@@ -125,7 +125,7 @@ def test_clusters_are_refined_independently_in_any_order(make):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_result_does_not_depend_on_thread_count(make):
+def test_shrinking_refiner_does_not_depend_on_thread_count(make):
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(np.stack([bleeding(ids == 1, 8), bleeding(ids == 2, 3)]), frame)
@@ -133,7 +133,7 @@ def test_result_does_not_depend_on_thread_count(make):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_degenerate_input_is_valid(make):
+def test_shrinking_refiner_degenerate_input_is_valid(make):
     refiner = make()
     depth, ids = room()
     nothing = lifted(np.zeros((0, 240, 320), bool), frame_of(depth))
@@ -149,7 +149,7 @@ def test_degenerate_input_is_valid(make):
 
 
 @pytest.mark.parametrize("make", [GmmEm, KMeans])
-def test_cluster_with_too_few_points_is_unchanged(make):
+def test_shrinking_refiner_keeps_cluster_with_too_few_points(make):
     depth, ids = room()
     tiny = np.zeros((1, 240, 320), bool)
     tiny[0, 100:105, 150:155] = True
@@ -160,7 +160,7 @@ def test_cluster_with_too_few_points_is_unchanged(make):
     assert len(make().refine(box, lonely).pixels) == (ids == 1).sum(), "a ring without readings"
 
 
-def test_unassigned_points_stay():
+def test_shrinking_refiner_unassigned_points_stay():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, 8)[None], frame)
@@ -245,7 +245,7 @@ def test_largest_component_matches_reference(reach, density):
         (LargestComponent, {"connection_radius": 0}, "LargestComponent.connection_radius"),
     ],
 )
-def test_invalid_parameter_raises(make, parameters, message):
+def test_shrinking_refiner_invalid_parameter_raises(make, parameters, message):
     with pytest.raises(ConfigError, match=message):
         make(**parameters)
 
@@ -297,7 +297,7 @@ def test_gmm_em_single_gaussian_matches_reference():
         KMeans(ring=Ring(ring_fraction=0.0)),
     ],
 )
-def test_all_points_stay_without_background_model(refiner):
+def test_gmm_em_without_background_model_keeps_all_points(refiner):
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, 8)[None], frame)

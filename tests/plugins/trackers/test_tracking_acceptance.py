@@ -64,19 +64,19 @@ def wall() -> list[Frame]:
     return [dataclasses.replace(f, depth=f.depth + n) for f, n in zip(exact, noise, strict=True)]
 
 
-def test_color_tracks_flat_wall(wall: list[Frame]) -> None:
+def test_tracking_with_color_follows_flat_wall(wall: list[Frame]) -> None:
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), wall)
     assert not any(p.lost for p in poses)
     assert drift(poses[-1], wall[-1]) < 0.01
 
 
 @pytest.mark.parametrize("min_information", [VoxelHashingIcp.min_information, 0.0], ids=["default", "unchecked"])
-def test_geometry_alone_drifts_or_is_lost_on_flat_wall(min_information: float, wall: list[Frame]) -> None:
+def test_tracking_without_color_drifts_or_is_lost_on_flat_wall(min_information: float, wall: list[Frame]) -> None:
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=0.0, min_information=min_information), wall)
     assert any(p.lost for p in poses) or drift(poses[-1], wall[-1]) > 0.1
 
 
-def test_drift_without_noise_is_below_one_voxel() -> None:
+def test_tracking_drift_without_noise_is_below_one_voxel() -> None:
     """40 frames of the walk whose 200 frames are a benchmark; 1 cm voxels."""
     room = Synthetic(frames=240, stop=40, noise=0.0)
     frames = rendered_frames(room)
@@ -85,7 +85,7 @@ def test_drift_without_noise_is_below_one_voxel() -> None:
     assert drift(poses[-1], frames[39]) < 0.002
 
 
-def test_color_does_not_reduce_accuracy(shared_data: Path) -> None:
+def test_tracking_with_color_is_not_less_accurate(shared_data: Path) -> None:
     """A real kitchen: with color the trajectory is not worse than without."""
     frames = list(RgbdFolder(shared_data / "redkitchen", stop=80, stride=2))
     truth = [f.T_world_camera for f in frames]
@@ -182,7 +182,7 @@ def there_and_back(frames: list[Frame], begin: int, bad: list[Frame], end: int) 
         (garbage, 5),
     ],
 )
-def test_bad_frames_are_lost_and_leave_map_accurate(
+def test_tracking_loses_bad_frames_and_keeps_map_accurate(
     spoilt, count: int, frames: list[Frame], surface, clean_error
 ) -> None:
     shown = there_and_back(frames, 25, [spoilt(f) for f in frames[25 : 25 + count]], 25 + count)
@@ -191,9 +191,7 @@ def test_bad_frames_are_lost_and_leave_map_accurate(
     assert_unharmed(poses, shown, surface.error(scene), clean_error)
 
 
-def test_cut_to_other_room_is_lost_and_leaves_map_accurate(
-    frames: list[Frame], elsewhere, surface, clean_error
-) -> None:
+def test_tracking_loses_cut_to_other_room_and_keeps_map(frames: list[Frame], elsewhere, surface, clean_error) -> None:
     bad = [dataclasses.replace(f, depth=e.depth, color=e.color) for f, e in zip(frames[25:28], elsewhere, strict=True)]
     shown = there_and_back(frames, 25, bad, 28)
     poses, scene = run(VoxelHashingIcp(), shown)
@@ -202,14 +200,14 @@ def test_cut_to_other_room_is_lost_and_leaves_map_accurate(
 
 
 @pytest.mark.parametrize("missing", [3, 5, 20, 40])
-def test_jump_is_tracked_or_lost(missing: int, frames: list[Frame], surface, clean_error) -> None:
+def test_tracking_follows_or_loses_jump(missing: int, frames: list[Frame], surface, clean_error) -> None:
     """Frames are missing from the middle of the video: 4, 9, 30 and 58 cm; 2, 5, 17 and 33 degrees."""
     shown = there_and_back(frames, 25, [], 25 + missing)
     poses, scene = run(VoxelHashingIcp(), shown)
     assert_unharmed(poses, shown, surface.error(scene), clean_error)
 
 
-def test_jump_in_real_video_is_tracked_or_lost(shared_data: Path) -> None:
+def test_tracking_follows_or_loses_jump_in_real_video(shared_data: Path) -> None:
     """As above, against the poses that the data come with, which are good to a centimeter or two."""
     frames = list(RgbdFolder(shared_data / "redkitchen", stop=70))
     shown = [*frames[:25], *frames[45:55], *frames[55:5:-2]]
@@ -219,7 +217,7 @@ def test_jump_in_real_video_is_tracked_or_lost(shared_data: Path) -> None:
     assert not np.isnan(off[-5:]).any()
 
 
-def test_sparse_video_is_tracked() -> None:
+def test_tracking_follows_sparse_video() -> None:
     """Steps of 6 and 40 cm, of 3 and 22 degrees, in turns: neither the last step nor the last pose tells the next."""
     video = Synthetic(frames=240, stop=200, width=320, height=240)
     sparse = rendered_frames(video, [k for k in range(200) if k % 32 in (0, 4)])
@@ -234,7 +232,7 @@ BALL = (np.array([-1.2, 0.8, 2.2]), 0.25)
 
 
 @pytest.mark.parametrize("spheres", [[BALL], []], ids=["ball", "bare"])
-def test_textureless_wall_is_lost(spheres: list[tuple[np.ndarray, float]]) -> None:
+def test_tracking_loses_textureless_wall(spheres: list[tuple[np.ndarray, float]]) -> None:
     """From a corner, bare or with a ball in it, along an untextured wall until nothing else is in view, and back."""
     corner = Scene(
         planes=[
@@ -257,7 +255,7 @@ def test_textureless_wall_is_lost(spheres: list[tuple[np.ndarray, float]]) -> No
     assert np.median(corner.distance(scene.mesh().vertices.astype(float))) < 0.1 * VOXEL
 
 
-def test_poses_and_map_do_not_depend_on_thread_count(frames: list[Frame], tmp_path: Path) -> None:
+def test_tracking_does_not_depend_on_thread_count(frames: list[Frame], tmp_path: Path) -> None:
     saved, tracked = [], []
     before = numba.get_num_threads()
     for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):

@@ -30,7 +30,7 @@ EXAMPLE = CHECKOUT / "examples" / "instancemap-depth-median"
 SITE = Path(sysconfig.get_paths()["purelib"])
 
 
-def test_example_plugin_matches_new_plugin_output() -> None:
+def test_new_plugin_output_matches_example_plugin() -> None:
     written = files_of("refiner", "depth_median")
     files = {path.relative_to(EXAMPLE) for path in EXAMPLE.rglob("*") if path.is_file()}
     left = {path for path in files if not {"__pycache__", ".ruff_cache", ".pytest_cache"}.intersection(path.parts)}
@@ -146,7 +146,7 @@ def run(place: Path, *line: str) -> str:
 
 
 @pytest.mark.acceptance
-def test_installed_plugins_pass_their_own_tests(place: Path) -> None:
+def test_new_plugin_installed_plugins_pass_their_tests(place: Path) -> None:
     where = run(place, "python", "-c", "import framework, instancemap_my_refiner; print(framework.__file__)")
     assert where.startswith(str(place))
     (place / "pytest.ini").touch()
@@ -158,7 +158,7 @@ def test_installed_plugins_pass_their_own_tests(place: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_sweep_of_plugin_and_builtin_tabulates_both(place: Path) -> None:
+def test_new_plugin_sweep_with_builtin_tabulates_both(place: Path) -> None:
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"

@@ -206,7 +206,7 @@ def test_plugins_faulty_options_are_listed_with_reason(tmp_path: Path, monkeypat
     assert len(found["maskrcnn2go"].parameters) > 3
 
 
-def test_registered_options_can_be_described() -> None:
+def test_describe_option_accepts_every_registered_option() -> None:
     options = registered(*GROUPS)
     assert {option.stage for option in options} == set(GROUPS)
     for option in options:

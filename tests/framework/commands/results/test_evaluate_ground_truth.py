@@ -83,7 +83,7 @@ def tracker(made: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", ["posed", "unposed"])
-def test_run_is_compared_with_another_run(made: Path, tmp_path: Path, name: str) -> None:
+def test_ground_truth_of_another_run_is_compared(made: Path, tmp_path: Path, name: str) -> None:
     named = {"ground_truth": str(made / "reference")}
     changes = {"tracker": tracker(made)} if name == "unposed" else {}
     metrics = mapped(tmp_path / "run", made / name, dataset=named, **changes)
@@ -92,7 +92,7 @@ def test_run_is_compared_with_another_run(made: Path, tmp_path: Path, name: str)
     assert metrics["annotation_release"] == "reference/mesh.ply"
 
 
-def test_unposed_map_is_moved_to_the_run(made: Path, tmp_path: Path) -> None:
+def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None:
     """The reference begins elsewhere: 0.5 m aside."""
     reference = tmp_path / "reference"
     reference.mkdir()
@@ -111,7 +111,9 @@ def test_unposed_map_is_moved_to_the_run(made: Path, tmp_path: Path) -> None:
     assert metrics_of(tmp_path / "run")["instances.ap50"] == 0.0
 
 
-def test_finished_run_gets_another_ground_truth(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_changes_ground_truth_of_finished_run(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """It is kept by later evaluations, reports and figures."""
     fake = {"_target_": "plugins.detectors.none.NoDetections"}
     directory = tmp_path / "run"
@@ -133,7 +135,9 @@ def test_finished_run_gets_another_ground_truth(made: Path, tmp_path: Path, caps
     np.testing.assert_array_equal(drawn.instance_ids, truth.instance_ids)
 
 
-def test_unusable_ground_truth_is_one_line(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_unusable_ground_truth_is_one_line_error(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     directory = tmp_path / "run"
     mapped(directory, made / "posed", dataset={"ground_truth": str(made / "reference")})
     before = (directory / "metrics.json").read_bytes()
@@ -144,7 +148,7 @@ def test_unusable_ground_truth_is_one_line(made: Path, tmp_path: Path, capsys: p
     assert (directory / "metrics.json").read_bytes() == before
 
 
-def test_re_evaluation_is_identical(made: Path, tmp_path: Path) -> None:
+def test_evaluate_again_gives_identical_metrics(made: Path, tmp_path: Path) -> None:
     """The alignment of a tracked map uses the poses that are stored."""
     reference = made / "reference"
     before = mapped(tmp_path / "run", made / "unposed", dataset={"ground_truth": str(reference)}, tracker=tracker(made))
@@ -153,7 +157,7 @@ def test_re_evaluation_is_identical(made: Path, tmp_path: Path) -> None:
     assert {key: value for key, value in after.items() if not key.startswith("evaluation.")} == before
 
 
-def test_inputs_contain_the_files_of_the_ground_truth(made: Path, tmp_path: Path) -> None:
+def test_inputs_contain_files_of_ground_truth(made: Path, tmp_path: Path) -> None:
     mesh, names = tmp_path / "mesh.ply", tmp_path / "instances.json"
     mesh.write_text("a mesh")
     names.write_text("{}")

@@ -129,7 +129,7 @@ def test_raycast_error_is_one_line(stored: Path, command: Command, arguments: li
     assert command(stored, *arguments) == (1, "", f"error: {message}\n")
 
 
-def test_raycast_without_map_is_one_line(stored: Path, command: Command, tmp_path: Path) -> None:
+def test_raycast_without_map_is_one_line_error(stored: Path, command: Command, tmp_path: Path) -> None:
     (stored / "map.npz").unlink()
     for run in (stored, tmp_path / "nowhere"):
         status, output, error = command(run)
@@ -137,7 +137,7 @@ def test_raycast_without_map_is_one_line(stored: Path, command: Command, tmp_pat
         assert error.startswith("error: raycast: expected a run directory, got")
 
 
-def test_raycast_without_mapped_frames_is_one_line(stored: Path, command: Command) -> None:
+def test_raycast_without_mapped_frames_is_one_line_error(stored: Path, command: Command) -> None:
     (stored / "trajectory.txt").write_text("")
     status, _, err = command(stored)
     assert status == 1

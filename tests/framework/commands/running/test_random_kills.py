@@ -47,7 +47,7 @@ def whole_files(place: Path) -> set[str]:
     return there
 
 
-def test_torn_file_is_detected(tmp_path: Path) -> None:
+def test_run_record_truncated_file_is_detected(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text('{"frames": 2')
     with pytest.raises(DataError):
         whole_files(tmp_path)

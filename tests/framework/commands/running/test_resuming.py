@@ -141,7 +141,7 @@ def test_resume_from_missing_map_raises(tmp_path: Path) -> None:
         Mapper(*GIVEN, "resume_from=7")
 
 
-def test_keyframes_round_trip_and_damage_raises(tmp_path: Path) -> None:
+def test_keyframes_file_round_trip_is_exact_and_damage_raises(tmp_path: Path) -> None:
     desk, _ = mapped([DESK[k] for k in range(0, 30, 5)], *TRACKED)
     keyframes = desk.pipeline.tracker.keyframes()
     path = tmp_path / "keyframes.npz"
@@ -173,7 +173,7 @@ def test_keyframes_round_trip_and_damage_raises(tmp_path: Path) -> None:
         read_keyframes(path)
 
 
-def test_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerRoom) -> None:
+def test_resumed_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerRoom) -> None:
     first, _ = mapped(room, *GIVEN)
     again, _ = mapped(room, *GIVEN, f"resume_from={put_away(first, tmp_path / 'first')}")
     again.scene.save(tmp_path / "again.npz")

@@ -89,7 +89,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.Co
     return directory, end(begin(directory, *BY_JOBLIB, *SIX))
 
 
-def test_joblib_sweep_continues_after_failed_runs(
+def test_sweep_by_joblib_continues_after_failed_runs(
     whole: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
     directory, done = whole
@@ -119,7 +119,7 @@ def test_sweep_with_other_launcher_keeps_completed_runs(
 
 
 @pytest.mark.acceptance
-def test_killed_sweep_resumes_to_same_table(
+def test_sweep_after_kill_resumes_to_same_table(
     whole: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
     """First one of its workers is killed, then all of it at once."""
@@ -152,7 +152,7 @@ def test_killed_sweep_resumes_to_same_table(
         assert (tmp_path / PLACE / name).read_bytes() == (whole[0] / PLACE / name).read_bytes()
 
 
-def test_plain_sweep_has_one_folder_and_reports_failures(tmp_path: Path) -> None:
+def test_sweep_without_experiment_reports_failures(tmp_path: Path) -> None:
     """Its place is named after the time, which workers must not read anew."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     done = end(begin(tmp_path, *FAKES, "dataset.frames=few,many", "launcher=joblib", sweep="-m"))
@@ -173,7 +173,7 @@ def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess
     return done, {path.parent.name.partition("refiner=fake,")[2]: path.stat().st_mtime_ns for path in runs}
 
 
-def test_plain_sweep_is_resumed(tmp_path: Path) -> None:
+def test_sweep_without_experiment_is_resumed(tmp_path: Path) -> None:
     """With whatever else that changes no result: it is not in the name of a run's directory."""
     _, first = swept(tmp_path, "seed=1,2")
     assert set(first) == {"seed=1,tracker=fake", "seed=2,tracker=fake"}
@@ -338,13 +338,13 @@ def test_cluster_launchers_run_locally(tmp_path: Path, package: str, arguments: 
 # Without a process
 
 
-def test_missing_launcher_error_names_extra() -> None:
+def test_launcher_missing_error_names_extra() -> None:
     error = MissingConfigException("?", missing_cfg_file="hydra/launcher/submitit_slurm", options=["basic"])
     assert one_line(error).endswith("pip install instancemap[slurm]")
 
 
 @pytest.mark.parametrize(("threads", "jobs"), [(1, 12), (5, 2), (12, 1), (13, 1), (0, 1)])
-def test_jobs_at_once_depend_on_threads_and_cores(monkeypatch: pytest.MonkeyPatch, threads: int, jobs: int) -> None:
+def test_jobs_at_once_depends_on_threads_and_cores(monkeypatch: pytest.MonkeyPatch, threads: int, jobs: int) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
     assert jobs_at_once(threads) == jobs
 
@@ -364,5 +364,5 @@ def test_launcher_config_uses_job_threads(launcher: str, node: str, monkeypatch:
         assert own.hydra.job.env_set.TQDM_DISABLE == "1"
 
 
-def test_threads_do_not_change_config_hash() -> None:
+def test_config_hash_ignores_threads() -> None:
     assert config_hash({"seed": 1, "threads": 0}) == config_hash({"seed": 1, "threads": 8})

@@ -75,7 +75,7 @@ def test_camera_frames_are_registered_to_color(brand: Brand, device: FakeCamera)
     assert not device.running
 
 
-def test_device_stream_request_matches_parameters(brand: Brand, device: FakeCamera) -> None:
+def test_camera_stream_request_matches_parameters(brand: Brand, device: FakeCamera) -> None:
     video = brand.video(serial=SERIAL, fps=60)
     assert video.name == f"{brand.name}_{SERIAL}"
     assert not device.started, "nothing before frames are asked for"
@@ -86,14 +86,14 @@ def test_device_stream_request_matches_parameters(brand: Brand, device: FakeCame
     assert len(device.started) == 2
 
 
-def test_depth_beyond_max_depth_is_invalid(brand: Brand, device: FakeCamera) -> None:
+def test_camera_depth_beyond_max_depth_is_invalid(brand: Brand, device: FakeCamera) -> None:
     [frame] = sent(brand.video(max_depth=2.5), 1)
     assert 2.4 < frame.depth.max() <= 2.5
     [whole] = sent(brand.video(max_depth=0.0), 1)
     assert whole.depth.max() > 2.9
 
 
-def test_lens_is_undistorted_only_for_supported_model(
+def test_camera_lens_is_undistorted_only_for_supported_model(
     brand: Brand, device: FakeCamera, caplog: pytest.LogCaptureFixture
 ) -> None:
     device.coeffs = (0.1, -0.05, 0.01, 0.02, 0.001)
@@ -109,7 +109,7 @@ def test_lens_is_undistorted_only_for_supported_model(
     assert caplog.messages == [expected]
 
 
-def test_missing_package_raises_one_line(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_camera_missing_package_raises_one_line_error(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, brand.library, None)
     with pytest.raises(
         ConfigError,
@@ -118,7 +118,7 @@ def test_missing_package_raises_one_line(brand: Brand, monkeypatch: pytest.Monke
         next(brand.video().frames())
 
 
-def test_missing_device_raises_one_line(brand: Brand, device: FakeCamera) -> None:
+def test_camera_missing_device_raises_one_line_error(brand: Brand, device: FakeCamera) -> None:
     device.plugged_in = False
     with pytest.raises(DataError, match=f"device with 96x72 at 30 Hz cannot be started: {brand.nothing_there}$"):
         next(brand.video().frames())
@@ -128,7 +128,7 @@ def test_missing_device_raises_one_line(brand: Brand, device: FakeCamera) -> Non
     ("parameters", "message"),
     [({"serial": "999"}, ": device 999 with 96x72"), ({"width": 640}, ": device with 640x72")],
 )
-def test_unsupported_device_request_raises_one_line(
+def test_camera_unsupported_request_raises_one_line_error(
     brand: Brand, device: FakeCamera, parameters: dict[str, object], message: str
 ) -> None:
     with pytest.raises(DataError, match=f"{message} at 30 Hz cannot be started: ") as caught:
@@ -137,7 +137,7 @@ def test_unsupported_device_request_raises_one_line(
     assert not device.running
 
 
-def test_disconnected_device_raises_and_stops(
+def test_camera_disconnected_device_raises_and_stops(
     brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device.unplugged_at = 2
@@ -163,13 +163,13 @@ def test_camera_pauses_below_timeout_are_tolerated(monkeypatch: pytest.MonkeyPat
     assert message == ["first", None, "second", None, "third", None]
 
 
-def test_idle_device_yields_none(brand: Brand, device: FakeCamera) -> None:
+def test_camera_idle_device_yields_none(brand: Brand, device: FakeCamera) -> None:
     device.frames = 0
     with closing(brand.video().frames()) as readers:
         assert [next(readers), next(readers)] == [None, None]
 
 
-def test_frame_without_depth_raises_and_next_is_read(brand: Brand, device: FakeCamera) -> None:
+def test_camera_missing_depth_raises_for_its_frame_only(brand: Brand, device: FakeCamera) -> None:
     device.without_depth = 1
     with closing(brand.video().frames()) as readers:
         first, second, third = (reader for reader in (next(readers) for _ in range(3)) if reader)

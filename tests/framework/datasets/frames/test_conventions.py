@@ -64,7 +64,7 @@ def test_camera_axes_match_system_conventions() -> None:
         ({"depth_delay": 1001}, "delay"),
     ],
 )
-def test_invalid_reading_parameter_raises(wrong: dict[str, float], message: str) -> None:
+def test_pose_reading_invalid_parameter_raises(wrong: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         DepthReading(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="pose_unit"):
@@ -109,7 +109,7 @@ def test_pose_delay_pairs_images_with_matching_pose(delay: int) -> None:
             assert frame.up is stored[k].up
 
 
-def test_recording_is_read_with_configured_conventions() -> None:
+def test_conventions_are_applied_when_recording_is_read() -> None:
     desk = {"root": Path("data/desk"), "scene": "rgbd_dataset_freiburg1_rpy"}
     plain = TumRgbd(**desk)  # type: ignore[arg-type]
     meant = TumRgbd(

@@ -92,7 +92,7 @@ def test_onnx_network_cuda_unavailable_raises(tmp_path):
 
 
 @pytest.mark.parametrize(("device", "loaded"), [("cpu", 0), ("auto", 1)])
-def test_cuda_libraries_are_loaded_before_session(tmp_path, monkeypatch, device, loaded):
+def test_onnx_network_cuda_libraries_are_loaded_before_session(tmp_path, monkeypatch, device, loaded):
     import onnxruntime
 
     calls = []

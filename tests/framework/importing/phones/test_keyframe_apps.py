@@ -35,7 +35,7 @@ def write(path: Path, tmp_path: Path, least: int = 1) -> list[str]:
 
 
 @pytest.mark.parametrize("least", [0, 1, 2])
-def test_export_matches_room_geometry(export: tuple[str, Path], tmp_path: Path, least: int) -> None:
+def test_keyframe_apps_export_matches_room_geometry(export: tuple[str, Path], tmp_path: Path, least: int) -> None:
     name, path = export
     source = open_source(path)
     assert (source.format, source.count) == (name, len(FRAMES))
@@ -79,7 +79,7 @@ def test_scanner_app_frames_without_color_are_dropped(tmp_path: Path) -> None:
         open_source(tmp_path / "export")
 
 
-def test_scan_without_times_is_timed_by_frame_number(tmp_path: Path) -> None:
+def test_scanner_app_scan_without_times_uses_frame_number(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "export", FRAMES)
     for path in (tmp_path / "export").glob("frame_*.json"):
         change(path, lambda content: content.pop("time"))
@@ -128,7 +128,7 @@ SPOILT_CAMERAS = {
 @pytest.mark.parametrize(
     ("app", "how", "message"), [(app, *case) for app, cases in SPOILT_CAMERAS.items() for case in cases]
 )
-def test_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, message: str) -> None:
+def test_keyframe_apps_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, message: str) -> None:
     WRITERS[app](tmp_path / "export", FRAMES)
     change(second(tmp_path / "export", "frame_*.json" if app == "3D Scanner App" else "cameras/*.json"), how)
     [fault] = write(tmp_path / "export", tmp_path)
@@ -143,7 +143,7 @@ def test_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, message: 
         *(("Polycam", f"{kind}/*") for kind in ("cameras", "images", "depth", "confidence")),
     ],
 )
-def test_truncated_file_loses_one_frame(tmp_path: Path, app: str, pattern: str) -> None:
+def test_keyframe_apps_truncated_file_loses_one_frame(tmp_path: Path, app: str, pattern: str) -> None:
     WRITERS[app](tmp_path / "export", FRAMES)
     path = second(tmp_path / "export", pattern)
     path.write_bytes(path.read_bytes()[:-10])

@@ -151,14 +151,14 @@ def test_match_is_independent_of_detection_order(seed: int) -> None:
 
 
 @pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
-def test_points_outside_image_raise(pixel: tuple[int, int]) -> None:
+def test_points_by_pixel_outside_image_raise(pixel: tuple[int, int]) -> None:
     clusters = clusters_of([columns(0, 2)], [1])
     clusters.pixels[3] = pixel
     with pytest.raises(DataError, match="image of 5x4"):
         list_points_by_pixel(clusters, SHAPE)
 
 
-def test_points_without_cluster_are_ignored() -> None:
+def test_association_ignores_points_without_cluster() -> None:
     clusters = clusters_of([columns(0, 3), columns(1, 4)], [1, 0.5])
     clusters.cluster[clusters.pixels[:, 0] == 1] = -1
     seen = np.full(SHAPE, 4, np.int32)

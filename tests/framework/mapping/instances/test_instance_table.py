@@ -24,7 +24,7 @@ def test_frame_set_behaves_like_set(ours: list[int], theirs: list[int]) -> None:
 
 
 @pytest.mark.parametrize("second", [range(10, 20), range(5, 15)], ids=["one after the other", "half together"])
-def test_merged_fragments_have_confidence_of_whole(second: range) -> None:
+def test_instance_table_merge_keeps_confidence_of_whole(second: range) -> None:
     """Each detected in every other frame that had it in view."""
     table = InstanceTable()
     seen = {table.create(1, 0).id: range(10), table.create(1, 0).id: second, table.create(1, 0).id: range(second.stop)}

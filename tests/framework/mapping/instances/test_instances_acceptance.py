@@ -52,7 +52,7 @@ def assert_one_each(scene: BoxScene, fuser: MapFuser, least: float) -> None:
 TOUCHING = [[(-0.6, 1.0, 0.0, 0.0, 1.6, 1.5)], [(0.0, 0.9, 0.0, 0.9, 1.6, 0.7)]]
 
 
-def test_touching_objects_under_one_mask_are_separated() -> None:
+def test_instances_of_touching_objects_are_separated() -> None:
     """Every other frame, the first too, has one mask over both, the others have a mask for each; all bleed by 8 px."""
     scene = BoxScene(TOUCHING)
     frames = [scene.frame(look_from(-1.2 + 0.1 * k, -1.6, 1.4, (0.1, 1.2, 0.5)), k) for k in range(24)]
@@ -64,7 +64,7 @@ def test_touching_objects_under_one_mask_are_separated() -> None:
     assert_one_each(scene, mapped(frames, detections), 0.9)
 
 
-def test_bleeding_mask_does_not_claim_undetected_neighbor() -> None:
+def test_instance_of_bleeding_mask_excludes_neighbor() -> None:
     scene = BoxScene(TOUCHING)
     frames = [scene.frame(look_from(-1.2 + 0.1 * k, -1.6, 1.4, (0.1, 1.2, 0.5)), k) for k in range(24)]
     detections = [detected([bled(true_mask(frame, 1), 8)], [TABLE]) for frame in frames]
@@ -76,7 +76,7 @@ def test_bleeding_mask_does_not_claim_undetected_neighbor() -> None:
     assert bleeding[2, 1] > 2 * found[2, 1]
 
 
-def test_adjacent_chairs_stay_separate() -> None:
+def test_instances_of_adjacent_chairs_stay_separate() -> None:
     """10 cm apart, alike, seen along the row: one behind the other, then side by side; a third of them is missed."""
     scene = BoxScene([chair(-0.275, 1.2), chair(0.275, 1.2)])
     frames = [
@@ -90,7 +90,7 @@ def test_adjacent_chairs_stay_separate() -> None:
     assert_one_each(scene, mapped(frames, detections), 0.9)
 
 
-def test_table_seen_from_two_sides_stays_one_instance() -> None:
+def test_instance_of_table_stays_one_from_two_sides() -> None:
     """From the one side, from low down; then, after a jump, from the other."""
     scene = BoxScene([table(0.0, 0.0)])
     sides = [(x, y, 1.2) for y in (-2.2, 1.8) for x in np.linspace(-0.8, 0.8, 12)]

@@ -38,7 +38,7 @@ def test_embedding_mean_is_unit_and_spread_is_lost_length() -> None:
     assert np.isfinite(opposite.mean).all()
 
 
-def test_merged_instances_combine_embeddings() -> None:
+def test_embeddings_of_merged_instances_are_combined() -> None:
     table = InstanceTable()
     for embedding in (X, Y, None):
         record = table.create(1, 0)
@@ -70,7 +70,7 @@ def test_merged_instances_combine_embeddings() -> None:
         (np.eye(2, 3, dtype=np.float32), "w" * 301, "at most 300 characters"),
     ],
 )
-def test_invalid_embeddings_raise(kind: type, embeddings: np.ndarray | None, space: str, fault: str) -> None:
+def test_embeddings_invalid_values_raise(kind: type, embeddings: np.ndarray | None, space: str, fault: str) -> None:
     scores, rows = np.ones(2, np.float32), np.ones((2, 1), np.float32)
     given = {"embeddings": embeddings, "embedding_space": space, "scores": scores, "class_probabilities": rows}
     if kind is Detections:
@@ -162,7 +162,7 @@ def test_embeddings_of_other_space_raise() -> None:
         ("embedding_counts", None, "expected embedding_counts with an embedding space, got none"),
     ],
 )
-def test_damaged_embeddings_in_file_raise(tmp_path: Path, array: str, value: np.ndarray | None, fault: str) -> None:
+def test_embeddings_damaged_in_file_raise(tmp_path: Path, array: str, value: np.ndarray | None, fault: str) -> None:
     path = tmp_path / "map.npz"
     mapped("bayesian_tsdf", embeddings=EMBEDDINGS).scene.save(path)
     with np.load(path) as file:

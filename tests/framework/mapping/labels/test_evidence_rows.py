@@ -37,7 +37,7 @@ def with_voxels(count: int) -> EvidenceRows:
         ([1, 3, 4, 0], [5, 4, 3, 0], [1, 3, 4, 0], [5, 4, 3, 0]),  # the dropped one not there: nothing changes
     ],
 )
-def test_merge_adds_evidence_and_keeps_best_first(
+def test_evidence_merge_adds_evidence_and_keeps_best_first(
     ids: list[int], logs: list[float], merged_ids: list[int], merged_logs: list[float]
 ) -> None:
     rows = with_voxels(1)
@@ -50,7 +50,7 @@ def test_merge_adds_evidence_and_keeps_best_first(
 
 
 @pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
-def test_merge_updates_all_labeled_voxels(count: int) -> None:
+def test_evidence_merge_updates_all_labeled_voxels(count: int) -> None:
     """Of thousands, a few know the instance: the first and the last in use, and some between; none beyond."""
     rows = with_voxels(count)
     evidence = rows.evidence
@@ -170,7 +170,7 @@ def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
     return evidence
 
 
-def test_evictions_of_new_voxel_are_counted() -> None:
+def test_evidence_rows_count_evictions_of_new_voxel() -> None:
     message = voted([1, 2, 3, 4, 5, 6], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0] * 6, Combine.SUM)
     expected = update_voxel(blank(), 0, message, COVERED)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
@@ -180,7 +180,7 @@ def test_evictions_of_new_voxel_are_counted() -> None:
     assert rows.evicted == expected == 2
 
 
-def test_exact_storage_keeps_all_evidence() -> None:
+def test_evidence_rows_exact_storage_keeps_all_evidence() -> None:
     """Many more instances and classes than the compact slots: every sum is there."""
     rng = np.random.default_rng(0)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=Storage.EXACT)

@@ -21,7 +21,7 @@ from tests.support.one_pixel import BARE, COVERED, FLOOR, SCORE_SCALE, blank, di
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10_000), labels=st.integers(1, INSTANCE_SLOTS))
-def test_update_matches_full_recursion_if_labels_fit(seed: int, labels: int) -> None:
+def test_label_update_matches_full_recursion_if_labels_fit(seed: int, labels: int) -> None:
     """With no more labels than slots, nothing is ever dropped, so posteriors are exact: eqs. [7] and [8]."""
     rng = np.random.default_rng(seed)
     classes = labels  # every class is named
@@ -49,7 +49,7 @@ def test_update_matches_full_recursion_if_labels_fit(seed: int, labels: int) -> 
     assert best_class(evidence, 0) == np.argmax(class_log)
 
 
-def test_update_matches_full_recursion_for_80_classes() -> None:
+def test_label_update_matches_full_recursion_for_80_classes() -> None:
     """More classes than slots: the argmax still agrees nearly always, and evictions are counted."""
     rng = np.random.default_rng(0)
     agree = 0
@@ -71,7 +71,7 @@ def test_update_matches_full_recursion_for_80_classes() -> None:
     assert evictions > 0
 
 
-def test_voxel_under_two_masks_gets_both_updates() -> None:
+def test_label_update_of_voxel_under_two_masks_applies_both() -> None:
     evidence = blank()
     p = np.full((2, 3), 1 / 3)
     update_voxel(evidence, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), COVERED)
@@ -80,7 +80,7 @@ def test_voxel_under_two_masks_gets_both_updates() -> None:
     assert found[2] == np.float32(np.log(0.5 / FLOOR))
 
 
-def test_absence_counts_only_against_detected_instances() -> None:
+def test_label_update_absence_counts_only_if_detected() -> None:
     evidence = blank()
     one = np.full((1, 3), 1 / 3)
     update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), COVERED)
@@ -94,14 +94,14 @@ def test_absence_counts_only_against_detected_instances() -> None:
     assert best_instance(evidence, 0) == 0, "the rest has become more likely"
 
 
-def test_cluster_without_instance_adds_no_evidence() -> None:
+def test_label_update_without_instance_adds_no_evidence() -> None:
     evidence = blank()
     update_voxel(evidence, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), COVERED)
     assert (evidence.instance_ids == 0).all()
     assert (evidence.class_ids == NO_CLASS).all()
 
 
-def test_class_gains_are_relative_to_unnamed_classes() -> None:
+def test_named_classes_are_relative_to_mean_of_unnamed_classes() -> None:
     p = np.array([[0.5, 0.2, 0.1, 0.06, 0.04, 0.03, 0.025, 0.02, 0.01, 0.009, 0.006]])
     relative, named, bits = named_classes(np.log(p), logarithmic=True)
     assert named.tolist() == [list(range(NEW_CLASSES))]
@@ -111,7 +111,7 @@ def test_class_gains_are_relative_to_unnamed_classes() -> None:
     assert np.allclose(relative, np.log(p / rest), atol=1e-5)
 
 
-def test_full_slots_replace_least_likely_label() -> None:
+def test_label_slots_replace_least_likely_label_if_full() -> None:
     labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
     assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM, np.float32(9)) == 1
     assert labels.tolist() == [1, 2, 3, 4], "the newcomer itself is the least likely"

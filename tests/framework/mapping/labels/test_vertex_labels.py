@@ -94,7 +94,7 @@ def test_vertex_labels_match_voxelwise_reference(fuser: BayesianTsdf, dropped: t
     assert not set(dropped) & set(instances.tolist())
 
 
-def test_vertex_in_unmapped_space_has_no_label(fuser: BayesianTsdf) -> None:
+def test_vertex_labels_of_unmapped_space_are_none(fuser: BayesianTsdf) -> None:
     scene = fuser.scene
     counts = np.ones(scene.table.last_id + 1, np.bool_)
     far = UnlabeledMesh(np.full((1, 3), 1e3, np.float32), np.zeros((0, 3), np.int32), np.zeros(1, np.int32))

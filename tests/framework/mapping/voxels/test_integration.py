@@ -112,14 +112,14 @@ def test_integration_allocates_blocks_near_surface() -> None:
     )
 
 
-def test_rounding_averages_are_unbiased() -> None:
+def test_integration_rounding_averages_are_unbiased() -> None:
     """A constant that is no multiple of the stored unit is met on average, though values are stored as integers."""
     rounding = [(k * GOLDEN) % 1.0 for k in range(1, 1001)]
     assert abs(np.mean(np.floor(0.3 + np.array(rounding))) - 0.3) < 0.01
 
 
 @pytest.mark.parametrize("frame_number", [987, 2584, 121393])
-def test_rounding_does_not_wrap_around(frame_number: int) -> None:
+def test_integration_rounding_does_not_wrap_around(frame_number: int) -> None:
     """At these frames frac(k * GOLDEN) is all but 1; air at the widest truncation stays air and white stays white."""
     assert (frame_number * GOLDEN) % 1.0 > 0.9995
     scene = room()
@@ -142,7 +142,7 @@ def channels(packed: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("depth", [0.0, 0.1, 7.0])
-def test_readings_outside_sensor_range_allocate_no_blocks(depth: float) -> None:
+def test_integration_outside_sensor_range_allocates_no_blocks(depth: float) -> None:
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), np.full(CAMERA.shape, depth, np.float32), CAMERA)
     integrator = new_integrator()
     integrator.integrate(frame, np.eye(4), VOXEL)
@@ -172,7 +172,7 @@ def test_readings_outside_sensor_range_allocate_no_blocks(depth: float) -> None:
         ),
     ],
 )
-def test_frame_exceeding_limits_raises_before_allocation(
+def test_integration_over_limits_raises_before_allocation(
     options: dict[str, float], T: float, error: type[Exception], message: str
 ) -> None:
     volume = assemble(VoxelHashing, max_blocks=1000, **options).new_volume()
@@ -189,7 +189,7 @@ def test_frame_exceeding_limits_raises_before_allocation(
         tracemalloc.stop()
 
 
-def test_color_is_stored_only_near_surface() -> None:
+def test_integration_stores_color_only_near_surface() -> None:
     frame = room().frame(pose())
     frame.color[:] = (10, 200, 90)
     sensor = SENSOR._replace(truncation_slope=np.float32(0.0))
@@ -202,7 +202,7 @@ def test_color_is_stored_only_near_surface() -> None:
     assert (grid.color[active][air] == 0).all()
 
 
-def test_air_color_is_not_averaged() -> None:
+def test_integration_does_not_average_color_of_air() -> None:
     """A wall comes nearer to where air was seen before: its color is its own, not a mixture with black."""
     integrator = new_integrator()
     for depth, frames in ((1.5, 5), (1.4, 13)):
@@ -216,7 +216,7 @@ def test_air_color_is_not_averaged() -> None:
     assert np.abs(channels(packed[packed > 0]) - 200).max() <= 0.25
 
 
-def test_weight_is_limited_to_maximum() -> None:
+def test_integration_limits_weight_to_maximum() -> None:
     """The weight stops at max_weight, in the stored unit, at the highest that may be set too."""
     frame = room().frame(pose())
     for most in (3.0, 255.0):
@@ -227,7 +227,7 @@ def test_weight_is_limited_to_maximum() -> None:
         assert integrator.voxels.grid.weight[: integrator.voxels.block_count].max() == most * WEIGHT_ONE
 
 
-def test_noise_averages_out() -> None:
+def test_integration_averages_noise() -> None:
     """40 frames with 10 mm noise leave about 10 / sqrt(40) mm in the voxels at the surface."""
     frame = room().frame(pose())
     integrator = new_integrator()
@@ -250,7 +250,7 @@ def test_noise_averages_out() -> None:
     assert np.std(np.concatenate(errors)) == pytest.approx(0.01 / np.sqrt(40), rel=0.15)
 
 
-def test_carving_removes_objects_seen_through() -> None:
+def test_integration_removes_objects_seen_through() -> None:
     """A sphere that is taken away disappears from the map once the wall behind it has been seen often enough."""
     scene, empty = room(), room()
     empty.spheres = []

@@ -49,7 +49,7 @@ def test_voxel_grid_growth_keeps_content(promised: int, monkeypatch: pytest.Monk
     assert (voxels.grid.tsdf[1:8000] == UNSEEN).all()
 
 
-def test_reserved_memory_is_smaller_under_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxel_grid_reserves_less_memory_under_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     def make(length: int) -> int:
         if length > 3000:
             raise MemoryError

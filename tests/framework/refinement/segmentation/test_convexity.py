@@ -183,7 +183,7 @@ def test_normal_sigma_matches_spread_of_fitted_normals():
     assert np.sqrt(2) * slopes.std() == pytest.approx(normal_sigma(sigma, window, cell, camera), rel=0.1)
 
 
-def test_connected_components_match_scipy():
+def test_convexity_components_match_scipy():
     rng = np.random.default_rng(0)
     inverse = np.ones((70, 41), np.float32)
     for density in (0.2, 0.4):
@@ -198,7 +198,7 @@ def test_connected_components_match_scipy():
         assert large_count == (sizes[1:] >= 5).sum()
 
 
-def test_connected_components_split_at_depth_step():
+def test_convexity_components_split_at_depth_step():
     inverse = np.ones((4, 10), np.float32)
     inverse[:, 5:] = 0.5
     labels, count = convexity_kernels.connected(inverse, np.zeros((4, 10), bool), NOISE, np.float32(0.01), 1)
@@ -207,7 +207,7 @@ def test_connected_components_split_at_depth_step():
 
 
 @pytest.mark.parametrize("radius", [0, 1, 2])
-def test_edge_closing_matches_scipy(radius):
+def test_convexity_edge_closing_matches_scipy(radius):
     edges = np.random.default_rng(0).random((30, 43)) < 0.1
     square = np.ones((2 * radius + 1, 2 * radius + 1))
     spread = ndimage.binary_dilation(edges, square)
