@@ -1,4 +1,4 @@
-"""The page of acceptance results: rows are kept, and outdated lines are found."""
+"""Tests of the acceptance page: rows are kept, and outdated lines are detected."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What instances cost in a frame: ten masks in 640x480, a map at 1 cm that knows them already.
+"""Cost of instances per frame: ten masks at 640x480, and a 1 cm map that already contains them.
 
-Run with `python -m pytest tests/benchmarks/test_instances.py`; refining is measured in test_refiners.py.
+Run with `python -m pytest tests/benchmarks/test_instances.py`; test_refiners.py measures refinement.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tests.benchmarks.test_refiners import MASKS, ten_masks
 
 @pytest.fixture(scope="module")
 def mapped() -> tuple[BayesianTsdf, Frame, Pose, PointClusters]:
-    """The fuser after five frames, the frame, and clusters of 80 classes that no refiner took points from."""
+    """Return the fuser after five frames, the frame, and unrefined clusters of 80 classes."""
     clusters, frame = ten_masks()
     probabilities = np.random.default_rng(0).dirichlet(np.full(len(COCO), 0.1), MASKS).astype(np.float32)
     clusters = dataclasses.replace(clusters, class_probabilities=probabilities, classes=COCO)

@@ -1,4 +1,4 @@
-"""Data check themselves where they are made."""
+"""Tests of the data objects, which validate themselves."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ def test_data_objects_invalid_values_raise_one_line_error(
 
 
 def test_instance_mesh_of_instance_has_only_its_vertices() -> None:
-    """The quad 0 1 2 3, of which the instance has all but vertex 1."""
+    """The instance has the quad 0 1 2 3 without vertex 1."""
     whole = mesh(
         vertices=np.arange(12, dtype=np.float32).reshape(4, 3),
         triangles=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
@@ -282,7 +282,7 @@ def test_pose_rigidity_check_tolerates_rounding() -> None:
         Pose(sheared)
 
 
-# Truth that is rendered when it is asked for
+# Ground truth that is rendered on access
 
 
 def deferred(render: Callable[[], np.ndarray], shape: tuple[int, int] = (3, 4)) -> DeferredTruth:

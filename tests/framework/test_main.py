@@ -1,4 +1,4 @@
-"""`python -m framework` as a user meets it: a process, its streams and its exit status."""
+"""Tests of `python -m framework` as a process: its streams and its exit status."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_leave_working_folder_of_removed_folder_exits(tmp_path: Path, monkeypatc
 def test_module_search_path_excludes_working_folder(
     options: list[str], at: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With --config-dir, of `python -m framework` and of the console script, they are, but last."""
+    """With --config-dir, `python -m framework` and the console script append these folders at the end."""
     monkeypatch.chdir(tmp_path)
     for first in ("", str(tmp_path)):
         monkeypatch.setattr(sys, "path", [first, "/elsewhere"])
@@ -129,7 +129,7 @@ def test_module_search_path_excludes_working_folder(
     monkeypatch.chdir(CHECKOUT)
     monkeypatch.setattr(sys, "path", [str(CHECKOUT)])
     leave_working_folder([])
-    assert sys.path == [str(CHECKOUT)], "where the project itself is"
+    assert sys.path == [str(CHECKOUT)], "the folder of the project"
 
 
 def test_run_directory_creation_error_is_one_line(tmp_path: Path) -> None:
@@ -197,14 +197,16 @@ FAULTY = {
 }
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"doctor"}))  # whose findings are no faults of its own
+@pytest.mark.parametrize(
+    "command", sorted(COMMANDS.keys() - {"doctor"})
+)  # whose findings are not errors of the command
 def test_command_debug_shows_traceback(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "metrics.json").write_text(json.dumps({"config_hash": config_hash({})}))
     (tmp_path / "old" / "config.yaml").write_text("{}")
-    if (CONF / f"{command.replace('-', '_')}.yaml").exists():  # what Hydra changes for its process stays there
+    if (CONF / f"{command.replace('-', '_')}.yaml").exists():  # Hydra's changes of its process stay there
         stderr = words(command, *FAULTY[command], "debug=true", directory=tmp_path).stderr
     else:
         monkeypatch.chdir(tmp_path)
@@ -274,7 +276,7 @@ def test_sweep_rejects_misspelled_name_before_first_job(tmp_path: Path) -> None:
 
 
 def test_run_ctrl_c_writes_partial_record(tmp_path: Path) -> None:
-    (tmp_path / "metrics.json").write_text("{}")  # of an earlier run into the same directory
+    (tmp_path / "metrics.json").write_text("{}")  # of an earlier run in the same directory
     line = command(f"hydra.run.dir={tmp_path}", "dataset.frames=100000", "dataset.slow_s=0.02")
     with subprocess.Popen(line, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 60

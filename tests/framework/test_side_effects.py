@@ -1,4 +1,4 @@
-"""A library leaves its host process as it was."""
+"""Tests that the library does not change its host process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Private parts of Hydra and numba are used in few places, which docs/development.md lists with the tested versions."""
+"""Tests that docs/development.md lists all uses of private parts of Hydra and numba, with the tested versions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Texts for readers contain no phrase of private_phrases.txt."""
+"""Tests that texts for readers contain no phrase of private_phrases.txt."""
 
 from __future__ import annotations
 

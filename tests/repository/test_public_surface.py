@@ -1,4 +1,4 @@
-"""Plugins of other packages import only `instancemap` and `instancemap.testing`."""
+"""Tests that plugins of other packages import only `instancemap` and `instancemap.testing`."""
 
 from __future__ import annotations
 

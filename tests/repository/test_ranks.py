@@ -1,4 +1,4 @@
-"""docs/results/ranks.py, against values computed by hand and against scipy's rank correlation."""
+"""Tests of docs/results/ranks.py, compared with manual results and scipy's rank correlation."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Ranking, ranks, spearman, write_ranks = script.Ranking, script.ranks, script.spe
 
 @pytest.fixture
 def places(tmp_path: Path) -> list[Path]:
-    """Four rows. The order is a, b, c, d in the rooms, b, a, c = d in the flat, d, c, b, a in the hall."""
+    """Return four rows. The order is a, b, c, d in the rooms, b, a, c = d in the flat, d, c, b, a in the hall."""
     return [
         experiment(tmp_path / "rooms", {"a": (0.9, 0.7), "b": (0.7, 0.7), "c": (0.5, 0.3), "d": (0.1, 0.1)}),
         experiment(tmp_path / "flat", {"d": (0.2,), "c": (0.2,), "b": (0.6,), "a": (0.5,)}),
@@ -106,7 +106,7 @@ def test_ranks_row_interval_is_bootstrap_over_rows(tmp_path: Path) -> None:
     low, high = np.quantile([spearmanr(ours[k], theirs[k]).statistic for k in drawn], [0.025, 0.975])
     assert found.over_rows == pytest.approx((low, high), abs=0.05)
     assert found.over_rows[0] < found.rho < found.over_rows[1]
-    assert np.isnan(found.over_runs).all(), "one run does not say what another would be"
+    assert np.isnan(found.over_runs).all(), "one run gives no interval"
 
 
 def test_ranks_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_ranks_intervals_are_repeatable(places: list[Path]) -> None:
 
 
 def test_ranks_scenes_have_equal_weight_in_mean(tmp_path: Path) -> None:
-    """One scene twice as often run counts as one: 0.9, 0.9 and 0.3 are 0.6 and not 0.7."""
+    """A scene with twice as many runs counts once: 0.9, 0.9 and 0.3 are 0.6 instead of 0.7."""
     figures = {"a": (0.9, 0.3), "b": (0.5, 0.5), "c": (0.1, 0.1)}
     one = experiment(tmp_path / "one", figures, scenes=("x", "y"))
     other = experiment(tmp_path / "other", figures, scenes=("x", "y"))
@@ -163,7 +163,7 @@ def test_ranks_list_rows_missing_in_one_dataset(places: list[Path]) -> None:
     assert "| e " not in text
 
 
-def test_ranks_several_figures_are_written_to_files(places: list[Path], tmp_path: Path) -> None:
+def test_ranks_of_several_metrics_are_written_to_files(places: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "new" / "folder"
     text = write_ranks(places, [AP50, IOU], out)
     assert (out / "ranks.md").read_text() == text

@@ -1,4 +1,4 @@
-"""The cache of rendered frames returns what the sequence renders."""
+"""Tests of the cache of rendered frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/results/steps.py, compared with values computed by hand."""
+"""Tests of docs/results/steps.py, compared with manual results."""
 
 from __future__ import annotations
 

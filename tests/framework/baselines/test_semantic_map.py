@@ -1,4 +1,4 @@
-"""Connected components on meshes that can be counted by hand, and beside scipy's."""
+"""Tests of connected components on small meshes, compared with manual results and scipy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a check says of real recordings: nothing where they are sound, and what to set where one convention is not."""
+"""Tests of the recording check: valid recordings have no findings, and each wrong convention is named."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
 
 
 def in_axes(axes: CameraAxes) -> Callable[[Float64], Float64]:
-    """The pose of the same camera, of which other axes are meant."""
+    """Return a function that converts a pose to one of the same camera in other axes."""
     T_axes_camera = np.eye(4)
     T_axes_camera[:3, :3] = axes.R_axes_camera
     return lambda T_world_camera: T_world_camera @ inverse(T_axes_camera)
 
 
 def scalar_first(T: Float64) -> Float64:
-    """What x y z w makes of a file with w x y z."""
+    """Return the pose whose quaternion w x y z is read in the order x y z w."""
     misread = T.copy()
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
     misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()
@@ -138,7 +138,7 @@ def test_recording_check_of_originals_reports_no_error(shared_data: Path) -> Non
 
 
 def test_recording_check_applies_configured_conventions(tmp_path: Path) -> None:
-    """The parameter that was named makes the recording sound; one more is a fault again."""
+    """The named parameter makes the recording valid; a second change makes it invalid again."""
     place = write_damaged(tmp_path / "damaged", DESK, pose=both, scale=2.0, depth_late=1, poses_late=-2)
     reading = PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL, pose_delay=-2)
     depth = DepthReading(depth_scale=5000, depth_delay=1)
@@ -150,7 +150,7 @@ def test_recording_check_applies_configured_conventions(tmp_path: Path) -> None:
 
 
 def test_recording_check_reports_clock_delay_in_two_units(tmp_path: Path) -> None:
-    """The desk in TUM's own files, the poses' times 0.1 s late."""
+    """The recording is the desk in TUM's files; its pose timestamps are 0.1 s late."""
     shutil.copytree(DESK.folder, tmp_path / DESK.name)
     path = tmp_path / DESK.name / "groundtruth.txt"
     words = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
@@ -176,7 +176,7 @@ def test_recording_check_unrelated_poses_fit_in_no_axes(tmp_path: Path) -> None:
 
 @dataclass
 class MovedDepth(RGBDSequence):
-    """The desk with depth zoomed and moved by an affine map (2, 3), as from a camera beside that of the colors."""
+    """The desk with depth moved by an affine map (2, 3), as from a second camera."""
 
     moved: Float64
 
@@ -205,7 +205,7 @@ def test_recording_check_reports_unregistered_depth(zoom: float, x: float, y: fl
 
 
 def test_recording_check_half_frame_color_depth_motion_is_note() -> None:
-    """The desk begins with a turn of 20 px a frame, and a Kinect does not take both at the same moment."""
+    """The desk begins with a turn of 20 px per frame, and a Kinect captures color and depth at different times."""
     [expected] = [
         finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject.startswith("col")
     ]
@@ -215,7 +215,7 @@ def test_recording_check_half_frame_color_depth_motion_is_note() -> None:
 
 @dataclass
 class Part(RGBDSequence):
-    """Some frames of the desk, without poses; what is changed in them."""
+    """Some frames of the desk without poses, with modifications."""
 
     count: int
     change: Callable[[Frame], Frame] = lambda frame: frame

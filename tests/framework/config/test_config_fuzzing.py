@@ -1,6 +1,6 @@
-"""Whatever the YAML of --config-dir says: an option is built, or refused in one line.
+"""Fuzz tests of option YAML files: an option is built or rejected with a one-line error.
 
-`INSTANCEMAP_FUZZ=2000 pytest tests/framework/config/test_config_fuzzing.py` tries so many.
+`INSTANCEMAP_FUZZ=2000 pytest tests/framework/config/test_config_fuzzing.py` tries 2000 cases.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ TOKENS = (
         b"~: 1\n",
     ),
 )
-SLOWEST = 5.0  # s of this process: others may keep the machine busy
+SLOWEST = 5.0  # s of CPU time, because other processes may use the machine
 BOMB = "a0: &a0 [x]\n" + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12))
 
 
@@ -65,7 +65,7 @@ def option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def line_of(option: Path, content: bytes) -> str:
-    """The line that refuses the option; "" = it was built. Fails for everything else that can happen."""
+    """Return the error line of the option; "" if it was built. Fails for any other outcome."""
     option.write_bytes(content)
     began = time.process_time()
     try:

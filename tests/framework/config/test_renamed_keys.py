@@ -1,4 +1,4 @@
-"""Old config keys are rejected with the new key, and the configs do not contain any."""
+"""Tests of renamed config keys: old keys are rejected with the new key, and no config contains them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rows of experiments, as people write them."""
+"""Tests of the validation of experiment rows."""
 
 from __future__ import annotations
 

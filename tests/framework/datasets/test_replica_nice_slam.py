@@ -1,4 +1,4 @@
-"""Replica in NICE-SLAM's layout, sound and with every fault."""
+"""Tests of Replica in NICE-SLAM's layout, with valid and invalid files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_camera(root: Path, **changes: Any) -> None:
 
 
 def pose_at(k: int) -> np.ndarray:
-    """A turn to the right about the vertical of the camera, away from the origin."""
+    """Return a pose away from the origin, rotated to the right about the vertical axis of the camera."""
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = Rotation.from_rotvec([0, 0.3 * k, 0]).as_matrix()
     T_world_camera[:3, 3] = 1, 2, 0.1 * k

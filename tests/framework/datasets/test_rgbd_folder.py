@@ -1,4 +1,4 @@
-"""RGB-D folders written in the exact layout, sound and with every fault."""
+"""Tests of RGB-D folders in the exact layout, with valid and invalid files."""
 
 import json
 import shutil
@@ -143,7 +143,7 @@ def test_rgbd_folder_timestamp_of_unusable_frame_is_ignored(folder, caplog):
 def test_rgbd_folder_has_poses_unless_file_has_no_pose_lines(folder):
     for k in range(FRAMES):
         set_pose_line(folder, k, f"{k} nan nan nan nan nan nan nan")
-    assert RgbdFolder(folder).has_poses()  # reading says what is wrong with them
+    assert RgbdFolder(folder).has_poses()  # reading reports the errors
     (folder / "poses.txt").unlink()
     assert not RgbdFolder(folder).has_poses()
 
@@ -185,7 +185,7 @@ def test_rgbd_folder_distant_pose_raises_and_truth_skips_it(folder, caplog):
     assert "ground truth: frame skipped: frame 1: " in caplog.text
 
 
-# Faults of the whole sequence: known when it is built.
+# Errors of the whole sequence, which are raised when it is built.
 
 
 def test_rgbd_folder_missing_folder_raises(tmp_path):
@@ -251,7 +251,7 @@ def test_rgbd_folder_duplicate_frame_number_raises(folder):
     "names", [["9.95", "10.05", "10.1", "10.15"], ["1_8", "1_9", "2_0", "2_1"], ["1", "2", "3", "1 - Copy 4"]]
 )
 def test_rgbd_folder_names_differing_in_two_numbers_raise(folder, names):
-    """The last digits alone would put the frames into another order."""
+    """Sorting by the last digits alone would change the order of the frames."""
     for kind in ("color", "depth", "instance"):
         for k, name in enumerate(names):
             (folder / kind / f"{k:06d}.png").rename(folder / kind / f"{name}.png")
@@ -358,7 +358,7 @@ def test_rgbd_folder_parameter_out_of_range_raises(folder, values):
         RgbdFolder(folder, **values)
 
 
-# Faults of one frame: known when it is read, and the others can be.
+# Errors of one frame, which are raised when it is read; other frames are readable.
 
 
 def read_all_but(folder, bad):

@@ -1,4 +1,4 @@
-"""TUM RGB-D in the published format, sound and with every fault."""
+"""Tests of TUM RGB-D in the published format, with valid and invalid files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def write_poses(folder: Path, lines: list[str]) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A walk of 1 m/s along x, seen at 100 Hz by the motion capture, before a wall at z = 2 m."""
+    """Write a motion of 1 m/s along x in front of a wall at z = 2 m, with motion capture at 100 Hz."""
     folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
     color = [color_time(k) for k in range(FRAMES)]
     depth = [time + DEPTH_DELAY for time in color]
@@ -58,7 +58,7 @@ def test_tum_rgbd_frame_matches_files(folder: Path) -> None:
     assert (len(sequence), sequence.name) == (FRAMES, "rgbd_dataset_freiburg1_xyz")
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, color_time(2))
-    inside = np.s_[40:440, 40:600]  # where the undistorted image has all of what was recorded
+    inside = np.s_[40:440, 40:600]  # where the undistorted image is complete
     assert (frame.color[inside] == (20, 20, 30)).all()
     assert (frame.depth[inside] == 2).all()  # 5000 units a meter
     assert frame.T_world_camera is not None
@@ -71,13 +71,13 @@ def test_tum_rgbd_recording_is_mapped(folder: Path) -> None:
     result, points_world = mapped(opened("tum_rgbd", *places, "dataset.stop=2", "dataset.undistort=false"))
     assert (result.frames, result.frames_skipped, result.frames_lost) == (2, 0, 0)
     np.testing.assert_allclose(points_world[:, 2], 2, atol=1e-6)
-    # the first pixel of each frame lies left of the camera, which walks along x
+    # the first pixel of each frame is left of the camera, which moves along x
     lefts = points_world[:: 640 * 480, 0]
     np.testing.assert_allclose(lefts, (0 - 318.6) / 517.3 * 2 + np.arange(2) / 30, atol=1e-4)
 
 
 def test_tum_rgbd_published_distortion_is_removed(folder: Path) -> None:
-    """A checker board's corners lie where OpenCV says that the lens' pixels belong."""
+    """The corners of a checkerboard are where OpenCV places the pixels of the lens."""
     board = np.kron(np.indices((15, 20)).sum(axis=0) % 2, np.full((32, 32), 200)).astype(np.uint8)
     path = next((folder / "rgb").glob("*.png"))
     cv2.imwrite(str(path), np.stack([board] * 3, axis=-1))
@@ -142,7 +142,7 @@ def test_tum_rgbd_published_camera_overrides_camera_json(folder: Path) -> None:
 
 
 def test_tum_rgbd_association_is_closest_first_and_one_to_one() -> None:
-    """Depth 0.015 is nearest to both color images: the closer one gets it, and the other what is left."""
+    """Depth 0.015 is nearest to both color images: the closer one gets it, the other one the remaining depth."""
     assert associate([0.0, 0.02], [0.015, 0.19], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, 0.035], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, -0.01], 0.02) == [(0, 1), (1, 0)]

@@ -1,4 +1,4 @@
-"""A detector for rendered rooms logs one warning for images of another domain."""
+"""Tests of the warning of a detector for rendered rooms about images of another domain."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_domain_is_set_only_by_rooms_detector(ready: Callable[[str, str], Any], 
 
 
 def test_domain_of_dataset_marks_rendered_images(tmp_path: Path) -> None:
-    """What `synthesize` writes says so; a folder of SceneNN itself does not."""
+    """Folders written by `synthesize` are marked; original SceneNN folders are not."""
     assert Synthetic.domain == RENDERED_ROOMS
     option_files.overrides("dataset", "scenenn", tmp_path)
     assert SceneNN(tmp_path).domain == ""

@@ -1,4 +1,4 @@
-"""`instancemap doctor` on this machine and on simulated broken ones."""
+"""Tests of the command `doctor` on this machine and on simulated broken ones."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def broken_library(folder: Path, name: str, text: str) -> None:
 
 
 def test_doctor_broken_libraries_are_one_line_errors(tmp_path: Path) -> None:
-    """One library raises, one ends the process that imports it."""
+    """One library raises, and one ends the importing process."""
     broken_library(tmp_path, "torch", "raise ImportError('libtorch.so: no such\\nfile')")
     broken_library(tmp_path, "open3d", "import os, signal\nos.kill(os.getpid(), signal.SIGILL)")
     done = doctor(tmp_path, PYTHONPATH=str(tmp_path), HOME=str(tmp_path))
@@ -59,7 +59,7 @@ def test_doctor_broken_libraries_are_one_line_errors(tmp_path: Path) -> None:
     assert str(tmp_path) not in done.stdout.replace("~", "")
     assert done.stdout.isascii()
     written = {path.name for path in tmp_path.iterdir()} - {"torch", "open3d"}
-    assert written <= {".config", ".cache"}, "matplotlib's own, when it is imported"
+    assert written <= {".config", ".cache"}, "logged by matplotlib when it is imported"
 
 
 def test_doctor_json_lists_every_section(tmp_path: Path) -> None:

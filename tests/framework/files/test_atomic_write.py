@@ -1,4 +1,4 @@
-"""What every reader of whole files does with one that is too large, or begins with a byte order mark."""
+"""Tests of the file readers (oversized files, byte order marks, pipes) and of atomic writes."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ READERS = (
 def test_reader_non_regular_file_raises_without_blocking(
     tmp_path: Path, read: Callable[[Path], object], kind: str
 ) -> None:
-    """A pipe to which nobody writes would be waited for, and zeros never end."""
+    """Reading a pipe without a writer would block, and /dev/zero never ends."""
     path = tmp_path / "name"
     if kind == "pipe":
         os.mkfifo(path)
@@ -141,7 +141,7 @@ def test_atomic_write_follows_symbolic_link(tmp_path: Path) -> None:
 
 
 def test_atomic_write_failure_names_requested_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not its temporary name: on a disk that is only to be read it cannot be removed either."""
+    """The error does not name the temporary file, which may not be removable on a read-only disk."""
 
     def refused(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")

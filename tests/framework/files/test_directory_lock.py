@@ -1,4 +1,4 @@
-"""A locked directory keeps others out, as long as its holder lives."""
+"""Tests of directory locks, which last as long as their process."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.integration
 def test_directory_lock_second_lock_error_names_holder(tmp_path: Path) -> None:
     place = tmp_path / "new" / "sweep"
     with locked(place), pytest.raises(DataError, match=rf"sweep: in use by process {os.getpid()} on "), locked(place):
-        pytest.fail("two are in one place")
+        pytest.fail("two processes hold the lock")
     with locked(place):
         pass
 
@@ -71,7 +71,7 @@ with locked(Path({str(tmp_path)!r})):
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"locked\n"
         with pytest.raises(DataError, match=f": in use by process {holder.pid} on "), locked(tmp_path):
-            pytest.fail("two are in one place")
+            pytest.fail("two processes hold the lock")
         holder.kill()
     with locked(tmp_path):
         pass
@@ -90,10 +90,10 @@ def test_directory_lock_unsupported_file_system_logs_warning(
 
 
 def test_directory_lock_named_pipe_as_file_raises(tmp_path: Path) -> None:
-    """Opening one waits for somebody who reads it."""
+    """Opening a pipe without a reader would block."""
     os.mkfifo(tmp_path / HOLDER)
     with pytest.raises(DataError, match=rf"{HOLDER}: expected a regular file, got a device, a pipe"), locked(tmp_path):
-        pytest.fail("nobody can be told who has it")
+        pytest.fail("the holder cannot be reported")
 
 
 def test_directory_lock_invalid_holder_file_raises_in_use(tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ def test_directory_lock_invalid_holder_file_raises_in_use(tmp_path: Path) -> Non
             (tmp_path / HOLDER).unlink()
             make(tmp_path / HOLDER)
             with pytest.raises(DataError, match="in use by another process"), locked(tmp_path):
-                pytest.fail("two are in one place")
+                pytest.fail("two processes hold the lock")
             if (tmp_path / HOLDER).is_dir():
                 (tmp_path / HOLDER).rmdir()
                 (tmp_path / HOLDER).touch()

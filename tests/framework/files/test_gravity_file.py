@@ -1,4 +1,4 @@
-"""Directions of gravity in a file: what is written is read, and what is none is said."""
+"""Tests of gravity files: round trips and invalid lines."""
 
 from __future__ import annotations
 

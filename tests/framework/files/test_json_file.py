@@ -1,4 +1,4 @@
-"""JSON that is no JSON, too deep or too large is refused in one line."""
+"""Tests of JSON files: invalid, too deep or too large files raise a one-line error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Matrices in text files: what is published is read, and what is wrong is named with its line."""
+"""Tests of matrices in text files: published formats, and errors with line numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines of numbers: what is wrong with one is said in one line, however long the file's is."""
+"""Tests of lines of numbers: formats, and one-line errors for lines of any length."""
 
 from __future__ import annotations
 

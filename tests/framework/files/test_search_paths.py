@@ -1,4 +1,4 @@
-"""Where relative paths are looked for."""
+"""Tests of the resolution of relative paths."""
 
 from __future__ import annotations
 

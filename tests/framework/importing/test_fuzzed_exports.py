@@ -1,4 +1,4 @@
-"""Exports with a damaged file: each is imported as far as it can be, or refused in one line."""
+"""Fuzz tests of exports: a damaged file is skipped, or raises a one-line error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mesh, instances, saving and loading of a small map with two objects."""
+"""Tests of the mesh, instances, saving and loading of a small map with two objects."""
 
 import json
 import re
@@ -21,7 +21,7 @@ CLASSES = ("chair", "bed")
 
 
 def true_detections(frame: Frame) -> Detections:
-    """One exact mask for each visible instance of the analytic scene."""
+    """Return one exact mask for each visible instance of the analytic scene."""
     assert frame.truth is not None
     ids = [i for i in frame.truth.class_names if (frame.truth.instance_ids == i).any()]
     masks = np.array([frame.truth.instance_ids == i for i in ids]).reshape(len(ids), *frame.depth.shape)
@@ -141,7 +141,7 @@ def test_instance_map_damaged_file_raises(scene_map: InstanceMap, tmp_path: Path
 
 @pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
 def test_instance_map_file_of_other_format_raises(other: int, tmp_path: Path) -> None:
-    """Before anything else is expected of it: other versions have other arrays."""
+    """The version is checked first, because other versions have other arrays."""
     path = tmp_path / "map.npz"
     np.savez(path, header=np.frombuffer(json.dumps({"format": other}).encode(), np.uint8))
     expected = re.escape(f"{path}: expected map format {FORMAT}, got {other}; map again")
@@ -173,7 +173,7 @@ def test_oriented_box_of_few_vertices_is_valid(points: int) -> None:
 
 
 def test_instance_map_continued_after_loading_is_identical(tmp_path: Path) -> None:
-    """A map that was saved, loaded and mapped into further equals the one that was never saved."""
+    """A map that is saved, loaded and extended equals one that was never saved."""
     whole, resumed = (assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0) for _ in range(2))
     for k, T in enumerate(walk(4)):
         if k == 2:

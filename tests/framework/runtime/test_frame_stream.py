@@ -1,4 +1,4 @@
-"""Live videos in the loop: the newest frame counts, the rest is dropped and counted, and being stopped is their end."""
+"""Tests of live videos: the newest frame is mapped, others are dropped and counted, and a stop ends the run."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from tests.support.scenes.corner_room import (
 )
 
 PATIENCE_S = 10.0
-SLOW_S = 0.03  # as long as a stage takes that is too slow for the video
+SLOW_S = 0.03  # duration of a stage that is too slow for the video
 
 
 @dataclass
 class Handed(LiveVideo):
-    """Frames that a test hands over, as numbers: `come` waits until the listener has them."""
+    """Frames that a test passes as numbers: `come` waits until the listener has them."""
 
     def __post_init__(self) -> None:
         self.name = "handed"
@@ -54,7 +54,7 @@ class Handed(LiveVideo):
 
     def come(self, *numbers: int) -> None:
         self.coming.extend(numbers)
-        for _ in range(3):  # rounds of the listener, the last of them whole
+        for _ in range(3):  # iterations of the listener, the last of them complete
             while self.asked.acquire(blocking=False):
                 pass
             assert self.asked.acquire(timeout=PATIENCE_S)
@@ -76,7 +76,7 @@ def test_live_frames_return_newest_and_count_dropped() -> None:
         video.come(4)
         video.come(5)
         video.over = True
-        assert (taken(stream), stream.dropped) == (5, 3), "the last one is not lost where the video ends"
+        assert (taken(stream), stream.dropped) == (5, 3), "the last frame is kept at the end of the video"
         assert taken(stream) is None
         assert taken(stream) is None
 
@@ -92,7 +92,7 @@ def test_live_frames_take_waits_for_frame_or_end() -> None:
         waiting.join(PATIENCE_S)
         assert found == [7, None]
         video.come(8)
-        assert taken(stream) is None, "what comes after the end is not mapped"
+        assert taken(stream) is None, "frames after the end are not mapped"
 
 
 def test_live_frames_raise_video_error_after_last_frame() -> None:
@@ -152,12 +152,12 @@ def test_live_video_at_fast_rate_drops_and_counts_frames(prefetch: int, caplog: 
     assert result.frames < 40
     indices = [frame.index for frame in result.tracked]
     assert indices == sorted(set(indices))
-    assert indices[-1] == 59, "the last frame is the newest for good"
+    assert indices[-1] == 59, "the last frame stays the newest"
     assert caplog.messages == [f"{result.live.frames_dropped} frames dropped because mapping fell behind"]
 
 
 def test_live_video_frames_are_not_queued() -> None:
-    """However far the loop may look prefetch in a recording: a queue would add its length to each latency."""
+    """The prefetch of recordings does not apply: a queue would add its length to each latency."""
     video, waiting = LiveRoom(frames_sent=200, period_s=0.002), []
 
     @dataclass
@@ -198,7 +198,7 @@ def test_live_video_ctrl_c_ends_normally(prefetch: int) -> None:
 
 
 def test_live_video_second_ctrl_c_interrupts_frame() -> None:
-    """In the middle of a frame: what is left is not whole."""
+    """The frame is interrupted, so that the record is partial."""
     video = LiveRoom(frames_sent=1000)
     result = pipeline(tracker=PressesCtrlC(at=2, times=2)).run(video)
     assert isinstance(result.stopped_by, KeyboardInterrupt)

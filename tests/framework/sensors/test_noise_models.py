@@ -1,4 +1,4 @@
-"""The noise of depth is that of Nguyen et al., whoever asks."""
+"""Tests of the depth noise model of Nguyen et al."""
 
 import numpy as np
 import pytest

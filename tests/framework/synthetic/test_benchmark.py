@@ -1,4 +1,4 @@
-"""Ten rooms, each with what its role promises; without a picture of any."""
+"""Tests of the ten benchmark rooms and of their roles, without rendering."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_cluttered_groups_place_objects_on_furniture(make, seed: int) -> None:
 
 
 def gap(piece, other) -> float:
-    """Between two boxes, m; negative is how deep they are in each other."""
+    """Return the distance between two boxes, m; negative is the depth of their overlap."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(np.maximum(low - other_high, other_low - high).max())
 
@@ -114,8 +114,8 @@ def test_benchmark_chairs_under_tables_do_not_intersect(make, seed: int) -> None
             inside = ((at > board.min(axis=0)) & (at < board.max(axis=0))).all(axis=1)
             assert not inside.any(), "nothing is in the table's wood"
         top = boards[0]
-        beside = at[(at[:, 2] > top[:, 2].min() - 0.1) & (at[:, 2] < top[:, 2].max() + 0.1)]
-        assert 0 <= beside[:, 1].min() - front < 0.1
+        near = at[(at[:, 2] > top[:, 2].min() - 0.1) & (at[:, 2] < top[:, 2].max() + 0.1)]
+        assert 0 <= near[:, 1].min() - front < 0.1
     assert all(gap(chair, table) < 0 or 0 < gap(chair, table) <= TOUCHING[1] for chair in chairs)
 
 
@@ -167,7 +167,7 @@ def test_strew_places_objects_in_contact_and_keeps_walkway(seed: int) -> None:
     for k, thing in enumerate(new):
         others = [piece for piece in [*before, *new[:k]] if piece.kind != "rug"]
         gaps = [gap(thing, other) for other in others]
-        assert min(gaps) > -1e-3, "it stands in nothing"
+        assert min(gaps) > -1e-3, "it does not intersect other objects"
         assert min(gaps) < 2 * CONTACT, "it touches something"
         assert -0.01 < thing.bounds()[0][2] < 0.02, "it stands on the floor or on a rug"
         half = np.array([layout.width, layout.depth]) / 2

@@ -1,4 +1,4 @@
-"""Nothing stands in anything else, and everything stands in the room."""
+"""Tests of the layout: furniture does not collide and stays inside the room."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""A room as SceneNN's files: what is written is what the renderer saw."""
+"""Tests of a rendered room as SceneNN files, compared with the renderer."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_scenenn_scene_poses_are_rigid_and_world_is_y_up(scene: SceneNNScene) ->
     for index, T_world_camera in found.items():
         check_rigid(f"pose {index}", T_world_camera)
         np.testing.assert_allclose(inverse(T_YUP_ZUP) @ T_world_camera, scene.path.pose(index), atol=1e-6)
-        assert 1.2 < T_world_camera[1, 3] < 1.8, "eyes above the floor"
+        assert 1.2 < T_world_camera[1, 3] < 1.8, "camera height above the floor"
         assert T_world_camera[1, 1] < -0.8, "the camera's y points down"
     assert np.linalg.det(T_YUP_ZUP) == 1.0
 
@@ -101,7 +101,7 @@ def test_scenenn_scene_annotation_labels_match_mesh(scene: SceneNNScene, mesh: P
         points = mesh.vertices[labels == one.id]
         np.testing.assert_allclose(one.aabb, [points.min(axis=0), points.max(axis=0)], atol=1e-6)
     of_pieces = [scene.room.surfaces.class_names[k] for k in np.argsort(scene.labels)[1:]]
-    assert of_pieces != sorted(of_pieces, key=str), "the order of ids says nothing"
+    assert of_pieces != sorted(of_pieces, key=str), "the order of ids is random"
 
 
 def test_clutter_names_exclude_evaluated_classes() -> None:
@@ -154,7 +154,7 @@ def test_benchmark_settings_out_of_range_raise(wrong: dict[str, float]) -> None:
 def test_scenenn_scene_half_rate_equals_every_second_frame(
     scene: SceneNNScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scenenn_scene, "NOISE", 0.0)  # of color: a frame's grain is its own
+    monkeypatch.setattr(scenenn_scene, "NOISE", 0.0)  # of color: each frame has its own grain
     (tmp_path / "image").mkdir()
     (tmp_path / "depth").mkdir()
     half = replace(RECORDING, rate=RECORDING.rate / 2)

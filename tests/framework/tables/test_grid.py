@@ -1,4 +1,4 @@
-"""Cells as Markdown and LaTeX."""
+"""Tests of table cells in Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_grid_decimals_depend_on_largest_value() -> None:
     assert decimals([math.nan]) == 3
 
 
-def test_grid_figure_includes_known_spread_and_sign() -> None:
+def test_grid_value_includes_known_spread_and_sign() -> None:
     assert figure(0.25, 0.0625, 2) == "0.25 ± 0.06"
     assert figure(0.25, math.nan, 3, signed=True) == "+0.250"
     assert figure(-1e-9, math.nan, 3, signed=True) == "+0.000"

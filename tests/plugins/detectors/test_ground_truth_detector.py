@@ -1,3 +1,5 @@
+"""Tests of detector=ground_truth and detector=none."""
+
 import numpy as np
 import pytest
 

@@ -1,4 +1,4 @@
-"""detector=mask_rcnn on a tiny network of random weights, and on one that is built to find a known object."""
+"""Tests of detector=mask_rcnn with random tiny networks, and with one that finds a known object."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ def detector(path):
 
 
 def test_mask_rcnn_class_row_excludes_background(path):
-    """Without suppression across classes, each detection is a label of a proposal with that proposal's softmax."""
+    """Without suppression across classes, each detection is one label of a proposal, with its softmax."""
     detector, frame = MaskRCNNDetector(weights=path, device="cpu", agnostic_nms_iou=1.0), noise(0)
     seen = []
     classify = detector._network.classify
@@ -113,7 +113,7 @@ def test_mask_rcnn_sides_default_to_network_settings(path):
 
 
 def known_object(folder, monkeypatch, extent, resized):
-    """A detector, at a scale, whose every proposal is a "chair" over the given box x1 y1 x2 y2 of a 160 x 120 image."""
+    """Return a detector at a scale; every proposal is a chair in the box x1 y1 x2 y2 of a 160 x 120 image."""
     network = tiny_network(replace(TINY, short_side=resized, long_side=4 * resized))
     for parameter in network.roi_heads.parameters():
         parameter.data.zero_()
@@ -129,7 +129,7 @@ def known_object(folder, monkeypatch, extent, resized):
 
 @pytest.mark.parametrize("resized", [60, 96, 120, 300])
 def test_mask_rcnn_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch, resized):
-    """Pixels u = 20..59, v = 30..89 have the borders 20..60, 30..90 in every resized image: nothing shifts."""
+    """Pixels u = 20..59, v = 30..89 have the borders 20..60, 30..90 in every resized image."""
     found = known_object(tmp_path, monkeypatch, (20, 30, 60, 90), resized).detect(noise(6))
     assert len(found) == 1
     expected = np.zeros((120, 160), bool)
@@ -141,7 +141,7 @@ def test_mask_rcnn_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("short_side", [32, 40, 80])
 def test_mask_rcnn_resize_keeps_ramp_position(path, short_side):
-    """A pixel's value is 5 times its place: after resizing, the one at u' is of the place (u' + 0.5) / scale - 0.5."""
+    """A pixel's value is 5 times its position: after resizing, pixel u' shows (u' + 0.5) / scale - 0.5."""
     ramp = np.repeat(np.tile(5 * np.arange(50, dtype=np.uint8), (40, 1))[..., None], 3, axis=2)
     image = MaskRCNNDetector(weights=path, device="cpu", short_side=short_side, long_side=400)._resize(picture(ramp))
     places = (np.arange(image.shape[3]) + 0.5) * 40 / short_side - 0.5

@@ -1,4 +1,4 @@
-"""Mask R-CNN 2Go: the real network on real pictures, in integers and in float."""
+"""Tests of Mask R-CNN 2Go: the published network on real images, in integers and in float."""
 
 import json
 from pathlib import Path
@@ -69,7 +69,7 @@ def test_maskrcnn2go_detects_expected_objects_in_real_images(detector, scene, in
 
 
 def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
-    """Replica's rendering has instance ground truth: the detection that is sure of a bed covers the labeled bed."""
+    """The confident detection of a bed covers the labeled bed of Replica's ground truth."""
     root = SHARED / "data" / "replica_floor2"
     if not root.is_dir():
         pytest.skip(f"{root} is absent")
@@ -82,11 +82,11 @@ def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
             if score > 0.7 and COCO[row.argmax()] == "bed":
                 ious.append(max((mask & (ids == i)).sum() / (mask | (ids == i)).sum() for i in beds))
     assert len(ious) >= 5
-    assert np.median(ious) > 0.7  # its pillows carry labels of their own
+    assert np.median(ious) > 0.7  # its pillows have their own labels
 
 
 def test_maskrcnn2go_mask_grids_match_full_graph():
-    """The shortcut computes one class a detection; the graph all 81."""
+    """The shortcut computes one class per detection; the full graph computes all 81."""
     detector = MaskRCNN2Go(device="cpu", int8=False)
     graph, tensors, _ = _read_network(WEIGHTS)
     whole = network_between(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
@@ -99,7 +99,7 @@ def test_maskrcnn2go_mask_grids_match_full_graph():
 
 @in_integers
 def test_maskrcnn2go_int8_detections_agree_with_float():
-    """The sure detections of real pictures: as many, of the same classes, with masks that agree."""
+    """The confident detections of real images have the same number, classes and similar masks."""
     integers, real = MaskRCNN2Go(device="cpu"), MaskRCNN2Go(device="cpu", int8=False)
     agreements = []
     for scene, index in (("redkitchen", 0), ("redkitchen", 290), ("mit76", 0), ("replica_floor2", 40)):

@@ -1,4 +1,4 @@
-"""Box detectors from ONNX files: known networks on known rooms, and YOLOX-nano on real pictures."""
+"""Tests of box detectors from ONNX files: known networks on known rooms, and YOLOX-nano on real images."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +23,9 @@ WEIGHTS = Path("weights") / "yolox_nano" / "yolox_nano.onnx"
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 CUP = np.zeros((120, 160), np.bool_)
 CUP[30:70, 40:60] = True
-BOX = np.array([19.0, 14.0, 31.0, 36.0])  # x1 y1 x2 y2 in the input: two pixels of the image around the cup
+BOX = np.array([19.0, 14.0, 31.0, 36.0])  # x1 y1 x2 y2 in the input: the cup with two pixels of the image around it
 SHAPE = (60, 80)
-LABELS = ("chair", "cup", "wall")  # nyu40 has the wall, which means no object
+LABELS = ("chair", "cup", "wall")  # nyu40 has the class wall, which is not an object
 
 
 def frame(index=0):
@@ -38,7 +38,7 @@ def center_size(box):
 
 
 def outputs_of(layout):
-    """One real candidate, the cup: 0.6 cup, 0.2 chair; one that is a wall; one that is too weak."""
+    """Return outputs of a cup (0.6 cup, 0.2 chair), a wall, and a weak candidate."""
     boxes = np.array([BOX, BOX + 20, BOX - 10])
     scores = np.array([[0.2, 0.6, 0.0], [0.1, 0.1, 0.9], [0.01, 0.02, 0.0]])
     rows = np.array([center_size(box) for box in boxes])
@@ -93,7 +93,7 @@ def test_onnx_boxes_known_network_detects_cup_in_each_layout(tmp_path, layout):
 
 @pytest.mark.parametrize("placement", Placement)
 def test_onnx_boxes_image_placement_is_inverted(tmp_path, placement):
-    """The input is taller than the image: the box is the cup's own in each placement."""
+    """The input is taller than the image: the box is that of the cup in each placement."""
     top, scale = {Placement.top_left: (0, 0.5), Placement.center: (20, 0.5), Placement.stretch: (0, 5 / 6)}[placement]
     box = np.array([BOX[0], BOX[1] / 0.5 * scale + top, BOX[2], BOX[3] / 0.5 * scale + top])
     weights = constant_network(
@@ -110,7 +110,7 @@ def test_onnx_boxes_image_placement_is_inverted(tmp_path, placement):
         device="cpu",
         min_readings=1.0,
     )
-    # at this significance everything in the box is foreground: the mask is the box
+    # at this significance, everything in the box is foreground, so that the mask is the box
     flat = replace(frame(), depth=np.ones((120, 160), np.float32))
     (mask,) = detector.detect(flat).masks
     expected = np.zeros_like(mask)

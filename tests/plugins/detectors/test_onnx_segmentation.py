@@ -1,4 +1,4 @@
-"""YOLO-style segmentation on networks whose boxes, scores and masks are known."""
+"""Tests of YOLO-style segmentation networks with known boxes, scores and masks."""
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ def frame():
 
 
 def outputs(objectness=False, transposed=False):
-    """A cup in the left and a chair in the lower half of their boxes; prototypes: column - 10.4, and row - 25.4."""
+    """Return a cup in the left and a chair in the lower half of their boxes; prototypes are linear in the pixel."""
     cells = SIZE // CELL
     prototypes = np.stack(
         [np.tile(np.arange(cells) - 10.4, (cells, 1)), np.tile(np.arange(cells) - 25.4, (cells, 1)).T]
@@ -89,7 +89,7 @@ def test_onnx_segmentation_tflite_file_error_names_converter(tmp_path):
 
 
 def suppressed(folder, **parameters):
-    """The same candidates in a network with suppression inside, where each has one class."""
+    """Return the same candidates from a network with internal suppression and one class each."""
     table, prototypes = outputs(transposed=True).values()
     (folder / "labels.txt").write_text("\n".join(LABELS))
     center, size, scores = table[0, :, :2], table[0, :, 2:4], table[0, :, 4:7]
@@ -101,7 +101,7 @@ def suppressed(folder, **parameters):
 
 @pytest.mark.parametrize(("spread", "expected"), [(1.0, [0.6, 0.5]), (0.5, [0.8, 0.7]), (0.0, [1.0, 1.0])])
 def test_onnx_segmentation_single_class_spreads_remaining_mass(tmp_path, spread, expected, caplog):
-    """A score of 0.4 is less than the even share of two classes, with spread 1."""
+    """A score of 0.4 is less than the equal probability of two classes, with spread 1."""
     with caplog.at_level("INFO"):
         found = suppressed(tmp_path, class_spread=spread).detect(frame())
     assert "n.onnx reports one class per detection" in caplog.text
@@ -170,7 +170,7 @@ IMAGES = ("mit76/color/000000.jpg", "redkitchen/color/000240.jpg", "replica_floo
 
 @pytest.fixture(scope="module")
 def yolo(shared):
-    """A real network, as its exporter wrote it."""
+    """Return a real network in its exporter's format."""
     path = shared / "weights" / "yolo11n_seg" / "yolo11n_seg.onnx"
     if not path.is_file():
         pytest.skip(f"{path} is not there")
@@ -179,7 +179,7 @@ def yolo(shared):
 
 @pytest.fixture(scope="module")
 def photographs(shared_data):
-    """Frames of three real videos."""
+    """Return frames of three real videos."""
     colors = [cv2.cvtColor(cv2.imread(str(shared_data / name)), cv2.COLOR_BGR2RGB) for name in IMAGES]
     cameras = [Camera(c.shape[1], c.shape[0], 500.0, 500.0, 0.0, 0.0) for c in colors]
     return [Frame(k, 0.0, c, np.ones(c.shape[:2], np.float32), cameras[k]) for k, c in enumerate(colors)]

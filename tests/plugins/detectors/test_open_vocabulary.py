@@ -1,4 +1,4 @@
-"""Objects named in words: what networks say at known places comes out in pixels, whatever the image's shape."""
+"""Tests of detection by text: boxes and masks of fake networks are mapped to pixels for any image shape."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def picture(shape: tuple[int, int]) -> Frame:
 
 
 class Saying:
-    """In place of OWLv2: these boxes in px, with these probabilities of the words."""
+    """Replaces OWLv2: returns these boxes in px with these probabilities of the queries."""
 
     dtype = torch.float32
 
@@ -58,7 +58,7 @@ class Saying:
 
 
 class Filling:
-    """In place of a SAM: everything in the prompted box, in a grid of a quarter of the input's size."""
+    """Replaces SAM: fills the prompted box, in a grid of a quarter of the input's size."""
 
     dtype = torch.float32
 
@@ -128,7 +128,7 @@ def test_open_vocabulary_masks_lie_in_prompt_boxes(sam: Path, shape: tuple[int, 
     expected = np.zeros((2, *shape), np.bool_)
     expected[0, 20:50, 10:30] = expected[1, :10, :60] = True
     overlap = (found & expected).sum(axis=(1, 2)) / (found | expected).sum(axis=(1, 2))
-    assert (overlap > 0.9).all(), "but for what the grid rounds"
+    assert (overlap > 0.9).all(), "except for the rounding of the grid"
     for mask, wanted in zip(found, expected, strict=True):
         center, middle = (np.argwhere(area).mean(axis=0) for area in (mask, wanted))
         np.testing.assert_allclose(center, middle, atol=0.5)
@@ -192,7 +192,7 @@ def test_open_vocabulary_unsupported_model_type_raises(owlv2: Path, tmp_path: Pa
 
 
 def test_open_vocabulary_tokenizer_loads_from_vocab_and_merges(tmp_path: Path) -> None:
-    """vocab.json and merges.txt: google/owlv2-base-patch16-ensemble has no tokenizer.json."""
+    """google/owlv2-base-patch16-ensemble has vocab.json and merges.txt, but no tokenizer.json."""
     (write_owlv2(tmp_path) / "tokenizer.json").unlink()
     letters = sorted(set("aphotofcuprbe"))
     words = ["!", *letters, *(f"{letter}</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]

@@ -1,4 +1,4 @@
-"""Anybody's detections: every form of a COCO result, folders of masks, and what is refused."""
+"""Tests of precomputed detections: all formats of COCO results, mask folders, and rejected files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def frame(index: int = 0, camera: Camera = CAMERA) -> Frame:
 
 
 def entry(**changes: Any) -> dict[str, Any]:
-    """One result; a change to None leaves the key out."""
+    """Return one result; a value of None removes the key."""
     segmentation = {"size": [6, 8], "counts": PACKED}
     result = {"image_id": 0, "category_name": "chair", "segmentation": segmentation, "score": 0.6} | changes
     return {key: value for key, value in result.items() if value is not None}
@@ -87,7 +87,7 @@ def test_precomputed_label_and_score_give_class_distribution(tmp_path: Path) -> 
 def test_precomputed_class_spread_sets_other_probabilities(
     tmp_path: Path, spread: float, score: float, own: float
 ) -> None:
-    """Never so much that the label is no longer the best."""
+    """The label always remains the most likely class."""
     [row] = detected(tmp_path, entry(score=score), class_spread=spread).class_probabilities
     assert row[CHAIR] == pytest.approx(own)
     np.testing.assert_allclose(np.delete(row, CHAIR), (1 - own) / 79, rtol=1e-5, atol=1e-9)
@@ -131,7 +131,7 @@ def test_precomputed_category_id_maps_to_label(
 def test_precomputed_foreign_labels_map_to_coco_or_are_dropped(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A wall is no object: dropped, and told."""
+    """A wall is not an object: it is dropped and logged."""
     entries = [entry(category_name="sofa", score=0.9), entry(category_name="wall", score=0.8)]
     with caplog.at_level(logging.INFO):
         found = detected(tmp_path, *entries, label_space="nyu40")
@@ -148,7 +148,7 @@ def test_precomputed_sorts_and_filters_detections_by_score(tmp_path: Path) -> No
     np.testing.assert_array_equal(found.boxes[:, 2] - found.boxes[:, 0], 1)
 
 
-# What framework.commands.running.detect writes
+# Output of framework.commands.running.detect
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_precomputed_detection_file_round_trip_is_exact(tmp_path: Path, detector
 
 
 def write_folder(folder: Path, ids: np.ndarray | None = None, listed: Any = None, name: str = "000003") -> Path:
-    """Instance 7 is a chair over MASK, 300 a tv in the corner, 9 is not listed."""
+    """Write instance 7 as a chair over MASK, 300 as a tv in the corner, and an unlisted instance 9."""
     image = np.where(MASK, 7, 0).astype(np.uint16)
     image[0, 0], image[5, 7] = 300, 9
     cv2.imwrite(str(folder / f"{name}.png"), image if ids is None else ids)
@@ -248,7 +248,7 @@ def test_precomputed_mask_image_with_wrong_size_or_type_raises(
         Precomputed(write_folder(tmp_path, ids)).detect(frame(3))
 
 
-# What is refused
+# Rejected files
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
-"""Whatever a file of detections says: they are used, or the file is refused in one line.
+"""Fuzz tests of detection files: a file is used, or raises a one-line error.
 
-`INSTANCEMAP_FUZZ=2000 pytest tests/plugins/detectors/test_precomputed_fuzzing.py` tries so many of each format.
+`INSTANCEMAP_FUZZ=2000 pytest tests/plugins/detectors/test_precomputed_fuzzing.py` tries 2000 cases per format.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def use(path: Path) -> None:
 
 
 def use_folder(description: Path) -> None:
-    """Its faults name the file, or the folder."""
+    """Read the folder; errors name the file or the folder."""
     try:
         use(description.parent)
     except DataError as error:

@@ -1,4 +1,4 @@
-"""The simulated detector: without errors it is the ground truth, and each error has the statistics that it promises."""
+"""Tests of the simulated detector: without errors it is the ground truth; each error has its configured statistics."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ IDS = np.zeros((120, 160), np.int32)
 IDS[20:60, 20:60] = 5  # a chair in the open
 IDS[20:60, 60:100] = 6  # a couch that touches it
 IDS[70:90, 40:60] = 9  # a small cup
-IDS[80:120, 100:160] = 12  # a bed that the image's corner cuts
+IDS[80:120, 100:160] = 12  # a bed cut by the image corner
 IDS[0:10, 0:10] = 30  # of no known class
 TRUTH = FrameTruth(IDS, {5: "chair", 6: "couch", 9: "cup", 12: "bed", 30: None})
 
@@ -59,7 +59,7 @@ def same(a, b):
 
 
 def count_of(detector, mask, frames=400):
-    """In how many frames a detection's center pixel lies in `mask`."""
+    """Return the number of frames with a detection whose center pixel is in `mask`."""
     return sum(bool((d.masks & mask).any()) for d in (detector.detect(frame(k)) for k in range(frames)))
 
 
@@ -90,7 +90,7 @@ def test_simulated_results_depend_on_seed_and_frame_not_order():
 
 
 def test_simulated_error_types_have_independent_random_streams():
-    """More misses take detections away; those that stay are the same, to the pixel."""
+    """A higher miss rate only removes detections; the others are identical."""
     few = SimulatedDetector(miss_rate=0.0, false_positives=0, merge_rate=0)
     many = replace(few, miss_rate=0.5)
     for index in range(20):
@@ -189,7 +189,7 @@ def test_confusion_kernel_is_normalized_and_favors_lookalikes():
 
 
 def distributions(detector, frames):
-    """The rows of the couch, found by its place."""
+    """Return the class rows of the couch, found by its position."""
     rows = []
     for k in range(frames):
         detections = detector.detect(frame(k))
@@ -335,7 +335,7 @@ def test_simulated_touching_pairs_match_reference():
             expected |= {tuple(sorted(pair)) for pair in zip(ids[here][touch], ids[there][touch], strict=True)}
         seen = replace(frame(), depth=depth, truth=FrameTruth(ids, {}))
         assert touching_pairs(seen).tolist() == sorted(map(list, expected))
-        assert 3 < len(expected) < 36  # of the 36 pairs that there could be
+        assert 3 < len(expected) < 36  # of 36 possible pairs
 
 
 @pytest.mark.parametrize("place", [(80.3, 60.2), (0.0, 0.0), (159.9, 119.9), (3.5, 118.0)])
@@ -344,7 +344,7 @@ def test_simulated_ellipse_matches_reference(place):
     v, u = np.ogrid[:120, :160]
     for seed, (a, b) in enumerate(((12.0, 80.0), (40.5, 13.0), (79.0, 80.0))):
         wobble = smooth_field(np.random.default_rng(seed), (120, 160), 12.0) * np.float32(0.4)
-        for field in (wobble, wobble + np.float32(3)):  # with the latter nothing is left
+        for field in (wobble, wobble + np.float32(3)):  # the latter leaves nothing
             expected = np.hypot((u - x) / a, (v - y) / b) + field < 1
             np.testing.assert_array_equal(ellipse(x, y, a, b, field), expected)
 

@@ -1,4 +1,4 @@
-"""The transformers detector: on tiny random networks of each family, beside slow decodings and the models' own."""
+"""Tests of the transformers detector on random tiny networks of each family, compared with reference decoders."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from torch.nn import functional
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError
 
-# a detector that any config registers keeps these; here they run on the networks below
+# the contract tests of registered detectors; here they run on the networks below
 from framework.testing.contracts import DetectorContract
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID
 from plugins.detectors.transformers_segmentation import (
@@ -65,13 +65,13 @@ def test_transformers_all_model_families_are_covered():
 
 def test_transformers_tiny_networks_return_detections(detector):
     found = [detector.detect(frame(seed)) for seed in range(3)]
-    assert sum(map(len, found)) >= 3, "or the other tests say nothing"
+    assert sum(map(len, found)) >= 3, "otherwise the other tests are meaningless"
     assert detector.classes == CLASSES
     assert not np.array_equal(found[0].masks, found[1].masks)
 
 
 def slow_decoding(detector, kind, image, threshold):
-    """Query by query: (score, mask, class distribution), best first, before masks are compared with each other."""
+    """Decode query by query: (score, mask, class distribution), best first, before suppression."""
     pixels, (down, right) = detector._preprocessing(image.color, torch.device("cpu"))
     output = detector._network(pixel_values=pixels)
     instance = "masks_queries_logits" not in output
@@ -113,12 +113,12 @@ def test_transformers_decoding_matches_reference(folders, kind):
     assert len(expected) > 1
     np.testing.assert_allclose(found.scores, [score for score, _, _ in expected], rtol=1e-4)
     np.testing.assert_allclose(found.class_probabilities, [row for _, _, row in expected], atol=1e-5)
-    if kind != "rf_detr":  # the slow one goes by the network's size, and only there it is that of the image
+    if kind != "rf_detr":  # the slow decoder uses the network's size, which equals the image size only there
         assert np.mean(found.masks == np.array([mask for _, mask, _ in expected])) > 0.999
 
 
 def test_transformers_decoding_agrees_with_mask2former(folders):
-    """Each of its (query, label) pairs that is a query's best is ours, with its mask and its score."""
+    """Each (query, label) pair that is the best of its query has the same mask and score."""
     from transformers import Mask2FormerImageProcessorPil
 
     camera = Camera(384, 384, 300.0, 300.0, 191.5, 191.5)  # the size at which it always decodes
@@ -187,7 +187,7 @@ def test_transformers_preprocessing_agrees_with_library(name, numbers, shape):
     content = {"image_processor_type": name, **numbers}
     pixels, _ = Preprocessing.parse(content, "here")(color, torch.device("cpu"))
     assert pixels.shape[1:] == expected.shape
-    # theirs goes through 8 bits after resizing
+    # theirs is quantized to 8 bits after resizing
     np.testing.assert_allclose(pixels[0].numpy(), expected, atol=2 / 255 / 0.2)
     assert np.abs(pixels[0].numpy() - expected).mean() < 0.6 / 255 / 0.2
 
@@ -288,7 +288,7 @@ def test_transformers_missing_model_offline_raises_with_advice(monkeypatch, vari
 
 
 def coco_rf_detr(folder, names):
-    """A tiny RF-DETR-Seg with the head of those trained on COCO, whose config calls the classes `names`."""
+    """Return a tiny RF-DETR-Seg with a COCO head, whose config names the classes `names`."""
     write_network(folder, "rf_detr", names)
     return built(folder, score_threshold=0.02, agnostic_nms_iou=1.0)
 
@@ -298,7 +298,7 @@ IN_A_ROW = {**dict(enumerate(COCO)), **dict.fromkeys(range(80, 91), "N/A")}
 
 @pytest.mark.parametrize("names", [dict(enumerate(COCO_BY_ID)), {k: f"LABEL_{k}" for k in range(91)}, IN_A_ROW])
 def test_transformers_rf_detr_uses_coco_91_ids(tmp_path, names):
-    """As transformers' own test of it: number 17 is the cat, 75 the remote; and as its own decoding."""
+    """As in transformers' test, number 17 is the cat and 75 the remote; the decoding agrees."""
     detector = coco_rf_detr(tmp_path, names)
     assert detector.classes == COCO
     labels = Checkpoint(str(tmp_path), "main").labels
@@ -343,7 +343,7 @@ def test_transformers_missing_package_error_names_extra(monkeypatch):
 
 @pytest.fixture
 def copy(folders, tmp_path):
-    """A copy of the mask2former folder, and a way to change its JSON files."""
+    """Return a copy of the mask2former folder, and a function that changes its JSON files."""
     for file in folders["mask2former"].iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
 
@@ -365,7 +365,7 @@ def copy(folders, tmp_path):
         ("config.json", {"id2label": {str(k): f"thing {k}" for k in range(6)}}, "'thing 0', 'thing 1'"),
         ("config.json", {"id2label": {"0": "chair", "1": "bed"}}, "expected the weights in"),
         ("config.json", {"num_queries": 13}, "expected the weights in"),
-        ("config.json", {"model_type": "never heard of"}, "never heard of"),
+        ("config.json", {"model_type": "unknown type"}, "unknown type"),
         (
             "preprocessor_config.json",
             {"size": {"height": 3}},

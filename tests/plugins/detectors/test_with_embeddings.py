@@ -1,4 +1,4 @@
-"""Detections with embeddings: by random CLIPs and SigLIPs, whose numbers are those of transformers' own code."""
+"""Tests of detections with embeddings of random CLIP and SigLIP models, compared with transformers."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_with_embeddings_frame_interval_sets_embedded_frames(siglip: Path) -> No
 
 
 def test_with_embeddings_contrast_controls_background(siglip: Path) -> None:
-    """With surroundings of 0 another background changes nothing, with 1 it does; the object always counts."""
+    """With 0, the background has no influence; with 1, it has; the object always has."""
     plain, other = picture(), picture()
     inside = Blocks().detect(plain).masks[0]
     other.color[~inside] = 255 - other.color[~inside]

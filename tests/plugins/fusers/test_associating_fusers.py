@@ -1,4 +1,4 @@
-"""Association and the table of instances, over every kind of map, on spheres whose masks are known exactly."""
+"""Tests of association and of the instance table with every map, on spheres with exact masks."""
 
 import dataclasses
 from collections.abc import Callable
@@ -56,9 +56,9 @@ def test_fuser_weak_detection_creates_no_instance(new_fuser: NewFuser, frames: l
     ("parameters", "updates"),
     [
         ({}, True),
-        ({"overlap_rule": OverlapRule.IOU}, False),  # a part shares little of all that is covered
+        ({"overlap_rule": OverlapRule.IOU}, False),  # a part has a small overlap with the union
         ({"min_class_agreement": 0.9}, True),
-        ({"min_class_agreement": 1.0}, False),  # the floor alone keeps distributions from agreeing wholly
+        ({"min_class_agreement": 1.0}, False),  # only the floor keeps distributions from agreeing completely
     ],
 )
 def test_fuser_overlap_rule_and_class_agreement_limit_matches(
@@ -74,7 +74,7 @@ def test_fuser_overlap_rule_and_class_agreement_limit_matches(
 
 
 def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
-    """A detector splits an object at first and finds it whole afterwards."""
+    """A detector splits an object at first and detects it as a whole later."""
     fuser = new_fuser()
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
@@ -91,12 +91,12 @@ def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frame
 
 @pytest.mark.parametrize(
     ("fuser_class", "merge_frames"),
-    [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # where a vote is a vote, the other half is soon outvoted
+    [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # with equal votes, the other half is soon outvoted
 )
 def test_fuser_instances_often_under_one_cluster_merge(
     fuser_class: type[MapFuser], merge_frames: int, frames: list[Frame]
 ) -> None:
-    """Weak detections of the whole, which would take long to outvote the voxels of the other half."""
+    """Weak detections of the whole would need long to outvote the voxels of the other half."""
     fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0, merge_overlap=0.5, merge_frames=merge_frames)
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
@@ -126,7 +126,7 @@ def test_fuser_instances_often_under_one_cluster_merge(
 def test_fuser_merges_supported_object_only_if_classes_agree(
     merge_agreement: float, agrees: bool, merged: bool, frames: list[Frame]
 ) -> None:
-    """The table's mask covers it in every frame; a part of the table in its place would be merged."""
+    """The table's mask covers the object in every frame; a part of the table would be merged."""
     fuser = assemble(
         BayesianTsdf,
         voxel_size=0.02,
@@ -198,7 +198,7 @@ def test_fuser_empty_scene_leaves_map_unchanged(new_fuser: NewFuser) -> None:
 
 
 def test_fuser_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFuser, frames: list[Frame]) -> None:
-    """Else its confidence would fall in every frame at whose border or behind whose objects a bit of it shows."""
+    """Otherwise its confidence would fall in frames that show only a small part of it."""
     fuser = new_fuser(create_points=50)
     mask = masks_of(frames[0])[0]
     fuse_masks(fuser, frames[0], [mask], [0.9])
@@ -214,7 +214,7 @@ def test_fuser_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFus
 
 @pytest.mark.parametrize("voxel_size", [0.01, 0.02, 0.04])
 def test_fuser_min_area_does_not_depend_on_voxel_size(new_fuser: NewFuser, voxel_size: float) -> None:
-    """A poster on a wall, of which the area is known."""
+    """The object is a poster on a wall with a known area."""
     depth, poster = 1.5, np.zeros(CAMERA.shape, np.bool_)
     poster[30:90, 40:120] = True
     area = poster.sum() * depth**2 / (CAMERA.fx * CAMERA.fy)
@@ -259,7 +259,10 @@ def test_fuser_floored_distribution_is_positive_and_normalized() -> None:
 def test_fuser_supported_object_keeps_voxels_under_larger_mask(
     lying_on: float, same_class: bool, keeps: bool, frames: list[Frame]
 ) -> None:
-    """Once it counts: the desk's mask covers it in frames that do not find it. A part of a desk is the desk's."""
+    """The object is confirmed; the desk's mask covers it in frames without its detection.
+
+    Parts of the desk are merged.
+    """
     fuser = assemble(
         BayesianTsdf,
         voxel_size=0.02,

@@ -1,4 +1,4 @@
-"""The map that the paper's fuser writes: its budget, its rows of evidence, the same with any number of threads."""
+"""Tests of fuser=bayesian_tsdf: map limits, evidence rows, and independence of the thread count."""
 
 import dataclasses
 

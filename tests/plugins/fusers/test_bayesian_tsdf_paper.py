@@ -1,4 +1,4 @@
-"""The fuser of preset=paper, compared with slow float64 references."""
+"""Tests of the fuser of preset=paper, compared with slow float64 references."""
 
 import dataclasses
 from pathlib import Path
@@ -79,7 +79,7 @@ def test_paper_fuser_association_agrees_with_slow_reference(frames: list[Frame])
 
 @pytest.mark.parametrize(("source", "found"), [("RAYCAST", True), ("SURFACE_LOOKUP", False)])
 def test_paper_fuser_new_surface_votes_for_instance_behind(source: str, found: bool) -> None:
-    """A sphere nearer than the mapped one covers it: its readings are not where the map has its surface."""
+    """A nearer sphere covers the mapped one: its depth is in front of the mapped surface."""
     behind, front = (Scene([(np.array([0.0, 0.0, -1.0]), -2.5)], [(np.array([0.0, 0.0, z]), 0.35)]) for z in (2.0, 1.6))
     fuser = paper_fuser(f"fuser.association={source}")
     fuse_masks(fuser, behind.frame(pose(), 0), masks_of(behind.frame(pose(), 0)), [0.9])
@@ -261,7 +261,7 @@ def test_paper_fuser_unmatched_masks_update_classes_only_if_set(frames: list[Fra
 
 
 def test_paper_fuser_pixels_of_all_masks_are_listed(frames: list[Frame]) -> None:
-    """The paper updates mask by mask: no mask gives way to a smaller one on top."""
+    """The paper updates mask by mask: overlapping masks all count."""
     fuser = paper_fuser()
     whole, small = masks_of(frames[0])[0], masks_of(frames[0])[0].copy()
     small[:, : int(np.median(np.nonzero(whole)[1]))] = False

@@ -1,4 +1,4 @@
-"""Class-only fusion on analytic scenes, and compared with the recursion of each voxel in float64."""
+"""Tests of class-only fusion on analytic scenes, compared with a float64 recursion per voxel."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def new_fuser(**parameters: object) -> ClassOnlyFusion:
 
 
 def mapped_boxes(boxes: list[box_scene.Box], class_ids: list[int]) -> SemanticMap:
-    """The boxes on the floor, seen from all views under their true masks.
+    """Map the boxes on the floor from all views under their true masks.
 
-    A hidden side of which one view sees a sliver is a piece of its own: `min_area` leaves it out.
+    A hidden side with few visible pixels is a separate component: `min_area` excludes it.
     """
     scene, fuser = BoxScene([[box] for box in boxes]), new_fuser(min_area=0.03)
     for k, T in enumerate(VIEWS):
@@ -54,7 +54,7 @@ def frames() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def mapped(frames: list[Frame]) -> SemanticMap:
-    """The three spheres: the first is detected in all frames, the second in three, the third in none."""
+    """Map three spheres: the first is detected in all frames, the second in three, the third in none."""
     fuser = new_fuser()
     for k, frame in enumerate(frames):
         found = 1 + (k in SECOND_FOUND)
@@ -62,7 +62,7 @@ def mapped(frames: list[Frame]) -> SemanticMap:
     return fuser.scene
 
 
-# What is an instance
+# Components
 
 
 def test_class_only_separate_boxes_of_one_class_are_two() -> None:
@@ -114,14 +114,14 @@ def test_class_only_instance_below_min_area_is_excluded(frames: list[Frame]) -> 
     fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [0.6])
     assert not fuser.scene.instances()
     assert (fuser.scene.mesh().class_ids == -1).all()
-    assert (fuser.scene.render(CAMERA, walk(10)[0]).class_ids == 0).any(), "voxels know nothing of areas"
+    assert (fuser.scene.render(CAMERA, walk(10)[0]).class_ids == 0).any(), "voxels have no area limit"
 
 
-# What is said of one
+# Attributes of an instance
 
 
 def test_class_only_voxel_evidence_matches_reference(mapped: SemanticMap, frames: list[Frame]) -> None:
-    """Against eq. [7] over classes and background, by projecting the voxel into each frame."""
+    """The reference is eq. [7] over classes and background, with the voxel projected into each frame."""
     grid, evidence, fuser = mapped.volume.voxels.grid, mapped.labels.evidence, new_fuser()
     rows = np.flatnonzero(grid.label_row[: mapped.volume.voxels.block_count] >= 0)
     rng = np.random.default_rng(0)
@@ -200,11 +200,11 @@ def test_class_only_detected_spheres_are_instances(mapped: SemanticMap) -> None:
     assert np.quantile(np.abs(np.linalg.norm(points - center, axis=1) - radius), 0.9) < 0.03
     view = mapped.render(CAMERA, walk(10)[5])
     assert (view.class_ids[masks_of(room().frame(walk(10)[5]))[0]] == 0).mean() > 0.9
-    assert not view.instance_ids.any(), "voxels know of no instance"
+    assert not view.instance_ids.any(), "voxels have no instance"
 
 
 def test_class_only_score_is_probability_of_best_class(frames: list[Frame]) -> None:
-    """Of a best class of 0.7, score 0.33 leaves the background more than half, and 0.6 a seventh."""
+    """If the best class has 0.7, score 0.33 leaves more than half to the background, and 0.6 a seventh."""
     for score, label in ((0.33, -1), (0.6, 0)):
         fuser = new_fuser()
         fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [score])
@@ -212,7 +212,7 @@ def test_class_only_score_is_probability_of_best_class(frames: list[Frame]) -> N
         assert np.median(view.class_ids[masks_of(frames[0])[0]]) == label
 
 
-# The map as such
+# The map
 
 
 def test_class_only_map_does_not_depend_on_thread_count(frames: list[Frame]) -> None:
@@ -292,7 +292,7 @@ def with_smoothness(mapped: SemanticMap, tmp_path: Path, smoothness: float) -> S
 
 
 def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
-    """Iterated conditional modes vertex by vertex, in float64 and with sets."""
+    """Run iterated conditional modes vertex by vertex, in float64 and with sets."""
     surface, grid, evidence = scene.volume.surface(), scene.volume.voxels.grid, scene.labels.evidence
     class_ids = scene.mesh().class_ids.tolist()
     neighbors: list[set[int]] = [set() for _ in class_ids]

@@ -1,4 +1,4 @@
-"""The baseline with one volume per object, on boxes seen by a perfect camera and detector."""
+"""Tests of the baseline with one volume per object, on boxes with exact depth and masks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def new_fuser(**parameters: object) -> ObjectVolumes:
 
 
 def pan(width: float) -> list[Frame]:
-    """Ten views of both boxes, `width` m from the first to the last."""
+    """Return ten views of both boxes, `width` m from the first to the last."""
     places = np.linspace(-width / 2, width / 2, 10)
     return [BOXES.frame(look_from(x, -1.4, 1.5, (0.0, 0.6, 0.2)), k) for k, x in enumerate(places)]
 
@@ -63,7 +63,7 @@ def mapped(frames: list[Frame]) -> ObjectVolumes:
     return fuser
 
 
-# What is mapped
+# Mapped surfaces
 
 
 def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
@@ -79,7 +79,7 @@ def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
 
 
 def test_object_volumes_label_whole_object_surface(mapped: ObjectVolumes) -> None:
-    """Or the nearest vertex to a true point would be the background's in one case of two."""
+    """Otherwise half of the true points would have a background vertex as nearest neighbor."""
     mesh = mapped.scene.mesh()
     owners = BOXES.owners(mesh.vertices.astype(np.float64), VOXEL / 4)
     for key in (1, 2):
@@ -105,21 +105,21 @@ def test_object_volumes_statistics_include_all_volumes(mapped: ObjectVolumes) ->
 
 
 def share_of_the_room(fuser: ObjectVolumes) -> float:
-    """The share of the first object's vertices that are the floor's or the wall's, a voxel away from all boxes."""
+    """Return the fraction of the first object's vertices on the floor or wall, a voxel away from all boxes."""
     mesh = fuser.scene.mesh()
     points = mesh.vertices[mesh.instance_ids == 1].astype(np.float64)
     return float((BOXES.owners(points, VOXEL) == 0).mean())
 
 
 def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
-    """What was never seen without the mask stays in either case: so the camera hardly moves."""
+    """Voxels always seen under the mask remain in both cases, so the camera moves little."""
     once, always = new_fuser(), new_fuser()
     for k, frame in enumerate(pan(0.1)):
         mask = masks_of(frame)[0]
         fuse(once, frame, [bled(mask, 12) if k == 3 else mask])
         fuse(always, frame, [bled(mask, 12)])
     assert share_of_the_room(once) < 0.02
-    assert share_of_the_room(always) > 0.2, "the weakness: nothing is cleaned, so what is always wrong stays"
+    assert share_of_the_room(always) > 0.2, "a known weakness: constant errors are not removed"
 
 
 def test_object_volumes_remove_bled_voxels_after_unmasked_view(frames: list[Frame]) -> None:
@@ -145,7 +145,7 @@ def test_object_volumes_change_only_when_detected(frames: list[Frame]) -> None:
 
 
 def part_of(mask: np.ndarray, share: float) -> np.ndarray:
-    """The first `share` of a mask's pixels, row by row."""
+    """Return the first `share` of a mask's pixels, row by row."""
     v, u = np.nonzero(mask)
     part = np.zeros_like(mask)
     part[v[: round(share * len(v))], u[: round(share * len(v))]] = True
@@ -210,7 +210,7 @@ def test_object_volumes_weak_or_far_detection_creates_none(frames: list[Frame]) 
         assert not fuser.scene.volumes
 
 
-# What is known of an object
+# Attributes of an object
 
 
 def test_object_volumes_probabilities_are_mean_of_detections(frames: list[Frame]) -> None:
@@ -225,7 +225,7 @@ def test_object_volumes_probabilities_are_mean_of_detections(frames: list[Frame]
 
 
 def test_object_volumes_unconfirmed_is_removed_when_visible(frames: list[Frame]) -> None:
-    """Detected once and missed n times it exists with probability 2 / (3 + n), which is below 0.1 from n = 18 on."""
+    """After 1 detection and n misses it exists with probability 2 / (3 + n), below 0.1 from n = 18 on."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     wall = np.zeros(CAMERA.shape, np.bool_)
     wall[10:50, 100:180] = True
@@ -234,7 +234,7 @@ def test_object_volumes_unconfirmed_is_removed_when_visible(frames: list[Frame])
     elsewhere = replace(frame, depth=np.zeros_like(frame.depth))
     for k in range(30):
         fuse(fuser, replace(elsewhere, index=1 + k), [])
-    assert set(fuser.scene.instances()) == {1}, "nobody has looked there"
+    assert set(fuser.scene.instances()) == {1}, "the region is unobserved"
     for k in range(17):
         fuse(fuser, replace(frame, index=31 + k), [])
     assert set(fuser.scene.instances()) == {1}
@@ -272,7 +272,7 @@ def test_object_volumes_incremental_mesh_equals_loaded_mesh(frames: list[Frame],
 
 
 def test_object_volumes_keep_surfaces_of_overlapping_objects(frames: list[Frame]) -> None:
-    """One detection a frame, now of the whole and now of a small part: what an IoU rule makes of a partial mask."""
+    """Each frame has one detection, of the whole or of a small part, which an IoU rule does not match."""
     fuser = new_fuser(min_observations=1)
     whole = masks_of(frames[0])[0]
     for k, mask in enumerate([whole, part_of(whole, 0.15)]):

@@ -1,4 +1,4 @@
-"""Open3D's blocks as a fuser: what a voxel counts, where surfaces lie, and what is kept, on scenes known exactly."""
+"""Tests of Open3D's voxel blocks as a fuser: votes, surfaces and storage, on exact scenes."""
 
 import dataclasses
 from pathlib import Path
@@ -41,7 +41,7 @@ def frames() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def mapped(frames: list[Frame]) -> Open3DMap:
-    """The room with its three spheres, from six frames."""
+    """Map the room with its three spheres from six frames."""
     fuser = new_fuser()
     for frame in frames:
         fuse_masks(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
@@ -49,7 +49,7 @@ def mapped(frames: list[Frame]) -> Open3DMap:
 
 
 def one_view(**changes: float) -> tuple[Open3DMap, Frame]:
-    """A wall seen once."""
+    """Map a wall from one frame."""
     frame = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)]).frame(np.eye(4))
     scene = Open3DMap(dataclasses.replace(SETTINGS, **changes), CONFIRMATION)
     scene.integrate(frame, np.eye(4))
@@ -60,7 +60,7 @@ def one_view(**changes: float) -> tuple[Open3DMap, Frame]:
 
 
 def majority(votes: list[int]) -> tuple[int, int]:
-    """Candidate and counter after Boyer and Moore, one vote at a time."""
+    """Return candidate and counter after Boyer and Moore, one vote at a time."""
     candidate = count = 0
     for vote in votes:
         if vote == candidate:
@@ -85,7 +85,7 @@ def test_open3d_vbg_voxel_votes_match_boyer_moore(votes: list[int]) -> None:
 
 
 def voxel_centers(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
-    """Flat numbers and places (m) of all voxels, the slow and obvious way."""
+    """Return the indices and positions (m) of all voxels with a slow reference."""
     r, size = scene.grid.settings.block_resolution, scene.grid.settings.voxel_size
     hashmap = scene.grid.blocks.hashmap()
     z, y, x = np.mgrid[:r, :r, :r].reshape(3, -1)
@@ -115,7 +115,7 @@ def test_open3d_vbg_only_voxels_in_band_under_mask_vote(frames: list[Frame]) -> 
     found = scene.grid.flat("instance")[numbers] == 7
     assert expected.sum() > 500
     assert (found != expected).mean() < 1e-4, "rounding at the border alone"
-    assert (scene.grid.flat("instance") == 7).sum() == found.sum(), "a voxel in no block has voted"
+    assert (scene.grid.flat("instance") == 7).sum() == found.sum(), "voxels without a block have no votes"
 
 
 @pytest.mark.parametrize(("scores", "winner"), [([0.9, 0.6], 1), ([0.6, 0.9], 2)])
@@ -135,7 +135,7 @@ def test_open3d_vbg_shared_pixels_go_to_higher_score(frames: list[Frame], scores
 
 @pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.1, 0.5, 0.0), (-0.2, -0.4, 0.3)])
 def test_open3d_vbg_rendered_surface_is_accurate(rotvec: tuple[float, float, float]) -> None:
-    """Open3D's own rays end 12 mm too far, and its depth look-up is off by half a pixel; neither is left."""
+    """Open3D's own rays end 12 mm too far, and its depth lookup is off by half a pixel; both are corrected."""
     scene, T = Open3DMap(SETTINGS, CONFIRMATION), pose(rotvec=rotvec)
     walls = Scene(planes=[(np.array([-0.3, 0.1, -1.0]) / np.sqrt(1.1), -1.777)], spheres=room().spheres)
     for _ in range(3):
@@ -187,7 +187,7 @@ def test_open3d_vbg_min_weight_applies_after_first_frames() -> None:
 
 
 def test_open3d_vbg_low_resolution_image_leaves_no_holes() -> None:
-    """Open3D touches blocks at every 4th pixel only: here 12 cm apart, for blocks of 8 cm."""
+    """Open3D touches blocks only at every 4th pixel: here 12 cm apart, for blocks of 8 cm."""
     coarse = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
     scene = Open3DMap(dataclasses.replace(SETTINGS, voxel_size=0.01), CONFIRMATION)
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.2)])
@@ -197,7 +197,7 @@ def test_open3d_vbg_low_resolution_image_leaves_no_holes() -> None:
 
 
 def test_open3d_vbg_close_view_is_complete_without_output(mapped: Open3DMap, capfd: pytest.CaptureFixture[str]) -> None:
-    """Open3D sizes its map of ranges by the first view, prints a warning in a later one and leaves holes there."""
+    """Open3D sizes its range map by the first view; in a later one it prints a warning and leaves holes."""
     scene = Open3DMap(mapped.grid.settings, CONFIRMATION)
     for T in walk(3):
         scene.integrate(room().frame(T), T)
@@ -264,7 +264,7 @@ def test_open3d_vbg_instance_below_min_area_is_excluded(frames: list[Frame]) -> 
         fuse_masks(fuser, frame, masks_of(frame)[:1], [0.9])
     assert not fuser.scene.instances()
     assert (fuser.scene.mesh().class_ids == -1).all()
-    assert fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids.any(), "it is tentative, not gone"
+    assert fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids.any(), "it is tentative, not removed"
 
 
 # Storage
@@ -297,7 +297,7 @@ def test_open3d_vbg_full_map_raises_and_keeps_content(frames: list[Frame], monke
     assert fuser.scene.statistics.voxels == budget * 512
     assert fuser.scene.grid.blocks.hashmap().capacity() <= budget
     assert np.array_equal(fuser.scene.mesh().vertices, before.vertices)
-    fuse_masks(fuser, frames[0], [], [])  # what is there can still be seen again
+    fuse_masks(fuser, frames[0], [], [])  # existing blocks can still be fused
 
 
 def test_open3d_vbg_statistics_count_blocks_in_use(mapped: Open3DMap) -> None:
@@ -340,7 +340,7 @@ def test_open3d_vbg_damaged_or_foreign_file_raises(mapped: Open3DMap, tmp_path: 
         Open3DMap.load(tmp_path / "none.npz")
 
 
-# Odd input
+# Unusual input
 
 
 def test_open3d_vbg_empty_map_round_trip_is_exact(tmp_path: Path) -> None:
@@ -352,7 +352,7 @@ def test_open3d_vbg_empty_map_round_trip_is_exact(tmp_path: Path) -> None:
 
 
 def test_open3d_vbg_single_depth_reading_is_mapped(frames: list[Frame]) -> None:
-    """It lies between the pixels that Open3D looks at, which then raises an error."""
+    """It is between the pixels that Open3D uses, which then raises an error."""
     depth = np.zeros_like(frames[0].depth)
     depth[61, 83] = 1.5
     fuser = new_fuser()

@@ -1,4 +1,4 @@
-"""Refiners in a row, as Hydra composes them."""
+"""Tests of chained refiners, as composed by Hydra."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support import registered
 
 
 class Halving(LargestComponent):
-    """Takes every other point: what it leaves depends on what it is given."""
+    """Keeps every other point, so that its result depends on its input."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return PointClusters(
@@ -48,7 +48,7 @@ def test_chain_links_refine_in_sequence() -> None:
 
 
 def test_chain_link_with_pixels_outside_image_raises() -> None:
-    class MadeUp(LargestComponent):
+    class InvalidPixels(LargestComponent):
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
             return replace(clusters, pixels=clusters.pixels - 9)
 
@@ -56,7 +56,7 @@ def test_chain_link_with_pixels_outside_image_raises() -> None:
     with pytest.raises(
         DataError, match=r"clusters: expected pixels in the image of 8x8, got u in \[-9, -9\], v in \[.*, .*\]"
     ):
-        Chain({"first": MadeUp(), "second": LargestComponent()}).refine(clusters, frame)
+        Chain({"first": InvalidPixels(), "second": LargestComponent()}).refine(clusters, frame)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Pieces of a cluster: what a step in depth parts from the rest leaves, what lies behind an occluder stays."""
+"""Tests of connected components of a cluster: parts behind a depth step are removed, parts behind an occluder kept."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def frame_of(depth: Float32, camera: Camera = CAMERA) -> Frame:
 
 
 def kept(refiner: Connected | LargestComponent, mask: Bool, depth: Float32) -> Bool:
-    """(H, W) the pixels of the mask that stay."""
+    """Return the kept pixels (H, W) of the mask."""
     frame = frame_of(depth)
     after = refiner.refine(clusters_of([mask], frame), frame)
     image = np.zeros(mask.shape, np.bool_)
@@ -37,7 +37,7 @@ def kept(refiner: Connected | LargestComponent, mask: Bool, depth: Float32) -> B
 
 
 def test_connected_occluder_does_not_split_object() -> None:
-    """A couch at 3 m, a pole at 2 m before it that the mask leaves out: LargestComponent loses the smaller half."""
+    """A couch at 3 m is behind a pole at 2 m that the mask excludes: LargestComponent loses the smaller half."""
     pole = (U >= 20) & (U < 24)
     depth = np.where(pole, 2.0, 3.0)
     assert (kept(Connected(), ~pole, depth) == ~pole).all()
@@ -63,7 +63,7 @@ def test_connected_removes_background_between_slats() -> None:
 
 
 def test_connected_keeps_slanted_surface_behind_occluder() -> None:
-    """At 0.8 m of depth a meter aside; at 4 m aside it would be a step."""
+    """The slope is 0.8 m of depth per meter; across 4 m it would be a step."""
     x = (U - CAMERA.cx) / CAMERA.fx
     slanted = 2.0 / (1 - 0.8 * x)  # z = 2 + 0.8 x z
     pole = (U >= 20) & (U < 30)
@@ -73,7 +73,7 @@ def test_connected_keeps_slanted_surface_behind_occluder() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_connected_refiner_matches_reference(seed: int) -> None:
-    """On clusters so small that every point is a sample."""
+    """The clusters are so small that every point is a sample."""
     rng = np.random.default_rng(seed)
     camera = Camera(16, 12, 20.0, 20.0, 7.5, 5.5)
     coarse = rng.choice([1.0, 1.05, 1.3, 2.0], (3, 4))

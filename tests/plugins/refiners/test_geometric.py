@@ -1,4 +1,4 @@
-"""Masks that claim convex segments: a box on a table under masks that fall short, bleed and overlap."""
+"""Tests of masks that claim convex segments: a box on a table under small, bleeding and overlapping masks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POSE = Pose(exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1])))
 
 
 def table() -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W) m and ids: 1 a box whose front is 1.2 m away, 0 the table below and the wall 2 m away."""
+    """Return depth (H, W) m and ids: 1 a box whose front is 1.2 m away, 0 the table below and the wall 2 m away."""
     v, u = np.mgrid[:240, :320]
     x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
     depth = np.minimum(2.0, 0.7 / np.maximum(y, 1e-9))
@@ -58,7 +58,7 @@ def shifted(mask: np.ndarray, dv: int, du: int) -> np.ndarray:
 
 
 def test_geometric_corrects_shifted_mask_to_box():
-    """Eight pixels too far right: the table on the right goes, the box's left rim comes, with the points of lift."""
+    """The mask is eight pixels too far right: the table is removed, and the box's left rim is added."""
     depth, ids = table()
     frame = frame_of(depth)
     mask = shifted(ids == 1, 0, 8)
@@ -120,7 +120,7 @@ def test_geometric_unassigned_points_stay():
 
 
 def test_geometric_collinear_points_are_not_extended():
-    """A mask of one column of a narrow segment has points on a line: they stay, no other comes."""
+    """A mask of one column in a narrow segment has collinear points, which are unchanged."""
     depth = np.zeros(CAMERA.shape, np.float32)
     depth[40:80, 60:62] = 1.0
     frame = frame_of(depth)

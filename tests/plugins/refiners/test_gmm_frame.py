@@ -1,4 +1,4 @@
-"""The tree over a frame's masks, compared with a slow float64 reference."""
+"""Tests of the mixture tree over all masks of a frame, compared with a slow float64 reference."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLASSES = ("chair", "bed")
 
 
 def clusters_of(points: Float32, masks: Int32, scores: tuple[float, ...], pixels: Int32 | None = None) -> PointClusters:
-    """Return clusters whose points have pixels of their own."""
+    """Return clusters without common pixels."""
     n = np.arange(len(points))
     return PointClusters(
         points_world=points,
@@ -32,7 +32,7 @@ def clusters_of(points: Float32, masks: Int32, scores: tuple[float, ...], pixels
 
 
 def three_objects(seed: int, bleed: float = 0.15) -> tuple[Float32, Int32, Int32]:
-    """Return points (S, 3) of three bent objects, their masks, some of which are of the wrong object, and the truth."""
+    """Return points (S, 3) of three curved objects, their masks with some wrong points, and the true objects."""
     rng = np.random.default_rng(seed)
     centers = np.array([[0.0, 0.0, 2.0], [0.5, 0.1, 2.2], [0.1, 0.6, 1.7]])
     truth = np.sort(rng.integers(0, 3, 900))

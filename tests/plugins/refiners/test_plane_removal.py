@@ -1,4 +1,4 @@
-"""Floors and walls leave the clusters, the flat parts of objects stay: exact scenes of boxes in a room."""
+"""Tests of plane removal: floors and walls are removed from clusters, flat parts of objects are kept."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 def scene(*boxes: Corners, pitch: float = PITCH, noise: float = 0.0) -> tuple[Frame, np.ndarray]:
-    """The room with the boxes in it, and the (H, W) ids: 0 room, k the k-th box. Noise in standard deviations / z^2."""
+    """Return the room with boxes, and (H, W) ids: 0 room, k the k-th box. Noise is in standard deviations / z^2."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
     c, s = np.cos(pitch), np.sin(pitch)
@@ -42,7 +42,7 @@ def scene(*boxes: Corners, pitch: float = PITCH, noise: float = 0.0) -> tuple[Fr
 
 
 def heights(frame: Frame, pitch: float = PITCH) -> np.ndarray:
-    """(H, W) m above the floor."""
+    """Return (H, W) m above the floor."""
     v = np.arange(CAMERA.height)[:, None]
     return 1.2 - (np.cos(pitch) * (v - CAMERA.cy) / CAMERA.fy + np.sin(pitch)) * frame.depth
 
@@ -59,7 +59,7 @@ def bleeding(mask: np.ndarray, px: int = 8) -> np.ndarray:
 
 
 def masks_of(clusters: PointClusters) -> np.ndarray:
-    """(N, H, W) the pixels that are left of each cluster."""
+    """Return (N, H, W) the remaining pixels of each cluster."""
     masks = np.zeros((len(clusters), *CAMERA.shape), bool)
     masks[clusters.cluster, clusters.pixels[:, 1], clusters.pixels[:, 0]] = True
     return masks
@@ -81,7 +81,7 @@ def test_structure_mask_marks_floor_and_walls():
 
 
 def test_plane_removal_sensor_noise_widens_plane_distance():
-    """A Kinect at 3 m: 99 % of the floor and the wall leave, and the box stays from 6 cm above the floor."""
+    """With Kinect noise at 3 m, 99 % of floor and wall are removed, and the box is kept above 6 cm."""
     frame, ids = scene(BOX, noise=0.002)
     bled = bleeding(ids == 1)
     [left] = masks_of(PlaneRemoval().refine(lifted(frame, bled), frame))
@@ -90,7 +90,7 @@ def test_plane_removal_sensor_noise_widens_plane_distance():
 
 
 def test_plane_removal_keeps_table_top():
-    """A table that fills the lower half of the image; what it hides of the floor and the room is behind its top."""
+    """The table fills the lower half of the image; the floor and the room are hidden behind its top."""
     table = (-1.2, 0.45, 0.9), (1.2, 0.5, 2.2)
     frame, ids = scene(table, BOX)
     top = PlaneRemoval(min_area=0.1)
@@ -100,7 +100,7 @@ def test_plane_removal_keeps_table_top():
 
 
 def test_plane_removal_keeps_plane_in_cluster_of_most_points():
-    """A table top that hides all: nothing is behind it, so that only the share that a cluster holds can tell."""
+    """The table top hides everything, so that only its fraction of the cluster is informative."""
     frame, ids = scene(((-9.0, 0.5, -9.0), (9.0, 0.6, 9.0)), ((-0.1, 0.3, 0.4), (0.1, 0.5, 0.6)), pitch=0.9)
     assert (ids > 0).all()
     refined = PlaneRemoval(min_area=0.3).refine(lifted(frame, ids == 1, bleeding(ids == 2)), frame)
@@ -109,7 +109,7 @@ def test_plane_removal_keeps_plane_in_cluster_of_most_points():
     assert cup.sum() > 0.8 * (ids == 2).sum()
     assert not cup[ids == 1].any()
     assert refined.structure is not None
-    assert not refined.structure[ids == 1].any(), "what an object keeps is no structure, whoever else lost it"
+    assert not refined.structure[ids == 1].any(), "points kept by an object are not structure"
     half = (ids == 1) & (np.cumsum(ids == 1).reshape(ids.shape) <= 0.49 * (ids == 1).sum())
     [left] = masks_of(PlaneRemoval(min_area=0.3).refine(lifted(frame, half), frame))
     assert not left.any()
@@ -119,7 +119,7 @@ def test_plane_removal_keeps_plane_in_cluster_of_most_points():
 
 @pytest.mark.parametrize(("share", "unchanged"), [(0.4, False), (0.6, True)])
 def test_plane_removal_cluster_fraction_counts_all_parts(share, unchanged):
-    """A wall seen between posts, in a mask that ends in the middle of it and is longer than what a thread counts."""
+    """The wall is visible between posts, in a mask that ends inside it and spans several thread blocks."""
     post = np.arange(320) // 32 % 2 == 1
     depth = np.where(post, 1.5, 2.0) * np.ones(CAMERA.shape)
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth.astype(np.float32), CAMERA)
@@ -130,7 +130,7 @@ def test_plane_removal_cluster_fraction_counts_all_parts(share, unchanged):
 
 
 def test_plane_removal_keeps_screen_and_removes_wall_behind():
-    """8 cm before the wall, 1.2 m x 0.7 m, in Kinect noise; even with planes this small: the wall is behind it."""
+    """The screen of 1.2 m x 0.7 m is 8 cm in front of the wall, with Kinect noise and a small minimum area."""
     screen = (-0.6, -0.4, 3.85), (0.6, 0.3, 3.92)
     for noise, kept, dropped in ((0.0, 1.0, 1.0), (0.001, 0.99, 0.99)):
         frame, ids = scene(screen, pitch=0.0, noise=noise)
@@ -142,7 +142,7 @@ def test_plane_removal_keeps_screen_and_removes_wall_behind():
 
 
 def test_plane_removal_wall_with_small_opening_is_structure():
-    """With a twentieth of the wall open it is structure, with a third of it it could be the side of a cupboard."""
+    """With an opening of a twentieth it is structure; with a third it could be the side of a cupboard."""
     for width, dropped in ((12, True), (100, False)):
         frame, _ = scene(BOX)
         depth = frame.depth.copy()
@@ -155,7 +155,7 @@ def test_plane_removal_wall_with_small_opening_is_structure():
 
 
 def test_plane_removal_max_tilt_limits_removal_to_floor():
-    """With a tilt of 60 degrees the wall counts no longer, the floor does."""
+    """With a tilt of 60 degrees the wall is no longer structure, the floor is."""
     frame, ids = scene(BOX)
     mask = np.ones(CAMERA.shape, bool)
     refiner = PlaneRemoval(plane_distance=0.02, max_tilt=60.0, max_cluster_fraction=1.0 - 1e-9)
@@ -180,7 +180,7 @@ def test_plane_removal_without_planes_changes_nothing():
 
 
 def test_plane_removal_small_plane_is_not_structure():
-    """Of 0.5 m^2, or of a twentieth of the frame, when more is asked."""
+    """The plane has 0.5 m^2, or a twentieth of the frame, which is below the minimum."""
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1))
     for strict in (PlaneRemoval(min_area=100.0), PlaneRemoval(min_frame_fraction=0.9)):

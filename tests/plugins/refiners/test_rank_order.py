@@ -1,4 +1,4 @@
-"""What rank-order clustering keeps of clusters."""
+"""Tests of rank-order clustering."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAME = Frame(0, 0.0, np.zeros((60, 90, 3), np.uint8), np.full((60, 90), 2.0, np
 
 
 def clusters_of(*sets: np.ndarray) -> PointClusters:
-    """The point sets as clusters, their points seen at the pixels of a 90x60 image one after the other."""
+    """Return the point sets as clusters, with their points at consecutive pixels of a 90x60 image."""
     points = np.concatenate([np.zeros((0, 3)), *sets]).astype(np.float32)
     ones = np.ones(len(sets), np.float32)
     at = np.concatenate([np.arange(0), *(np.arange(len(s)) for s in sets)])
@@ -49,7 +49,7 @@ def test_rank_order_separated_blobs_split_at_any_scale(scale):
 
 
 def test_rank_order_skipped_points_follow_nearest_sample():
-    """Two plates; blocks of pixels leave 200 of 5400 points, and the others follow by distance in space."""
+    """There are two plates; pixel blocks leave 200 of 5400 points, and the others follow by distance."""
     v, u = np.mgrid[:60, :90]
     rng = np.random.default_rng(0)
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.5)], axis=-1).reshape(-1, 3)
@@ -114,14 +114,14 @@ def test_rank_order_invalid_parameter_raises(parameters, message):
 
 
 def neighbor_order(points: np.ndarray) -> list[list[int]]:
-    """All points in the order of their distance from each one; itself first, of equally near the first."""
+    """Return all points in the order of their distance from each one; itself first, ties by index."""
     distances = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
     np.fill_diagonal(distances, -1)
     return [sorted(range(len(points)), key=lambda b, row=row: (row[b], b)) for row in distances]
 
 
 def slow_groups(points: np.ndarray, k: int, threshold: float) -> np.ndarray:
-    """The definition, word by word."""
+    """Return the groups by the definition."""
     order = neighbor_order(points)
     n = len(points)
 
@@ -149,6 +149,6 @@ def test_rank_order_groups_match_reference(points, k, threshold):
 
 
 def test_rank_order_reference_splits_test_data():
-    """Neither one group nor as many as points: the comparison above says something."""
+    """There are several groups and fewer groups than points, so that the comparison is meaningful."""
     for points, k in ((blobs(0, 70), 6), (blobs(1, 50), 9), (blobs(2, 60), 3)):
         assert 1 < len(np.unique(slow_groups(points, k, 0.5))) < len(points) // 2

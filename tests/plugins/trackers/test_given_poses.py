@@ -1,4 +1,4 @@
-"""The trackers of given poses in a run: frames without one are skipped, counted and told in one line, by both alike."""
+"""Tests of trackers with given poses: frames without a pose are skipped, counted and logged in one line."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_given_poses_skip_frames_without_pose_with_one_warning(
 def test_given_poses_missing_do_not_hide_unreadable_frames(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Unreadable frames are told one by one up to a limit, which frames without poses do not count in."""
+    """Unreadable frames are logged one by one up to a limit, in which frames without poses do not count."""
     late = 30
     room = CornerRoom(frames=late + 2, unposed=tuple(range(late)), unreadable=late)
     given = tracker(tmp_path)
@@ -87,7 +87,7 @@ def test_given_poses_missing_do_not_hide_unreadable_frames(
 
 
 def test_given_poses_error_uses_only_frames_with_true_pose(tmp_path: Path) -> None:
-    """Every pose given is wrong where the true one is not known: neither ATE nor RPE may notice."""
+    """Every given pose without a true pose is wrong; neither ATE nor RPE may change."""
     poses = [np.linalg.inv(pose_at(9 * k)) if k in GAP else pose_at(k) for k in range(FRAMES)]
     write_tum(tmp_path / "poses.txt", [k / 30 for k in range(FRAMES)], poses)
     tracker = TrajectoryFile(tmp_path / "poses.txt")

@@ -1,4 +1,4 @@
-"""Poses come from the file by time, in the world that the contract or the file defines."""
+"""Tests of poses from a file by timestamp, in the world frame of the contract or of the file."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from tests.support import registered
 from tests.support.scenes.corner_room import CornerRoom, GridMap, pose_at
 
 SCENE = GridMap()
-T_FILE_WORLD = exp_se3(np.array([3.0, -2.0, 1.0, 0.4, -0.7, 0.2]))  # another system's world
+T_FILE_WORLD = exp_se3(np.array([3.0, -2.0, 1.0, 0.4, -0.7, 0.2]))  # world of another system
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Frames 0 to 5 of the corner room, as another system saw them: 4 ms late, and without frame 3."""
+    """Write frames 0 to 5 of the corner room with timestamps 4 ms late, and without frame 3."""
     path = tmp_path / "other_slam.txt"
     frames = [0, 1, 2, 4, 5]
     write_tum(path, [k / 30 + 0.004 for k in frames], [T_FILE_WORLD @ pose_at(k) for k in frames])

@@ -1,4 +1,4 @@
-"""The tracker on a scene whose motion is known exactly."""
+"""Tests of tracker=voxel_hashing_icp on a scene with known motion."""
 
 import dataclasses
 import pickle
@@ -38,7 +38,7 @@ def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], Scen
 
 
 def drift(pose: Pose, frame: Frame) -> tuple[float, float]:
-    """(m, rad) between the estimate and the truth."""
+    """Return (m, rad) between the estimate and the truth."""
     assert frame.T_world_camera is not None
     error = inverse(frame.T_world_camera) @ pose.T_world_camera
     return float(np.linalg.norm(error[:3, 3])), rotation_angle(error[:3, :3])
@@ -65,14 +65,14 @@ def test_voxel_hashing_icp_keyframe_stops_drift_at_standstill(shared: Path) -> N
 
 
 def test_voxel_hashing_icp_color_determines_motion_along_wall() -> None:
-    """Facing one textured wall, geometry alone cannot see sideways motion; with color it is seen."""
+    """Geometry does not determine sideways motion in front of one wall; its texture does."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     frames = [wall.frame(T, k) for k, T in enumerate(walk(20))]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], frames[-1])[0] < 0.01
     alone, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=0.0), frames)
-    assert any(pose.lost for pose in alone), "and alone it says that the motion is not determined"
+    assert any(pose.lost for pose in alone), "alone it reports that the motion is undetermined"
 
 
 def test_voxel_hashing_icp_resumes_after_covered_frames() -> None:
@@ -99,7 +99,7 @@ def test_voxel_hashing_icp_relocalizes_or_loses_jump() -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1])
 def test_voxel_hashing_icp_does_not_depend_on_feature_timing(seconds: float) -> None:
-    """Of frames that are taken aside, one is in doubt or lost and asks for keyframes right after one was offered."""
+    """A doubtful or lost frame needs keyframes right after one was offered to the worker thread."""
     path = [exp_se3(np.array([0.03 * k - 0.3, 0, 0, 0, 0.01 * k, 0])) for k in range(24)]
     for k in (8, 16, 17):
         path[k] = path[k] @ exp_se3(np.array([0, 0, -0.4, 0, 0.3, 0]))
@@ -225,7 +225,7 @@ def test_voxel_hashing_icp_loses_unmappable_depth() -> None:
 
 
 def test_voxel_hashing_icp_continues_after_object_is_removed() -> None:
-    """No texture, so no keyframe can confirm the pose; the ball covers several per cent of the view."""
+    """Without texture, no keyframe can confirm the pose; the ball covers several percent of the view."""
     planes = room().planes
     with_ball, without = (Scene(planes, spheres, contrast=0.0) for spheres in ([(np.array([0, 0.1, 1.3]), 0.2)], []))
     frames = [(with_ball if k < 10 else without).frame(T, k) for k, T in enumerate(walk(30)[:16])]
@@ -261,7 +261,7 @@ ONE_STEP = {
 
 
 def test_voxel_hashing_icp_accepts_pose_after_good_final_step() -> None:
-    """Before it, 6 cm away, too little agreed with the map; the single step goes most of that way."""
+    """Before the step, 6 cm away, too few points agree with the map; the step removes most of the distance."""
     start = walk(1)[0]
     frames = [room().frame(T, k) for k, T in enumerate((start, start @ exp_se3(np.array([0.06, 0, 0, 0, 0, 0]))))]
     poses, _ = run(VoxelHashingIcp(**ONE_STEP), frames)
@@ -279,7 +279,7 @@ def test_voxel_hashing_icp_loses_pose_after_bad_final_step(monkeypatch: pytest.M
 
 
 def aligned(T_world_camera: np.ndarray, agreement: float = 0.85, behind: float = 0.05) -> Alignment:
-    """An alignment that an imperfect camera has, or a wrong pose."""
+    """Return the alignment of an imperfect camera, or a wrong pose."""
     return Alignment(T_world_camera, 0.7, agreement, behind, agreement / (1 - behind), "", "85% agree")
 
 
@@ -290,7 +290,7 @@ def moved(step: float) -> np.ndarray:
 def test_voxel_hashing_icp_steady_motion_needs_less_agreement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A camera that moves 1 cm a frame, of whose points never more than 85 % agree with the map."""
+    """The camera moves 1 cm per frame, and at most 85 % of its points agree with the map."""
     frames = [room().frame(walk(1)[0], k) for k in range(2 * STEADY + 6)]
     ends = iter(moved(0.01 * k) for k in range(1, len(frames)))
     tracker = VoxelHashingIcp(finest_scale=1.0, relocalize=False)
@@ -303,7 +303,7 @@ def test_voxel_hashing_icp_steady_motion_needs_less_agreement(
     lost = [tracker.track(frame, fuser.scene).lost for frame in frames[1 : STEADY + 4]]
     assert not any(lost), "the prediction has been right before"
     monkeypatch.setattr(tracker, "_align", lambda *_: aligned(tracker._T_world_last @ moved(0.2)))
-    assert tracker.track(frames[-2], fuser.scene).lost, "20 cm beside the prediction"
+    assert tracker.track(frames[-2], fuser.scene).lost, "20 cm from the prediction"
     for worse in (aligned(tracker._T_world_last, agreement=0.7), aligned(tracker._T_world_last, 0.8, behind=0.15)):
         tracker._lost_frames, tracker._steady_frames = 0, STEADY
         monkeypatch.setattr(tracker, "_align", lambda *_, worse=worse: worse)
@@ -321,7 +321,7 @@ def test_voxel_hashing_icp_uses_features_until_motion_is_steady(monkeypatch: pyt
 
 
 def test_voxel_hashing_icp_features_reject_contradicting_pose(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All points agree with the map, but features tell a place 30 cm away, from where alignment leads nowhere."""
+    """All points agree with the map, but features give a position 30 cm away, from where alignment diverges."""
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     tracker = VoxelHashingIcp(finest_scale=1.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
@@ -334,7 +334,7 @@ def test_voxel_hashing_icp_features_reject_contradicting_pose(monkeypatch: pytes
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_voxel_hashing_icp_resumes_without_relocalization(moving: bool) -> None:
-    """Half of the view is hidden for some frames, during which the camera stands, or turns."""
+    """Half of the view is hidden for some frames, while the camera stands still or rotates."""
     there = walk(30)[:14]
     frames = [room().frame(T, k) for k, T in enumerate(there)]
     hidden = [room().frame(there[7 + (k if moving else 0)], 7 + k) for k in range(4)]
@@ -349,7 +349,7 @@ def test_voxel_hashing_icp_resumes_without_relocalization(moving: bool) -> None:
 
 
 def coarse(frame: Frame) -> Frame:
-    """As if depth had been stored in 8 bits."""
+    """Quantize depth as if it were stored in 8 bits."""
     steps = (np.floor(frame.depth / 0.0392) + 0.5) * 0.0392
     return dataclasses.replace(frame, depth=np.where(frame.depth > 0, steps, 0).astype(np.float32))
 

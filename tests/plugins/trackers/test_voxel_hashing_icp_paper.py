@@ -1,4 +1,4 @@
-"""The tracker of preset=paper: the parameters of VoxelHashing, without our checks and relocalization."""
+"""Tests of the tracker of preset=paper: VoxelHashing's parameters, without our checks and relocalization."""
 
 import dataclasses
 from typing import Any
@@ -57,7 +57,7 @@ def test_paper_tracker_recovers_known_motion() -> None:
 
 
 def test_paper_tracker_uses_published_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of each level: iterations, weights of color and depth, and gates."""
+    """Each level has its iterations, weights of color and depth, and gates."""
     calls: list[tuple[int, Any, float, Any]] = []
     linearize = voxel_hashing_icp.linearize
 
@@ -106,14 +106,14 @@ def test_paper_tracker_uses_no_features(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def hidden_frames() -> list[Frame]:
-    """A walk, with random depth in half of the last view."""
+    """Return a walk with random depth in half of the last view."""
     frames = walked(8)
     frames[-1].depth[:, :80] = np.random.default_rng(0).uniform(0.5, 4, (120, 80))
     return frames
 
 
 def test_paper_tracker_agreement_is_not_checked() -> None:
-    """Half of the points lie anywhere: that is a doubt, which only the checks of agreement have."""
+    """Half of the points are random, which only the agreement checks of the default tracker reject."""
     poses = run(paper_tracker(), hidden_frames())
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], hidden_frames()[-1]) < 0.01

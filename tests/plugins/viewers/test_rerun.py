@@ -1,4 +1,4 @@
-"""A run in rerun's files: what is in them, what is left of a killed run, and what stands in the way."""
+"""Tests of rerun recordings: their content, killed runs, and errors."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def pipeline(viewer: RerunViewer, **stages: Any) -> Pipeline:
 
 
 def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
-    """What was logged to an entity as time went by: the values by column, the times by time line, in ns."""
+    """Return the logged values of an entity by column, and the times by timeline, in ns."""
     for chunk in RrdReader(file).stream():
         if chunk.entity_path == f"/{entity}" and not chunk.is_static:
             batch = chunk.to_record_batch()
@@ -74,7 +74,7 @@ def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
 
 
 def fixed(file: Path) -> Path:
-    """The messages that are whole, which rerun's viewer shows: `RrdReader` refuses a file that ends within one."""
+    """Return the complete messages, which rerun's viewer shows: `RrdReader` rejects a truncated file."""
     whole = file.with_name("whole.rrd")
     rrd("merge", file, "-o", str(whole))
     return whole
@@ -82,7 +82,7 @@ def fixed(file: Path) -> Path:
 
 def rrd(command: str, file: Path, *options: str) -> None:
     line = [sys.executable, "-m", "rerun", "rrd", command, str(file), *options]
-    home = os.environ | {"HOME": str(file.parent)}  # where rerun notes that it has run
+    home = os.environ | {"HOME": str(file.parent)}  # rerun records here that it has run
     done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, env=home)
     assert done.returncode == 0, done.stderr
 
@@ -93,7 +93,7 @@ def entities(file: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of six frames, of which 2 cannot be read and 4 is lost."""
+    """Return a run of six frames, of which 2 cannot be read and 4 is lost."""
     directory = tmp_path_factory.mktemp("run")
     viewer = RerunViewer(frame_interval=1, stride=1, mesh_interval=0.1, min_confidence=0.1)
     pipeline(viewer).run_to_any_end(CornerRoom(unreadable=2), directory)
@@ -172,7 +172,7 @@ def test_rerun_camera_has_pose_and_intrinsics(recorded: Path) -> None:
 
 
 def test_rerun_viewer_does_not_change_result(tmp_path: Path) -> None:
-    """To the byte, with a viewer that looks at the map after every frame."""
+    """The outputs are byte-identical with a viewer that reads the map after every frame."""
     maps = {}
     for name in ("none", "rerun"):
         viewer = build_viewer(name, "viewer.mesh_interval=0.1") if name == "rerun" else build_viewer(name)
@@ -191,7 +191,7 @@ def build_viewer(name: str, *overrides: str) -> Any:
 
 
 def test_rerun_recording_of_killed_run_has_last_second(tmp_path: Path) -> None:
-    """By the computer's clock, which rerun notes with everything, and by when the last frame was fused."""
+    """The clock is that of the recording; the reference is the time of the last fused frame."""
     endless = ("dataset.frames=100000", "dataset.slow_s=0.03", "fuser.capacity=100000", "fuser.note=note")
     line = [
         sys.executable,
@@ -219,9 +219,9 @@ def test_rerun_recording_of_killed_run_has_last_second(tmp_path: Path) -> None:
     finally:
         os.kill(run.pid, signal.SIGKILL)
         run.communicate()
-    fused_at = (tmp_path / "note").stat().st_mtime  # later than that nothing can have been drawn, and the rest must be
+    fused_at = (tmp_path / "note").stat().st_mtime  # nothing can be drawn later, and everything before must be
     file = tmp_path / "run" / "recording.rrd"
-    os.truncate(file, file.stat().st_size - 1)  # as if it had been killed while it wrote, which happens now and then
+    os.truncate(file, file.stat().st_size - 1)  # as if killed during a write, which happens occasionally
     frames = list(rows(fixed(file), "world/camera/color"))
     assert len(frames) > 3
     last = max(row["log_time"] for row in frames) / 1e9
@@ -299,7 +299,7 @@ def test_rerun_occupied_port_raises(tmp_path: Path) -> None:
 
 
 def listening() -> set[str]:
-    """ADDRESS:PORT, in /proc's hexadecimal, where this process waits for calls."""
+    """Return ADDRESS:PORT, in /proc's hexadecimal, on which this process listens."""
     own = {str(file.readlink()) for file in list(Path("/proc/self/fd").iterdir()) if file.is_symlink()}
     lines = [line.split() for table in ("tcp", "tcp6") for line in Path("/proc/net", table).read_text().splitlines()]
     return {line[1] for line in lines if line[3] == "0A" and f"socket:[{line[9]}]" in own}
@@ -316,7 +316,7 @@ def test_rerun_browser_mode_listens_only_on_localhost(tmp_path: Path) -> None:
 
 
 def test_rerun_window_mode_binds_only_localhost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a program in rerun's place that notes how it was called, and listens for a while."""
+    """A program that records its arguments and listens replaces rerun."""
     program, port = tmp_path / "rerun", free_port()
     program.write_text(
         f"""#!{sys.executable}
@@ -329,7 +329,7 @@ if "--port" in sys.argv:
     )
     program.chmod(0o755)
     monkeypatch.setattr(rerun_program, "program", lambda: str(program))
-    for _ in range(2):  # the second time one is there
+    for _ in range(2):  # the second call finds it running
         rerun_program.open_window(port, "1GB")
     disabled, opened, *others = (tmp_path / "calls").read_text().splitlines()
     assert disabled == "analytics disable"

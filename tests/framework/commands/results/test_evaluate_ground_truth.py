@@ -1,4 +1,4 @@
-"""Runs that are compared with the map of another run, and with another ground truth later."""
+"""Tests of runs that are evaluated with the map of another run as ground truth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FRAMES = 6
 
 
 def write_folder(root: Path) -> None:
-    """The corner of the room as an RGB-D folder, without poses and annotation."""
+    """Write the corner of the room as an RGB-D folder without poses and annotation."""
     for name in ("color", "depth"):
         (root / name).mkdir(parents=True)
     camera = {key: getattr(CAMERA, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
@@ -43,7 +43,7 @@ def write_folder(root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `reference`, a run with true masks and poses, and `posed` and `unposed`, recordings of it."""
+    """Return a folder with `reference`, a run with true masks and poses, and its recordings `posed` and `unposed`."""
     place = tmp_path_factory.mktemp("truth")
     reported_run.write_run(place / "reference")
     for name in ("posed", "unposed"):
@@ -77,7 +77,7 @@ def evaluated(directory: Path, ground_truth: Path | None) -> int:
 
 
 def tracker(made: Path) -> dict[str, str]:
-    """Poses in the world of the first frame."""
+    """Return a tracker with poses in the world of the first frame."""
     path = made / "reference" / "trajectory.txt"
     return {"_target_": "plugins.trackers.trajectory_file.TrajectoryFile", "path": str(path)}
 
@@ -93,7 +93,7 @@ def test_ground_truth_of_another_run_is_compared(made: Path, tmp_path: Path, nam
 
 
 def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None:
-    """The reference begins elsewhere: 0.5 m aside."""
+    """The world of the reference is shifted by 0.5 m."""
     reference = tmp_path / "reference"
     reference.mkdir()
     for file in (made / "reference").iterdir():
@@ -106,7 +106,7 @@ def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None
     write_tum(reference / "trajectory.txt", times, shift @ poses)
     named = {"ground_truth": str(reference)}
     assert mapped(tmp_path / "run", made / "unposed", dataset=named, tracker=tracker(made))["instances.ap50"] == 1.0
-    write_tum(reference / "trajectory.txt", times, poses)  # now the poses do not fit the mesh
+    write_tum(reference / "trajectory.txt", times, poses)  # the poses no longer fit the mesh
     assert evaluated(tmp_path / "run", reference) == 0
     assert metrics_of(tmp_path / "run")["instances.ap50"] == 0.0
 
@@ -114,7 +114,7 @@ def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None
 def test_evaluate_changes_ground_truth_of_finished_run(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is kept by later evaluations, reports and figures."""
+    """Later evaluations, reports and figures keep it."""
     fake = {"_target_": "plugins.detectors.none.NoDetections"}
     directory = tmp_path / "run"
     assert "instances.ap50" not in mapped(directory, made / "posed", detector=fake)
@@ -149,7 +149,7 @@ def test_evaluate_unusable_ground_truth_is_one_line_error(
 
 
 def test_evaluate_again_gives_identical_metrics(made: Path, tmp_path: Path) -> None:
-    """The alignment of a tracked map uses the poses that are stored."""
+    """The alignment of a tracked map uses the stored poses."""
     reference = made / "reference"
     before = mapped(tmp_path / "run", made / "unposed", dataset={"ground_truth": str(reference)}, tracker=tracker(made))
     assert evaluated(tmp_path / "run", None) == 0

@@ -1,4 +1,4 @@
-"""`python -m framework raycast`: the ray-cast view of a run."""
+"""Tests of the command `raycast`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path) -> Path:
-    """A run whose third frame is lost."""
+    """Return a run whose third frame is lost."""
     run = Path(shutil.copytree(mapped, tmp_path / "run"))
     timestamps, poses = read_tum(run / "trajectory.txt")
     write_tum(run / "trajectory.txt", np.delete(timestamps, 2), np.delete(poses, 2, axis=0))
@@ -43,7 +43,7 @@ def stored(mapped: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Run the command here; return its status and what it wrote to stdout and stderr."""
+    """Run the command in this process; return its status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["raycast", *map(str, arguments)])
@@ -60,7 +60,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 @pytest.fixture
 def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[View, str]]:
-    """The drawn views with their notes."""
+    """Return the drawn views with their notes."""
     drawn: list[tuple[View, str]] = []
     write = raycast_figure.write_raycast
 

@@ -1,4 +1,4 @@
-"""How a run ends: completed, partial or with nothing to keep, and what its place is."""
+"""Tests of the end of a run (complete, partial or without result) and of its directory."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def begin(directory: Path, *arguments: str, before: Callable[[], object] | None 
 
 
 def end(process: ForkedCommand) -> tuple[int | None, str]:
-    """Return exit status and stderr."""
+    """Return the exit status and stderr."""
     try:
         _, stderr = process.communicate(timeout=PATIENCE_S)
     except subprocess.TimeoutExpired:
@@ -56,7 +56,7 @@ def figures(directory: Path, name: str = "metrics.partial.json") -> dict[str, ob
 
 
 def limit_file_size() -> None:
-    """Limit files to 64 KiB. The kernel then answers as on a full disk."""
+    """Limit files to 64 KiB. The kernel then responds as on a full disk."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))
 
 
@@ -67,7 +67,7 @@ def ignore_ctrl_c() -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("background", [False, True])
 def test_run_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, background: bool) -> None:
-    """Also where a script has started the run in the background, which ignores Ctrl-C then."""
+    """This includes runs that a script starts in the background, which ignore Ctrl-C."""
     place = tmp_path / "run"
     process = begin(tmp_path, *ENDLESS, f"hydra.run.dir={place}", before=ignore_ctrl_c if background else None)
     wait_for(tmp_path / "note", process)
@@ -123,7 +123,7 @@ def test_run_error_before_first_frame_leaves_no_record(tmp_path: Path) -> None:
 
 
 def test_run_stage_system_exit_leaves_partial_record(tmp_path: Path) -> None:
-    """As submitit does when its job is preempted."""
+    """A preempted job of submitit exits like this."""
     place = tmp_path / "run"
     status, _ = end(begin(tmp_path, "detector=faulty", "detector.kind=SystemExit", f"hydra.run.dir={place}"))
     assert status == 7

@@ -1,4 +1,4 @@
-"""Cameras in JSON; every fault of a value is in the tests of the readers that use it."""
+"""Tests of cameras in JSON. Invalid values are tested with the readers."""
 
 from __future__ import annotations
 

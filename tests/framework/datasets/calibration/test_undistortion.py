@@ -1,4 +1,4 @@
-"""Undistortion against OpenCV's map, and against a pinhole camera's view of a scene that is known exactly."""
+"""Tests of undistortion, compared with OpenCV and with the view of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_distorted_matches_opencv(intrinsics: Intrinsics) -> None:
 
 
 def recorded(camera: Camera, lens: Distortion, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(depth, color) that a camera with this lens records: the ray of each pixel by inversion of the lens."""
+    """Return (depth, color) as recorded with this lens; the ray of each pixel inverts the lens model."""
     wide = Camera(3 * camera.width, 3 * camera.height, 2 * camera.fx, 2 * camera.fy, 239.5, 179.5)
     depth, color, _ = room().render(wide, T_world_camera)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)
@@ -47,7 +47,7 @@ def test_undistortion_view_matches_pinhole_view() -> None:
     depth, color = recorded(CAMERA, LENS, T)
     true_depth, true_color, surface = room().render(CAMERA, T)
     inside = np.ones(CAMERA.shape, bool)
-    inside[:6], inside[-6:], inside[:, :6], inside[:, -6:] = False, False, False, False  # the lens shows less there
+    inside[:6], inside[-6:], inside[:, :6], inside[:, -6:] = False, False, False, False  # the lens covers less there
     edges = cv2.dilate(cv2.Laplacian(surface.astype(np.float32), cv2.CV_32F), np.ones((7, 7))) != 0
     kept = inside & ~edges & (true_depth > 0)
     undistortion = Undistortion(CAMERA, LENS)

@@ -1,4 +1,4 @@
-"""Depth cameras, by fakes of their libraries: what is asked of these, and what their faults become."""
+"""Tests of depth cameras with fake vendor libraries."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from tests.support.scenes.fake_cameras import SERIAL, UNIT, FakeCamera, orbbec_m
 
 @dataclass(frozen=True)
 class Brand:
-    """A reader, and a fake of its library."""
+    """A reader and a fake of its library."""
 
     name: str
     reader: type[RealSense] | type[Orbbec]
     library: str
     module: Callable[[FakeCamera], ModuleType]
-    depth_size: tuple[int, int]  # that is asked for; 0 = any
-    nothing_there: str  # what is said
+    depth_size: tuple[int, int]  # requested rate; 0 = any
+    nothing_there: str  # expected error
 
     def video(self, **parameters: object) -> LiveVideo:
         size = {"width": CAMERA.width, "height": CAMERA.height}
@@ -78,7 +78,7 @@ def test_camera_frames_are_registered_to_color(brand: Brand, device: FakeCamera)
 def test_camera_stream_request_matches_parameters(brand: Brand, device: FakeCamera) -> None:
     video = brand.video(serial=SERIAL, fps=60)
     assert video.name == f"{brand.name}_{SERIAL}"
-    assert not device.started, "nothing before frames are asked for"
+    assert not device.started, "nothing is logged before the first frame is requested"
     assert len(list(sent(video, 1))) == len(list(sent(video, 1))) == 1
     for asked in device.started:
         assert asked["color"] == (96, 72, "rgb", 60)
@@ -179,7 +179,7 @@ def test_camera_missing_depth_raises_for_its_frame_only(brand: Brand, device: Fa
 
 
 def test_orbbec_waits_for_first_depth_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its units are known from there."""
+    """The depth unit is known from this frame on."""
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", orbbec_module(FakeCamera(without_depth=0)))
     [frame] = sent(BRANDS[1].video(), 1)
     np.testing.assert_allclose(frame.depth, CornerRoom()[1].depth, atol=UNIT)

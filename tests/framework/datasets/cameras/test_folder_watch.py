@@ -1,4 +1,4 @@
-"""A folder that fills while it is watched: whole frames only, in order, and nothing that came is without a word."""
+"""Tests of a watched folder: complete frames in order, and reports of all skipped files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ROOM = CornerRoom(frames=30)
 
 
 def encoded(k: int) -> dict[str, bytes]:
-    """The bytes of both files of frame k."""
+    """Return the bytes of both files of frame k."""
     frame = ROOM[k % len(ROOM)]
     color = cv2.imencode(".jpg", frame.color[..., ::-1])[1]
     return {
@@ -54,14 +54,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 class Watched:
-    """What a watch has said since one last asked."""
+    """A watched folder with the messages since the last call."""
 
     def __init__(self, folder: Path, **parameters: float) -> None:
         self.over = False
         self._frames = FolderWatch(folder, poll_interval=0.001, **parameters).frames()
 
     def readers(self) -> Iterator[FrameReader]:
-        """Those of one look, to the None after it."""
+        """Return the readers of one scan, up to the first None."""
         while (reader := next(self._frames, self)) is not None:
             if isinstance(reader, Watched):
                 self.over = True
@@ -69,7 +69,7 @@ class Watched:
             yield reader
 
     def look(self) -> list[int | str]:
-        """The frames that can be read by their numbers, of the others what is said."""
+        """Return the numbers of the readable frames and the messages about the others."""
         return [outcome(reader) for reader in self.readers()]
 
 
@@ -249,14 +249,14 @@ def test_folder_watch_parameter_out_of_range_raises(folder: Path, parameter: dic
 
 @dataclass
 class Known(PoseTracker):
-    """By the frame's number."""
+    """Returns detections by frame number."""
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         return Pose(pose_at(frame.index))
 
 
 def test_folder_watch_maps_folder_while_it_is_written(folder: Path) -> None:
-    """By a writer that is slow, writes its files in place, and ends."""
+    """The writer is slow, writes its files in place, and ends."""
 
     def writer() -> None:
         for k in range(len(ROOM)):

@@ -1,3 +1,5 @@
+"""Tests of frame selection: start, stop, stride and frame_fraction."""
+
 import pytest
 
 from framework.datasets.frames.sequence_reader import check_selection, choose_frames
@@ -35,7 +37,7 @@ def test_frame_fraction_is_seeded_ordered_subset():
 
 
 def test_frame_fraction_sampling_is_uniform():
-    """Each of 20 frames is in half of the subsets of half of them: 500 +- 5 standard deviations of 1000."""
+    """Each of 20 frames is in half of the subsets: 500 +- 5 standard deviations of 1000."""
     taken = [index for seed in range(1000) for index in choose_frames(20, 0, -1, 1, frame_fraction=0.5, seed=seed)]
     counts = [taken.count(index) for index in range(20)]
     assert min(counts) > 420

@@ -1,4 +1,4 @@
-"""The ground truth that the user names, on a labeled wall in front of a camera."""
+"""Tests of a ground truth chosen by the user, on a labeled wall in front of a camera."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def label_at(x: np.ndarray) -> np.ndarray:
 
 
 def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray) -> None:
-    """A wall of 4 x 4 m, moved by T; by default with labels."""
+    """Write a wall of 4 x 4 m, moved by T; by default with labels."""
     side = np.arange(-2.0, 2.0 + CELL / 2, CELL)
     x, y = np.meshgrid(side, side)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -57,7 +57,7 @@ def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray
 
 
 def seen_labels(k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The label of each pixel's point on the wall, and the pixels that are clear of borders between labels."""
+    """Return the label of each pixel's point on the wall, and the pixels away from label borders."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(CAMERA.shape)], axis=-1)
     T = pose(k)
@@ -68,7 +68,7 @@ def seen_labels(k: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A recording with poses and no annotation."""
+    """Return a recording with poses and no annotation."""
     root = tmp_path / "room"
     for name in ("color", "depth"):
         (root / name).mkdir(parents=True)
@@ -92,7 +92,7 @@ def mesh(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tracked_run(tmp_path: Path) -> Path:
-    """A run of the recording in a world of its own; instance UNKNOWN is tentative, without an entry."""
+    """Return a run of the recording in its own world; instance UNKNOWN is tentative, without an entry."""
     run = tmp_path / "run"
     run.mkdir()
     write_wall(run / "mesh.ply", T_RUN_WORLD)
@@ -190,7 +190,7 @@ def test_named_truth_tracked_run_is_aligned_to_map(folder: Path, tracked_run: Pa
 
 
 def test_named_truth_run_with_given_poses_is_not_aligned(folder: Path, tracked_run: Path) -> None:
-    """The map begins with the given pose and drifts; its drift counts."""
+    """The map begins at the given pose and drifts; its drift is part of the error."""
     (tracked_run / "metrics.json").write_text('{"pose_source": "ground_truth"}')
     times, poses = read_tum(tracked_run / "trajectory.txt")
     truth = RgbdFolder(folder, ground_truth=tracked_run).scene_truth()
@@ -255,7 +255,7 @@ def test_named_truth_rejects_directory_without_mesh(folder: Path, tmp_path: Path
 
 @pytest.mark.parametrize("name", ["redkitchen", "freiburg1_rpy"])
 def test_named_truth_masks_agree_with_annotated_images(shared_data: Path, name: str) -> None:
-    """Wrong axes, an inverted pose or other ids agree in less than half of the annotated pixels."""
+    """With wrong axes, an inverted pose or other ids, less than half of the annotated pixels agree."""
     kitchen, desk = shared_data / "redkitchen", shared_data / "tum_fr1_rpy_a"
     images: list[Path] = sorted(((kitchen if name == "redkitchen" else desk / "annotation") / "instance").iterdir())
     video: Recording = RgbdFolder(kitchen, ground_truth=kitchen / "annotation" / "mesh.ply")

@@ -1,4 +1,4 @@
-"""Votes on tiny scenes with exact answers, and against a slow obvious reference."""
+"""Tests of the voxel votes on small scenes with exact results, compared with a slow reference."""
 
 from collections import Counter, defaultdict
 

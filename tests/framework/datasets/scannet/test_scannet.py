@@ -1,4 +1,4 @@
-"""Scans of ScanNet written as published, as `.sens` files and as exported folders, through the whole pipeline."""
+"""Tests of ScanNet scans as `.sens` files and as exported folders."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def write(request: pytest.FixtureRequest) -> Writer:
 
 
 def write_labels(scene: Path) -> None:
-    """A wall 2 m in front of the first camera: left of x = 0 a chair, right of x = 0.3 what nobody labeled."""
+    """Write a wall 2 m in front of the first camera: a chair left of x = 0, unlabeled right of x = 0.3."""
     x, y = np.meshgrid(np.linspace(-1.5, 1.5, 31), np.linspace(-1.5, 1.5, 31))
     vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(30)[:, None] * 31 + np.arange(30)).ravel()
@@ -247,7 +247,7 @@ def test_scannet_truth_matches_labeled_mesh(tmp_path: Path, write: Writer) -> No
 
 
 def test_scannet_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Of the same map it gives other figures, so tables must not mix the two."""
+    """The same map has other metrics without the table, so tables must not mix both."""
     as_sens(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     (tmp_path / "scannetv2-labels.combined.tsv").unlink()
@@ -256,7 +256,7 @@ def test_scannet_missing_label_table_changes_annotation_name(tmp_path: Path, cap
     assert f"{tmp_path / 'scannetv2-labels.combined.tsv'}: expected a label table" in caplog.text
     truth = sequence.scene_truth()
     assert truth is not None
-    assert set(truth.class_names.values()) == {None}, "nobody else knows what a folding chair is"
+    assert set(truth.class_names.values()) == {None}, "other tables have no folding chair"
 
 
 def test_scannet_first_release_names_are_resolved_by_its_table(tmp_path: Path) -> None:
@@ -295,7 +295,7 @@ def test_scannet_incomplete_truth_files_give_no_truth_and_log(tmp_path: Path, ca
 
 
 def read_all(path: Path) -> None:
-    """Every frame of the scan in which the file is; raises the fault of the last that has one."""
+    """Read every frame of the scan; raise the error of the last invalid frame."""
     sequence = ScanNet(path.parent)
     fault = None
     for k in range(len(sequence)):
@@ -332,7 +332,7 @@ def test_scannet_fuzzed_file_is_read_or_raises_one_line_error(tmp_path: Path, na
     path = scene / name if (scene / name).exists() else tmp_path / name
     content = path.read_bytes()
     for other in (MESH,) if name.endswith(".sens") else ():
-        (scene / other).unlink()  # it costs time, and is read in the other tests
+        (scene / other).unlink()  # it is slow, and other tests read it
     read, tokens = FUZZED[name]
 
     @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))

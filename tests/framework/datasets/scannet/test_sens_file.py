@@ -1,4 +1,4 @@
-"""`.sens` files written field by field, sound, cut and with every field wrong."""
+"""Tests of `.sens` files, written field by field: valid, truncated and with every field wrong."""
 
 from __future__ import annotations
 
@@ -197,5 +197,5 @@ def test_sens_file_deleted_raises_on_frame_read(path: Path) -> None:
 
 
 def starts(path: Path, content: bytes) -> list[int]:
-    """Where each frame begins."""
+    """Return the position of each frame."""
     return [frame.byte - FRAME.size for frame in opened(path, content).frames]

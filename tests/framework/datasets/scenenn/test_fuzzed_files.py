@@ -1,6 +1,6 @@
-"""Damaged files of every format: each is read, or raises one line that says which file and where; nothing else.
+"""Fuzz tests of every file format: a damaged file is read, or raises a one-line error with file and position.
 
-`INSTANCEMAP_FUZZ=5000 pytest tests/framework/datasets/scenenn/test_fuzzed_files.py` tries so many of each format.
+`INSTANCEMAP_FUZZ=5000 pytest tests/framework/datasets/scenenn/test_fuzzed_files.py` tries 5000 cases per format.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PLACE = re.compile(r"(line|byte) \d+")
 
 PLY_HEADER = b"""ply
 format %s 1.0
-comment two triangles, a square, and an element that nobody knows
+comment two triangles, a square, and an unknown element
 element vertex 5
 property float x
 property double y

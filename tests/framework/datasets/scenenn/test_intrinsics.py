@@ -1,4 +1,4 @@
-"""Intrinsics: keys and values in every spelling that such files have."""
+"""Tests of intrinsics files in every known spelling of keys and values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frames of .oni recordings: pairing on its own, and real play-back where OpenNI 2 is installed."""
+"""Tests of .oni frames: pairing of color and depth, and real playback if OpenNI 2 is installed."""
 
 import ctypes
 import signal
@@ -125,7 +125,7 @@ def times_of(frames):
 
 
 def play_back(color_times, depth_times):
-    """SceneNN's PlaybackSync: reads one of each, then of the earlier one until both are close."""
+    """Pair frames like SceneNN's PlaybackSync: read one of each, then the earlier stream until both are close."""
     paired, color_reader, depth_reader = [], iter(color_times), iter(depth_times)
     try:
         while True:

@@ -1,4 +1,4 @@
-"""What the records of an .oni say, also where it ends too early."""
+"""Tests of the records of .oni files, including truncated files."""
 
 import os
 import struct

@@ -1,4 +1,4 @@
-"""trajectory.log: the published text, lost and cut-off frames, and what is wrong with its line."""
+"""Tests of trajectory.log: the published format, lost and truncated frames, and errors with line numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SceneNN's folders written in the exact layout, sound and with what real copies lack."""
+"""Tests of SceneNN folders: the exact layout, and known omissions of real copies."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ WALL = 2.0  # m, where the mesh lies in front of the first camera
 
 
 def labels() -> list[Annotated]:
-    """In no order, as in the data set."""
+    """Return the labels in random order, as in the dataset."""
     named = ((CHAIR, "chair1", "chair"), (NAMELESS, "thing", ""), (CABINET, "cabinet", "cabinet"), (SOFA, "s", "Sofa"))
     return [Annotated(i, text, nyu, (10, 20, 30), None, None) for i, text, nyu in named]
 
 
 def striped_wall() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A wall of vertical stripes 0.25 m wide from x = -1 to 1, each of one label; vertices every 5 cm."""
+    """Return a wall from x = -1 to 1 of vertical stripes 0.25 m wide, one label each; vertices every 5 cm."""
     x, y = np.meshgrid(np.arange(-20, 21) * 0.05, np.arange(-20, 21) * 0.05)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
     corner = (np.arange(40)[:, None] * 41 + np.arange(40)).ravel()
@@ -78,7 +78,7 @@ def test_scenenn_frame_matches_files(root: Path) -> None:
     assert (frame.depth == np.float32(2.002)).all()
     assert frame.T_world_camera is not None
     np.testing.assert_allclose(frame.T_world_camera, pose(2), atol=1e-9)
-    assert frame.truth is None, "it costs time, and only some detectors need it"
+    assert frame.truth is None, "it is slow, and only some detectors need it"
 
 
 def test_scenenn_labels_map_to_instances_of_nine_classes(root: Path) -> None:
@@ -133,7 +133,7 @@ def test_scenenn_true_masks_match_mesh_at_true_pose(root: Path) -> None:
     row = vertex_labels.reshape(41, 41)[0]
     expected = np.where(np.abs(x) <= 1, row[np.clip(nearest, 0, 40)], 0)
     expected[expected == CABINET] = 0
-    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01  # amid two vertices it is a matter of rounding
+    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01  # between two vertices the result depends on rounding
     np.testing.assert_array_equal(frame.truth.instance_ids[11, sure], expected[sure])
 
 

@@ -1,4 +1,4 @@
-"""NNN.xml: the published attributes, what is missing or odd, and what is an attack."""
+"""Tests of NNN.xml: published attributes, missing or invalid values, and malicious files."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_scenenn_annotation_round_trip_preserves_labels(path):
 
 
 def test_scenenn_annotation_box_is_rotated_by_quaternion(path):
-    """A quarter turn about z: the box's x axis is the world's y."""
+    """After a quarter turn about z, the box's x axis is the world's y axis."""
     half = np.sqrt(0.5)
     box = read_label(path, f'id="1" obbox="1 2 3 4 5 6 0 0 {half} {half}"').obb
     np.testing.assert_allclose(box.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-15)

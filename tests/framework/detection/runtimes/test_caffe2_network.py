@@ -1,4 +1,4 @@
-"""Networks of 8-bit integers: each operator against its definition, in float and in integers."""
+"""Tests of 8-bit networks: each operator compared with its definition, in float and in integers."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ def real(values, scale_zero):
 
 
 def run_one(kind, args, x_nhwc, tensors):
-    """One operator through the graph interpreter, from and to NHWC as in the graph's own definition."""
+    """Run one operator in the graph interpreter; input and output are NHWC, as in the graph."""
     operator = {"type": kind, "inputs": ["x", *tensors], "outputs": ["y"], "args": args}
     network = network_between([operator], tensors, ("x",), ("y",))
     (y,) = network(torch.from_numpy(x_nhwc.astype(np.float32)).permute(0, 3, 1, 2))
@@ -101,7 +101,7 @@ def test_caffe2_network_runs_only_operators_for_outputs():
 # In integers
 
 IMAGE = {"type": "Int8Quantize", "inputs": ["image"], "outputs": ["x"], "args": {"Y_scale": 0.02, "Y_zero_point": 110}}
-LAST = {  # what leaves a network is computed in float from the integers before: here, from "y"
+LAST = {  # outputs are computed in float from the integers before, here from "y"
     "type": "Int8Relu", "inputs": ["y"], "outputs": ["z"], "args": {"Y_scale": 1.0, "Y_zero_point": 0}
 }  # fmt: skip
 
@@ -148,14 +148,14 @@ def test_caffe2_integer_convolution_is_exact_and_rounded_once(kind, stride, pad,
         first = out // (6 // group) * (6 // group)
         window = padded[0, first : first + 6 // group, i * stride : i * stride + 3, j * stride : j * stride + 3]
         y = int((window.transpose(1, 2, 0) * (weight[out].astype(int) - 120)).sum()) * 0.02 * 0.001 + bias[out]
-        if kind == "Int8ConvRelu" or group > 1:  # the others stay as they are
+        if kind == "Int8ConvRelu" or group > 1:  # the others are unchanged
             y = (np.clip(np.rint(y / result.scale) + result.zero_point, 0, 255) - result.zero_point) * result.scale
         assert z[0, out, i, j] == pytest.approx(max(y, 0), abs=1e-4), (out, i, j)
 
 
 @in_integers
 def test_caffe2_int8_kernels_with_overflow_are_detected():
-    """Without VNNI, oneDNN adds pairs of products in 16 bits. It takes the variable when it is loaded."""
+    """Without VNNI, oneDNN adds pairs of products in 16 bits. It reads the variable when it is loaded."""
     asked = "from framework.detection.runtimes.caffe2_network import has_int8_kernels; print(has_int8_kernels())"
     for instructions, expected in (("AVX2", "False"), ("DEFAULT", "True")):
         environment = {**os.environ, "ONEDNN_MAX_CPU_ISA": instructions}

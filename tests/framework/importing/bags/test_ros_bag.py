@@ -1,4 +1,4 @@
-"""ROS bags of a small room in all their kinds: what is found in them, and what is said of damage."""
+"""Tests of ROS bags of a small room, in all formats, valid and damaged."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_ros_bag_odometry_is_read_in_axes_of_child_frame(
 
 
 def test_ros_bag_poses_are_interpolated(tmp_path: Path) -> None:
-    """A walk of 1 m/s along x, of which two poses are known."""
+    """The camera moves at 1 m/s along x, and two poses are known."""
     bag = BagWriter()
     add_camera_of_ros(bag)
     for x in (0.0, 0.13):
@@ -351,7 +351,7 @@ R_IMU_CAMERA = Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix()
 def add_accelerometer(
     bag: BagWriter, topic: str = "/camera/imu", frame_id: str = "imu", length: float = 9.81, late: float = 0.0
 ) -> None:
-    """At 300 Hz, on the camera, which turns slowly; trembling of 4 m/s^2 at 50 Hz."""
+    """Add an accelerometer at 300 Hz to a slowly rotating camera, with vibrations of 4 m/s^2 at 50 Hz."""
     for n in range(-30, 10 * COUNT + 30):
         acceleration = length * UP_WORLD + np.array([4.0, 0, 0]) * np.sin(2 * np.pi * n / 6)
         measured = R_IMU_CAMERA @ pose_at(n / 10)[:3, :3].T @ acceleration
@@ -371,7 +371,7 @@ def check_up(folder: Path, within: float = 1.0) -> None:
 
 @pytest.mark.parametrize("name", ["ros1.bag", "ros2_folder"])
 def test_ros_bag_accelerometer_gives_up_vector_in_camera_axes(tmp_path: Path, name: str) -> None:
-    """Over a chain of frames, both up and down it; a gyroscope's topic has no acceleration."""
+    """The frame chain is used in both directions; the topic of a gyroscope has no acceleration."""
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
     add_accelerometer(bag)

@@ -1,4 +1,4 @@
-"""Turned images show the same world: pixels, rays and lenses."""
+"""Tests of rotated images, whose pixels, rays and lenses show the same world."""
 
 from __future__ import annotations
 

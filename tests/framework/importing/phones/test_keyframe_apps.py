@@ -1,4 +1,4 @@
-"""Polycam and 3D Scanner App, which store each frame in files of its own: as they write them, and damaged."""
+"""Tests of the exports of Polycam and 3D Scanner App, which store each frame separately; valid and damaged."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_polycam_optimized_poses_and_images_are_used(tmp_path: Path) -> None:
 
 
 def test_polycam_optimized_poses_without_images_are_used(tmp_path: Path) -> None:
-    """As in exports of which the app has left out the images, and of the camera all but the pose."""
+    """Such exports have no optimized images, and only the pose of the camera."""
     drifted = [replace(frame, T_world_camera=DRIFT @ frame.T_world_camera) for frame in FRAMES]
     write_polycam(tmp_path / "export", drifted)
     write_polycam(tmp_path / "export", FRAMES, "corrected_")
@@ -101,7 +101,7 @@ def change(path: Path, how: Callable[[dict[str, Any]], Any]) -> None:
 
 
 def second(folder: Path, pattern: str) -> Path:
-    """The file of the second frame."""
+    """Return the file of the second frame."""
     return sorted(folder.rglob(pattern))[1]
 
 

@@ -1,4 +1,4 @@
-"""Record3D's export and .r3d files: as the app writes them, damaged, and a real export."""
+"""Tests of Record3D's export and .r3d files: valid, damaged, and a real export."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.support.recordings.phone_exports import (
 )
 
 FRAMES = room_frames()
-REAL_FRAMES = 4  # whose images are there; the metadata is of all 345
+REAL_FRAMES = 4  # frames with images; the metadata covers all 345
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_record3d_older_export_uses_common_camera_and_rate(export: Path, tmp_pat
 
 
 def test_record3d_poses_from_identity_give_no_gravity_file(export: Path, tmp_path: Path) -> None:
-    """As the app wrote them in 2022: of the world of the first frame."""
+    """In 2022 the app wrote poses in the world of the first frame."""
     changed(export, lambda m: m["poses"].__setitem__(0, [0, 0, 0, 1, 0, 0, 0]))
     write_folder(open_source(export), tmp_path / "out", Writing())
     assert len(RgbdFolder(tmp_path / "out")) == 4
@@ -213,7 +213,7 @@ def test_record3d_real_export_is_imported(shared_data: Path, tmp_path: Path) -> 
     assert frame.timestamp == pytest.approx(0.05000420800206484)
     assert (frame.depth > 0).mean() > 0.99
     assert np.median(frame.depth) == pytest.approx(0.247, abs=0.003)
-    # it looks down at a door handle: the view is 50 degrees below the horizon, and up is up
+    # it looks down at a door handle, 50 degrees below the horizon
     T_world_camera = frame.T_world_camera
     assert T_world_camera is not None
     assert T_world_camera[1, 2] == pytest.approx(-0.77, abs=0.02)

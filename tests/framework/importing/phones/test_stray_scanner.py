@@ -1,4 +1,4 @@
-"""Stray Scanner's folders: as the app writes them, damaged, and a real one."""
+"""Tests of Stray Scanner's folders: valid, damaged, and a real one."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_stray_scanner_invalid_export_leaves_no_folder(
 
 
 def test_stray_scanner_real_recording_is_imported(shared_data: Path, tmp_path: Path) -> None:
-    """Its poses, depth and confidence; the video is not there, and another one stands in for it."""
+    """Poses, depth and confidence are real; the video is a replacement."""
     original = shared_data / "originals" / "stray_scanner"
     if not original.is_dir():
         pytest.skip(f"{original} is not there")

@@ -1,4 +1,4 @@
-"""Embeddings of objects: their mean and spread, and that they stay with their objects."""
+"""Tests of object embeddings: mean, spread, and their assignment to objects."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_embeddings_invalid_values_raise(kind: type, embeddings: np.ndarray | No
 
 
 def mapped(name: str, frames: int = 4, embeddings: np.ndarray | None = None, space: str = "words@1") -> MapFuser:
-    """The analytic room with its three objects, the last of which is never embedded."""
+    """Map the analytic room with three objects, the last of which has no embedding."""
     fuser: MapFuser = registered.built("fuser", name, "fuser.voxel_size=0.08")
     for k, T in enumerate(walk(4)[:frames]):
         frame = room().frame(T, k)
