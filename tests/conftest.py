@@ -1,4 +1,4 @@
-"""What all tests share: seeds, and the way to the data that are not part of the project."""
+"""Shared fixtures: seeds, and access to data that are not part of the project."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import hypothesis
 import numpy as np
 import pytest
 
-import tests.support.cores  # isort: skip; before numba is loaded, which reads what it sets
+import tests.support.cores  # isort: skip; sets variables that numba reads when it is loaded
 
 pytest.register_assert_rewrite("framework.testing")  # before they are loaded
 
@@ -22,12 +22,12 @@ import tests.support.cached_lights  # noqa: E402, F401
 from framework.config import composition  # noqa: E402
 from tests.support.scenes.corner_room import CornerRoom  # noqa: E402
 
-os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # no test downloads 180 MB because the machine could
-hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)  # a busy machine fails no test
+os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # tests never download 180 MB
+hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)  # a busy machine must not fail a test
 hypothesis.settings.load_profile("tests")
 CHECKOUT = Path(__file__).resolve().parent.parent
 
-# who starts the tests in the background has them, and all that they start, ignore Ctrl-C; nohup, a closed terminal
+# tests started in the background ignore Ctrl-C and pass this to their processes; nohup ignores a closed terminal
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
@@ -58,14 +58,14 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture(autouse=True)
 def seeded() -> None:
-    """The same random numbers in every test, whichever tests run before it."""
+    """Seed the random numbers of every test."""
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The directory `shared` beside the checkout, with data and weights; skips where there is none."""
+    """Return the directory `shared` next to the checkout, with data and weights; skip the test if it is missing."""
     directory = CHECKOUT.parent / "shared"
     if not directory.is_dir():
         pytest.skip(f"{directory} with its data and weights is not there")
@@ -74,7 +74,7 @@ def shared() -> Path:
 
 @pytest.fixture(scope="session")
 def shared_data(shared: Path) -> Path:
-    """`shared/data`, with the RGB-D folders."""
+    """Return `shared/data`, which contains RGB-D folders."""
     if not (shared / "data").is_dir():
         pytest.skip(f"{shared / 'data'} is not there")
     return shared / "data"
@@ -82,7 +82,7 @@ def shared_data(shared: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def ready(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]:
-    """Builds an option with what only a user has. Skips where a package is not there, and only there."""
+    """Build an option with generated user files. Skip only if a package is missing."""
     from tests.support import option_files, registered
 
     made = functools.cache(lambda *option: option_files.overrides(*option, tmp_path_factory.mktemp(option[1])))
@@ -95,11 +95,11 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]
 
 @pytest.fixture
 def room() -> CornerRoom:
-    """A video of six frames whose every pixel is known."""
+    """Return a video of six frames with exact ground truth."""
     return CornerRoom()
 
 
 @pytest.fixture
 def fakes_registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The stages of tests/support/fake_conf may be built here, as with --config-dir tests/support/fake_conf."""
+    """Register the stages of tests/support/fake_conf, as --config-dir does."""
     monkeypatch.setattr(composition, "_added", [CHECKOUT / "tests" / "support" / "fake_conf"])

@@ -91,7 +91,7 @@ def kitchen_ap50() -> Measured:
 def speed_ratio() -> Measured:
     with tempfile.TemporaryDirectory() as directory:
         report = Path(directory, "benchmark.json")
-        chosen = "test_slam_compared_with_open3d and redkitchen and 1cm"
+        chosen = "test_slam_speed_compared_with_open3d and redkitchen and 1cm"
         failures("tests/benchmarks/test_slam.py", "-k", chosen, f"--benchmark-json={report}")
         info = json.loads(report.read_text())["benchmarks"][0]["extra_info"]
     ours, theirs = info["whole loop, ms (ours, Open3D)"]

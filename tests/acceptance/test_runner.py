@@ -1,4 +1,4 @@
-"""The page of acceptance results: rows are kept, and outdated lines are found."""
+"""Tests of the acceptance page: rows are kept, and outdated lines are detected."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from tests.acceptance.runner import is_current, read_rows, write_rows
 ROW = ["kitchen_ate", "12.1", "ATE <= 15 mm", "2026-01-01", "abc1234", "2 cores, CPU", "1.0"]
 
 
-def test_page_round_trip_keeps_rows(tmp_path: Path) -> None:
+def test_acceptance_page_round_trip_keeps_rows(tmp_path: Path) -> None:
     write_rows({"kitchen_ate": ROW}, tmp_path / "page.md")
     assert read_rows(tmp_path / "page.md") == {"kitchen_ate": ROW}
 
 
-def test_row_of_unknown_or_uncommitted_code_is_outdated() -> None:
+def test_acceptance_row_of_unknown_or_changed_code_is_outdated() -> None:
     assert not is_current(ROW, ["framework"])
     assert not is_current([*ROW[:4], "abc1234+", *ROW[5:]], ["framework"])

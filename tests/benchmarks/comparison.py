@@ -1,4 +1,4 @@
-"""Tables of ours beside others', in Markdown and aligned for the terminal."""
+"""Comparison tables in Markdown, aligned for the terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ NOTHING = "-"  # a cell without a number: not measured, or not defined
 
 @dataclass
 class Table:
-    """A title, columns and rows of text; notes below say how it was measured."""
+    """A title, columns and rows of text. The notes state how the values were measured."""
 
     title: str
     columns: Sequence[str]
@@ -18,7 +18,7 @@ class Table:
     notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """The table as aligned Markdown: words to the left, numbers to the right."""
+        """Return the table as aligned Markdown: text to the left, numbers to the right."""
         table = [list(self.columns), *map(list, self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         numbers = [all(_is_number(row[k]) for row in self.rows) for k in range(len(self.columns))]
@@ -47,5 +47,5 @@ def mib(count: float) -> str:
 
 
 def times(theirs: float, ours: float) -> str:
-    """How many times as fast as theirs ours is."""
+    """Return the speedup of ours over theirs."""
     return f"{theirs / ours:.1f}" if ours else NOTHING

@@ -1,4 +1,4 @@
-"""What the benchmarks share: they run as typed, and their tables are printed at the end of the session."""
+"""Shared settings of the benchmarks: they run only when requested, and their tables are printed at the end."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TABLES = pytest.StashKey[list[Table]]()
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-benchmark reads its options
 def pytest_configure(config: pytest.Config) -> None:
-    """`pytest tests/benchmarks` runs them; `pytest` alone, which comes to them with all other tests, skips them."""
+    """Enable the benchmarks if pytest is called on this folder; a plain `pytest` skips them."""
     config.stash.setdefault(TABLES, [])
     named = [Path(config.invocation_params.dir, argument.split("::")[0]).resolve() for argument in config.args]
     if named and all(path.is_relative_to(HERE) for path in named):
@@ -23,7 +23,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="session")
 def tables(pytestconfig: pytest.Config) -> list[Table]:
-    """What is appended to it is printed when all tests are done."""
+    """Return the list of tables that are printed when all tests are done."""
     return pytestconfig.stash[TABLES]
 
 

@@ -1,6 +1,7 @@
-"""`python -m tests.benchmarks.feeder SOURCE TARGET FRAMES HZ`: an RGB-D folder written into another one, like a camera.
+"""`python -m tests.benchmarks.feeder SOURCE TARGET FRAMES HZ`: copy an RGB-D folder frame by frame, like a camera.
 
-The source's frames go to and fro. Each file appears whole, by a rename. TARGET/feeder.csv says when each was there.
+The frames of the source are played forward and backward. Each file is written atomically. TARGET/feeder.csv contains
+the time of each frame.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from framework.datasets.frames.numbered_images import numbered_images
 
 
 def feed(source: Path, target: Path, frames: int, hz: float) -> None:
-    """Writes camera.json, the frames one after the other, each at its time, and `end`."""
+    """Write camera.json, each frame at its time, and `end`."""
     color = list(numbered_images(source / "color", (".jpg", ".png")).values())
     depth = list(numbered_images(source / "depth", (".png",)).values())
     there = []

@@ -1,4 +1,4 @@
-"""Open3D's dense SLAM (t.pipelines.slam), driven and timed as its own example `dense_slam.py` does."""
+"""Open3D's dense SLAM (t.pipelines.slam), called and timed as in its example `dense_slam.py`."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from framework.data import Detections, Float64, Frame, Pose
 Method = o3d.t.pipelines.odometry.Method
 
 DEPTH_SCALE = 1000.0  # units per meter: depth goes in as uint16 millimeters
-MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; the latter is our fuser's
+MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; the latter is that of our fuser
 MAX_DEPTH_DIFFERENCE = 0.07  # m, the default
 TRUNCATION = 8.0  # voxels, the default
-BLOCK = 16  # voxels a side, the example's
-BLOCKS = {0.01: 16_000, 0.02: 4_000}  # by voxel size, m: room for all that the benchmarks see
+BLOCK = 16  # voxels per side, as in the example
+BLOCKS = {0.01: 16_000, 0.02: 4_000}  # by voxel size, m: capacity for all benchmarks
 
 
 class Open3DSlam:
-    """One map and one camera; the steps of a frame are separate, so that each can be timed. No labels."""
+    """One map and one camera. The steps of a frame are separate, so that each can be timed. There are no labels."""
 
     def __init__(
         self, first: Frame, voxel_size: float, method: Method = Method.PointToPlane, device: str = "CPU:0"
@@ -39,7 +39,7 @@ class Open3DSlam:
         self._frames = 0
 
     def load(self, frame: Frame) -> None:
-        """Hands over the images; not part of what is timed."""
+        """Pass the images to Open3D. This is not part of the measured time."""
         depth = np.round(frame.depth * DEPTH_SCALE).astype(np.uint16)
         self._input.set_data_from_image("depth", o3d.t.geometry.Image(o3d.core.Tensor(depth, device=self._device)))
         self._input.set_data_from_image(
@@ -47,7 +47,7 @@ class Open3DSlam:
         )
 
     def __call__(self, frame: Frame, _detections: Detections) -> Pose:
-        """All steps of a frame; what is lost is not integrated."""
+        """Run all steps of a frame. A lost frame is not integrated."""
         self.load(frame)
         pose = self.track()
         if not pose.lost:
@@ -56,7 +56,7 @@ class Open3DSlam:
         return pose
 
     def track(self) -> Pose:
-        """The pose of the loaded frame against the view that was rendered last."""
+        """Return the pose of the loaded frame relative to the last rendered view."""
         if not self._frames:
             return Pose(self._T_world_camera)
         try:
@@ -74,11 +74,11 @@ class Open3DSlam:
         self._frames += 1
 
     def render(self) -> None:
-        """What its tracker needs: the depth of the full image, and color where the method uses it."""
+        """Render what the tracker needs: the depth of the full image, and color if the method uses it."""
         self._model.synthesize_model_frame(self._view, DEPTH_SCALE, MIN_DEPTH, MAX_DEPTH, TRUNCATION, self._color)
 
     def render_all(self) -> None:
-        """Depth, normals and color of the full image."""
+        """Render depth, normals and color of the full image."""
         self._model.voxel_grid.ray_cast(
             self._model.frustum_block_coords,
             self._K,
@@ -95,12 +95,12 @@ class Open3DSlam:
 
     @property
     def bytes_used(self) -> int:
-        """Of the blocks that hold something."""
+        """Return the size of the blocks in use."""
         return int(self._model.get_hashmap().size()) * self._bytes_a_block
 
     @property
     def bytes_allocated(self) -> int:
-        """Of all the blocks that were asked for in advance."""
+        """Return the size of all allocated blocks."""
         return int(self._model.get_hashmap().capacity()) * self._bytes_a_block
 
     @property
@@ -111,7 +111,7 @@ class Open3DSlam:
 
 
 def _rigid(T: Float64) -> Float64:
-    """Rounding of a product of hundreds of transforms taken out."""
+    """Remove the rounding error of a product of many transforms."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = U @ Vt, T[:3, 3]

@@ -1,4 +1,4 @@
-"""The videos that the benchmarks run on, with their detections, held in memory: reading and detecting is not timed."""
+"""The videos of the benchmarks with their detections, in memory, so that reading and detection are not timed."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ class Recording:
 
 
 def red_kitchen(shared: Path, frames: int) -> Recording:
-    """A real Kinect video with a real detector's masks."""
+    """Return a real Kinect video with the masks of a real detector."""
     sequence = RgbdFolder(shared / "data" / "redkitchen", stop=frames)
     return _recorded("redkitchen", sequence, MaskRCNN2Go())
 
 
 def furnished_room(frames: int) -> Recording:
-    """A synthetic room with a Kinect's noise, whose depth is dense, and masks as faulty as a real detector's."""
+    """Return a synthetic room with dense, noisy Kinect depth and masks with the errors of a real detector."""
     return _recorded("synthetic room", Synthetic(frames=240, stop=frames), SimulatedDetector())
 
 

@@ -1,7 +1,7 @@
-"""A walk through a row of furnished rooms that are all alike: new surface in every frame, and as much of it as before.
+"""A walk through a row of identical furnished rooms. Every frame shows the same amount of new surface.
 
-World: x along the row, y to the left, z up. The walk repeats itself with every room, so that two stretches a whole
-number of rooms apart show the same pictures of other places, and whatever costs more in the second is the map's fault.
+World: x along the row, y to the left, z up. The walk is periodic with the rooms. Two segments that are a whole number
+of rooms apart show the same images of different places, so any extra cost of the second one is due to the map.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ OBJECT_OF_BOX = np.array([OBJECTS.index(name) + 1 if name else 0 for *_, name in
 
 @dataclass
 class RoomRow(RGBDSequence):
-    """Frames of the walk, without noise, with exact poses and instances."""
+    """Frames of the walk without noise, with exact poses and instances."""
 
     frames: int = 2000
 
     def __post_init__(self) -> None:
         self.camera, self.name = CAMERA, "row of rooms"
-        rooms = self.frames // FRAMES_A_ROOM + 4  # from the one behind the camera to the last that it looks into
+        rooms = self.frames // FRAMES_A_ROOM + 4  # from the room behind the camera to the last visible one
         self.class_names = {r * len(OBJECTS) + k: name for r in range(rooms) for k, name in enumerate(OBJECTS, start=1)}
 
     def __len__(self) -> int:
@@ -71,7 +71,7 @@ class RoomRow(RGBDSequence):
 
 
 def pose_at(k: int) -> Float64:
-    """T_world_camera of frame k: straight through the doors, looking to the left and to the right in turn."""
+    """Return T_world_camera of frame k: straight through the doors, looking left and right in turn."""
     phase = 2 * np.pi * k / FRAMES_A_ROOM
     yaw, pitch = PAN * np.sin(phase), -PITCH + np.deg2rad(2.0) * np.sin(3 * phase)
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
@@ -99,7 +99,7 @@ def _render(
     color: UInt8,
     ids: Int32,
 ) -> None:
-    """Depth along z, color and instance ids of every pixel, in closed form."""
+    """Render depth along z, color and instance ids of every pixel, in closed form."""
     ox, oy, oz = np.float32(T[0, 3]), np.float32(T[1, 3]), np.float32(T[2, 3])
     for v in prange(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -112,7 +112,7 @@ def _render(
             t_level = ((HEIGHT if dz > 0 else 0.0) - oz) / dz if dz != 0 else np.inf
             t = min(t_side, t_level)
             box = -1 if t_side < t_level else (-2 if dz > 0 else -3)
-            # room by room along the ray, until what was met lies before the next one
+            # room by room along the ray, until the hit is in front of the next room
             room = int(np.floor((ox + WALL) / LENGTH))
             hit_room = room
             while True:
@@ -136,7 +136,7 @@ def _render(
 
 @njit(cache=True, nogil=True)
 def _entry(box, begin, ox, oy, oz, dx, dy, dz):
-    """Where a ray enters the box of a room that begins at x = `begin`, infinite if it does not."""
+    """Return where a ray enters the box of a room that begins at x = `begin`; infinite if it does not."""
     near, far = np.float32(1e-3), np.float32(np.inf)
     for axis in range(3):
         o = ox - begin if axis == 0 else (oy if axis == 1 else oz)
@@ -152,8 +152,8 @@ def _entry(box, begin, ox, oy, oz, dx, dy, dz):
 
 @njit(cache=True, nogil=True)
 def _paint(x, y, z, box, out):
-    """A solid texture of a few wave lengths, alike in all rooms, in another tone for each box."""
-    x -= LENGTH * np.floor(x / LENGTH)  # the waves along x fit into a room a whole number of times
+    """Paint a solid texture of a few wavelengths, equal in all rooms, with a different tone for each box."""
+    x -= LENGTH * np.floor(x / LENGTH)  # a room contains a whole number of waves along x
     turn = np.float32(2 * np.pi / LENGTH)
     one = np.sin(6 * turn * x + 5 * y + 3 * z + box)
     two = np.sin(-9 * turn * x + 13 * y + 11 * z + 2 * box)

@@ -1,4 +1,4 @@
-"""Our tracker and fuser on one frame after the other, with the time that each step takes."""
+"""Our tracker and fuser, run frame by frame, with the time of each step."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ RENDERING = "render for tracking"  # a part of track
 
 
 def seconds(step: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """How long a step took, and what it returned."""
+    """Return the duration of a step and its result."""
     begin = time.perf_counter()
     answer = step(*arguments)
     return time.perf_counter() - begin, answer
 
 
 class SlamLoop:
-    """Track, lift, fuse. The public interfaces only, so that any tracker and fuser can be measured."""
+    """Track, lift and fuse. Only public interfaces are used, so that any tracker and fuser can be measured."""
 
     def __init__(self, tracker: PoseTracker, fuser: MapFuser) -> None:
         self.tracker = tracker
@@ -47,11 +47,11 @@ class SlamLoop:
         return sum(pose.lost for pose in self.poses)
 
     def render_all(self, frame: Frame) -> None:
-        """Depth, normals, color, instance and class ids of the full image, from where the camera was last."""
+        """Render depth, normals, color, instance and class ids of the full image from the last pose."""
         self.fuser.scene.render(frame.camera, self.poses[-1].T_world_camera)
 
     def _watch_rendering(self) -> None:
-        """Adds up the time that the tracker spends in what the map offers for rendering."""
+        """Accumulate the time that the tracker spends in the rendering functions of the map."""
         scene = self.fuser.scene
         for name in dir(type(scene)):
             if name.startswith(("render", "cast")) and callable(getattr(scene, name)):

@@ -82,7 +82,7 @@ class Agreement:
 
 @pytest.fixture(scope="module")
 def images(shared: Path) -> Callable[[str], list[Frame]]:
-    """The images for a detector: real ones, or rendered rooms for the network that was trained on these."""
+    """Return the images for a detector: real ones, or rendered rooms for the network trained on rooms."""
     kitchen = list(RgbdFolder(shared / "data" / "redkitchen", stop=5 * IMAGES, stride=5))
     rooms = list(Synthetic(frames=240, stride=240 // IMAGES))
     return lambda name: rooms if name == "mask_rcnn_rooms" else kitchen
@@ -100,7 +100,7 @@ def tables_of_detectors(tables: list[Table]) -> tuple[Table, Table]:
 
 
 def settings(option: str) -> Iterator[tuple[str, list[str]]]:
-    """The name and the overrides of each device and precision; float32 on the CPU is first."""
+    """Return the name and the overrides of each device and precision; float32 on the CPU is first."""
     parameters = registered.composed("detector", option).detector
     integers = ["detector.int8=false"] * ("int8" in parameters)
     yield "CPU, float32", ["device=cpu", *integers]
@@ -130,7 +130,7 @@ def run(detector: Any, frames: Sequence[Frame]) -> tuple[list[float], list[Detec
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_cuda_detector(
+def test_cuda_detector_speed_and_agreement(
     benchmark: BenchmarkFixture, images: Callable[[str], list[Frame]], tables_of_detectors: tuple[Table, Table],
     shared: Path, tmp_path: Path, name: str,
 ) -> None:  # fmt: skip
@@ -159,8 +159,8 @@ def test_cuda_detector(
             agreement.rows.append([name, setting, *Agreement.of(expected[:n], found[:n]).cells()])
 
 
-def test_cuda_slam(benchmark: BenchmarkFixture, shared: Path, tables: list[Table]) -> None:
-    """Our loop on the CPU and Open3D's on both devices, on the same frames in turns."""
+def test_cuda_slam_speed(benchmark: BenchmarkFixture, shared: Path, tables: list[Table]) -> None:
+    """Our loop runs on the CPU and Open3D's on both devices, in turns on the same frames."""
     kitchen = red_kitchen(shared, LAST)
     ours = SlamLoop(VoxelHashingIcp(), assemble(BayesianTsdf, voxel_size=VOXEL_SIZE))
     theirs = {device: Open3DSlam(kitchen.frames[0], VOXEL_SIZE, device=device) for device in ("CPU:0", "CUDA:0")}

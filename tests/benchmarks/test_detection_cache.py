@@ -1,4 +1,4 @@
-"""What the detection cache costs and saves at 640x480: `python -m pytest tests/benchmarks -k detection_cache`."""
+"""Cost and savings of the detection cache at 640x480: `python -m pytest tests/benchmarks -k detection_cache`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def noise() -> Frame:
 
 
 def ellipses() -> Detections:
-    """Objects of 60 to 260 px."""
+    """Return objects of 60 to 260 px."""
     random = np.random.default_rng(0)
     v, u = np.ogrid[:480, :640]
     half, center = random.uniform(30, 130, (OBJECTS, 2)), random.uniform(0, (640, 480), (OBJECTS, 2))
@@ -39,20 +39,20 @@ def ellipses() -> Detections:
 
 
 @pytest.mark.parametrize("reads", [("color",), FRAME_FIELDS], ids=["color", "everything"])
-def test_frame_hash_speed(benchmark: BenchmarkFixture, reads: tuple[str, ...]) -> None:
+def test_detection_cache_frame_hash_speed(benchmark: BenchmarkFixture, reads: tuple[str, ...]) -> None:
     benchmark(frame_hash, noise(), reads)
 
 
-def test_detection_pack_speed(benchmark: BenchmarkFixture) -> None:
+def test_detection_cache_pack_speed(benchmark: BenchmarkFixture) -> None:
     benchmark.extra_info["bytes"] = len(benchmark(pack, ellipses()))
 
 
-def test_detection_unpack_speed(benchmark: BenchmarkFixture) -> None:
+def test_detection_cache_unpack_speed(benchmark: BenchmarkFixture) -> None:
     benchmark(unpack, pack(ellipses()), COCO)
 
 
-def test_second_run_reads_all_detections_from_cache(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
-    """A network on a real video, then the same video again, from the cache."""
+def test_detection_cache_second_run_detects_nothing(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
+    """A network runs on a real video; a second run reads all detections from the cache."""
     data = shared / "data" / "redkitchen"
     if not data.is_dir():
         pytest.skip(f"{data} is not there")

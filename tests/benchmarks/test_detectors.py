@@ -1,7 +1,7 @@
-"""Time and memory of every detector that can run here, at 640x480: `python -m pytest tests/benchmarks -k detectors`.
+"""Time and memory of every available detector at 640x480: `python -m pytest tests/benchmarks -k detectors`.
 
-Each runs in a process of its own, so that its peak of memory is its own. Networks whose weights are not at hand are
-made with random ones: their time is right, and what they find is fixed to MASKS objects an image.
+Each detector runs in its own process, so that its peak memory is measured alone. Networks without local weights get
+random weights: their time is correct, and their output is fixed to MASKS objects per image.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ THREADS = 2
 FRAMES = 8
 ROUNDS = 3  # over the frames
 WARM_UP = 2  # images that are not counted
-LONGEST = 20.0  # s, after which a slow one has shown enough
-MASKS = 20  # that networks of random weights return
+LONGEST = 20.0  # s, after which a slow detector is stopped
+MASKS = 20  # detections that random networks return
 
 
 def random_mask_rcnn(backbone: str, folder: Path) -> list[str]:
-    """The overrides for a network of the published architecture that takes whatever it sees for the first class."""
+    """Return the overrides for a network of the published architecture that assigns everything to the first class."""
     torch.manual_seed(0)
     network = MaskRCNN(Architecture(COCO, ResNetShape(backbone)))
     with torch.no_grad():
@@ -53,7 +53,7 @@ def random_mask_rcnn(backbone: str, folder: Path) -> list[str]:
 def random_transformer(
     model: str, parameters: dict[str, Any], preprocessing: dict[str, Any], folder: Path
 ) -> list[str]:
-    """The overrides for a model of `transformers` with COCO's classes."""
+    """Return the overrides for a `transformers` model with COCO's classes."""
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
     model_class = getattr(transformers, model)
@@ -74,7 +74,7 @@ MASK2FORMER = partial(
 
 
 def rf_detr_seg(side: int, windows: int) -> Callable[[Path], list[str]]:
-    """As published for Nano (312 px, one window) and Small (384 px, two)."""
+    """Return the published settings of Nano (312 px, one window) or Small (384 px, two windows)."""
     backbone = {
         "model_type": "rf_detr_dinov2", "hidden_size": 384, "num_attention_heads": 6, "image_size": side,
         "patch_size": 12, "num_windows": windows, "out_features": ["stage3", "stage6", "stage9", "stage12"],
@@ -95,18 +95,18 @@ RANDOM: dict[str, tuple[str, Callable[[Path], list[str]]]] = {
 
 @dataclass(frozen=True)
 class Measured:
-    """What a detector took."""
+    """Measured values of a detector."""
 
     seconds: list[float]  # an image
     detections: float  # an image
-    mib: float  # by which the process grew at its peak
-    fault: str = ""  # why it cannot run here
+    mib: float  # peak increase of the process
+    fault: str = ""  # reason if it cannot run
 
 
 def measure(name: str, overrides: list[str], frames: list[Frame]) -> Measured:
-    """Builds detector=`name` and runs it on frames."""
+    """Build detector=`name` and run it on frames."""
     torch.set_num_threads(THREADS)
-    Path("/proc/self/clear_refs").write_text("5")  # the peak, which a new process has from its parent, begins anew
+    Path("/proc/self/clear_refs").write_text("5")  # reset the peak, which a new process inherits
     before = peak_kib()
     try:
         detector = registered.built("detector", name, f"threads={THREADS}", *overrides)
@@ -126,14 +126,14 @@ def measure(name: str, overrides: list[str], frames: list[Frame]) -> Measured:
 
 
 def peak_kib() -> int:
-    """The most memory that this process has had, on Linux."""
+    """Return the peak memory of this process on Linux."""
     [line] = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
     return int(line.split()[1])
 
 
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
-    """The synthetic room, where all can run, also those that look at the truth."""
+    """Return frames of the synthetic room, which every detector accepts, including those that use the ground truth."""
     return list(Synthetic(frames=240, stride=240 // FRAMES))
 
 
@@ -152,7 +152,9 @@ def table(tables: list[Table]) -> Table:
 
 
 @pytest.mark.parametrize("name", [*registered.names("detector"), *RANDOM])
-def test_detectors(benchmark: BenchmarkFixture, table: Table, frames: list[Frame], tmp_path: Path, name: str) -> None:
+def test_detectors_time_and_memory(
+    benchmark: BenchmarkFixture, table: Table, frames: list[Frame], tmp_path: Path, name: str
+) -> None:
     option, made = RANDOM.get(name, (name, None))
     overrides = made(tmp_path) if made else []
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:

@@ -1,6 +1,6 @@
-"""What instances cost in a frame: ten masks in 640x480, a map at 1 cm that knows them already.
+"""Cost of instances per frame: ten masks at 640x480, and a 1 cm map that already contains them.
 
-Run with `python -m pytest tests/benchmarks/test_instances.py`; refining is measured in test_refiners.py.
+Run with `python -m pytest tests/benchmarks/test_instances.py`; test_refiners.py measures refinement.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tests.benchmarks.test_refiners import MASKS, ten_masks
 
 @pytest.fixture(scope="module")
 def mapped() -> tuple[BayesianTsdf, Frame, Pose, PointClusters]:
-    """The fuser after five frames, the frame, and clusters of 80 classes that no refiner took points from."""
+    """Return the fuser after five frames, the frame, and unrefined clusters of 80 classes."""
     clusters, frame = ten_masks()
     probabilities = np.random.default_rng(0).dirichlet(np.full(len(COCO), 0.1), MASKS).astype(np.float32)
     clusters = dataclasses.replace(clusters, class_probabilities=probabilities, classes=COCO)
@@ -30,7 +30,7 @@ def mapped() -> tuple[BayesianTsdf, Frame, Pose, PointClusters]:
     return fuser, frame, pose, clusters
 
 
-def test_associate_ten_masks(benchmark, mapped) -> None:
+def test_associate_ten_masks_speed(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
 
     def associate() -> None:
@@ -43,7 +43,7 @@ def test_associate_ten_masks(benchmark, mapped) -> None:
     assert len(fuser.scene.table.records) == MASKS
 
 
-def test_write_labels_of_ten_masks(benchmark, mapped) -> None:
+def test_write_labels_of_ten_masks_speed(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
     points = list_points_by_pixel(clusters, frame.depth.shape)
     overlaps = fuser.association.look_up(fuser.scene, frame, pose, points)
@@ -58,6 +58,6 @@ def test_write_labels_of_ten_masks(benchmark, mapped) -> None:
     benchmark(write_labels)
 
 
-def test_fuse_ten_masks(benchmark, mapped) -> None:
+def test_fuse_ten_masks_speed(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
     benchmark(fuser.fuse, frame, pose, clusters)

@@ -1,7 +1,7 @@
-"""How old a frame is when the map has it, and what is dropped: `python -m pytest tests/benchmarks -k live`.
+"""Latency and dropped frames of a live run: `python -m pytest tests/benchmarks -k live`.
 
-Another process writes real frames into a folder at 15 Hz, and a run with the default stages at 1 cm maps them as they
-come. INSTANCEMAP_LIVE_FRAMES=2000 feeds it longer than the 300 frames that the video has: to and fro.
+Another process writes real frames into a folder at 15 Hz, and a run with the default stages at 1 cm maps them.
+INSTANCEMAP_LIVE_FRAMES=2000 plays the 300 frames of the video forward and backward.
 """
 
 from __future__ import annotations
@@ -24,17 +24,19 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 FRAMES = int(os.environ.get("INSTANCEMAP_LIVE_FRAMES", "300"))
 HZ = 15.0
 PATIENCE_S = 120.0
-WARM_S = 10.0  # after which kernels are loaded, and caches are warm
+WARM_S = 10.0  # after these frames, kernels are loaded and caches are warm
 
 
 def resident(process: subprocess.Popen[str]) -> int:
-    """Bytes."""
+    """Return the resident memory in bytes."""
     pages = Path(f"/proc/{process.pid}/statm").read_text().split()[1]
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux for the memory of a process")
-def test_live_folder(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, tables: list[Table]) -> None:
+def test_live_folder_latency_and_drops(
+    benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, tables: list[Table]
+) -> None:
     source, watched, place = shared / "data" / "redkitchen", tmp_path / "watched", tmp_path / "run"
     if not source.is_dir():
         pytest.skip(f"{source} is not there")
@@ -46,7 +48,7 @@ def test_live_folder(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, 
         line = [sys.executable, "-m", "framework", *chosen, f"dataset.camera_timeout={PATIENCE_S}"]
         run = subprocess.Popen(line, cwd=CHECKOUT, stderr=subprocess.DEVNULL, text=True)
         deadline = time.monotonic() + PATIENCE_S
-        while not (place / "config.yaml").exists():  # it has loaded its network, and waits for the camera
+        while not (place / "config.yaml").exists():  # the network is loaded, and the run waits for the camera
             assert run.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.1)

@@ -1,4 +1,4 @@
-"""The mesh of a real kitchen at 1 cm: from scratch, after one more frame, and Open3D's from the same voxels.
+"""Mesh extraction of a real kitchen at 1 cm: full, after one more frame, and by Open3D from the same voxels.
 
 Run with `python -m pytest tests/benchmarks/test_meshing.py -s`.
 """
@@ -23,7 +23,7 @@ from plugins.fusers.bayesian_tsdf import BayesianTsdf
 
 KITCHEN = Path(__file__).resolve().parents[3] / "shared" / "data" / "redkitchen"
 FRAMES = 300
-UPDATES = 20  # of them, the last ones, are added one by one
+UPDATES = 20  # last frames, added one by one
 medians_ms: dict[str, float] = {}
 
 
@@ -35,7 +35,7 @@ def fuse(fuser: BayesianTsdf, frame: Frame) -> None:
 
 @pytest.fixture(scope="module")
 def kitchen() -> tuple[BayesianTsdf, Iterator[Frame]]:
-    """The map of all frames but the last UPDATES, and those."""
+    """Return the map of all frames except the last UPDATES, and these frames."""
     if not KITCHEN.is_dir():
         pytest.skip(f"{KITCHEN} is absent")
     frames = iter(RgbdFolder(root=KITCHEN, stop=FRAMES))
@@ -45,23 +45,23 @@ def kitchen() -> tuple[BayesianTsdf, Iterator[Frame]]:
     return fuser, frames
 
 
-def test_slam_mesh_update(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
-    """The mesh after one more frame."""
+def test_slam_mesh_update_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
+    """Measure the mesh update after one more frame."""
     fuser, frames = kitchen
     fuser.scene.mesh()
     benchmark.pedantic(fuser.scene.mesh, setup=lambda: fuse(fuser, next(frames)), rounds=UPDATES)
     note(benchmark, "update after one frame", len(fuser.scene.mesh().triangles))
 
 
-def test_slam_mesh_full(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
-    """The whole mesh with colors and labels."""
+def test_slam_mesh_full_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
+    """Measure the full mesh with colors and labels."""
     scene = kitchen[0].scene
     benchmark.pedantic(scene.mesh, setup=scene.volume.changed, rounds=20, warmup_rounds=1)
     note(benchmark, "full", len(scene.mesh().triangles))
 
 
-def test_slam_mesh_open3d(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
-    """Open3D's marching cubes on the same distances, with colors and without labels."""
+def test_slam_mesh_open3d_speed(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
+    """Measure Open3D's marching cubes on the same distances, with colors and without labels."""
     volume = open3d_volume(kitchen[0].scene)
     mesh = benchmark.pedantic(volume.extract_triangle_mesh, (0.5,), rounds=5, warmup_rounds=1)
     note(benchmark, "Open3D", len(mesh.triangle.indices))
@@ -79,7 +79,7 @@ def note(benchmark, name: str, triangles: int) -> None:
 
 
 def open3d_volume(scene: InstanceMap) -> o3d.t.geometry.VoxelBlockGrid:
-    """The map's voxels in Open3D's structure."""
+    """Return the map's voxels in Open3D's structure."""
     grid, count = scene.volume.voxels.grid, scene.volume.voxels.block_count
     seen = grid.tsdf[:count] != UNSEEN
     values = {

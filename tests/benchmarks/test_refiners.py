@@ -1,4 +1,4 @@
-"""Speed of the refiners: ten masks in a 640x480 frame, and gmm_em's mixtures beside scikit-learn's and gmm_tree's.
+"""Speed of the refiners on ten masks at 640x480; the mixtures of gmm_em compared with scikit-learn and gmm_tree.
 
 Run with `python -m pytest tests/benchmarks/test_refiners.py -s`.
 """
@@ -36,7 +36,7 @@ CAMERA = Camera(640, 480, 540.0, 540.0, 319.5, 239.5)
 
 
 def ten_masks() -> tuple[PointClusters, Frame]:
-    """Ten ellipsoidal objects of 30 to 100 px before a slanted wall, masks bleeding 8 px, depth noise of a Kinect."""
+    """Return ten ellipsoids of 30 to 100 px in front of a slanted wall; masks bleed by 8 px, depth has Kinect noise."""
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:480, :640]
     depth = 2.5 + 0.001 * u
@@ -55,7 +55,7 @@ def ten_masks() -> tuple[PointClusters, Frame]:
 
 
 def default_chain() -> Chain:
-    """The links of conf/refiner/chain.yaml, which are to take at most 10 ms together on 2 cores."""
+    """Return the links of conf/refiner/chain.yaml, whose budget is 10 ms in total on 2 cores."""
     return Chain({"plane_removal": PlaneRemoval(), "gmm_em": GmmEm(), "connected": Connected()})
 
 
@@ -76,7 +76,7 @@ def default_chain() -> Chain:
     ],
     ids=lambda r: type(r).__name__,
 )
-def test_refine_ten_masks(benchmark, refiner: ClusterRefiner):
+def test_refine_ten_masks_speed(benchmark, refiner: ClusterRefiner):
     clusters, frame = ten_masks()
     refiner.refine(clusters, frame)
     refined = benchmark(refiner.refine, clusters, frame)
@@ -87,12 +87,12 @@ def test_refine_ten_masks(benchmark, refiner: ClusterRefiner):
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_em_agrees_with_scikit_learn_and_is_faster(benchmark):
-    """The same points, start and number of iterations: log-likelihoods agree, times are compared."""
+def test_gmm_em_agrees_with_scikit_learn_and_is_faster(benchmark):
+    """With the same points, start and iterations, the log-likelihoods agree; times are compared."""
     iterations, components = 8, 8
     clusters, frame = ten_masks()
     sample = surroundings(clusters, frame, Ring()).sampled(1000)
-    # a start without empty groups, which scikit-learn could not take
+    # a start without empty groups, which scikit-learn rejects
     labels = (np.arange(len(sample.points_camera)) * 7 // 3 % components).astype(np.int32)
 
     def ours() -> Mixtures:
@@ -132,8 +132,8 @@ def test_em_agrees_with_scikit_learn_and_is_faster(benchmark):
 
 
 @pytest.mark.parametrize(("levels", "components"), [(2, 64), (3, 512)])
-def test_tree_fit_is_faster_than_flat_mixture(benchmark, levels: int, components: int):
-    """As many Gaussians, the same kind of start, iterations and points, of ten masks at once: who is faster."""
+def test_gmm_tree_fit_is_faster_than_flat_mixture(benchmark, levels: int, components: int):
+    """Both use the same number of Gaussians, start, iterations and points of ten masks."""
     clusters, frame = ten_masks()
     sample = surroundings(clusters, frame, Ring()).sampled(10_000)
     points, starts = sample.points_camera, sample.starts

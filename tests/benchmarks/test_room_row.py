@@ -1,4 +1,4 @@
-"""The walk that the long benchmark takes: if its rooms were not alike, the comparison would mean nothing."""
+"""Tests of the walk of the long benchmark, whose rooms must be identical."""
 
 import numpy as np
 
@@ -6,21 +6,21 @@ from framework.geometry import back_project, inverse, project, transform
 from tests.benchmarks.room_row import CAMERA, FRAMES_A_ROOM, LENGTH, OBJECTS, RoomRow, pose_at
 
 
-def test_frames_repeat_after_one_room() -> None:
+def test_room_row_frames_repeat_after_one_room() -> None:
     walk = RoomRow(FRAMES_A_ROOM + 100)
     now, later = walk[80], walk[80 + FRAMES_A_ROOM]
     np.testing.assert_allclose(now.depth, later.depth, atol=1e-4)
     assert (now.color != later.color).mean() < 0.001
     seen, seen_later = (set(np.unique(f.truth.instance_ids).tolist()) - {0} for f in (now, later))
     assert len(seen) >= 3
-    assert {i + len(OBJECTS) for i in seen} == seen_later, "the same objects, and others"
+    assert {i + len(OBJECTS) for i in seen} == seen_later, "the same objects and additional ones"
     assert all(walk.class_names[i] == walk.class_names[i + len(OBJECTS)] for i in seen)
     step = pose_at(80 + FRAMES_A_ROOM)[:3, 3] - pose_at(80)[:3, 3]
     np.testing.assert_allclose(step, (LENGTH, 0, 0), atol=1e-9)
 
 
-def test_nearby_frames_show_same_surface() -> None:
-    """What one frame measures lies where the next one sees it, but for what is hidden."""
+def test_room_row_nearby_frames_show_same_surface() -> None:
+    """Points measured in one frame lie on the surface of the next one, except hidden points."""
     walk = RoomRow(100)
     one, other = walk[60], walk[64]
     v, u = (x.ravel() for x in np.mgrid[: CAMERA.height, : CAMERA.width])

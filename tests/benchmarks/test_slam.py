@@ -1,7 +1,7 @@
-"""Tracking and mapping beside Open3D's, on the same frames, a few frames each in turns, in one process.
+"""Tracking and mapping compared with Open3D, alternating every few frames in one process.
 
-`python -m pytest tests/benchmarks -k slam` prints the tables when all is measured; `--benchmark-json` keeps the
-numbers. Nothing here asserts a time: a number of a busy machine is no fault of the code. Ratios are of medians.
+`python -m pytest tests/benchmarks -k slam` prints the tables at the end; `--benchmark-json` stores the numbers. No time
+is asserted, because the load of the machine is unknown. Ratios are of medians.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
 
 VOXEL_SIZES = (0.01, 0.02)  # m
 TURN = 10  # frames
-FIRST, LAST = 20, 80  # frames in [FIRST, LAST) count: at first the map is small, and pages and caches are cold
+FIRST, LAST = 20, 80  # frames in [FIRST, LAST) count: before, the map is small and caches are cold
 TARGETS = {  # times as fast as Open3D ...
     "redkitchen": {"whole loop": ">= 6", "integrate": ">= 3.5", "render full image": ">= 3"},
     "synthetic room": {"whole loop": ">= 5", "integrate": ">= 4", "render full image": ">= 3"},
 }
 TARGETS_AT = 0.01  # m, ... at this voxel size
 WALK = 2000  # frames
-WARM = 10  # frames, after which none may be late
-EARLY, LATE = (WARM, 700), (WARM + 1300, WALK)  # frames whose cost is compared: a third each, whole rooms apart
+WARM = 10  # number of frames after which none may be late
+EARLY, LATE = (WARM, 700), (WARM + 1300, WALK)  # compared frames: a third each, whole rooms apart
 SECOND_START = LATE[0] - EARLY[0]
-assert SECOND_START % FRAMES_A_ROOM == 0, "both see the same pictures"
+assert SECOND_START % FRAMES_A_ROOM == 0, "both views show the same images"
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def recordings(shared: Path) -> dict[str, Recording]:
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled() -> None:
-    """Every kernel compiled, or loaded from numba's cache, before anything is timed."""
+    """Compile every kernel, or load it from numba's cache, before the measurement."""
     room = furnished_room(3)
     loop = SlamLoop(VoxelHashingIcp(), assemble(BayesianTsdf, voxel_size=0.02))
     for frame, detections in zip(room.frames, room.detections, strict=True):
@@ -61,8 +61,8 @@ def compiled() -> None:
 
 @pytest.mark.parametrize("voxel_size", VOXEL_SIZES, ids=lambda size: f"{100 * size:.0f}cm")
 @pytest.mark.parametrize("name", ["redkitchen", "synthetic room"], ids=lambda name: name.replace(" ", "_"))
-def test_slam_compared_with_open3d(benchmark, recordings, tables, name: str, voxel_size: float) -> None:
-    """pytest-benchmark's own figures are of our loop with lifting; the setup of a round gives the frame to Open3D."""
+def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: str, voxel_size: float) -> None:
+    """pytest-benchmark times our loop with lifting; the setup of each round passes the frame to Open3D."""
     recording = recordings[name]
     duel = Duel(
         recording,
@@ -120,11 +120,11 @@ def test_slam_compared_with_open3d(benchmark, recordings, tables, name: str, vox
     )
 
 
-def test_slam_long_walk(benchmark, tables) -> None:
-    """2,000 frames through eight rooms that are all alike: the last third costs what the first did, none is late.
+def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
+    """Map 2,000 frames in eight identical rooms: the last third takes as long as the first; no frame is late.
 
-    From frame 1300 on, five whole rooms from the start, a second loop begins the walk in turns with the first: it sees
-    the same pictures at the same time, on a map that is still small. pytest-benchmark's figures are of the first loop.
+    From frame 1300 on, five rooms from the start, a second loop begins the walk in alternation with the first one. It
+    sees the same images at the same time with a small map. pytest-benchmark times the first loop.
     """
     walk, detector = RoomRow(WALK), GroundTruthDetector()
     long, short = (SlamLoop(VoxelHashingIcp(), BayesianTsdf()) for _ in range(2))
@@ -153,10 +153,10 @@ def test_slam_long_walk(benchmark, tables) -> None:
     keep_books()
     drift = np.linalg.norm((inverse(walk[WALK - 1].T_world_camera) @ long.poses[-1].T_world_camera)[:3, 3])
     lost = long.lost
-    for k in range(WALK - 2, WALK - FRAMES_A_ROOM, -1):  # back through the last room, where nothing is new
+    for k in range(WALK - 2, WALK - FRAMES_A_ROOM, -1):  # back through the last room, which is already mapped
         long(walk[k], detector.detect(walk[k]))
 
-    early, late, beside = (
+    early, late, small_map = (
         float(np.median(spent[who][slice(*window)]))
         for who, window in (("long", EARLY), ("long", LATE), ("short", EARLY))
     )
@@ -169,7 +169,7 @@ def test_slam_long_walk(benchmark, tables) -> None:
         f"Long walk: {WALK} frames, {WALK / FRAMES_A_ROOM:.1f} rooms, 640x480, 1 cm voxels",
         ["", *(f"frames {begin} to {end}" for begin, end in (EARLY, LATE)), "ratio", "target"],
         [
-            ["track + fuse, ms, median; in turns", ms(beside), ms(late), f"{late / beside:.2f}", "<= 1.05"],
+            ["track + fuse, ms, median; in turns", ms(small_map), ms(late), f"{late / small_map:.2f}", "<= 1.05"],
             ["track + fuse, ms, median; one after the other", ms(early), ms(late), f"{late / early:.2f}", "<= 1.05"],
             ["worst frame, ms; of all, over the median", ms(worst[0]), ms(worst[1]), f"{worst[2] / usual:.2f}",
              "<= 2.5"],
@@ -191,7 +191,8 @@ def test_slam_long_walk(benchmark, tables) -> None:
     )  # fmt: skip
     tables.append(table)
     benchmark.extra_info.update(
-        early_ms=1e3 * early, late_ms=1e3 * late, small_map_ms=1e3 * beside, bytes_700=at_700[0], bytes_2000=at_2000[0],
+        early_ms=1e3 * early, late_ms=1e3 * late, small_map_ms=1e3 * small_map,
+        bytes_700=at_700[0], bytes_2000=at_2000[0],
         median_ms=1e3 * usual, worst_ms=1e3 * worst[2], one_in_a_thousand_ms=1e3 * percentile,
         voxels_700=at_700[1], voxels_2000=at_2000[1], voxels_after_return=after[1], drift_m=float(drift), lost=lost,
     )  # fmt: skip
@@ -199,7 +200,7 @@ def test_slam_long_walk(benchmark, tables) -> None:
 
 @pytest.fixture(scope="module")
 def walks(shared: Path) -> dict[str, list[Frame]]:
-    """Two videos for accuracy: 300 real frames, and 200 without any noise."""
+    """Return two videos for accuracy: 300 real frames, and 200 frames without noise."""
     return {
         "redkitchen": list(RgbdFolder(shared / "data" / "redkitchen", stop=300)),
         "room without noise": list(Synthetic(frames=240, stop=200, noise=0.0)),
@@ -231,8 +232,8 @@ ACCURACY = {("redkitchen", "voxel_hashing_icp"): "ATE <= 25", ("room without noi
 
 @pytest.mark.parametrize("tracker", TRACKERS)
 @pytest.mark.parametrize("video", ["redkitchen", "room without noise"])
-def test_slam_trajectory(benchmark, walks, trajectories, video: str, tracker: str) -> None:
-    """Tracking and mapping, without labels."""
+def test_slam_trajectory_error(benchmark, walks, trajectories, video: str, tracker: str) -> None:
+    """Measure tracking and mapping without labels."""
     frames = walks[video]
     slam = TRACKERS[tracker](frames[0])
     nothing = Detections.none(frames[0].camera.shape, ("thing",))
@@ -254,7 +255,7 @@ def test_slam_trajectory(benchmark, walks, trajectories, video: str, tracker: st
 class Duel:
     """Run both systems on the same frames, alternating every TURN frames.
 
-    Other load on the machine affects both equally, and each mostly finds its caches as when it runs alone.
+    Other load on the machine affects both equally, and each system mostly finds warm caches.
     """
 
     def __init__(self, recording: Recording, ours: SlamLoop, theirs: Open3DSlam) -> None:
@@ -267,7 +268,7 @@ class Duel:
         self._frame = -1
 
     def begin_frame(self) -> tuple[tuple[Frame, Detections], dict[str, Any]]:
-        """Hands the next frame over for ours, at the beginning of a turn after Open3D's turn."""
+        """Load the next frame for our loop at the beginning of its turn."""
         if self._frame >= 0:
             self.finish_frame()
         self._frame += 1
@@ -282,7 +283,7 @@ class Duel:
         self._their_seconds.append({step.__name__: seconds(step)[0] for step in steps})
 
     def finish_frame(self) -> None:
-        """After our loop: the picture that nobody needs but viewers, and the books."""
+        """After our loop, render the view for viewers and record the times."""
         full, _ = seconds(self.ours.render_all, self.recording.frames[self._frame])
         o, t = self.ours.seconds, self._their_seconds[self._frame]
         for row, pair in {
@@ -296,7 +297,7 @@ class Duel:
         self._lifting.append(o["lift"])
 
     def quantiles(self, q: float) -> dict[str, Float64]:
-        """(2,) seconds of ours and of Open3D's, by row."""
+        """Return quantiles (2,) in seconds of ours and of Open3D, by row."""
         return {row: np.quantile(pairs[FIRST:], q, axis=0) for row, pairs in self._measured.items()}
 
     def lifting(self) -> float:

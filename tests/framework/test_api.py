@@ -1,4 +1,4 @@
-"""Mapping from Python is what the command does, frame by frame."""
+"""Tests of the Python API, which maps frame by frame like the command."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_mapper_add_unusable_frame_keeps_map_unchanged(room: CornerRoom) -> None
 
 @pytest.mark.parametrize("fuser", ["bayesian_tsdf", "open3d_vbg", "object_volumes", "class_only_fusion"])
 def test_mapper_sensor_up_direction_is_saved_in_map(fuser: str, tmp_path: Path) -> None:
-    """A camera over a slanted table alone, which surfaces take for level; the tracker's world is the first frame."""
+    """Only a slanted table is visible, so that surfaces give a wrong up direction; the world is the first frame."""
     tilt = np.radians(20)
     up = np.array([np.sin(tilt), -np.cos(tilt) * np.sin(1.0), -np.cos(tilt) * np.cos(1.0)])  # in the first camera
     table = Scene(planes=[(np.array([0.0, -np.sin(1.0), -np.cos(1.0)]), -0.8)])
@@ -97,7 +97,7 @@ def test_mapper_sensor_up_direction_is_saved_in_map(fuser: str, tmp_path: Path) 
 
 
 def test_mapper_is_thread_safe(room: CornerRoom) -> None:
-    """Without the lock the kernels write over each other's buffers, and the process dies."""
+    """Without the lock, the kernels would overwrite each other's buffers and crash the process."""
     mapper, alone, faults = Mapper(*STAGES), Mapper(*STAGES), []
 
     def work(one: Callable[[], object]) -> None:
@@ -129,7 +129,7 @@ def test_mapper_pickle_round_trip_continues_mapping(room: CornerRoom, fuser: str
     mapper = Mapper(*STAGES, f"fuser={fuser}")
     mapper.add(room[0])
     pickled = pickle.dumps(mapper)
-    assert len(pickled) < 20e6, "without what is only reserved: gigabytes"
+    assert len(pickled) < 20e6, "without reserved memory, which is gigabytes"
     copied = pickle.loads(pickled)
     for one in (mapper, copied):
         one.add(room[1])
@@ -209,7 +209,7 @@ def test_load_map_damaged_file_raises_data_error(room: CornerRoom, tmp_path: Pat
         damaged[position] ^= 0xFF
         (tmp_path / "map.npz").write_bytes(damaged)
         try:
-            load_map(tmp_path / "map.npz")  # not every byte means something
+            load_map(tmp_path / "map.npz")  # not every byte is significant
         except DataError as error:
             assert "map.npz" in str(error)
 

@@ -1,4 +1,4 @@
-"""Data check themselves where they are made."""
+"""Tests of the data objects, which validate themselves."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def with_nan(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
     return array
 
 
-def test_valid_data_objects_are_accepted() -> None:
+def test_data_objects_accept_valid_values() -> None:
     assert len(detections()) == len(clusters()) == 2
     assert len(Detections.none((3, 4), ("chair",))) == 0
     frame()
@@ -189,7 +189,7 @@ def test_valid_data_objects_are_accepted() -> None:
         (mesh, {"triangles": [[0, 1, 2]]}, "triangles: expected an array of int32, got list"),
     ],
 )
-def test_invalid_data_objects_raise_one_line_error(
+def test_data_objects_invalid_values_raise_one_line_error(
     make: Callable[..., object], changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(DataError, match=message) as caught:
@@ -198,7 +198,7 @@ def test_invalid_data_objects_raise_one_line_error(
 
 
 def test_instance_mesh_of_instance_has_only_its_vertices() -> None:
-    """The quad 0 1 2 3, of which the instance has all but vertex 1."""
+    """The instance has the quad 0 1 2 3 without vertex 1."""
     whole = mesh(
         vertices=np.arange(12, dtype=np.float32).reshape(4, 3),
         triangles=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
@@ -282,7 +282,7 @@ def test_pose_rigidity_check_tolerates_rounding() -> None:
         Pose(sheared)
 
 
-# Truth that is rendered when it is asked for
+# Ground truth that is rendered on access
 
 
 def deferred(render: Callable[[], np.ndarray], shape: tuple[int, int] = (3, 4)) -> DeferredTruth:

@@ -1,4 +1,4 @@
-"""Messages are one line that a person reads, whatever a file or a name was made of."""
+"""Tests of error messages, which are one printable line for any file content or name."""
 
 from __future__ import annotations
 

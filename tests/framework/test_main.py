@@ -1,4 +1,4 @@
-"""`python -m framework` as a user meets it: a process, its streams and its exit status."""
+"""Tests of `python -m framework` as a process: its streams and its exit status."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_run_escapes_invalid_unicode_file_names(tmp_path: Path) -> None:
         assert f"frame skipped: {tmp_path}/color/\\udcff_0.png: expected a JPEG or PNG file" in message
 
 
-def test_removed_working_folder_exits_with_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_leave_working_folder_of_removed_folder_exits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
@@ -114,10 +114,10 @@ def test_removed_working_folder_exits_with_one_line(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize(("options", "at"), [([], None), (["--config-dir", "conf"], -1), (["-cd=conf"], -1)])
-def test_working_folder_is_not_in_module_search_path(
+def test_module_search_path_excludes_working_folder(
     options: list[str], at: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With --config-dir, of `python -m framework` and of the console script, they are, but last."""
+    """With --config-dir, `python -m framework` and the console script append these folders at the end."""
     monkeypatch.chdir(tmp_path)
     for first in ("", str(tmp_path)):
         monkeypatch.setattr(sys, "path", [first, "/elsewhere"])
@@ -129,7 +129,7 @@ def test_working_folder_is_not_in_module_search_path(
     monkeypatch.chdir(CHECKOUT)
     monkeypatch.setattr(sys, "path", [str(CHECKOUT)])
     leave_working_folder([])
-    assert sys.path == [str(CHECKOUT)], "where the project itself is"
+    assert sys.path == [str(CHECKOUT)], "the folder of the project"
 
 
 def test_run_directory_creation_error_is_one_line(tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_help_lists_all_commands(tmp_path: Path) -> None:
         assert find_spec(module_of(name))
 
 
-def test_misspelled_command_suggests_nearest_name(tmp_path: Path) -> None:
+def test_command_misspelled_name_suggests_nearest_name(tmp_path: Path) -> None:
     done = words("tabels", "outputs", directory=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "error: 'tabels': unknown command; did you mean tables?\n"
@@ -197,14 +197,16 @@ FAULTY = {
 }
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"doctor"}))  # whose findings are no faults of its own
-def test_debug_shows_traceback_of_any_command(
+@pytest.mark.parametrize(
+    "command", sorted(COMMANDS.keys() - {"doctor"})
+)  # whose findings are not errors of the command
+def test_command_debug_shows_traceback(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "metrics.json").write_text(json.dumps({"config_hash": config_hash({})}))
     (tmp_path / "old" / "config.yaml").write_text("{}")
-    if (CONF / f"{command.replace('-', '_')}.yaml").exists():  # what Hydra changes for its process stays there
+    if (CONF / f"{command.replace('-', '_')}.yaml").exists():  # Hydra's changes of its process stay there
         stderr = words(command, *FAULTY[command], "debug=true", directory=tmp_path).stderr
     else:
         monkeypatch.chdir(tmp_path)
@@ -273,8 +275,8 @@ def test_sweep_rejects_misspelled_name_before_first_job(tmp_path: Path) -> None:
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
-def test_ctrl_c_writes_partial_record(tmp_path: Path) -> None:
-    (tmp_path / "metrics.json").write_text("{}")  # of an earlier run into the same directory
+def test_run_ctrl_c_writes_partial_record(tmp_path: Path) -> None:
+    (tmp_path / "metrics.json").write_text("{}")  # of an earlier run in the same directory
     line = command(f"hydra.run.dir={tmp_path}", "dataset.frames=100000", "dataset.slow_s=0.02")
     with subprocess.Popen(line, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 60
@@ -294,7 +296,7 @@ def test_ctrl_c_writes_partial_record(tmp_path: Path) -> None:
     assert 0 < metrics["frames"] < 100000
 
 
-def test_full_map_writes_partial_record_and_exits_with_error(tmp_path: Path) -> None:
+def test_run_full_map_writes_partial_record_and_fails(tmp_path: Path) -> None:
     done = start(tmp_path, "fuser.capacity=2")
     assert done.returncode == 3
     assert "raise fuser.capacity" in done.stderr.splitlines()[-1]

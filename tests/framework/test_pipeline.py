@@ -1,4 +1,4 @@
-"""The loop: order, faults, early ends, and the worker threads that change nothing."""
+"""Tests of the main loop: order, errors, early ends, and worker threads that change no result."""
 
 from __future__ import annotations
 
@@ -142,15 +142,15 @@ def test_pipeline_refines_only_inexact_masks_and_checks_pixels(room: CornerRoom)
             return replace(super().detect(frame), exact=True)
 
     @dataclass
-    class MadeUp(KeepAll):
+    class InvalidPixels(KeepAll):
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
             return replace(clusters, pixels=clusters.pixels - 99)
 
     with pytest.raises(
         DataError, match=r"clusters: expected pixels in the image of .*x.*, got u in \[.*, .*\], v in \[.*, .*\]"
     ):
-        pipeline(refiner=MadeUp()).run(room)
-    assert pipeline(detector=Exact(), refiner=MadeUp()).run(room).frames_skipped == 0
+        pipeline(refiner=InvalidPixels()).run(room)
+    assert pipeline(detector=Exact(), refiner=InvalidPixels()).run(room).frames_skipped == 0
 
 
 @pytest.mark.parametrize(
@@ -265,8 +265,8 @@ def test_run_to_any_end_returns_partial_result_after_error(room: CornerRoom) -> 
 
 
 @dataclass
-class ForgetsOnce(GivenPose):
-    """What it has begun to remember fails when somebody first asks, after the last frame."""
+class FailsOnceOnKeyframes(GivenPose):
+    """Its keyframes raise an error on first access, after the last frame."""
 
     asked: int = 0
 
@@ -278,11 +278,11 @@ class ForgetsOnce(GivenPose):
 
 
 def test_run_to_any_end_keeps_map_after_keyframes_error(room: CornerRoom) -> None:
-    result = pipeline(tracker=ForgetsOnce()).run_to_any_end(room)
+    result = pipeline(tracker=FailsOnceOnKeyframes()).run_to_any_end(room)
     assert isinstance(result.stopped_by, MemoryError)
     assert (result.frames, len(result.tracked)) == (6, 6)
     assert len(mapped(result).vertices) > 0
-    result = pipeline(tracker=ForgetsOnce(), fuser=_Fails()).run_to_any_end(room)
+    result = pipeline(tracker=FailsOnceOnKeyframes(), fuser=_Fails()).run_to_any_end(room)
     assert "40 GiB" in str(result.stopped_by), "what came first"
 
 
@@ -311,12 +311,12 @@ class PressesCtrlC(GivenPose):
 
 
 def working_threads() -> int:
-    """All but tqdm's, which the first progress bar of a process starts for good."""
+    """Return all threads except tqdm's monitor, which the first progress bar of a process starts."""
     return sum(not isinstance(thread, TMonitor) for thread in threading.enumerate())
 
 
 @PREFETCH
-def test_ctrl_c_ends_pipeline_after_current_frame(room: CornerRoom, prefetch: int) -> None:
+def test_pipeline_ctrl_c_ends_after_current_frame(room: CornerRoom, prefetch: int) -> None:
     handler, threads = signal.getsignal(signal.SIGINT), working_threads()
     result = pipeline(prefetch, tracker=PressesCtrlC()).run(room)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
@@ -325,7 +325,7 @@ def test_ctrl_c_ends_pipeline_after_current_frame(room: CornerRoom, prefetch: in
     assert working_threads() == threads
 
 
-def test_second_ctrl_c_ends_pipeline_immediately(room: CornerRoom) -> None:
+def test_pipeline_second_ctrl_c_ends_immediately(room: CornerRoom) -> None:
     result = pipeline(tracker=PressesCtrlC(times=2)).run(room)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
     assert len(mapped(result).vertices) == 3
@@ -341,7 +341,7 @@ def test_pipeline_runs_outside_main_thread(room: CornerRoom) -> None:
 
 @dataclass
 class _InPairs(SphereDetector):
-    """Each detection waits until another one is in work: there must be an even number of them."""
+    """Each detection waits for a second one: their number must be even."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -354,7 +354,7 @@ class _InPairs(SphereDetector):
 
 @dataclass
 class _OneReader(CornerRoom):
-    """Can only be read in order, one frame after the other, as a film can."""
+    """Can only be read in order, frame by frame."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -371,7 +371,7 @@ class _OneReader(CornerRoom):
 
 
 def pretend_cores(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For who asks numba, which itself goes on as it can."""
+    """Set the core count for callers of numba; numba itself is unchanged."""
     monkeypatch.setattr(numba, "get_num_threads", lambda: count)
     monkeypatch.setattr(numba, "set_num_threads", lambda number: None)
 
@@ -425,23 +425,23 @@ def test_pipeline_runs_without_stderr(room: CornerRoom, monkeypatch: pytest.Monk
 
 @dataclass
 class Listener(Viewer):
-    """Notes what it hears."""
+    """Records its calls."""
 
-    heard: list[str] = field(default_factory=list)
+    calls: list[str] = field(default_factory=list)
     stages: list[set[str]] = field(default_factory=list)
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
-        self.heard.append(f"begin {video} in {directory.name}")
+        self.calls.append(f"begin {video} in {directory.name}")
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
-        self.heard.append(f"{'lost' if pose.lost else 'mapped'} {frame.index} with {len(detections)}")
+        self.calls.append(f"{'lost' if pose.lost else 'mapped'} {frame.index} with {len(detections)}")
         self.stages.append(set(stage_ms))
 
     def skip(self, reason: str) -> None:
-        self.heard.append(f"skipped {reason}")
+        self.calls.append(f"skipped {reason}")
 
     def end(self) -> None:
-        self.heard.append("end")
+        self.calls.append("end")
 
 
 @PREFETCH
@@ -454,7 +454,7 @@ def test_viewer_receives_all_frames_in_order(prefetch: int, tmp_path: Path) -> N
     listener = Listener()
     pipeline(prefetch, tracker=GetsLost(), viewer=listener).run_to_any_end(CornerRoom(unreadable=1), tmp_path)
     skipped = "skipped frame 1: depth/000001.png is truncated"
-    assert listener.heard == [
+    assert listener.calls == [
         f"begin corner_room in {tmp_path.name}",
         *("mapped 0 with 2", skipped, "mapped 2 with 2", "lost 3 with 2", "mapped 4 with 2", "mapped 5 with 2"),
         "end",
@@ -467,13 +467,13 @@ def test_viewer_receives_all_frames_in_order(prefetch: int, tmp_path: Path) -> N
 def test_viewer_end_is_called_once_for_any_end(room: CornerRoom, stages: dict[str, object]) -> None:
     listener = Listener()
     pipeline(viewer=listener, **stages).run_to_any_end(room)
-    assert listener.heard[-1] == "end"
-    assert listener.heard.count("end") == 1
+    assert listener.calls[-1] == "end"
+    assert listener.calls.count("end") == 1
 
 
 @PREFETCH
 @pytest.mark.parametrize("verb", ["show", "skip", "end"])
-def test_failing_viewer_does_not_affect_run(
+def test_viewer_failure_does_not_affect_run(
     verb: str, prefetch: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> None:
@@ -487,12 +487,12 @@ def test_failing_viewer_does_not_affect_run(
     assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
     expected = [record.message for record in caplog.records if "viewer" in record.message]
     assert expected == ["viewer: disabled after an error; the run continues: no screen any more"]
-    assert calls == [verb], "it is left alone"
-    assert verb == "end" or listener.heard[-1] == "end"
+    assert calls == [verb], "it is not called again"
+    assert verb == "end" or listener.calls[-1] == "end"
 
 
 def test_viewer_end_is_called_after_unusable_sequence() -> None:
     listener = Listener()
     with pytest.raises(DataError):
         pipeline(viewer=listener).run(CornerRoom(frames=1, unreadable=0))
-    assert listener.heard[-1] == "end"
+    assert listener.calls[-1] == "end"

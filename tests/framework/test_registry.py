@@ -1,4 +1,4 @@
-"""A config node becomes a checked plugin, or one line that says what is wrong."""
+"""Tests of the registry, which builds a plugin from a config node or raises a one-line error."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Abstract(Detector):
 
 @dataclass
 class Suppression:
-    """A part: parameters that several plugins have."""
+    """A part: parameters that several plugins share."""
 
     nms: float = 0.5
     agnostic: bool = False
@@ -101,7 +101,7 @@ REGISTERED = ("Probe", "Undecorated", "Abstract", "Assembled", "Ambiguous", "Odd
 
 
 def register(monkeypatch: pytest.MonkeyPatch, folder: Path, stage: str, *targets: str) -> None:
-    """As --config-dir does."""
+    """Register the options like --config-dir."""
     (folder / stage).mkdir(exist_ok=True)
     for target in targets:
         (folder / stage / f"{target.replace('.', '_').lower()}.yaml").write_text(f"_target_: {target}\n")
@@ -111,7 +111,7 @@ def register(monkeypatch: pytest.MonkeyPatch, folder: Path, stage: str, *targets
 
 @pytest.fixture(autouse=True)
 def importable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """This module under a fixed name, whatever pytest calls it, and its classes registered, whatever they are."""
+    """Import this module under a fixed name and register its classes."""
     monkeypatch.setitem(sys.modules, HERE, sys.modules[__name__])
     others = ("framework.interfaces.Detector", "framework.interface.Detector", "os.system", "nowhere.at.All", "Probe")
     register(monkeypatch, tmp_path, "detector", *(f"{HERE}.{name}" for name in REGISTERED), *others)
@@ -219,12 +219,12 @@ def test_find_class_import_failure_raises_one_line_error(tmp_path: Path, monkeyp
 
 
 @pytest.fixture
-def talkative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package, and a module with a class Named in it, that print when they are imported."""
+def printing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write a package, and a module with a class Named, which print when they are imported."""
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "talkative").mkdir()
-    (tmp_path / "talkative" / "__init__.py").write_text("print('imported')\n")
-    (tmp_path / "talkative" / "one.py").write_text("print('imported')\nclass Named: pass\n")
+    (tmp_path / "printing").mkdir()
+    (tmp_path / "printing" / "__init__.py").write_text("print('imported')\n")
+    (tmp_path / "printing" / "one.py").write_text("print('imported')\nclass Named: pass\n")
 
 
 @pytest.mark.parametrize("hydra_runs", [True, False])
@@ -236,21 +236,21 @@ def talkative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             "plugins.trackers.ground_truth.GroundTruth",
             "expected the _target_ of a registered option of",
         ),  # of another stage
-        ("talkative.one.Named", "expected the _target_ of a registered option of"),
+        ("printing.one.Named", "expected the _target_ of a registered option of"),
         ("os.system", "expected the _target_ of a registered option of"),
         ("this.X", "expected the _target_ of a registered option of"),
     ],
 )
-@pytest.mark.usefixtures("talkative")
+@pytest.mark.usefixtures("printing")
 def test_build_does_not_import_unregistered_target(
     target: str, output: str, hydra_runs: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The options are those of Hydra's search path, also where a stored config is read and no Hydra runs."""
+    """Options come from Hydra's search path, also for a stored config without Hydra."""
     monkeypatch.setattr(composition, "_added", [])
     with initialize_config_dir(str(CONF), version_base="1.3") if hydra_runs else nullcontext():
         assert output in fault(_target_=target)
         assert build(Detector, OmegaConf.create({"_target_": "plugins.detectors.none.NoDetections"})).classes
-    assert not {"this", "talkative", "talkative.one"} & set(sys.modules)
+    assert not {"this", "printing", "printing.one"} & set(sys.modules)
     assert capfd.readouterr() == ("", "")
 
 
@@ -259,7 +259,7 @@ def test_build_inside_hydra_application_ignores_its_options(tmp_path: Path) -> N
         assert detector() == Probe(Path("w.bin"))
 
 
-def test_conflicting_plugins_package_is_reported(tmp_path: Path) -> None:
+def test_registry_reports_conflicting_plugins_package(tmp_path: Path) -> None:
     (tmp_path / "plugins").mkdir()
     (tmp_path / "plugins" / "__init__.py").write_text("print('imported')\n")
     line = [sys.executable, "-m", "framework", "plugins"]
@@ -278,7 +278,7 @@ def test_registry_has_interface_for_each_stage() -> None:
 
 
 def test_find_class_wrong_video_kind_raises() -> None:
-    """`check` and `detect` want frames in any order; a run takes a live video as well."""
+    """`check` and `detect` need random access to frames; a run also accepts live video."""
     live = "tests.support.scenes.corner_room.LiveRoom"
     assert find_class(RGBDVideo, live).__name__ == "LiveRoom"
     with pytest.raises(ConfigError, match=r"LiveRoom: expected a subclass of RGBDSequence "):

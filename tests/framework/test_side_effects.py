@@ -1,4 +1,4 @@
-"""A library leaves its host process as it was."""
+"""Tests that the library does not change its host process."""
 
 from __future__ import annotations
 
@@ -212,7 +212,7 @@ print(numba.threading_layer(), stages.fuser.scene.statistics.voxels)
 """
 
 
-def test_detection_without_thread_safe_layer_is_single_threaded() -> None:
+def test_pipeline_without_thread_safe_layer_gives_same_map() -> None:
     found = {}
     for layer in ("omp", "workqueue"):
         done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Every option of every config group composes and builds."""
+"""Tests that every option of every config group composes and builds."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_option_composes_and_builds(stage: str, name: str, ready: Callable[..., 
     assert isinstance(ready(stage, name), GROUPS[stage])
 
 
-NEEDY = {  # by option: the first parameter that only the user knows
+NEEDY = {  # by option: the first parameter that the user must set
     key: asked[0]
     for key, option in registered.OPTION.items()
     if (asked := [parameter.name for parameter in option.parameters if parameter.default == "???"])
@@ -44,7 +44,7 @@ NEEDY = {  # by option: the first parameter that only the user knows
 
 
 @pytest.mark.parametrize(("stage", "name"), NEEDY)
-def test_missing_required_parameter_or_file_raises(stage: str, name: str) -> None:
+def test_option_missing_required_parameter_or_file_raises(stage: str, name: str) -> None:
     key = f"{stage}.{NEEDY[stage, name]}"
     with pytest.raises(ConfigError, match=rf"expected a value for .*, got none; set .*{key}"):
         registered.built(stage, name)
@@ -63,7 +63,7 @@ def test_option_yaml_lists_all_parameters_with_comments(stage: str, name: str) -
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
-    """What OmegaConf calls "???" where there is none."""
+    """Return the default value, which OmegaConf calls "???" if there is none."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return "???" if field.default is dataclasses.MISSING else field.default
@@ -71,7 +71,7 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
 def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
-    """But for what a variant changes. What only the user knows has no default, in either."""
+    """Variants may differ. Values that the user must set have no default in either."""
     path = CONF / stage / f"{name}.yaml"
     own = OmegaConf.load(path)
     is_variant = "_target_" not in own  # of the option that it inherits
@@ -89,7 +89,7 @@ def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
             assert found == registered.composed(stage, link)[stage], "a link is the option of its name"
     fields = [field for name, (field, _) in parameter_fields(plugin_class).items() if name not in links]
     asked = [field.name for field in fields if OmegaConf.is_missing(node, field.name)]
-    answered = set(own) if is_variant else set()  # desk says where its frames are
+    answered = set(own) if is_variant else set()  # desk sets the path of its frames
     assert asked == [field.name for field in fields if default_of(field) == "???" and field.name not in answered]
     typed = parameters(stage, plugin_class, OmegaConf.merge(node, dict.fromkeys(asked, "given by the user")))
     differing = {
@@ -121,14 +121,14 @@ def test_main_config_lists_experiment_last_in_defaults() -> None:
     defaults = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults)
     assert isinstance(defaults, list)
     assert defaults[0] == "_self_"
-    after_the_stages = ["dataset", "viewer", "launcher", "preset", "experiment"]  # which may override what stages are
+    after_the_stages = ["dataset", "viewer", "launcher", "preset", "experiment"]  # which may override the stages
     stages = [stage for stage in STAGES if stage not in after_the_stages]
     assert [next(iter(entry)) for entry in defaults[1:]] == stages + after_the_stages
     assert defaults[-1] == {"experiment": None}
 
 
 def test_sweep_run_names_exclude_keys_without_effect() -> None:
-    """Else a run that was watched, or asked for with skip_completed=true, would not be found again."""
+    """Otherwise skip_completed=true would not find a run with other settings of these keys."""
     main = OmegaConf.load(CONF / "config.yaml")
     left_out = set(OmegaConf.select(main, "hydra.job.config.override_dirname.exclude_keys"))
     shown = {

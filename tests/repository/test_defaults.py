@@ -1,4 +1,4 @@
-"""Which detector a run takes where nobody chooses one, and that all defaults are at hand wherever the project is."""
+"""Tests of the default detector of each dataset, and that all defaults are part of the project."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TIMED = {"table1_runtime", "figure3_stage_times", "ablation_detection_interval"}
 
 
 def chosen(*overrides: str, main: str = "config") -> dict[str, str]:
-    """The choices that Hydra makes by these overrides, by group; those of the composed config must agree."""
+    """Return Hydra's choices for these overrides by group; those of the composed config must agree."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config: DictConfig = compose(main, [*overrides], return_hydra_config=True)
     choices = {stage: str(config.hydra.runtime.choices[stage]) for stage in ("dataset", "detector")}
@@ -48,7 +48,7 @@ def test_default_detector_depends_on_dataset(dataset: str, main: str) -> None:
 
 @pytest.mark.parametrize("dataset", ["synthetic", "rgbd_folder"])
 @pytest.mark.parametrize("detector", ["none", "maskrcnn2go", "mask_rcnn_rooms"])
-def test_explicit_detector_overrides_default(dataset: str, detector: str) -> None:
+def test_default_detector_is_overridden_by_explicit_one(dataset: str, detector: str) -> None:
     for order in ([0, 1], [1, 0]):
         words = [f"dataset={dataset}", f"detector={detector}"]
         assert chosen(*(words[k] for k in order))["detector"] == detector
@@ -67,8 +67,8 @@ def test_experiment_detector_overrides_dataset_not_command_line(experiment: str)
     assert chosen(f"experiment={experiment}", "detector=none")["detector"] == "none"
 
 
-def test_external_dataset_has_default_detector(tmp_path: Path) -> None:
-    """And one that inherits the rendered rooms inherits their detector."""
+def test_default_detector_of_external_dataset_is_set(tmp_path: Path) -> None:
+    """A dataset that inherits the rendered rooms inherits their detector."""
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "theirs.yaml").write_text("_target_: theirs.Theirs\n")
     (tmp_path / "dataset" / "their_rooms.yaml").write_text("defaults: [synthetic, _self_]\nframes: 3\n")
@@ -82,11 +82,11 @@ def test_default_dataset_is_desk() -> None:
     assert chosen() == {"dataset": "desk", "detector": "maskrcnn2go"}
 
 
-def test_config_without_dataset_uses_photo_detector() -> None:
+def test_default_detector_without_dataset_is_for_photos() -> None:
     assert composed("~dataset").detector == registered.composed("detector", "maskrcnn2go").detector
 
 
-def test_dataset_sweep_jobs_have_own_default_detector() -> None:
+def test_default_detector_depends_on_dataset_of_sweep_job() -> None:
     """The launcher composes each job from the sweep's own config and the job's overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
@@ -97,7 +97,7 @@ def test_dataset_sweep_jobs_have_own_default_detector() -> None:
 
 
 def test_default_paths_are_inside_project() -> None:
-    """Each path that a YAML names is there, below the project, or the user is asked for it."""
+    """Each path in a YAML file exists below the project, or must be set by the user."""
     files = sorted(CONF.rglob("*.yaml"))
     assert len(files) > 60
     assert not [file for file in files if "../" in file.read_text()]

@@ -1,4 +1,4 @@
-"""No command and no script is shown, in the README or below docs/, that no test runs or looks at."""
+"""Tests that every command and script of the README and of docs/ is tested."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ RUN_ELSEWHERE = {"python -m framework doctor"}  # in test_doctor.py
 
 
 class ParsedError(Exception):
-    """Raised in place of what a command does."""
+    """Raised in place of running a command."""
 
 
 @pytest.mark.parametrize("command", [line for line in PARSED if line not in {*COMMANDS, *RUNNABLE, *RUN_ELSEWHERE}])
@@ -48,8 +48,8 @@ def test_documented_command_line_is_parsed(command: str, monkeypatch: pytest.Mon
         importlib.import_module(main.module_of(command.split()[3])).main()
 
 
-def test_all_documented_commands_and_scripts_are_tested() -> None:
-    """Every line of a console but those of other programs, such as viewers, and every script."""
+def test_documented_commands_and_scripts_are_all_tested() -> None:
+    """This includes every script and console line, except those of other programs such as viewers."""
     make = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
     looked_at = {*COMMANDS, *RUNNABLE, *PARSED, *BENCHMARKS, *(f"make {target}" for target in make), OWN_PLUGIN}
     shown_in = (CHECKOUT / "docker" / "Dockerfile").read_text()

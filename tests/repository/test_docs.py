@@ -1,4 +1,4 @@
-"""The pages of docs/ are built without a warning, what they link to and name is there, and CITATION.cff fits."""
+"""Tests that the documentation builds without warnings, its links and names exist, and CITATION.cff is valid."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
 
 
 def anchors(page: str) -> set[str]:
-    """Those of a page's headings, as code hosts and myst-parser make them."""
+    """Return the anchors of a page's headings, as code hosts and myst-parser generate them."""
     titles = re.findall(r"^#+ (.*)", re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
@@ -58,7 +58,7 @@ def option_names(stage: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The pages as HTML."""
+    """Build the pages as HTML."""
     missing = [name for name in ("sphinx", "furo", "myst_parser") if find_spec(name) is None]
     if missing:
         pytest.skip(f"{', '.join(missing)}: not installed, pip install --group docs")
@@ -74,7 +74,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_api_reference_has_all_public_names(built: Path) -> None:
     page = (built / "api.html").read_text()
     assert not [name for name in instancemap.__all__ if f'id="instancemap.{name}"' not in page]
-    assert "(H, W) m along z, 0 = no reading" in page  # a comment beside a field
+    assert "(H, W) m along z, 0 = no reading" in page  # the comment of a field
 
 
 def test_configuration_reference_has_all_parameters(built: Path) -> None:
@@ -90,8 +90,8 @@ def test_configuration_reference_has_all_parameters(built: Path) -> None:
     assert "seed of all random numbers of a run" in (built / "configuration.html").read_text()
 
 
-def test_plugins_and_parameters_in_pages_exist(built: Path) -> None:
-    """`fuser=NAME` and `fuser.parameter`, in prose and commands: the configuration reference has them."""
+def test_page_plugins_and_parameters_exist(built: Path) -> None:
+    """`fuser=NAME` and `fuser.parameter` in prose and commands are in the configuration reference."""
     text = "\n".join(PAGES.values())
     for stage in GROUPS:
         reference = (built / "configuration" / f"{stage}.html").read_text()
@@ -118,7 +118,7 @@ def test_project_files_are_pages_with_valid_links(built: Path) -> None:
 
 
 def test_citation_file_has_required_keys() -> None:
-    """Citation File Format 1.2.0: the keys that it asks for, and of each reference."""
+    """Citation File Format 1.2.0 requires keys of the file and of each reference."""
     citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text())
     assert citation["cff-version"] == "1.2.0"
     assert str(citation["version"]) == __version__
@@ -133,7 +133,7 @@ def test_citation_file_has_required_keys() -> None:
 
 
 def test_dockerfile_matches_project_files() -> None:
-    """Nobody here can build it: what it copies is there and reaches docker, and it installs what the Makefile does."""
+    """The image is not built here: its copied files exist, and it installs what the Makefile installs."""
     dockerfile = (CHECKOUT / "docker" / "Dockerfile").read_text().replace("\\\n", " ")
     steps = re.findall(r"^([A-Z]+) (.*)", dockerfile, re.MULTILINE)
     copied = {source for step, words in steps if step == "COPY" for source in words.split()[:-1]}

@@ -1,4 +1,4 @@
-"""The layout rules: folders, names, and the direction of imports. CONTRIBUTING.md describes the layout."""
+"""Tests of the layout rules: folders, names, and the direction of imports. CONTRIBUTING.md describes the layout."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def parsed(path: Path) -> ast.Module:
 
 
 def python_folders(package: str) -> set[Path]:
-    """The folders of a package that contain Python files, relative to the checkout."""
+    """Return the folders of a package that contain Python files, relative to the checkout."""
     return {path.parent.relative_to(CHECKOUT) for path in MODULES if path.is_relative_to(CHECKOUT / package)}
 
 
@@ -93,7 +93,7 @@ def at_module_level(tree: ast.Module) -> Iterator[str]:
 
 
 def part_of(module: str) -> str:
-    """The package or root module of framework/ that a module of it is in."""
+    """Return the package or root module of framework/ that contains a module."""
     return module.split(".")[1]
 
 
@@ -125,7 +125,7 @@ def test_packages_have_no_import_cycle() -> None:
 
 
 def test_modules_have_no_import_cycle() -> None:
-    """Imports inside functions count: such an import hides a cycle, it does not remove it."""
+    """Imports inside functions count, because they only hide a cycle."""
     modules = {name_of(path): path for path in MODULES}
     imports = {name: set(imported_modules(path, modules)) - {name} for name, path in modules.items()}
     TopologicalSorter(imports).prepare()
@@ -165,7 +165,7 @@ def test_public_classes_are_defined_once() -> None:
 
 @pytest.mark.parametrize("package", ["framework", "plugins"])
 def test_test_folders_mirror_package(package: str) -> None:
-    """Each folder of tests tests the folder of the same name."""
+    """Each folder of tests corresponds to the folder of the same name."""
     folders = {path.parent.relative_to(CHECKOUT / "tests") for path in (CHECKOUT / "tests" / package).rglob("*.py")}
     assert folders <= python_folders(package) | {Path(package)}
 

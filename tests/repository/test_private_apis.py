@@ -1,4 +1,4 @@
-"""Private parts of Hydra and numba are used in few places, which docs/development.md lists with the tested versions."""
+"""Tests that docs/development.md lists all uses of private parts of Hydra and numba, with the tested versions."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def test_private_imports_are_listed_in_development_notes() -> None:
     assert listed == set(private_imports())
 
 
-def test_private_hydra_is_imported_in_one_module() -> None:
+def test_private_imports_of_hydra_are_in_one_module() -> None:
     files = {path for (module, _), paths in private_imports().items() if module.startswith("hydra") for path in paths}
     assert files == {"framework/config/hydra_api.py"}
 
 
-def test_listed_versions_match_installed_versions() -> None:
+def test_private_imports_list_has_installed_versions() -> None:
     assert hydra.__version__ in hydra_api.TESTED
     assert numba.__version__ in worker.TESTED
     assert f"hydra-core {hydra.__version__} and numba {numba.__version__}" in SECTION

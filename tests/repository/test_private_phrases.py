@@ -1,4 +1,4 @@
-"""Texts for readers contain no phrase of private_phrases.txt."""
+"""Tests that texts for readers contain no phrase of private_phrases.txt."""
 
 from __future__ import annotations
 
@@ -71,6 +71,6 @@ def test_configs_have_no_private_phrase() -> None:
         ("option.yaml", "voxel_size: 0.01 # m, as told\n"),
     ],
 )
-def test_planted_phrase_is_found(tmp_path: Path, name: str, text: str) -> None:
+def test_phrases_in_finds_planted_phrase(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
     assert phrases_in(tmp_path / name)

@@ -1,4 +1,4 @@
-"""Plugins of other packages import only `instancemap` and `instancemap.testing`."""
+"""Tests that plugins of other packages import only `instancemap` and `instancemap.testing`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHOWN = [
 
 
 @pytest.mark.parametrize("path", SHOWN, ids=lambda path: str(path.relative_to(CHECKOUT)))
-def test_shown_code_imports_only_public_names(path: Path) -> None:
+def test_documented_code_imports_only_public_names(path: Path) -> None:
     text = path.read_text()
     assert not re.findall(r"(?m)^ *(?:from|import) (?:framework|plugins|hydra)\b.*", text)
     for module, block, line in re.findall(r"(?m)^ *from (instancemap[.\w]*) import (?:\(([^)]*)\)|(.+))", text):

@@ -1,4 +1,4 @@
-"""The scripts of docs/python.md run unchanged, in one process."""
+"""Tests that the scripts of docs/python.md run unchanged, in one process."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ for name, script in json.load(open("scripts.json")).items():
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which all scripts ran, with their output in printed.txt."""
+    """Return the folder in which all scripts ran, with their output in printed.txt."""
     directory = tmp_path_factory.mktemp("scripts")
     (directory / "scripts.json").write_text(json.dumps(SCRIPTS))
     done = subprocess.run(
@@ -57,17 +57,17 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def test_all_scripts_have_expected_output() -> None:
+def test_documented_scripts_all_have_expected_output() -> None:
     assert list(SCRIPTS) == list(PRINTED)
 
 
 @pytest.mark.parametrize("name", PRINTED)
-def test_script_prints_expected_output(place: Path, name: str) -> None:
+def test_documented_script_prints_expected_output(place: Path, name: str) -> None:
     parts = (place / "printed.txt").read_text().split(MARK)[1:]
     printed = dict(part.split("\n", 1) for part in parts)
     assert re.search(PRINTED[name], printed[name])
 
 
 @pytest.mark.parametrize(("name", "size"), [("desk.npz", 100_000), ("view.png", 1000), ("object.ply", 1000)])
-def test_script_writes_file(place: Path, name: str, size: int) -> None:
+def test_documented_script_writes_file(place: Path, name: str, size: int) -> None:
     assert (place / name).stat().st_size > size

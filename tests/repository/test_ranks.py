@@ -1,4 +1,4 @@
-"""docs/results/ranks.py, against values computed by hand and against scipy's rank correlation."""
+"""Tests of docs/results/ranks.py, compared with manual results and scipy's rank correlation."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Ranking, ranks, spearman, write_ranks = script.Ranking, script.ranks, script.spe
 
 @pytest.fixture
 def places(tmp_path: Path) -> list[Path]:
-    """Four rows. The order is a, b, c, d in the rooms, b, a, c = d in the flat, d, c, b, a in the hall."""
+    """Return four rows. The order is a, b, c, d in the rooms, b, a, c = d in the flat, d, c, b, a in the hall."""
     return [
         experiment(tmp_path / "rooms", {"a": (0.9, 0.7), "b": (0.7, 0.7), "c": (0.5, 0.3), "d": (0.1, 0.1)}),
         experiment(tmp_path / "flat", {"d": (0.2,), "c": (0.2,), "b": (0.6,), "a": (0.5,)}),
@@ -46,7 +46,7 @@ def lines_of(text: str) -> list[str]:
     return [" ".join(line.split()) for line in text.splitlines()]
 
 
-def test_means_and_ranks_match_hand_computed_values(places: list[Path]) -> None:
+def test_ranks_and_means_match_hand_computed_values(places: list[Path]) -> None:
     lines = lines_of(write_ranks(places, [AP50], None))
     assert "| row | rooms | rank | flat | rank | hall | rank | mean of the others | rank |" in lines
     first = lines.index("| a | 0.800 | 1 | 0.500 | 2 | 0.100 | 4 | 0.300 | 3.5 |")
@@ -58,7 +58,7 @@ def test_means_and_ranks_match_hand_computed_values(places: list[Path]) -> None:
     assert "- Runs of each row: rooms 2, flat 1, hall 2." in lines
 
 
-def test_rho_matches_hand_computed_values(places: list[Path]) -> None:
+def test_ranks_rho_matches_hand_computed_values(places: list[Path]) -> None:
     """With ranks 1 2 3 4 and 2 1 3.5 3.5, from their mean: -1.5 -0.5 0.5 1.5 and -0.5 -1.5 1 1; 3.5 / sqrt(5 * 4.5)."""
     lines = lines_of(write_ranks(places, [AP50], None))
     rhos = {line.split(" | ")[0]: line.split(" | ")[1:3] for line in lines if ", " in line and line.startswith("|")}
@@ -68,13 +68,13 @@ def test_rho_matches_hand_computed_values(places: list[Path]) -> None:
     assert rhos == {f"| {pair}": ["4", f"{rho:+.2f}"] for pair, rho in expected.items()}
 
 
-def test_two_places_have_no_mean_of_others(places: list[Path]) -> None:
+def test_ranks_of_two_datasets_have_no_mean_of_others(places: list[Path]) -> None:
     text = write_ranks(places[:2], [AP50], None)
     assert "the others" not in text
     assert text.count("| rooms, flat ") == 1
 
 
-def test_rho_with_ties_agrees_with_scipy() -> None:
+def test_ranks_rho_with_ties_agrees_with_scipy() -> None:
     rng = np.random.default_rng(0)
     ours, theirs = rng.integers(0, 4, (200, 7)).astype(float), rng.integers(0, 4, (200, 7)) / 3
     expected = [
@@ -84,7 +84,7 @@ def test_rho_with_ties_agrees_with_scipy() -> None:
     assert np.isnan(spearman(np.ones((1, 5)), np.arange(5.0)[None])).all()
 
 
-def test_means_equal_up_to_rounding_share_rank() -> None:
+def test_ranks_means_equal_up_to_rounding_share_rank() -> None:
     assert ranks(np.array([0.1 + 0.2, 0.0, 0.3])).tolist() == [1.5, 3, 1.5]
     assert spearman(np.array([[0.1 + 0.2, 0.0, 0.3]]), np.array([[0.3, 0.0, 0.1 + 0.2]])) == pytest.approx([1])
 
@@ -94,7 +94,7 @@ def agreement(places: Sequence[Path]) -> object:
     return found
 
 
-def test_row_interval_is_bootstrap_over_rows(tmp_path: Path) -> None:
+def test_ranks_row_interval_is_bootstrap_over_rows(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     ours = rng.random(12)
     theirs = ours + rng.normal(0, 0.2, 12)
@@ -106,10 +106,10 @@ def test_row_interval_is_bootstrap_over_rows(tmp_path: Path) -> None:
     low, high = np.quantile([spearmanr(ours[k], theirs[k]).statistic for k in drawn], [0.025, 0.975])
     assert found.over_rows == pytest.approx((low, high), abs=0.05)
     assert found.over_rows[0] < found.rho < found.over_rows[1]
-    assert np.isnan(found.over_runs).all(), "one run does not say what another would be"
+    assert np.isnan(found.over_runs).all(), "one run gives no interval"
 
 
-def test_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
+def test_ranks_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
     """Rows that no seed exchanges keep their order; two that each seed exchanges do not."""
     steady = {"a": (0.9, 0.8, 0.9), "b": (0.5, 0.4, 0.5), "c": (0.1, 0.2, 0.1)}
     one, same = experiment(tmp_path / "one", steady), experiment(tmp_path / "same", steady)
@@ -123,14 +123,14 @@ def test_run_interval_reflects_seed_noise(tmp_path: Path) -> None:
     assert agreement([one, rare]).over_runs == (1, 1)
 
 
-def test_intervals_are_repeatable(places: list[Path]) -> None:
+def test_ranks_intervals_are_repeatable(places: list[Path]) -> None:
     alone, with_another = agreement(places[::2]), agreement([places[0], places[2], places[1]])
     assert alone == with_another
     assert write_ranks(places, [AP50], None) == write_ranks(places, [AP50], None)
 
 
-def test_scenes_have_equal_weight_in_mean(tmp_path: Path) -> None:
-    """One scene twice as often run counts as one: 0.9, 0.9 and 0.3 are 0.6 and not 0.7."""
+def test_ranks_scenes_have_equal_weight_in_mean(tmp_path: Path) -> None:
+    """A scene with twice as many runs counts once: 0.9, 0.9 and 0.3 are 0.6 instead of 0.7."""
     figures = {"a": (0.9, 0.3), "b": (0.5, 0.5), "c": (0.1, 0.1)}
     one = experiment(tmp_path / "one", figures, scenes=("x", "y"))
     other = experiment(tmp_path / "other", figures, scenes=("x", "y"))
@@ -141,7 +141,7 @@ def test_scenes_have_equal_weight_in_mean(tmp_path: Path) -> None:
     assert "- Runs of each row: one 3, other 2." in lines
 
 
-def test_only_runs_common_to_all_rows_are_compared(tmp_path: Path) -> None:
+def test_ranks_compare_only_runs_common_to_all_rows(tmp_path: Path) -> None:
     """A row without the hard seed does not gain rank by the missing run."""
     one = experiment(tmp_path / "one", {"a": (0.9, 0.3), "b": (0.8, 0.2), "c": (0.7, None), "d": (0.6, 0.1)})
     other = experiment(tmp_path / "other", {"a": (0.9,), "b": (0.8,), "c": (0.7,), "d": (0.6,)})
@@ -151,19 +151,19 @@ def test_only_runs_common_to_all_rows_are_compared(tmp_path: Path) -> None:
     assert "- Omitted runs, without this metric in some rows: one 1." in lines
 
 
-def test_folders_of_same_name_are_shown_with_path(tmp_path: Path) -> None:
+def test_ranks_show_folders_of_same_name_with_path(tmp_path: Path) -> None:
     roots = [experiment(tmp_path / k / "ranks", {"a": (0.9,), "b": (0.8,), "c": (0.7,)}) for k in "xy"]
     assert f"| row | {roots[0]} | rank | {roots[1]} | rank |" in lines_of(write_ranks(roots, [AP50], None))
 
 
-def test_rows_missing_in_one_place_are_listed(places: list[Path]) -> None:
+def test_ranks_list_rows_missing_in_one_dataset(places: list[Path]) -> None:
     run(places[1], "e", 0, 0.7)
     text = write_ranks(places, [AP50], None)
     assert "- Omitted rows, missing in some folders: e: not in rooms, hall." in text
     assert "| e " not in text
 
 
-def test_several_figures_are_written_to_files(places: list[Path], tmp_path: Path) -> None:
+def test_ranks_of_several_metrics_are_written_to_files(places: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "new" / "folder"
     text = write_ranks(places, [AP50, IOU], out)
     assert (out / "ranks.md").read_text() == text
@@ -178,7 +178,7 @@ def test_several_figures_are_written_to_files(places: list[Path], tmp_path: Path
     assert (float(line["mean"]), line["rank"]) == (pytest.approx(0.45), "2")
 
 
-def test_provenance_of_runs_is_printed(places: list[Path]) -> None:
+def test_ranks_provenance_of_runs_is_printed(places: list[Path]) -> None:
     [line] = [line for line in lines_of(write_ranks(places, [AP50], None)) if line.startswith("- flat: ")]
     assert "dataset=d, detector=seen, poses ground truth; annotation: unknown; code 1234567; SHA-256" in line
 
@@ -204,7 +204,7 @@ def test_provenance_of_runs_is_printed(places: list[Path]) -> None:
         (["rooms", "apart"], [AP50], "apart: expected a run with instances.ap50 in all rows, got none"),
     ],
 )
-def test_incomparable_folders_raise_one_line(
+def test_ranks_incomparable_folders_raise_one_line_error(
     places: list[Path], asked: list[str], keys: list[str], message: str
 ) -> None:
     root = places[0].parent
@@ -222,7 +222,7 @@ def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
 
 
-def test_documented_command_prints_and_writes_tables(tmp_path: Path) -> None:
+def test_ranks_documented_command_prints_and_writes_tables(tmp_path: Path) -> None:
     [command] = [line.removeprefix(COMMAND) for line in LINES if line.startswith(COMMAND)]
     folders = [word for word in shlex.split(command) if word.startswith("outputs/ranks_")]
     assert len(folders) == 3
@@ -236,7 +236,7 @@ def test_documented_command_prints_and_writes_tables(tmp_path: Path) -> None:
     assert "+1.00" in done.stdout
 
 
-def test_script_error_is_one_line(tmp_path: Path) -> None:
+def test_ranks_script_error_is_one_line(tmp_path: Path) -> None:
     experiment(tmp_path / "rooms", {"a": (0.9,), "b": (0.8,), "c": (0.7,)})
     done = start(tmp_path, "rooms", "flat")
     assert (done.returncode, done.stdout) == (1, "")

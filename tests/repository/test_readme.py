@@ -1,4 +1,4 @@
-"""What the README and the pages of docs/ show works."""
+"""Tests that the commands and examples of the README and of docs/ work."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_contributing_paths_exist() -> None:
 
 @pytest.fixture
 def my_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The detector of the tutorial, saved where it says."""
+    """Write the detector of the tutorial to the documented path."""
     (tmp_path / "my_plugins").mkdir()
     (tmp_path / "my_plugins" / "color_blobs.py").write_text(block("python", "class ColorBlobs"))
     (tmp_path / "my_conf" / "detector").mkdir(parents=True)
@@ -97,7 +97,7 @@ def test_tutorial_detector_detects_red_square(my_plugins: Path, monkeypatch: pyt
 
 
 def test_tutorial_detector_runs_by_option_name(my_plugins: Path) -> None:
-    """The tutorial's command, with the other stages faked for speed."""
+    """The command is that of the tutorial, with the other stages faked for speed."""
     chosen = [f"{stage}=fake" for stage in FAKES]
     (my_plugins / "my_conf").joinpath("dataset").mkdir()
     for stage, name in FAKES.items():
@@ -133,12 +133,12 @@ def test_documented_command_composes(command: str) -> None:
             )
 
 
-OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording, and reads what a run made of it
+OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording, and reads the outputs of a run
 SMALL = ["dataset.frames=4", "dataset.width=160", "dataset.height=120"]
 OWN = ["dataset=rgbd_folder", "dataset.root=DIR"]  # the imported recording
 DEFAULTS = "python -m framework"
-RUNNABLE = {  # what to append, by a command that then takes seconds
-    # twice as large: of what is left of a noisy room in a quarter of 160x120, tracking is not to be had
+RUNNABLE = {  # arguments to append, by command, so that it takes seconds
+    # twice as large: tracking fails on a noisy room at a quarter of 160x120
     DEFAULTS: [*SMALL, "dataset=synthetic", "dataset.width=320", "dataset.height=240", "hydra.run.dir=defaults"],
     "python -m framework import SOURCE DIR": [],
     "python -m framework check dataset=rgbd_folder dataset.root=DIR": [],
@@ -193,7 +193,7 @@ for line in json.load(open("commands.json")):
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which all of these ran, one after the other in one process: to load the libraries takes longest."""
+    """Return the folder in which all commands ran in one process, because loading libraries takes longest."""
     folder = tmp_path_factory.mktemp("readme")
     write_stray_scanner(folder / "SOURCE", room_frames(6))
     recording, result = OWN_DATA
@@ -212,7 +212,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_runnable_commands_write_expected_files(ran: Path) -> None:
+def test_documented_commands_write_expected_files(ran: Path) -> None:
     assert set(RUNNABLE) - {DEFAULTS} <= set(LINES)
     assert not [name for name in LEFT_BEHIND if not (ran / name).exists()]
     assert len(list((ran / "outputs" / "table3_map").glob("*/metrics.json"))) == 3
@@ -221,7 +221,7 @@ def test_runnable_commands_write_expected_files(ran: Path) -> None:
 
 
 def test_default_pipeline_runs_end_to_end(ran: Path) -> None:
-    """The network that comes with the project, tracked, refined by both links and fused: on four small frames."""
+    """The included network, tracking, both refiner links and fusion run on four small frames."""
     metrics = json.loads((ran / "defaults" / "metrics.json").read_text())
     assert (metrics["frames"], metrics["frames_lost"], metrics["frames_skipped"]) == (4, 0, 0)
     assert metrics["pose_source"] == "tracked"

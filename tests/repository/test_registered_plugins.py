@@ -1,6 +1,6 @@
-"""The contracts of `framework.interfaces`, on every plugin that a config registers. A new plugin needs no line here.
+"""Contract tests of `framework.interfaces` on every registered plugin. A new plugin needs no change here.
 
-They are in framework/testing, where packages that bring plugins find them, too.
+The contracts are in framework/testing, which other packages can import.
 """
 
 from __future__ import annotations
@@ -84,11 +84,11 @@ def video(request: pytest.FixtureRequest, ready: Ready, monkeypatch: pytest.Monk
 
 
 def come(video: LiveVideo) -> Iterator[Frame]:
-    """The frames, which can be read; something is said while none comes."""
+    """Return the frames of a live video, which must be readable; a wait without frames is logged."""
     with closing(video.frames()) as readers:
         message = time.monotonic()
         for reader in readers:
-            assert time.monotonic() - message < 1, "ten times a second, but for a busy machine"
+            assert time.monotonic() - message < 1, "ten times per second, with slack for a busy machine"
             if reader is not None:
                 yield reader()
             message = time.monotonic()

@@ -1,4 +1,4 @@
-"""The cache of rendered frames returns what the sequence renders."""
+"""Tests of the cache of rendered frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def sequence() -> Synthetic:
     return Synthetic(frames=240, stop=2, width=32, height=24)
 
 
-def test_cached_frames_equal_rendered_frames(
+def test_rendered_frames_from_cache_are_identical(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sequence: Synthetic
 ) -> None:
     monkeypatch.setattr(platformdirs, "user_cache_dir", lambda name: str(tmp_path))
@@ -35,7 +35,7 @@ def test_cached_frames_equal_rendered_frames(
         assert dict(one.truth.class_names) == dict(other.truth.class_names)
 
 
-def test_different_frames_have_separate_cache_entries(
+def test_rendered_frames_have_separate_cache_entries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sequence: Synthetic
 ) -> None:
     monkeypatch.setattr(platformdirs, "user_cache_dir", lambda name: str(tmp_path))

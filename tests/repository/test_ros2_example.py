@@ -1,4 +1,4 @@
-"""The ROS 2 node of examples/ maps messages and publishes markers; ROS itself is faked."""
+"""Tests of the ROS 2 node of examples/ with a fake ROS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DESK = TumRgbd(CHECKOUT / "data" / "desk", scene="rgbd_dataset_freiburg1_rpy")
 
 
 class Message(SimpleNamespace):
-    """Any message: its fields are made when they are asked for."""
+    """A message whose fields are created on access."""
 
     DELETEALL, CUBE = 3, 1
 
@@ -31,7 +31,7 @@ class Message(SimpleNamespace):
 
 
 class Node:
-    """What the node uses of rclpy's."""
+    """The part of rclpy's node that the example uses."""
 
     def __init__(self, name: str) -> None:
         self.published: list[Any] = []
@@ -82,7 +82,7 @@ def node_class(monkeypatch: pytest.MonkeyPatch) -> type[Any]:
 def messages(k: int, encoding: str, in_meters: bool) -> tuple[Message, Message, Message]:
     frame = DESK[k]
     color = frame.color if encoding == "rgb8" else frame.color[..., ::-1]
-    padded = np.pad(color.reshape(480, -1), ((0, 0), (0, 32)))  # rows may be longer than the image
+    padded = np.pad(color.reshape(480, -1), ((0, 0), (0, 32)))  # rows may have padding
     depth = frame.depth if in_meters else np.rint(1000 * frame.depth).astype(np.uint16)
     if in_meters:
         depth = np.where(depth > 0, depth, np.nan).astype(np.float32)

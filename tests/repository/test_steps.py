@@ -1,4 +1,4 @@
-"""docs/results/steps.py, compared with values computed by hand."""
+"""Tests of docs/results/steps.py, compared with manual results."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def lines_of(text: str) -> list[str]:
     return [" ".join(line.split()) for line in text.splitlines()]
 
 
-def test_differences_match_hand_computed_values(tmp_path: Path) -> None:
+def test_steps_differences_match_hand_computed_values(tmp_path: Path) -> None:
     """Seeds of a real scene are averaged; seeds of the synthetic dataset are scenes."""
     kitchen = {"paper": (0.1, 0.3), "step": (0.4, 0.4), "default": (0.5, 0.7), "without_step": (0.4, 0.6)}
     office = {"paper": (0.4,), "step": (0.4,), "default": (0.6,), "without_step": (0.6,)}
@@ -49,13 +49,13 @@ def test_differences_match_hand_computed_values(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "steps.png").stat().st_size > 10_000
 
 
-def test_rows_without_default_are_compared_with_first_row(tmp_path: Path) -> None:
+def test_steps_rows_without_default_are_compared_with_first_row(tmp_path: Path) -> None:
     place = experiment(tmp_path / "kitchen", {"paper": (0.1,), "flat": (0.4,), "drop": (0.3,)})
     lines = lines_of(script.write_steps([place], [AP50], None))
     assert "| drop | paper | 0.300 | +0.200 | 1 |" in lines
 
 
-def test_interval_is_confidence_interval_of_mean() -> None:
+def test_steps_interval_is_confidence_interval_of_mean() -> None:
     values = np.random.default_rng(0).normal(0.3, 1.0, 400)
     low, high = script.Difference(values).interval
     half = 1.96 * values.std() / 20
@@ -63,7 +63,7 @@ def test_interval_is_confidence_interval_of_mean() -> None:
     assert high == pytest.approx(values.mean() + half, abs=0.1 * half)
 
 
-def test_rows_missing_in_one_folder_are_excluded(tmp_path: Path) -> None:
+def test_steps_rows_missing_in_one_folder_are_excluded(tmp_path: Path) -> None:
     places = [
         experiment(tmp_path / "kitchen", {"paper": (0.1,), "flat": (0.4,), "drop": (0.3,)}),
         experiment(tmp_path / "office", {"paper": (0.1,), "drop": (0.3,)}),
@@ -73,7 +73,7 @@ def test_rows_missing_in_one_folder_are_excluded(tmp_path: Path) -> None:
     assert "- Omitted rows, missing in some folders: flat." in lines
 
 
-def test_folders_without_common_rows_raise(tmp_path: Path) -> None:
+def test_steps_folders_without_common_rows_raise(tmp_path: Path) -> None:
     places = [experiment(tmp_path / "a", {"paper": (0.1,)}), experiment(tmp_path / "b", {"flat": (0.1,)})]
     with pytest.raises(DataError, match="expected at least two common rows of all folders, got none"):
         script.write_steps(places, [AP50], None)

@@ -1,7 +1,7 @@
-"""Which cores the tests run on: of several processes of pytest-xdist each has some to itself.
+"""The cores of test processes: each process of pytest-xdist has its own.
 
-Their parallel kernels would wait for each other else: tests of the tracker that take 22 s on a core took 72 s where two
-processes shared two cores.
+Otherwise their parallel kernels wait for each other: tracker tests of 22 s on a core took 72 s with two processes on
+two shared cores.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ ALL = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [
 
 
 def _share_among_processes() -> None:
-    """Before numba is loaded, which else could never use a second thread.
+    """Set the cores before numba is loaded, which could not add threads later.
 
     numba gives the thread that starts its OpenMP threads its own number of threads. Torch uses the same OpenMP and
     would otherwise use another number in a new thread, where networks would round differently.
@@ -31,7 +31,7 @@ def _share_among_processes() -> None:
 
 @contextmanager
 def all_cores() -> Iterator[None]:
-    """The body, and the threads that it starts, run on every core."""
+    """Run the body, and the threads that it starts, on every core."""
     if not ALL:
         yield
         return

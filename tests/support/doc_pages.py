@@ -1,4 +1,4 @@
-"""What README.md and the pages of docs/ show: commands, and code by its language. What stands twice is there once."""
+"""Commands and code of README.md and of the pages of docs/, by language and without duplicates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PAGES = {
 
 
 def blocks(language: str, page: str | None = None) -> list[str]:
-    """The distinct code blocks of a language on one page, or on all, in their order."""
+    """Return the distinct code blocks of a language on one page, or on all, in their order."""
     texts = PAGES.values() if page is None else [PAGES[page]]
     return list(
         dict.fromkeys(code for text in texts for code in re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL))
@@ -22,7 +22,7 @@ def blocks(language: str, page: str | None = None) -> list[str]:
 
 
 def block(language: str, containing: str) -> str:
-    """The one code block with these words in it."""
+    """Return the only code block that contains these words."""
     [found] = [code for code in blocks(language) if containing in code]
     return found
 

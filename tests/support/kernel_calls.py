@@ -1,10 +1,10 @@
-"""Which kernels the pipelines call, and with what types: framework/compilation/kernels.txt.
+"""Kernels that the pipelines call, with their types: framework/compilation/kernels.txt.
 
     python -m tests.support.kernel_calls
 
-writes it anew, in a minute. Runs every registered refiner, fuser and tracker over the demo's video, and one over a
-made-up room, and notes each kernel that Python calls for the first time with some types. A test compares the list with
-what the same runs call.
+rewrites it in a minute. It runs every registered refiner, fuser and tracker on the demo's video, and one on a synthetic
+room, and lists each kernel that Python calls for the first time with some types. A test compares the list with the same
+runs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FEW = ("dataset=desk", "dataset.stride=3", "dataset.stop=12")
 
 
 class Compiled(event.Listener):
-    """Names the kernels that are compiled while it listens."""
+    """Names of the kernels that are compiled while it is active."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -48,7 +48,7 @@ class Compiled(event.Listener):
 
 
 class Remembered(Detector):
-    """What the default detector has found in each of the frames."""
+    """Detections of the default detector in each frame."""
 
     def __init__(self, detector: Detector) -> None:
         self.detector = detector
@@ -62,7 +62,7 @@ class Remembered(Detector):
 
 
 def calls() -> list[str]:
-    """The lines of the list from here on; numba asks for types that it has not had, and then never again."""
+    """Return a list to which called kernels are appended from here on; numba requests each type only once."""
     noted: list[str] = []
     compile_for = Dispatcher._compile_for_args
 
@@ -80,7 +80,7 @@ def run_default(directory: Path, *overrides: str) -> None:
 
 
 def run_others() -> None:
-    """Each registered stage in place of the default one, but for detectors: they share their kernels, or have none."""
+    """Run each registered stage in place of the default one, except detectors, which have no own kernels."""
     config = composed(*FEW)
     Settings.of(config).apply()
     detector = Remembered(build(Detector, config.detector))
@@ -103,7 +103,7 @@ def run_others() -> None:
 
 
 def run_rendered(directory: Path) -> None:
-    """A made-up room: what renders it, and what compares a map with its true surface."""
+    """Run a synthetic room: its renderer, and the comparison of a map with its true surface."""
     config = composed(
         "dataset=synthetic", "detector=simulated", "dataset.frames=8", "dataset.width=160", "dataset.height=120"
     )
@@ -111,7 +111,7 @@ def run_rendered(directory: Path) -> None:
 
 
 def sections(whole: bool) -> dict[str, set[str]]:
-    """The lines of the list, by section; without `whole` a shorter default run, which calls no others."""
+    """Return the lines of the list by section; without `whole` a shorter default run with the same calls."""
     noted = calls()
     with tempfile.TemporaryDirectory() as directory:
         run_default(Path(directory), *(() if whole else ("dataset.stride=2", "dataset.stop=24")))
@@ -123,14 +123,14 @@ def sections(whole: bool) -> dict[str, set[str]]:
 
 
 def record() -> None:
-    """Writes the list. Runs compile what was listed before, as far as it is still there, in other processes."""
+    """Write the list. Other processes compile the kernels of the previous list that still exist."""
     found = sections(whole=True)
     text = "\n\n".join("\n".join([section, *sorted(lines)]) for section, lines in found.items())
     LIST.write_text(f"{text}\n", encoding="utf-8")
 
 
 def check() -> None:
-    """Prints what runs call that is not listed, and what they compile."""
+    """Print kernels that runs call and the list lacks, and kernels that runs compile."""
     compiled = Compiled()
     event.register("numba:compile", compiled)
     found = sections(whole=False)
@@ -147,7 +147,7 @@ def main() -> None:
         {"--check": check, "--record": record}[sys.argv[1]]()
         return
     LIST.write_text("", encoding="utf-8")
-    for _ in range(2):  # what a kernel calls that is compiled here is not asked for again: the second time, none is
+    for _ in range(2):  # the callees of a kernel compiled here are not requested again: the second call compiles none
         subprocess.run([sys.executable, "-m", "tests.support.kernel_calls", "--record"], check=True)
 
 

@@ -1,4 +1,4 @@
-"""What clusters over one pixel say, and a voxel that sees it."""
+"""Clusters over one pixel, and a voxel that sees it."""
 
 import numpy as np
 
@@ -8,12 +8,12 @@ from framework.mapping.labels.label_evidence import Evidence, Measurement, named
 from framework.mapping.labels.label_evidence_kernels import Combine
 
 FLOOR = 0.05
-SCORE_SCALE = 1 << 16  # as fine as in exact storage
+SCORE_SCALE = 1 << 16  # as precise as exact storage
 BARE, COVERED = np.int32(0), np.int32(1)  # numbers of the lists of clusters over the pixel: none, all of a measurement
 
 
 def blank() -> Evidence:
-    """Of one voxel with slots."""
+    """Return the evidence of one voxel with slots."""
     return Evidence(
         np.zeros((1, 512), np.int32),
         np.zeros((1, INSTANCE_SLOTS), np.int32),
@@ -30,7 +30,7 @@ def measured(
     absence: float,
     last_id: int,
 ) -> Measurement:
-    """Every cluster covers the one pixel that there is."""
+    """Return clusters that all cover the only pixel."""
     message = np.flatnonzero(ids).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True
@@ -51,7 +51,7 @@ def measured(
 
 
 def voted(ids: list[int], weights: list[float], classes: list[int], combine: Combine, number: int = 6) -> Measurement:
-    """Clusters over the one pixel, each for an instance and one class, by a rule that is not Bayes'."""
+    """Return clusters over the only pixel, each for an instance and one class, by a rule that is not Bayesian."""
     evidence = np.zeros((len(ids), number))
     evidence[np.arange(len(ids)), classes] = weights
     relative, named, bits = named_classes(evidence, logarithmic=False)

@@ -1,4 +1,4 @@
-"""What only a user has: small files of every kind, so that the contracts run on the options that need some."""
+"""Small files that a user must provide, so that the contracts run on options that need some."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FRAMES = 3
 
 
 def modules(stage: str, name: str) -> dict[str, ModuleType]:
-    """The libraries of devices that an option needs, with a device in each. Nothing for one that needs none."""
+    """Return fake device libraries that an option needs; empty for other options."""
     plugged_in = {
         ("dataset", "orbbec"): {"pyorbbecsdk": orbbec_module(FakeCamera())},
         ("dataset", "realsense"): {"pyrealsense2": realsense_module(FakeCamera())},
@@ -32,13 +32,13 @@ def modules(stage: str, name: str) -> dict[str, ModuleType]:
 
 
 def overrides(stage: str, name: str, folder: Path) -> list[str]:
-    """What to set so that an option works; files are made in `folder`. Nothing for one that needs none."""
+    """Return the overrides of an option with files made in `folder`; empty for other options."""
     write = WRITERS.get((stage, name))
     return write(folder) if write else []
 
 
 def _images(color: str, depth: str, first: int = 0) -> None:
-    """The corner room's, in millimeters; the names get the frame's number, counted from `first`."""
+    """Write the images of the corner room, in millimeters; names contain the frame's number, counted from `first`."""
     for frame in CornerRoom(frames=FRAMES):
         for path, image in (
             (Path(color.format(first + frame.index)), frame.color[..., ::-1]),
@@ -122,7 +122,7 @@ def _mask_rcnn(folder: Path) -> list[str]:
 
 
 def _onnx_boxes(folder: Path) -> list[str]:
-    """Two boxes of 16 px in an input of 32, in YOLOX's cells: 4 x 4, 2 x 2 and one."""
+    """Write two boxes of 16 px in an input of 32, in YOLOX's cells: 4 x 4, 2 x 2 and one."""
     pytest.importorskip("onnx")
     from tests.support.networks.tiny_networks import constant_network
 
@@ -134,7 +134,7 @@ def _onnx_boxes(folder: Path) -> list[str]:
 
 
 def _onnx_segmentation(folder: Path) -> list[str]:
-    """Two boxes whose masks are the left and the lower halves of the image."""
+    """Write two boxes whose masks are the left and the lower halves of the image."""
     pytest.importorskip("onnx")
     from tests.support.networks.tiny_networks import constant_network
 

@@ -1,4 +1,4 @@
-"""Every option of every config group, for tests that run on all of them."""
+"""Options of all config groups, for tests that run on each of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OPTIONS = [*OPTION]
 
 
 def names(stage: str, kind: type = object) -> list[str]:
-    """The options of one stage, or those of them whose class is of a kind."""
+    """Return the options of one stage, or those whose class is of a kind."""
     return [
         option.name
         for option in OPTION.values()
@@ -39,5 +39,5 @@ def _composed(stage: str, name: str, *overrides: str) -> DictConfig:
 
 
 def built(stage: str, name: str, *overrides: str) -> Any:
-    """The option as the command would build it."""
+    """Build the option like the command."""
     return build(GROUPS[stage], composed(stage, name, *overrides)[stage])

@@ -1,4 +1,4 @@
-"""A small run with true instances, for tests of what is made from records."""
+"""A small run with true instances, for tests of reports."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CONFIG: dict[str, Any] = {
 
 
 def write_run(directory: Path, **dataset: Any) -> Path:
-    """Maps the corner of a room with its spheres."""
+    """Map the corner of a room with its spheres."""
     config = CONFIG | {"dataset": CONFIG["dataset"] | dataset}
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(composition, "_added", [FAKES])
@@ -39,7 +39,7 @@ def write_run(directory: Path, **dataset: Any) -> Path:
 
 
 def rename_class(directory: Path, name: str) -> None:
-    """Gives the first object another name, as a hostile record may."""
+    """Rename the class of the first object, e.g., to a hostile name."""
     path = directory / "instances.json"
     entries = json.loads(path.read_text())
     entries[0]["class"] = name

@@ -1,4 +1,4 @@
-"""The evaluation of instances once more, slowly, as the text of framework.evaluation.instances says it."""
+"""A slow reference of the instance evaluation, written from the text of framework.evaluation.instances."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Pairs = list[tuple[int, int]]  # predicted and true id of each point, 0 = none
 
 @dataclass
 class Matched:
-    """What one walk through the predictions found."""
+    """The result of one pass over the predictions."""
 
     hits: list[bool]
     ignored: int
@@ -25,7 +25,7 @@ class Matched:
 
     @property
     def ap(self) -> Fraction:
-        """The mean over the recalls k / truths of the best precision at that or a higher recall."""
+        """Return the mean over the recalls k / truths of the best precision at that or a higher recall."""
         total = Fraction(0)
         for k in range(1, self.truths + 1):
             precisions = [
@@ -45,7 +45,7 @@ class Matched:
 def slow_metrics(
     predictions: PredictedInstances, truth: SceneTruth, transfer: Transfer, max_distance: float, min_points: int
 ) -> dict[str, float]:
-    """The same keys and figures as `evaluate(...).metrics()`."""
+    """Return the same keys and values as `evaluate(...).metrics()`."""
     pairs = _pairs(predictions, truth, transfer, max_distance)
     sizes = {t: int((truth.instance_ids == t).sum()) for t in set(truth.instance_ids.tolist()) - {0}}
     classes = {t: truth.class_names.get(t) for t, size in sizes.items() if size >= min_points}
@@ -70,7 +70,7 @@ def slow_metrics(
         return mostly or any(overlap[p, t] >= threshold for t in ignored)
 
     def match(threshold: Fraction, of: str | None, by_class: bool) -> Matched:
-        """`of` one class, None = all; `by_class`: a match must agree in class."""
+        """Match predictions `of` one class, None = all; `by_class`: a match must agree in class."""
         chosen = [t for t, name in counted.items() if of in (None, name)]
         found = Matched([], 0, Fraction(0), len(chosen))
         free = set(counted)

@@ -1,4 +1,4 @@
-"""What a process writes to a terminal."""
+"""The output of a process to a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures that a tiny network can learn from in seconds: red chairs and blue beds on gray."""
+"""Images that a tiny network can learn in seconds: red chairs and blue beds on gray."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PICTURES = 6
 
 
 def write_room(folder: Path, number: int) -> None:
-    """A room as render_room() leaves it, of 64x48 px."""
+    """Write a room like render_room(), of 64x48 px."""
     room = room_folder(folder, number)
     room.mkdir(parents=True)
     rng = np.random.default_rng(number)

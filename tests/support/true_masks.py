@@ -1,4 +1,4 @@
-"""The masks of an analytic scene, and what a fuser is given where they were detected."""
+"""The masks of an analytic scene, and the fuser input of their detections."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PROBABILITIES = (0.7, 0.3)  # of every detection
 
 
 def masks_of(frame: Frame) -> list[np.ndarray]:
-    """(H, W) for each instance of the frame's truth."""
+    """Return (H, W) for each true instance of the frame."""
     assert frame.truth is not None
     return [frame.truth.instance_ids == i for i in frame.truth.class_names]
 

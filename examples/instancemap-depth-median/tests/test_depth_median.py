@@ -14,7 +14,7 @@ class TestDepthMedian(OptionContract, RefinerContract):
     option = "depth_median"
 
 
-def test_background_points_of_bleeding_mask_are_dropped() -> None:
+def test_depth_median_drops_background_of_bleeding_mask() -> None:
     frame = frame_at(1)
     refined = DepthMedian().refine(bleeding_clusters(frame), frame)
     ids = frame.truth.instance_ids[refined.pixels[:, 1], refined.pixels[:, 0]]
@@ -24,7 +24,7 @@ def test_background_points_of_bleeding_mask_are_dropped() -> None:
     assert (ids > 0).sum() > 0.99 * (before > 0).sum()
 
 
-def test_only_distant_point_is_dropped() -> None:
+def test_depth_median_drops_only_distant_point() -> None:
     frame = frame_at(1)
     clusters = exact_clusters(frame)
     farthest = frame.depth[clusters.pixels[:, 1], clusters.pixels[:, 0]].argmax()
@@ -33,6 +33,6 @@ def test_only_distant_point_is_dropped() -> None:
     np.testing.assert_array_equal(refined.pixels, np.delete(clusters.pixels, farthest, axis=0))
 
 
-def test_parameters_are_checked() -> None:
+def test_depth_median_invalid_parameter_raises() -> None:
     with pytest.raises(ConfigError, match=r"DepthMedian.reach: expected .* \[0, inf\], got -1"):
         DepthMedian(reach=-1)

@@ -1,4 +1,4 @@
-"""The recursion over classes and background in one voxel, beside the dense one that keeps every class."""
+"""Tests of the class evidence of one voxel, compared with a dense recursion over all classes."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def one_voxel(classes: int) -> ClassEvidence:
     return rows.evidence
 
 
-def masks_that_say(log_ratio: np.ndarray, frame: int = 0) -> MaskClasses:
-    """Masks with these (N, C), side by side in one row of pixels."""
+def masks_of(log_ratio: np.ndarray, frame: int = 0) -> MaskClasses:
+    """Return masks with these distributions (N, C), next to each other in one row of pixels."""
     n, c = log_ratio.shape
     clusters = PointClusters(
         np.zeros((n, 3), np.float32),
@@ -44,7 +44,7 @@ def observe(evidence, masks, k):
 
 
 def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
-    """(C,) what the voxel holds for each class."""
+    """Return the stored sums (C,) of the voxel."""
     found = np.full(classes, evidence.rest[0, 0], np.float64)
     for label, value in zip(evidence.class_ids[0, 0], evidence.log_ratio[0, 0], strict=True):
         if label != NO_CLASS:
@@ -55,7 +55,7 @@ def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
 def test_class_evidence_few_classes_are_exact() -> None:
     rng = np.random.default_rng(0)
     message = rng.normal(0, 2, (30, 5))
-    masks, evidence = masks_that_say(message), one_voxel(5)
+    masks, evidence = masks_of(message), one_voxel(5)
     assert sum(observe(evidence, masks, k) for k in range(30)) == 0
     np.testing.assert_allclose(sums(evidence, 5), message.sum(axis=0), atol=1e-4)
     assert evidence.class_ids[0, 0, 0] == message.sum(axis=0).argmax()
@@ -63,12 +63,12 @@ def test_class_evidence_few_classes_are_exact() -> None:
 
 
 def test_class_evidence_late_class_includes_earlier_masks() -> None:
-    """Of 14 classes each mask names 8 and finds the others alike: as a detector's floor does."""
+    """Each mask names 8 of 14 classes and gives the others equal probabilities, like a detector's floor."""
     rng = np.random.default_rng(1)
     message = np.full((20, 14), -3.0)
     for row in message:
         row[rng.choice(14, NEW_CLASSES, replace=False)] = rng.normal(0, 1, NEW_CLASSES)
-    masks, evidence = masks_that_say(message), one_voxel(14)
+    masks, evidence = masks_of(message), one_voxel(14)
     assert sum(observe(evidence, masks, k) for k in range(20)) == 0
     np.testing.assert_allclose(sums(evidence, 14), message.sum(axis=0), atol=1e-4)
 
@@ -76,7 +76,7 @@ def test_class_evidence_late_class_includes_earlier_masks() -> None:
 def test_class_evidence_full_voxel_drops_least_likely_class() -> None:
     message = np.full((3, 40), -5.0)
     message[0, :8], message[1, 8:16], message[2, 16:24] = 1.0, 2.0, 9.0
-    masks, evidence = masks_that_say(message), one_voxel(40)
+    masks, evidence = masks_of(message), one_voxel(40)
     assert evidence.class_ids.shape[2] == CLASS_SLOTS
     assert [observe(evidence, masks, k) for k in range(3)] == [0, 0, 8]
     # classes 0 to 7 have 1 - 5 - 5, 8 to 15 have -5 + 2 - 5, 16 to 23 have -5 - 5 + 9
@@ -88,7 +88,7 @@ def test_class_evidence_full_voxel_drops_least_likely_class() -> None:
 def test_class_evidence_tracks_frame_count_first_and_last() -> None:
     evidence = one_voxel(2)
     for frame in (4, 7, 9):
-        observe(evidence, masks_that_say(np.zeros((1, 2)), frame), 0)
+        observe(evidence, masks_of(np.zeros((1, 2)), frame), 0)
     assert (evidence.masked[0, 0], evidence.first_frame[0, 0], evidence.last_frame[0, 0]) == (3, 4, 9)
     assert (evidence.masked[0, 1], evidence.first_frame[0, 1], evidence.last_frame[0, 1]) == (0, -1, -1)
 

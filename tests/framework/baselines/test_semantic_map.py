@@ -1,4 +1,4 @@
-"""Connected components on meshes that can be counted by hand, and beside scipy's."""
+"""Tests of connected components on small meshes, compared with manual results and scipy."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ STRIP = np.int32([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 6]])
 """Seven vertices in a row of triangles."""
 
 
-def test_connected_components_are_split_by_other_class() -> None:
+def test_semantic_map_components_are_split_by_other_class() -> None:
     assert connected_components(STRIP, np.int32([2, 2, 2, 2, 2, 2, 2]), 1).tolist() == [1] * 7
     assert connected_components(STRIP, np.int32([2, 2, 2, 5, 5, 2, 2]), 1).tolist() == [1, 1, 1, 2, 2, 3, 3]
 
 
-def test_connected_components_background_and_small_have_no_id() -> None:
+def test_semantic_map_background_and_small_parts_have_no_id() -> None:
     assert connected_components(STRIP, np.int32([0, -1, -1, -1, -1, 0, 0]), 1).tolist() == [1, 0, 0, 0, 0, 2, 2]
     assert connected_components(STRIP, np.int32([0, -1, -1, -1, -1, 0, 0]), 2).tolist() == [0, 0, 0, 0, 0, 1, 1]
     assert connected_components(np.zeros((0, 3), np.int32), np.zeros(0, np.int32), 1).tolist() == []
@@ -27,7 +27,7 @@ def test_connected_components_background_and_small_have_no_id() -> None:
 
 @settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.integers(0, 2**32 - 1))
-def test_connected_components_match_scipy(seed: int) -> None:
+def test_semantic_map_components_match_scipy(seed: int) -> None:
     rng = np.random.default_rng(seed)
     v = int(rng.integers(3, 60))
     triangles = rng.integers(0, v, (int(rng.integers(0, 40)), 3)).astype(np.int32)

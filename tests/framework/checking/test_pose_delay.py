@@ -1,4 +1,4 @@
-"""Poses of frames later or earlier, told by points that are known exactly."""
+"""Tests of delay detection between poses and frames, on exact points."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ AS_IT_IS = (PoseFit(PoseReading(), 1.0, np.zeros(0)),)
 
 
 def trembling_walk() -> list[Float64]:
-    """A camera whose velocity changes from frame to frame."""
+    """Return the poses of a camera whose velocity changes from frame to frame."""
     chosen = np.random.default_rng(0)
     poses = [np.eye(4)]
     for _ in range(FRAMES - 1):
@@ -30,12 +30,12 @@ def trembling_walk() -> list[Float64]:
 
 
 def even_walk() -> list[Float64]:
-    """One that moves on as it did: the same step from frame to frame."""
+    """Return the poses of a camera with constant steps."""
     return [exp_se3(k * np.array([0.01, 0.0, 0.005, 0.0, 0.01, 0.0])) for k in range(FRAMES)]
 
 
 def pairs_of(true: Sequence[Float64], stored: Sequence[Float64 | None], noise: float = 0.0) -> list[MatchedPair]:
-    """Of frames all over the walk, each with its stored pose; noise in px."""
+    """Return pairs of frames along the walk, each with its stored pose; noise in px."""
     pairs = []
     for k, step in ((k, step) for k in range(8, FRAMES - 24, 6) for step in (4, 8, 16)):
         chosen = np.random.default_rng(k)
@@ -51,7 +51,7 @@ def pairs_of(true: Sequence[Float64], stored: Sequence[Float64 | None], noise: f
 
 
 def late(poses: Sequence[Float64], frames: int) -> list[Float64 | None]:
-    """As they are stored where they come so many frames late."""
+    """Return the stored poses if they are this many frames late."""
     return [poses[k - frames] if 0 <= k - frames < len(poses) else None for k in range(len(poses))]
 
 
@@ -70,28 +70,27 @@ def test_pose_delay_is_found_without_residual_error(frames: int) -> None:
     assert delay.finding(1, 0.1).setting == f"dataset.pose_delay={1 + frames}"
 
 
-def test_correct_poses_with_noisy_points_have_no_delay() -> None:
+def test_pose_delay_of_correct_poses_and_noisy_points_is_none() -> None:
     for noise in (0.0, 1.0, 5.0):
         assert found(trembling_walk(), 0, noise) is None
 
 
 @pytest.mark.parametrize("frames", [-2, 1, 3])
-def test_uniform_motion_has_no_detectable_delay(frames: int) -> None:
+def test_pose_delay_in_uniform_motion_is_undetectable(frames: int) -> None:
     assert found(even_walk(), frames, 0.5) is None
 
 
-def test_delay_beyond_search_range_is_not_reported() -> None:
+def test_pose_delay_beyond_search_range_is_not_reported() -> None:
     for frames in (LONGEST_DELAY + 1, LONGEST_DELAY + 2):
         assert found(trembling_walk(), frames) is None
 
 
-def test_unrelated_poses_have_no_delay() -> None:
-    """Whichever delay fits them least badly."""
+def test_pose_delay_of_unrelated_poses_is_none() -> None:
     other = [exp_se3(np.array([0, 0, 0, 0, 0, 0.5 * k])) for k in range(FRAMES)]
     assert find_delay(pairs_of(trembling_walk(), other), other, AS_IT_IS) is None
 
 
-def test_pairs_without_neighboring_poses_are_skipped() -> None:
+def test_pose_delay_skips_pairs_without_neighboring_poses() -> None:
     poses = trembling_walk()
     stored = late(poses, 2)
     pairs = pairs_of(poses, stored)
@@ -113,7 +112,7 @@ def test_pose_delay_is_found_in_fitting_axes() -> None:
     assert delay.frames == 3
 
 
-def test_delayed_pairs_have_matching_poses() -> None:
+def test_delayed_returns_pairs_with_matching_poses() -> None:
     poses = trembling_walk()
     stored = late(poses, -2)
     for pair in pairs_of(poses, stored):

@@ -1,4 +1,4 @@
-"""Readings of poses, judged by points that are known exactly."""
+"""Tests of pose conventions, evaluated on exact points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BLANK = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)
 def pair(
     T_world_first: Float64, T_world_second: Float64, stored: Callable[[Float64], Float64], seed: int
 ) -> MatchedPair:
-    """Two frames of a cloud of points, with the poses that are stored of them, and what the images tell."""
+    """Return two frames of a point cloud with their stored poses and image matches."""
     chosen = np.random.default_rng(seed)
     points = np.column_stack([chosen.uniform(-0.6, 0.6, (60, 2)), chosen.uniform(1.5, 3, 60)])
     T_second_first = inverse(T_world_second) @ T_world_first
@@ -49,7 +49,7 @@ def pairs_of(poses: list[Float64], stored: Callable[[Float64], Float64] = lambda
     return [pair(a, b, stored, k) for k, (a, b) in enumerate(pairwise(poses))]
 
 
-def test_correct_poses_fit_without_error() -> None:
+def test_pose_fit_of_correct_poses_has_no_error() -> None:
     for one in pairs_of(walk(0)):
         np.testing.assert_allclose(motion_of(one, PoseReading()), one.T_second_first, atol=1e-12)
     exact = fit(pairs_of(walk(0)), PoseReading())
@@ -59,9 +59,9 @@ def test_correct_poses_fit_without_error() -> None:
 
 
 @pytest.mark.parametrize("reading", list(readings()), ids=repr)
-def test_pose_reading_is_identified_from_moving_camera(reading: PoseReading) -> None:
+def test_pose_fit_identifies_reading_from_moving_camera(reading: PoseReading) -> None:
     def stored(T_world_camera: Float64) -> Float64:
-        """What the reading makes T_world_camera of; its order of steps, backwards."""
+        """Return the stored pose that the reading converts to T_world_camera."""
         T = T_world_camera.copy()
         T[:3, :3] = T[:3, :3] @ reading.camera_axes.R_axes_camera.T
         if reading.pose_kind is PoseKind.T_CAMERA_WORLD:
@@ -77,8 +77,8 @@ def test_pose_reading_is_identified_from_moving_camera(reading: PoseReading) -> 
     assert "equally well" not in judged.findings[0].text
 
 
-def test_ambiguous_axes_of_pan_are_reported() -> None:
-    """Turned about the image's vertical, an inverted pose and one of OpenGL's axes turn alike."""
+def test_pose_fit_reports_ambiguous_axes_of_pan() -> None:
+    """For a rotation about the vertical image axis, an inverted pose and an OpenGL pose rotate equally."""
     judged = judge(pairs_of(walk(2, pan_only=True), inverse), PoseReading(), 1000.0, 2.0)
     [fault] = judged.findings
     assert fault.verdict is Verdict.FAULT
@@ -89,7 +89,7 @@ def test_ambiguous_axes_of_pan_are_reported() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.2, 5.0, 1000.0])
-def test_wrong_pose_unit_is_measured(factor: float) -> None:
+def test_pose_fit_measures_wrong_unit(factor: float) -> None:
     def stored(T: Float64) -> Float64:
         scaled = T.copy()
         scaled[:3, 3] *= factor
@@ -101,7 +101,7 @@ def test_wrong_pose_unit_is_measured(factor: float) -> None:
     assert judged.findings[-1].setting == "dataset.depth_scale=1000"
 
 
-def test_poses_in_configured_axes_are_correct() -> None:
+def test_pose_fit_in_configured_axes_is_correct() -> None:
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     of_opengl = pairs_of(walk(4), lambda T: T @ flip)
     judged = judge(of_opengl, PoseReading(camera_axes=CameraAxes.OPENGL), 1000.0, 2.0)
@@ -110,8 +110,8 @@ def test_poses_in_configured_axes_are_correct() -> None:
     assert wrong.findings[0].setting == "dataset.camera_axes=OPENCV"
 
 
-def test_configured_pose_unit_is_kept_in_axes_search() -> None:
-    """In millimeters and inverted: with the unit set, the direction alone is left to be named."""
+def test_pose_fit_keeps_configured_unit_in_axes_search() -> None:
+    """The poses are inverted and in millimeters. If the unit is set, only the direction is reported."""
 
     def stored(T: Float64) -> Float64:
         inverted = inverse(T)

@@ -1,4 +1,4 @@
-"""What a check says of real recordings: nothing where they are sound, and what to set where one convention is not."""
+"""Tests of the recording check: valid recordings have no findings, and each wrong convention is named."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
 
 
 def in_axes(axes: CameraAxes) -> Callable[[Float64], Float64]:
-    """The pose of the same camera, of which other axes are meant."""
+    """Return a function that converts a pose to one of the same camera in other axes."""
     T_axes_camera = np.eye(4)
     T_axes_camera[:3, :3] = axes.R_axes_camera
     return lambda T_world_camera: T_world_camera @ inverse(T_axes_camera)
 
 
 def scalar_first(T: Float64) -> Float64:
-    """What x y z w makes of a file with w x y z."""
+    """Return the pose whose quaternion w x y z is read in the order x y z w."""
     misread = T.copy()
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
     misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()
@@ -94,7 +94,7 @@ def settings(findings: tuple[Finding, ...]) -> list[str]:
 
 @pytest.mark.acceptance
 @pytest.mark.parametrize(("name", "damage", "setting"), ELEVEN)
-def test_damaged_recording_check_names_setting(
+def test_recording_check_of_damaged_recording_names_setting(
     shared_data: Path, tmp_path: Path, name: str, damage: Mapping[str, Any], setting: str
 ) -> None:
     place = write_damaged(tmp_path / "damaged", shared_recording(shared_data, name), **damage)
@@ -113,15 +113,13 @@ def test_damaged_recording_check_names_setting(
         ({"poses_late": -3, "depth_late": -3}, f"{POSES}-3 {DELAY}-3"),
     ],
 )
-def test_desk_with_changed_convention_check_names_setting(
-    tmp_path: Path, damage: Mapping[str, Any], setting: str
-) -> None:
+def test_recording_check_of_changed_desk_names_setting(tmp_path: Path, damage: Mapping[str, Any], setting: str) -> None:
     place = write_damaged(tmp_path / "damaged", DESK, **damage)
     assert " ".join(settings(check(RgbdFolder(place), FARTHEST).findings)) == setting
 
 
 @pytest.mark.acceptance
-def test_original_recordings_have_no_faults(shared_data: Path) -> None:
+def test_recording_check_of_originals_reports_no_error(shared_data: Path) -> None:
     originals = shared_data / "originals"
     recordings: list[Recording] = [
         DESK,
@@ -139,8 +137,8 @@ def test_original_recordings_have_no_faults(shared_data: Path) -> None:
         assert found.findings[0].subject == "depth"
 
 
-def test_check_applies_configured_conventions(tmp_path: Path) -> None:
-    """The parameter that was named makes the recording sound; one more is a fault again."""
+def test_recording_check_applies_configured_conventions(tmp_path: Path) -> None:
+    """The named parameter makes the recording valid; a second change makes it invalid again."""
     place = write_damaged(tmp_path / "damaged", DESK, pose=both, scale=2.0, depth_late=1, poses_late=-2)
     reading = PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL, pose_delay=-2)
     depth = DepthReading(depth_scale=5000, depth_delay=1)
@@ -151,8 +149,8 @@ def test_check_applies_configured_conventions(tmp_path: Path) -> None:
     assert "3 frames early (0.0" in found.faults[0].text
 
 
-def test_pose_clock_delay_is_reported_in_frames_and_seconds(tmp_path: Path) -> None:
-    """The desk in TUM's own files, the poses' times 0.1 s late."""
+def test_recording_check_reports_clock_delay_in_two_units(tmp_path: Path) -> None:
+    """The recording is the desk in TUM's files; its pose timestamps are 0.1 s late."""
     shutil.copytree(DESK.folder, tmp_path / DESK.name)
     path = tmp_path / DESK.name / "groundtruth.txt"
     words = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
@@ -162,7 +160,7 @@ def test_pose_clock_delay_is_reported_in_frames_and_seconds(tmp_path: Path) -> N
     assert "3 frames late (0.096 s)" in fault.text
 
 
-def test_unrelated_poses_fit_in_no_axes(tmp_path: Path) -> None:
+def test_recording_check_unrelated_poses_fit_in_no_axes(tmp_path: Path) -> None:
     turned = iter(range(1000))
 
     def another(_: Float64) -> Float64:
@@ -178,7 +176,7 @@ def test_unrelated_poses_fit_in_no_axes(tmp_path: Path) -> None:
 
 @dataclass
 class MovedDepth(RGBDSequence):
-    """The desk with depth zoomed and moved by an affine map (2, 3), as from a camera beside that of the colors."""
+    """The desk with depth moved by an affine map (2, 3), as from a second camera."""
 
     moved: Float64
 
@@ -195,7 +193,7 @@ class MovedDepth(RGBDSequence):
 
 
 @pytest.mark.parametrize(("zoom", "x", "y"), [(1.0, -20, 8), (1.11, 0, 0)])
-def test_unregistered_depth_is_reported(zoom: float, x: float, y: float) -> None:
+def test_recording_check_reports_unregistered_depth(zoom: float, x: float, y: float) -> None:
     moved = cv2.getRotationMatrix2D((319.5, 239.5), 0, zoom)
     moved[:, 2] += (x, y)
     [fault] = [fault for fault in check(MovedDepth(moved), FARTHEST).faults if fault.subject == "color and depth"]
@@ -206,8 +204,8 @@ def test_unregistered_depth_is_reported(zoom: float, x: float, y: float) -> None
         assert found_y == pytest.approx(-100 * y / 640, abs=0.4)
 
 
-def test_half_frame_motion_between_color_and_depth_is_note() -> None:
-    """The desk begins with a turn of 20 px a frame, and a Kinect does not take both at the same moment."""
+def test_recording_check_half_frame_color_depth_motion_is_note() -> None:
+    """The desk begins with a turn of 20 px per frame, and a Kinect captures color and depth at different times."""
     [expected] = [
         finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject.startswith("col")
     ]
@@ -217,7 +215,7 @@ def test_half_frame_motion_between_color_and_depth_is_note() -> None:
 
 @dataclass
 class Part(RGBDSequence):
-    """Some frames of the desk, without poses; what is changed in them."""
+    """Some frames of the desk without poses, with modifications."""
 
     count: int
     change: Callable[[Frame], Frame] = lambda frame: frame
@@ -239,13 +237,13 @@ def verdicts(sequence: RGBDSequence) -> dict[str, Verdict]:
     return {finding.subject: finding.verdict for finding in check(sequence, FARTHEST).findings}
 
 
-def test_single_frame_or_missing_poses_can_be_checked() -> None:
+def test_recording_check_accepts_single_frame_or_missing_poses() -> None:
     fine = dict.fromkeys(("depth", "poses", "sharpness"), Verdict.FINE)
     assert verdicts(Part(1)) == fine | dict.fromkeys(("motion", "color and depth"), Verdict.UNKNOWN)
     assert verdicts(Part(20)) == fine | dict.fromkeys(("motion", "color and depth"), Verdict.FINE)
 
 
-def test_single_frame_defects_are_reported() -> None:
+def test_recording_check_reports_defects_of_single_frame() -> None:
     def blurred(frame: Frame) -> Frame:
         return replace(frame, color=cv2.GaussianBlur(frame.color, (0, 0), 12))
 
@@ -267,7 +265,7 @@ def test_single_frame_defects_are_reported() -> None:
     assert verdicts(Part(8, sparse))["depth"] is Verdict.NOTE
 
 
-def test_unreadable_frames_are_reported() -> None:
+def test_recording_check_reports_unreadable_frames() -> None:
     def unreadable(frame: Frame) -> Frame:
         if frame.index % 3 == 0:
             raise FrameError("torn")

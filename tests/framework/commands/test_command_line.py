@@ -1,4 +1,4 @@
-"""Names of a sweep's directories, and how commands end."""
+"""Tests of the directory names of sweeps and of the end of commands."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_print_for_directories_continues_after_error(
 
 @pytest.mark.parametrize("command", ["tables", "figures", "evaluate", "plugins"])
 def test_command_with_closed_pipe_ends_silently(command: str) -> None:
-    """As in `python -m framework tables DIR | head -1`."""
+    """Example: `python -m framework tables DIR | head -1`."""
     reader, writer = os.pipe()
     os.close(reader)
     arguments = [sys.executable, "-m", "framework", command, "--help"]
@@ -62,5 +62,5 @@ def test_command_with_closed_pipe_ends_silently(command: str) -> None:
     ],
 )
 def test_config_dirs_are_read_from_command_line(words: list[str], folders: list[str]) -> None:
-    """Also of the command without arguments, which maps the desk."""
+    """This includes the command without arguments, which maps the desk."""
     assert _config_dirs(words) == [Path(folder) for folder in folders]

@@ -1,4 +1,4 @@
-"""kernels.txt has all kernels that runs call: after `compile`, a run compiles nothing."""
+"""Tests of kernels.txt, which lists all kernels of a run, so that a run after `compile` compiles nothing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LINES = [line for line in catalog.LIST.read_text().splitlines() if line and not 
 
 
 @pytest.mark.parametrize("kernel", listed(DEFAULT, OTHERS), ids=lambda kernel: f"{kernel.module}.{kernel.name}")
-def test_listed_kernels_exist(kernel: Kernel) -> None:
+def test_kernel_catalog_contains_only_existing_kernels(kernel: Kernel) -> None:
     assert isinstance(kernel.dispatcher, Dispatcher)
     assert line_of(kernel.dispatcher, kernel.signature) in LINES
     assert len(kernel.signature) == kernel.dispatcher.py_func.__code__.co_argcount
@@ -48,10 +48,13 @@ def test_kernel_signature_text_round_trip_is_exact() -> None:
 
 
 @pytest.mark.acceptance
-def test_runs_call_only_listed_kernels() -> None:
-    """The demo, a room, each other refiner, fuser and tracker: `python -m tests.support.kernel_calls` updates it."""
+def test_kernel_catalog_contains_all_called_kernels() -> None:
+    """Run the demo, a room, and every other refiner, fuser and tracker.
+
+    `python -m tests.support.kernel_calls` updates it.
+    """
     if missing := [kernel for kernel in listed(DEFAULT, OTHERS) if not kernel.is_compiled()]:
-        compile_all(missing)  # as `make test` does
+        compile_all(missing)  # like `make test`
     line = [sys.executable, "-m", "tests.support.kernel_calls", "--check"]
     done = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -88,7 +91,7 @@ def twice(x):
 
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with two modules of kernels, which workers find, too; the file of the callee."""
+    """Return a folder with two kernel modules that workers can import, and the file of the callee."""
     (tmp_path / "kernel_caller.py").write_text(SMALL)
     callee = tmp_path / "kernel_callee.py"
     callee.write_text(CALLEE.format(2))
@@ -109,7 +112,9 @@ def test_kernel_is_recompiled_after_callee_change(small: Path) -> None:
     assert not kernel.is_compiled()
 
 
-def test_index_with_renamed_class_is_deleted(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernel_index_with_renamed_class_is_deleted(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "kernel_types.py").write_text("from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    x: int\n")
     (tmp_path / "kernel_caller.py").write_text(PAIRS)
     monkeypatch.delitem(sys.modules, "kernel_types", raising=False)

@@ -1,6 +1,6 @@
-"""Whatever the YAML of --config-dir says: an option is built, or refused in one line.
+"""Fuzz tests of option YAML files: an option is built or rejected with a one-line error.
 
-`INSTANCEMAP_FUZZ=2000 pytest tests/framework/config/test_config_fuzzing.py` tries so many.
+`INSTANCEMAP_FUZZ=2000 pytest tests/framework/config/test_config_fuzzing.py` tries 2000 cases.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ TOKENS = (
         b"~: 1\n",
     ),
 )
-SLOWEST = 5.0  # s of this process: others may keep the machine busy
+SLOWEST = 5.0  # s of CPU time, because other processes may use the machine
 BOMB = "a0: &a0 [x]\n" + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12))
 
 
@@ -65,7 +65,7 @@ def option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def line_of(option: Path, content: bytes) -> str:
-    """The line that refuses the option; "" = it was built. Fails for everything else that can happen."""
+    """Return the error line of the option; "" if it was built. Fails for any other outcome."""
     option.write_bytes(content)
     began = time.process_time()
     try:
@@ -80,13 +80,13 @@ def line_of(option: Path, content: bytes) -> str:
     return line
 
 
-def test_undamaged_option_is_composed(option: Path) -> None:
+def test_config_option_undamaged_is_composed(option: Path) -> None:
     assert "/nowhere/results.json: cannot be read" in line_of(option, OPTION)
 
 
 @settings(max_examples=EXAMPLES // 2, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 @given(content=damaged(OPTION, TOKENS))
-def test_damaged_option_is_built_or_raises_one_line(content: bytes, option: Path) -> None:
+def test_config_option_damaged_builds_or_raises_one_line_error(content: bytes, option: Path) -> None:
     line_of(option, content)
 
 
@@ -104,13 +104,13 @@ def test_damaged_option_is_built_or_raises_one_line(content: bytes, option: Path
     ],
     ids=range(8),
 )
-def test_invalid_option_file_raises_one_line_with_path(content: str, message: str, option: Path) -> None:
+def test_config_option_invalid_file_error_is_one_line_with_path(content: str, message: str, option: Path) -> None:
     line = line_of(option, content.encode(errors="surrogateescape"))
     assert message in line
     assert line.startswith(str(option))
 
 
-def test_option_linked_to_device_raises(option: Path) -> None:
+def test_config_option_linked_to_device_raises(option: Path) -> None:
     option.symlink_to("/dev/zero")
     with pytest.raises(InstanceMapError, match="detector: expected one of"):
         composed("~dataset", "detector=mine")

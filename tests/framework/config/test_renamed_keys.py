@@ -1,4 +1,4 @@
-"""Old config keys are rejected with the new key, and the configs do not contain any."""
+"""Tests of renamed config keys: old keys are rejected with the new key, and no config contains them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ CHECKOUT = Path(__file__).resolve().parents[3]
 @pytest.mark.parametrize(
     "override", ["map=outputs/demo", "fuser.on_top=0.5", "refiner.links.plane_removal.max_own=0.1"]
 )
-def test_override_old_key_names_new_key(override: str) -> None:
+def test_renamed_key_override_error_names_new_key(override: str) -> None:
     key = override.partition("=")[0]
     with pytest.raises(ConfigError, match=str(new_name(key))):
         composed(override)
 
 
-def test_stored_config_old_parameter_names_new_key() -> None:
+def test_renamed_key_stored_config_error_names_new_key() -> None:
     fuser = composed("dataset=desk").fuser
     stored = OmegaConf.create({**OmegaConf.to_container(fuser), "lying_on": 0.6})
     with pytest.raises(ConfigError, match=r"fuser\.support_overlap"):

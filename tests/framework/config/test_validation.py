@@ -1,4 +1,4 @@
-"""The rows of experiments, as people write them."""
+"""Tests of the validation of experiment rows."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_experiment_rows_give_overrides() -> None:
         ("mine", "rows: expected names with overrides"),
     ],
 )
-def test_invalid_experiment_rows_raise_one_line(rows: Any, message: str) -> None:
+def test_experiment_rows_invalid_raise_one_line_error(rows: Any, message: str) -> None:
     for node in (rows, OmegaConf.create({"rows": rows}).rows):
         with pytest.raises(ConfigError, match=message) as caught:
             checked_rows(node)

@@ -1,4 +1,4 @@
-"""Recordings as publishers, apps and drivers wrote them, not as our own writers would: exact numbers of each."""
+"""Tests of original recordings of publishers, apps and drivers, with exact numbers of each."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ GAP = (1305031244.897635, 1305031244.997688)  # s, of the color images that have
 
 @pytest.fixture(scope="module")
 def originals(shared_data: Path) -> Path:
-    """`shared/data/originals`; skips where it is not there."""
+    """Return `shared/data/originals`; skip the test if it is missing."""
     if not (shared_data / "originals").is_dir():
         pytest.skip(f"{shared_data / 'originals'} is not there")
     return shared_data / "originals"
 
 
 def readings(depth: np.ndarray) -> tuple[float, float, float]:
-    """The nearest and the farthest reading, and the share of pixels that have one."""
+    """Return the smallest and largest depth, and the fraction of valid pixels."""
     return float(depth[depth > 0].min()), float(depth[depth > 0].max()), float((depth > 0).mean())
 
 
@@ -61,14 +61,14 @@ def raw(path: Path) -> np.ndarray:
 
 
 def run(*overrides: str) -> tuple[RGBDSequence, RunResult]:
-    """The command's own stages, without detection."""
+    """Run the default stages without detection."""
     config = composed("detector=none", "fuser.voxel_size=0.02", *overrides)
     sequence = build(RGBDSequence, config.dataset)
     return sequence, begin(config).run(sequence)
 
 
 def check_map_shows_its_frames(sequence: RGBDSequence, result: RunResult) -> None:
-    """What the map shows from the pose of each frame lies where that frame's readings are, to half a voxel."""
+    """Check that the view of the map at the pose of each frame matches its depth to half a voxel."""
     for k, tracked in enumerate(result.tracked):
         frame = sequence[k]
         seen = result.scene.render(frame.camera, tracked.pose.T_world_camera).depth
@@ -98,7 +98,7 @@ def test_openni_1_recording_without_end_is_truncated(
     assert {images.count for images in contents.streams.values()} == {count}
 
 
-def test_recording_without_images_raises_one_line(originals: Path, tmp_path: Path) -> None:
+def test_openni_1_without_images_raises_one_line_error(originals: Path, tmp_path: Path) -> None:
     path = originals / "oni/no_images.oni"
     with pytest.raises(DataError) as caught:
         convert(path, tmp_path / "out")
@@ -142,7 +142,7 @@ def test_openni_1_recording_is_converted_and_mapped(
 # 7-Scenes
 
 
-def test_published_seven_scenes_frame_matches_files(originals: Path) -> None:
+def test_seven_scenes_published_frame_matches_files(originals: Path) -> None:
     sequence = SevenScenes(originals / "seven_scenes", scene=KITCHEN)
     assert (len(sequence), sequence.name, sequence.camera) == (3, "redkitchen-seq-01", COLOR_CAMERA)
     assert sequence.camera.shape == VGA
@@ -228,7 +228,7 @@ def test_replica_excerpt_skips_frames_with_missing_images(originals: Path, tmp_p
 
 
 def given_poses(tracker: PoseTracker, sequence: RGBDSequence) -> RunResult:
-    """A run that costs nothing but reading."""
+    """Run with given poses, which costs only reading."""
     return Pipeline(NoDetections(), tracker, KeepAll(), GridFuser(), prefetch=0).run(sequence)
 
 
@@ -250,7 +250,7 @@ def test_tum_excerpt_reads_available_images(originals: Path) -> None:
 
 
 def test_tum_pose_is_interpolated_between_neighbors(originals: Path) -> None:
-    """Lines 689 and 690 of groundtruth.txt, at ...2.8231 and ...2.8332 s; 26 % of the way to the second."""
+    """Lines 689 and 690 of groundtruth.txt are at ...2.8231 and ...2.8332 s; the frame is at 26 % between them."""
     T_world_camera = TumRgbd(originals / "tum_rgbd", scene=FREIBURG1_RPY)[99].T_world_camera
     assert T_world_camera is not None
     share = (0.825767 - 0.8231) / (0.8332 - 0.8231)
@@ -277,7 +277,7 @@ def test_tum_is_mapped(originals: Path) -> None:
 
 
 def around_the_gap(originals: Path, folder: Path) -> TumRgbd:
-    """The frames around the gap of motion capture, with the original times and poses; images of another time."""
+    """Return the frames around the gap of motion capture with original times and poses; the images are others."""
     source = originals / "tum_rgbd" / FREIBURG1_RPY
     target = folder / FREIBURG1_RPY
     target.mkdir()
@@ -289,7 +289,7 @@ def around_the_gap(originals: Path, folder: Path) -> TumRgbd:
     return TumRgbd(target)
 
 
-def test_frames_in_motion_capture_gap_are_skipped(
+def test_tum_frames_in_motion_capture_gap_are_skipped(
     originals: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     sequence = around_the_gap(originals, tmp_path)
@@ -310,7 +310,7 @@ def test_frames_in_motion_capture_gap_are_skipped(
         np.testing.assert_allclose(ours.pose.T_world_camera[:3, 3], theirs.pose.T_world_camera[:3, 3], atol=0.01)
 
 
-def test_run_inside_motion_capture_gap_raises_one_line(originals: Path, tmp_path: Path) -> None:
+def test_tum_run_in_motion_capture_gap_raises_one_line_error(originals: Path, tmp_path: Path) -> None:
     sequence = around_the_gap(originals, tmp_path)
     first = [recorded.timestamp for recorded in sequence.contents.frames].index(GAP[0])
     alone = TumRgbd(sequence.folder, start=first, stop=first + 1)
@@ -327,7 +327,7 @@ def test_run_inside_motion_capture_gap_raises_one_line(originals: Path, tmp_path
 
 
 def test_scannet_first_release_names_are_known(shared_data: Path) -> None:
-    """The annotation has `trashcan` and `dishrack`, the label table `trash can` and `dish rack`: no class of COCO's."""
+    """The annotation has `trashcan` and `dishrack`, the label table `trash can` and `dish rack`; COCO has neither."""
     root = shared_data / "scannet_scene0000"
     if not root.is_dir():
         pytest.skip(f"{root} is not there")
@@ -338,7 +338,7 @@ def test_scannet_first_release_names_are_known(shared_data: Path) -> None:
     assert len(names) == 17
     assert names.count("chair") == 4  # stools
     unknown = [instance for instance, name in mesh.class_names.items() if name is None]
-    assert unknown == [56], "what nobody labeled is one instance more than the 55 objects"
+    assert unknown == [56], "the unlabeled part is one instance more than the 55 objects"
     groups = read_aggregation(scene.folder / "scene0000_00.aggregation.json")
     segments = json.loads((scene.folder / "scene0000_00_vh_clean_2.0.010000.segs.json").read_text())["segIndices"]
     for label, count in (("trashcan", 3), ("dishrack", 1)):

@@ -1,4 +1,4 @@
-"""Replica in NICE-SLAM's layout, sound and with every fault."""
+"""Tests of Replica in NICE-SLAM's layout, with valid and invalid files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_camera(root: Path, **changes: Any) -> None:
 
 
 def pose_at(k: int) -> np.ndarray:
-    """A turn to the right about the vertical of the camera, away from the origin."""
+    """Return a pose away from the origin, rotated to the right about the vertical axis of the camera."""
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = Rotation.from_rotvec([0, 0.3 * k, 0]).as_matrix()
     T_world_camera[:3, 3] = 1, 2, 0.1 * k
@@ -47,7 +47,7 @@ def root(tmp_path: Path) -> Path:
     return root
 
 
-def test_frame_matches_files(root: Path) -> None:
+def test_replica_frame_matches_files(root: Path) -> None:
     sequence = ReplicaNiceSlam(root, scene="room0")
     assert (len(sequence), sequence.name) == (FRAMES, "room0")
     assert sequence.camera == Camera(24, 16, 12.0, 12.0, 11.5, 7.5)
@@ -68,13 +68,13 @@ def test_replica_recording_is_mapped(root: Path) -> None:
         assert (points[0] - center) @ R[:, 1] < 0 < (points[-1] - center) @ R[:, 1]  # the first row is above
 
 
-def test_partial_recording_keeps_matching_poses(root: Path) -> None:
+def test_replica_partial_recording_keeps_matching_poses(root: Path) -> None:
     for name in ("frame000000.jpg", "depth000000.png"):
         (root / "room0/results" / name).unlink()
     np.testing.assert_allclose(ReplicaNiceSlam(root / "room0")[0].T_world_camera, pose_at(1), atol=1e-12)
 
 
-def test_invalid_pose_raises_for_its_frame(root: Path) -> None:
+def test_replica_invalid_pose_raises_for_its_frame(root: Path) -> None:
     stretched = pose_at(1)
     stretched[0] *= 1.1
     write_poses(root / "room0", [pose_at(0), stretched, pose_at(2)])
@@ -89,24 +89,24 @@ def test_invalid_pose_raises_for_its_frame(root: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["frame000001.jpg", "depth000001.png"])
-def test_missing_image_raises_for_its_frame(root: Path, name: str) -> None:
+def test_replica_missing_image_raises_for_its_frame(root: Path, name: str) -> None:
     (root / "room0/results" / name).unlink()
     assert f"{name}: cannot be read" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
 
 
 @pytest.mark.parametrize("name", ["results", "traj.txt"])
-def test_missing_results_or_trajectory_raises(root: Path, name: str) -> None:
+def test_replica_missing_results_or_trajectory_raises(root: Path, name: str) -> None:
     (root / "room0" / name).rename(root / "elsewhere")
     with pytest.raises(DataError, match=name):
         ReplicaNiceSlam(root, scene="room0")
 
 
-def test_missing_scene_parameter_raises_with_hint(root: Path) -> None:
+def test_replica_missing_scene_parameter_raises_with_hint(root: Path) -> None:
     with pytest.raises(DataError, match=r"cam_params\.json: expected camera parameters .*, such as room0"):
         ReplicaNiceSlam(root)
 
 
-def test_frames_without_pose_are_counted(root: Path) -> None:
+def test_replica_frames_without_pose_are_counted(root: Path) -> None:
     write_poses(root / "room0", [pose_at(0), pose_at(1)])
     sequence = ReplicaNiceSlam(root, scene="room0")
     assert "frame000002.jpg: expected a pose in traj.txt, got none among its 2 poses" in fault_of(sequence, 2)
@@ -114,23 +114,23 @@ def test_frames_without_pose_are_counted(root: Path) -> None:
     assert (result.frames, result.frames_skipped) == (FRAMES, 1)
 
 
-def test_poses_without_frame_are_ignored(root: Path) -> None:
+def test_replica_poses_without_frame_are_ignored(root: Path) -> None:
     write_poses(root / "room0", [pose_at(k) for k in range(FRAMES + 2)])
     assert len(list(ReplicaNiceSlam(root, scene="room0"))) == FRAMES
 
 
-def test_scene_in_working_directory_is_read(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replica_scene_in_working_directory_is_read(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(root / "room0")
     assert ReplicaNiceSlam(Path()).camera == Camera(24, 16, 12.0, 12.0, 11.5, 7.5)
 
 
-def test_scene_symbolic_link_is_read(root: Path, tmp_path: Path) -> None:
+def test_replica_scene_symbolic_link_is_read(root: Path, tmp_path: Path) -> None:
     (root / "room0").rename(tmp_path / "elsewhere")
     (root / "room0").symlink_to(tmp_path / "elsewhere")
     assert len(ReplicaNiceSlam(root, scene="room0")) == FRAMES
 
 
-def test_invalid_pose_line_error_gives_line_number(root: Path) -> None:
+def test_replica_invalid_pose_line_error_gives_line_number(root: Path) -> None:
     write_poses(root / "room0", [pose_at(0), pose_at(1)[:3], pose_at(2)])
     with pytest.raises(DataError, match=r"traj\.txt, line 2: expected 16 numbers, got 12"):
         ReplicaNiceSlam(root, scene="room0")
@@ -139,20 +139,20 @@ def test_invalid_pose_line_error_gives_line_number(root: Path) -> None:
 @pytest.mark.parametrize(
     "changes", [{"w": "wide"}, {"h": 16.5}, {"fx": -1.0}, {"cy": float("nan")}, {"scale": 0}, {"fy": 10**18}]
 )
-def test_invalid_camera_value_raises(root: Path, changes: dict[str, Any]) -> None:
+def test_replica_invalid_camera_value_raises(root: Path, changes: dict[str, Any]) -> None:
     write_camera(root, **changes)
     with pytest.raises(DataError, match=rf"cam_params\.json: .*{next(iter(changes))}"):
         ReplicaNiceSlam(root, scene="room0")
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"camera": 3}', "{}", "[" * 100_000, '{"camera": {"w": 24}}'])
-def test_invalid_camera_file_raises(root: Path, text: str) -> None:
+def test_replica_invalid_camera_file_raises(root: Path, text: str) -> None:
     (root / "cam_params.json").write_text(text)
     with pytest.raises(DataError, match=r"cam_params\.json"):
         ReplicaNiceSlam(root, scene="room0")
 
 
-def test_image_size_mismatch_raises(root: Path) -> None:
+def test_replica_image_size_mismatch_raises(root: Path) -> None:
     write_depth(root / "room0/results/depth000002.png", 1, (8, 12))
     assert ", got 12x8 px" in fault_of(ReplicaNiceSlam(root, scene="room0"), 2)
     write_camera(root, w=120, h=68)

@@ -1,4 +1,4 @@
-"""RGB-D folders written in the exact layout, sound and with every fault."""
+"""Tests of RGB-D folders in the exact layout, with valid and invalid files."""
 
 import json
 import shutil
@@ -60,7 +60,7 @@ def change_camera(folder, **changes):
     (folder / "camera.json").write_text(json.dumps(CAMERA | changes))
 
 
-def test_frame_matches_files(folder):
+def test_rgbd_folder_frame_matches_files(folder):
     sequence = RgbdFolder(folder)
     assert (len(sequence), sequence.name) == (FRAMES, "kitchen")
     frame = sequence[2]
@@ -74,7 +74,7 @@ def test_frame_matches_files(folder):
     assert set(np.unique(frame.truth.instance_ids)) == {0, 7, 300}
 
 
-def test_frame_fraction_keeps_order_index_and_contents(folder):
+def test_rgbd_folder_frame_fraction_keeps_order_and_contents(folder):
     sequence = RgbdFolder(folder, frame_fraction=0.5, seed=1)
     indices = [frame.index for frame in sequence]
     assert len(indices) == 2
@@ -89,7 +89,7 @@ def test_frame_fraction_keeps_order_index_and_contents(folder):
         RgbdFolder(folder, frame_fraction=1.5)
 
 
-def test_start_stop_stride_keep_original_frame_index(folder):
+def test_rgbd_folder_start_stop_stride_keep_frame_index(folder):
     sequence = RgbdFolder(folder, start=1, stop=4, stride=2)
     assert [frame.index for frame in (sequence[0], sequence[1])] == [1, 3]
     assert len(sequence) == 2
@@ -97,11 +97,11 @@ def test_start_stop_stride_keep_original_frame_index(folder):
         sequence[2]
 
 
-def test_scene_selects_subfolder(folder):
+def test_rgbd_folder_scene_selects_subfolder(folder):
     assert RgbdFolder(folder.parent, scene="kitchen").name == "kitchen"
 
 
-def test_depth_65535_or_beyond_max_depth_is_invalid(folder):
+def test_rgbd_folder_depth_65535_or_beyond_max_is_invalid(folder):
     image = depth_mm(0)
     image[0, :3] = 65535, 2500, 0
     cv2.imwrite(str(folder / "depth/000000.png"), image)
@@ -109,7 +109,7 @@ def test_depth_65535_or_beyond_max_depth_is_invalid(folder):
     assert RgbdFolder(folder, max_depth=2.0)[0].depth[0, :3].tolist() == [0, 0, 0]
 
 
-def test_frame_number_gaps_are_accepted(folder):
+def test_rgbd_folder_frame_number_gaps_are_accepted(folder):
     for name in ("color", "depth", "instance"):
         (folder / name / "000001.png").rename(folder / name / "frame-12345.png")
     sequence = RgbdFolder(folder)
@@ -117,7 +117,7 @@ def test_frame_number_gaps_are_accepted(folder):
     np.testing.assert_array_equal(sequence[1].color, picture(2))
 
 
-def test_missing_poses_give_no_pose(folder):
+def test_rgbd_folder_missing_poses_give_no_pose(folder):
     (folder / "poses.txt").unlink()
     sequence = RgbdFolder(folder)
     assert sequence[3].T_world_camera is None
@@ -126,7 +126,7 @@ def test_missing_poses_give_no_pose(folder):
 
 
 @pytest.mark.parametrize("times", [(0, 0, 0, 0), (5, 6, 7, 6.5), (5, 6, 6, 7)])
-def test_nonincreasing_timestamps_default_to_30_hz(folder, caplog, times):
+def test_rgbd_folder_nonincreasing_timestamps_default_to_30_hz(folder, caplog, times):
     for k, time in enumerate(times):
         set_pose_line(folder, k, f"{time} {k} 0 0 0 0 0 1")
     sequence = RgbdFolder(folder)
@@ -135,21 +135,21 @@ def test_nonincreasing_timestamps_default_to_30_hz(folder, caplog, times):
     assert caplog.text.count("kitchen: expected increasing timestamps") == 1
 
 
-def test_timestamp_of_unusable_frame_is_ignored(folder, caplog):
+def test_rgbd_folder_timestamp_of_unusable_frame_is_ignored(folder, caplog):
     set_pose_line(folder, 1, "0 nan nan nan nan nan nan nan")
     assert [RgbdFolder(folder)[k].timestamp for k in (0, 2, 3)] == [0, 0.2, 0.3]
     assert not caplog.records
 
 
-def test_has_poses_is_false_only_without_pose_lines(folder):
+def test_rgbd_folder_has_poses_unless_file_has_no_pose_lines(folder):
     for k in range(FRAMES):
         set_pose_line(folder, k, f"{k} nan nan nan nan nan nan nan")
-    assert RgbdFolder(folder).has_poses()  # reading says what is wrong with them
+    assert RgbdFolder(folder).has_poses()  # reading reports the errors
     (folder / "poses.txt").unlink()
     assert not RgbdFolder(folder).has_poses()
 
 
-def test_missing_instances_give_no_truth(folder):
+def test_rgbd_folder_missing_instances_give_no_truth(folder):
     shutil.rmtree(folder / "instance")
     (folder / "instances.json").unlink()
     sequence = RgbdFolder(folder)
@@ -157,7 +157,7 @@ def test_missing_instances_give_no_truth(folder):
     assert sequence.scene_truth() is None
 
 
-def test_scene_truth_lies_on_labeled_surface(folder):
+def test_rgbd_folder_scene_truth_lies_on_labeled_surface(folder):
     truth = RgbdFolder(folder, stop=1).scene_truth()
     assert truth.class_names == {7: "chair", 300: None}
     depth, ids = depth_mm(0) / 1000, RgbdFolder(folder)[0].truth.instance_ids
@@ -171,12 +171,12 @@ def test_scene_truth_lies_on_labeled_surface(folder):
     assert nearest.max() < 0.02
 
 
-def test_scene_truth_skips_unreadable_frames(folder):
+def test_rgbd_folder_scene_truth_skips_unreadable_frames(folder):
     (folder / "depth/000001.png").write_bytes(b"")
     assert len(RgbdFolder(folder).scene_truth().points_world) > 100
 
 
-def test_distant_pose_raises_for_its_frame_and_truth_skips_it(folder, caplog):
+def test_rgbd_folder_distant_pose_raises_and_truth_skips_it(folder, caplog):
     set_pose_line(folder, 1, "0.1 0 1e4 0 0 0 0 1")
     RgbdFolder(folder)[1]
     set_pose_line(folder, 1, "0.1 0 1e5 0 0 0 0 1")
@@ -186,63 +186,63 @@ def test_distant_pose_raises_for_its_frame_and_truth_skips_it(folder, caplog):
     assert "ground truth: frame skipped: frame 1: " in caplog.text
 
 
-# Faults of the whole sequence: known when it is built.
+# Errors of the whole sequence, which are raised when it is built.
 
 
-def test_missing_folder_raises(tmp_path):
+def test_rgbd_folder_missing_folder_raises(tmp_path):
     with pytest.raises(DataError, match=r"dataset\.root: expected an existing folder, got .*nowhere"):
         RgbdFolder(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("name", ["color", "depth"])
-def test_missing_image_folder_raises(folder, name):
+def test_rgbd_folder_missing_image_folder_raises(folder, name):
     shutil.rmtree(folder / name)
     with pytest.raises(DataError, match=f"{name}: expected"):
         RgbdFolder(folder)
 
 
-def test_missing_camera_json_raises(folder):
+def test_rgbd_folder_missing_camera_json_raises(folder):
     (folder / "camera.json").unlink()
     with pytest.raises(DataError, match=r"camera\.json: expected a camera"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("key", list(CAMERA))
-def test_missing_camera_key_raises(folder, key):
+def test_rgbd_folder_missing_camera_key_raises(folder, key):
     (folder / "camera.json").write_text(json.dumps({k: v for k, v in CAMERA.items() if k != key}))
     with pytest.raises(DataError, match=f"camera.json: expected a key '{key}', got none"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("changes", [{"fx": "wide"}, {"fx": -1.0}, {"width": 24.5}, {"cx": float("nan")}, {"fy": True}])
-def test_invalid_camera_value_raises(folder, changes):
+def test_rgbd_folder_invalid_camera_value_raises(folder, changes):
     change_camera(folder, **changes)
     with pytest.raises(DataError, match=rf"camera\.json.*{next(iter(changes))}"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("scale", [0, -1000, 0.001, 1e7])
-def test_depth_scale_out_of_range_raises(folder, scale):
+def test_rgbd_folder_depth_scale_out_of_range_raises(folder, scale):
     reported = r"depth_scale: expected 1 to 1e\+06 units per m \(1000 for millimeters\), got"
     change_camera(folder, depth_scale=scale)
     with pytest.raises(DataError, match=rf"camera\.json: {reported} {scale:g}".replace("+07", r"\+07")):
         RgbdFolder(folder)
 
 
-def test_invalid_camera_json_raises(folder):
+def test_rgbd_folder_invalid_camera_json_raises(folder):
     (folder / "camera.json").write_text("{width: 3")
     with pytest.raises(DataError, match="expected valid JSON"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("name", ["color", "depth", "instance"])
-def test_image_count_mismatch_error_names_first_frame(folder, name):
+def test_rgbd_folder_image_count_error_names_first_frame(folder, name):
     (folder / name / "000002.png").unlink()
     with pytest.raises(DataError, match=rf"{name}: expected .*4 images.*, got 3 images and none for frame 2"):
         RgbdFolder(folder)
 
 
-def test_duplicate_frame_number_raises(folder):
+def test_rgbd_folder_duplicate_frame_number_raises(folder):
     shutil.copy(folder / "color/000001.png", folder / "color/1.png")
     with pytest.raises(DataError, match="expected unique frame numbers, got 1 for"):
         RgbdFolder(folder)
@@ -251,8 +251,8 @@ def test_duplicate_frame_number_raises(folder):
 @pytest.mark.parametrize(
     "names", [["9.95", "10.05", "10.1", "10.15"], ["1_8", "1_9", "2_0", "2_1"], ["1", "2", "3", "1 - Copy 4"]]
 )
-def test_file_names_differing_in_two_numbers_raise(folder, names):
-    """The last digits alone would put the frames into another order."""
+def test_rgbd_folder_names_differing_in_two_numbers_raise(folder, names):
+    """Sorting by the last digits alone would change the order of the frames."""
     for kind in ("color", "depth", "instance"):
         for k, name in enumerate(names):
             (folder / kind / f"{k:06d}.png").rename(folder / kind / f"{name}.png")
@@ -260,7 +260,7 @@ def test_file_names_differing_in_two_numbers_raise(folder, names):
         RgbdFolder(folder)
 
 
-def test_file_name_without_number_raises(folder):
+def test_rgbd_folder_file_name_without_number_raises(folder):
     shutil.copy(folder / "color/000001.png", folder / "color/cover.png")
     with pytest.raises(DataError, match="expected a name that ends in a frame number"):
         RgbdFolder(folder)
@@ -268,7 +268,7 @@ def test_file_name_without_number_raises(folder):
 
 @pytest.mark.parametrize("name", ["poses.txt", "instances.json", "instance"])
 @pytest.mark.parametrize("kind", ["folder", "dangling link"])
-def test_unreadable_file_is_not_treated_as_missing(folder, name, kind):
+def test_rgbd_folder_unreadable_file_is_not_missing(folder, name, kind):
     path = folder / name
     if path.is_dir():
         shutil.rmtree(path)
@@ -282,20 +282,20 @@ def test_unreadable_file_is_not_treated_as_missing(folder, name, kind):
 
 
 @pytest.mark.parametrize("key", ["Distortion", "distorsion", "depthscale", "Width"])
-def test_misspelled_camera_key_raises_with_suggestion(folder, key):
+def test_rgbd_folder_misspelled_camera_key_has_suggestion(folder, key):
     change_camera(folder, **{key: 1})
     with pytest.raises(DataError, match=f"unknown key '{key}'; did you mean"):
         RgbdFolder(folder)
 
 
-def test_unused_camera_keys_are_logged(folder, caplog):
+def test_rgbd_folder_unused_camera_keys_are_logged(folder, caplog):
     change_camera(folder, serial="A7", k1=0.1)
     assert len(RgbdFolder(folder)) > 0
     [record] = caplog.records
     assert "camera.json: ignored unknown keys: serial, k1; known keys: width, height, fx" in record.message
 
 
-def test_fewer_poses_than_frames_raises(folder):
+def test_rgbd_folder_fewer_poses_than_frames_raises(folder):
     lines = (folder / "poses.txt").read_text().splitlines()
     (folder / "poses.txt").write_text("\n".join(lines[:-1]))
     with pytest.raises(DataError, match="expected one line per frame, got 3 poses for 4 frames in color/"):
@@ -310,13 +310,13 @@ def test_fewer_poses_than_frames_raises(folder):
         ("nan 1 2 3 0 0 0 1", "line 4: expected a finite timestamp"),
     ],
 )
-def test_invalid_pose_line_error_gives_line_number(folder, line, message):
+def test_rgbd_folder_invalid_pose_line_error_gives_line_number(folder, line, message):
     set_pose_line(folder, 2, line)
     with pytest.raises(DataError, match=rf"poses\.txt, {message}"):
         RgbdFolder(folder)
 
 
-def test_instance_images_without_names_raise(folder):
+def test_rgbd_folder_instance_images_without_names_raise(folder):
     (folder / "instances.json").unlink()
     with pytest.raises(DataError, match=r"instances\.json: expected the class of each instance"):
         RgbdFolder(folder)
@@ -340,26 +340,26 @@ def test_instance_images_without_names_raise(folder):
         ({"7": {"class": " Chairs"}}, r"instance 7: .* got ' Chairs'; did you mean 'chair'\?"),
     ],
 )
-def test_invalid_instances_entry_raises(folder, entry, message):
+def test_rgbd_folder_invalid_instances_entry_raises(folder, entry, message):
     (folder / "instances.json").write_text(json.dumps(entry))
     with pytest.raises(DataError, match=rf"instances\.json: {message}") as caught:
         RgbdFolder(folder)
     assert len(str(caught.value)) < 300
 
 
-def test_image_and_camera_size_mismatch_raises(folder):
+def test_rgbd_folder_image_and_camera_size_mismatch_raises(folder):
     change_camera(folder, width=48)
     with pytest.raises(DataError, match=r"000000\.png: expected 48x16 px as in .*camera\.json, got 24x16 px"):
         RgbdFolder(folder)
 
 
 @pytest.mark.parametrize("values", [{"max_depth": -1.0}, {"ground_truth_spacing": 0.0}, {"stride": 0}])
-def test_parameter_out_of_range_raises(folder, values):
+def test_rgbd_folder_parameter_out_of_range_raises(folder, values):
     with pytest.raises(ConfigError, match=f"dataset.{next(iter(values))}"):
         RgbdFolder(folder, **values)
 
 
-# Faults of one frame: known when it is read, and the others can be.
+# Errors of one frame, which are raised when it is read; other frames are readable.
 
 
 def read_all_but(folder, bad):
@@ -375,7 +375,7 @@ def read_all_but(folder, bad):
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_truncated_color_image_raises_for_its_frame(folder, suffix, share):
+def test_rgbd_folder_truncated_color_raises_for_its_frame(folder, suffix, share):
     (folder / "color/000002.png").unlink()
     path = folder / f"color/000002.{suffix}"
     cv2.imwrite(str(path), np.repeat(np.repeat(picture(2), 1, axis=0), 1, axis=1))
@@ -386,7 +386,7 @@ def test_truncated_color_image_raises_for_its_frame(folder, suffix, share):
 
 
 @pytest.mark.parametrize("padding", [b"\0" * 10, b"\0" * 100_000, b"\n", b"\r\n", b"\0" * 100 + b"\n"])
-def test_jpeg_with_trailing_padding_is_read(folder, padding):
+def test_rgbd_folder_jpeg_with_trailing_padding_is_read(folder, padding):
     (folder / "color/000002.png").unlink()
     path = folder / "color/000002.jpg"
     cv2.imwrite(str(path), picture(2))
@@ -394,7 +394,7 @@ def test_jpeg_with_trailing_padding_is_read(folder, padding):
     assert RgbdFolder(folder)[2].index == 2
 
 
-def test_damaged_depth_image_raises_for_its_frame(folder):
+def test_rgbd_folder_damaged_depth_raises_for_its_frame(folder):
     path = folder / "depth/000001.png"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
@@ -402,13 +402,13 @@ def test_damaged_depth_image_raises_for_its_frame(folder):
     assert "damaged" in read_all_but(folder, 1)
 
 
-def test_non_image_file_raises_for_its_frame(folder):
+def test_rgbd_folder_non_image_file_raises_for_its_frame(folder):
     (folder / "color/000001.png").write_bytes(b"hello world" * 20)
     assert "expected a JPEG or PNG file" in read_all_but(folder, 1)
 
 
 @pytest.mark.parametrize("name", ["color", "depth", "instance"])
-def test_image_size_mismatch_raises_for_its_frame(folder, name):
+def test_rgbd_folder_size_mismatch_raises_for_its_frame(folder, name):
     path = folder / name / "000003.png"
     cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:-2])
     message = read_all_but(folder, 3)
@@ -416,7 +416,7 @@ def test_image_size_mismatch_raises_for_its_frame(folder, name):
     assert "24x16" in message
 
 
-def test_depth_other_than_uint16_raises_for_its_frame(folder):
+def test_rgbd_folder_non_uint16_depth_raises_for_its_frame(folder):
     cv2.imwrite(str(folder / "depth/000001.png"), picture(1))
     assert "1 channel of uint16, got 3 of uint8" in read_all_but(folder, 1)
 
@@ -431,20 +431,20 @@ def test_depth_other_than_uint16_raises_for_its_frame(folder):
         ("0.1 0 0 0 0 0 0 0", "expected a quaternion qx qy qz qw of length 1, got 0"),
     ],
 )
-def test_invalid_pose_raises_for_its_frame(folder, line, message):
+def test_rgbd_folder_invalid_pose_raises_for_its_frame(folder, line, message):
     set_pose_line(folder, 1, line)
     found = read_all_but(folder, 1)
     assert message in found
     assert "poses.txt, line 3" in found
 
 
-def test_rounded_quaternion_is_made_rigid(folder):
+def test_rgbd_folder_rounded_quaternion_is_made_rigid(folder):
     set_pose_line(folder, 1, "0.1 0 0 0 0 0.601 0 0.801")
     R = RgbdFolder(folder)[1].T_world_camera[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
-def test_instance_without_name_raises_for_its_frame(folder):
+def test_rgbd_folder_unnamed_instance_raises_for_its_frame(folder):
     ids = np.full((HEIGHT, WIDTH), 9, np.uint16)
     cv2.imwrite(str(folder / "instance/000001.png"), ids)
     assert "instances.json, got 9" in read_all_but(folder, 1)
@@ -462,7 +462,7 @@ def test_instance_without_name_raises_for_its_frame(folder):
         ("redwood5", 5, (480, 640), False),
     ],
 )
-def test_real_recordings_are_read(scene, frames, shape, labeled):
+def test_rgbd_folder_real_recordings_are_read(scene, frames, shape, labeled):
     if not (SHARED / scene).is_dir():
         pytest.skip(f"{SHARED / scene} is not there")
     sequence = RgbdFolder(SHARED, scene=scene)
@@ -474,7 +474,7 @@ def test_real_recordings_are_read(scene, frames, shape, labeled):
     assert (frame.truth is not None) == labeled
 
 
-def test_replica_truth_has_plausible_extent_and_classes():
+def test_rgbd_folder_replica_truth_has_plausible_extent():
     if not (SHARED / "replica_floor2").is_dir():
         pytest.skip(f"{SHARED / 'replica_floor2'} is not there")
     truth = RgbdFolder(SHARED, scene="replica_floor2", stride=12).scene_truth()
@@ -484,7 +484,7 @@ def test_replica_truth_has_plausible_extent_and_classes():
     assert {truth.class_names[i] for i in np.unique(truth.instance_ids) if i} >= {"bed", None}
 
 
-def test_lens_is_undistorted_in_color_depth_and_instances(folder):
+def test_rgbd_folder_lens_is_undistorted_in_all_images(folder):
     change_camera(folder, distortion=[0.3, 0, 0, 0.01, 0])
     K, lens = np.array([[20.0, 0, 11.5], [0, 21.0, 7.5], [0, 0, 1]]), np.array([0.3, 0, 0, 0.01, 0])
     u, v = cv2.initUndistortRectifyMap(K, lens, None, K, (WIDTH, HEIGHT), cv2.CV_32FC1)
@@ -497,7 +497,7 @@ def test_lens_is_undistorted_in_color_depth_and_instances(folder):
     assert not np.array_equal(frame.color, picture(0))
 
 
-def test_gravity_file_gives_up_direction_of_frames(folder):
+def test_rgbd_folder_gravity_file_gives_up_direction(folder):
     (folder / "gravity.txt").write_text("0 -9.81 0\nnan nan nan\n0 0 -2\n# the last one\n0.6 -0.8 0\n")
     ups = [frame.up for frame in RgbdFolder(folder, start=1)]
     assert ups[0] is None
@@ -515,7 +515,7 @@ def test_gravity_file_gives_up_direction_of_frames(folder):
         ("0 -1 0\n" * 3 + "0 0 0\n", r"gravity\.txt, line 4: expected a direction"),
     ],
 )
-def test_invalid_gravity_file_raises(folder, content, output):
+def test_rgbd_folder_invalid_gravity_file_raises(folder, content, output):
     (folder / "gravity.txt").write_text(content)
     with pytest.raises(DataError, match=output):
         RgbdFolder(folder)

@@ -1,4 +1,4 @@
-"""7-Scenes in the published format, sound and with every fault; registration against exact projection."""
+"""Tests of 7-Scenes in the published format; registration is compared with exact projection."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAMES = 3
 
 
 def pose_at(k: int) -> np.ndarray:
-    """T_world_depthcamera."""
+    """Return T_world_depthcamera."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([0, 0.1 * k, 0.05]).as_matrix()
     T[:3, 3] = 0.1 * k, -1, 2
@@ -27,7 +27,7 @@ def pose_at(k: int) -> np.ndarray:
 
 
 def write_pose(folder: Path, k: int, T: np.ndarray) -> None:
-    """With eight digits and tabs, as published."""
+    """Write a pose with eight digits and tabs, as published."""
     rows = "".join("\t ".join(f"{x:.7e}" for x in row) + "\t \n" for row in T)
     (folder / f"frame-{k:06d}.pose.txt").write_text(rows)
 
@@ -44,18 +44,18 @@ def folder(tmp_path: Path) -> Path:
 
 
 def all_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """The readings (P, 3) in camera coordinates."""
+    """Return the measured points (P, 3) in camera coordinates."""
     v, u = np.nonzero(depth)
     return back_project(camera, np.stack([u, v], 1).astype(np.int32), depth[v, u])
 
 
-def test_frame_matches_files(folder: Path) -> None:
+def test_seven_scenes_frame_matches_files(folder: Path) -> None:
     sequence = SevenScenes(folder.parents[1], scene="chess/seq-01")
     assert (len(sequence), sequence.name, sequence.camera) == (FRAMES, "chess-seq-01", COLOR_CAMERA)
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, pytest.approx(2 / 30))
     assert (frame.color == (80, 100, 200)).all()
-    assert set(np.unique(frame.depth)) == {0, 2}  # the border, which the depth camera does not see
+    assert set(np.unique(frame.depth)) == {0, 2}  # the border is invisible to the depth camera
     assert (frame.depth > 0).mean() == pytest.approx((529 / 585) ** 2, abs=0.02)
     T_depthcamera_camera = inverse(pose_at(2)) @ frame.T_world_camera
     np.testing.assert_allclose(T_depthcamera_camera[:3, :3], np.eye(3), atol=1e-6)
@@ -63,7 +63,7 @@ def test_frame_matches_files(folder: Path) -> None:
 
 
 def test_seven_scenes_recording_is_mapped(folder: Path) -> None:
-    """The wall that each depth camera has 2 m before it is mapped where that camera saw it."""
+    """The wall 2 m in front of each depth camera is mapped at its true position."""
     root = folder.parents[1]
     result, points_world = mapped(
         opened("seven_scenes", f"dataset.root={root}", "dataset.scene=chess/seq-01", "dataset.stop=2")
@@ -71,13 +71,13 @@ def test_seven_scenes_recording_is_mapped(folder: Path) -> None:
     assert (result.frames, result.frames_skipped) == (2, 0)
     for k, points in enumerate(np.split(points_world, 2)):
         z = transform(inverse(pose_at(k)), points.astype(np.float64))[:, 2]
-        seen = np.abs(z) > 1e-5  # what has no reading is mapped at the camera itself by the tests' fuser
+        seen = np.abs(z) > 1e-5  # the tests' fuser maps pixels without depth to the camera position
         assert seen.mean() > 0.7
         np.testing.assert_allclose(z[seen], 2, atol=1e-5)
 
 
-def test_registered_depth_matches_color_camera_projection() -> None:
-    """Each reading's own point, projected into the color camera, lies within half a pixel of where it went."""
+def test_seven_scenes_registered_depth_matches_projection() -> None:
+    """Each measured point, projected into the color camera, is within half a pixel of its new pixel."""
     raw = np.zeros(DEPTH_CAMERA.shape, np.uint16)
     raw[20::40, 20::40] = 800 + 10 * np.arange(12 * 16).reshape(12, 16)  # far apart, all different
     registered = register(raw)
@@ -92,7 +92,7 @@ def test_registered_depth_matches_color_camera_projection() -> None:
         assert abs(rows[0] - v) <= 0.501
 
 
-def test_registration_keeps_nearest_depth_and_holes() -> None:
+def test_seven_scenes_registration_keeps_nearest_and_holes() -> None:
     raw = np.full(DEPTH_CAMERA.shape, 4000, np.uint16)
     raw[:, 300:340] = 1000
     raw[:100] = 65535
@@ -105,13 +105,13 @@ def test_registration_keeps_nearest_depth_and_holes() -> None:
     near = np.flatnonzero(row == 1000)
     # x = (u - 320) / 585 m at 1 m, seen from 25 mm to the right
     np.testing.assert_allclose(near[[0, -1]], 320 + 529 * ((np.array([300, 339]) - 320) / 585 - 0.025), atol=0.51)
-    # left of the near strip the far wall goes on, hidden behind it as far as the cameras' parallax says
+    # left of the near strip, the far wall is hidden by the parallax of the cameras
     assert row[near[0] - 1] == 4000
     gap = np.flatnonzero(row[near[-1] + 1 :] == 4000)[0]
     assert gap == pytest.approx(529 * 0.025 * (1 / 1 - 1 / 4), abs=1.5)
 
 
-def test_rounded_rotation_is_made_rigid(folder: Path) -> None:
+def test_seven_scenes_rounded_rotation_is_made_rigid(folder: Path) -> None:
     rounded = np.round(pose_at(1), 3)
     write_pose(folder, 1, rounded)
     T = SevenScenes(folder)[1].T_world_camera
@@ -133,24 +133,24 @@ def test_rounded_rotation_is_made_rigid(folder: Path) -> None:
         ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", "pose.txt: pose: expected the last row 0 0 0 1"),
     ],
 )
-def test_invalid_pose_raises_for_its_frame(folder: Path, text: str | None, message: str) -> None:
+def test_seven_scenes_invalid_pose_raises_for_its_frame(folder: Path, text: str | None, message: str) -> None:
     path = folder / "frame-000001.pose.txt"
     path.unlink() if text is None else path.write_text(text)
     assert re.search(rf"frame-000001\.{message}", fault_of(SevenScenes(folder), 1))
 
 
 @pytest.mark.parametrize("name", ["color", "depth"])
-def test_missing_image_raises_for_its_frame(folder: Path, name: str) -> None:
+def test_seven_scenes_missing_image_raises_for_its_frame(folder: Path, name: str) -> None:
     (folder / f"frame-000002.{name}.png").unlink()
     assert f"frame-000002.{name}.png: cannot be read" in fault_of(SevenScenes(folder), 2)
 
 
-def test_folder_without_frames_error_gives_scene_example(folder: Path) -> None:
+def test_seven_scenes_empty_folder_error_gives_scene_example(folder: Path) -> None:
     with pytest.raises(DataError, match=r"expected frame-000000\.color\.png .*; set dataset\.scene .* chess/seq-01"):
         SevenScenes(folder.parents[1], scene="chess")
 
 
-def test_image_size_mismatch_raises(folder: Path) -> None:
+def test_seven_scenes_image_size_mismatch_raises(folder: Path) -> None:
     write_color(folder / "frame-000001.color.png", (1, 2, 3), (240, 320))
     assert "expected 640x480 px as in the camera of 7-Scenes, got 320x240 px" in fault_of(SevenScenes(folder), 1)
     write_depth(folder / "frame-000000.depth.png", 1, (240, 320))

@@ -1,4 +1,4 @@
-"""TUM RGB-D in the published format, sound and with every fault."""
+"""Tests of TUM RGB-D in the published format, with valid and invalid files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def write_poses(folder: Path, lines: list[str]) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A walk of 1 m/s along x, seen at 100 Hz by the motion capture, before a wall at z = 2 m."""
+    """Write a motion of 1 m/s along x in front of a wall at z = 2 m, with motion capture at 100 Hz."""
     folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
     color = [color_time(k) for k in range(FRAMES)]
     depth = [time + DEPTH_DELAY for time in color]
@@ -53,12 +53,12 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def test_frame_matches_files(folder: Path) -> None:
+def test_tum_rgbd_frame_matches_files(folder: Path) -> None:
     sequence = TumRgbd(folder)
     assert (len(sequence), sequence.name) == (FRAMES, "rgbd_dataset_freiburg1_xyz")
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, color_time(2))
-    inside = np.s_[40:440, 40:600]  # where the undistorted image has all of what was recorded
+    inside = np.s_[40:440, 40:600]  # where the undistorted image is complete
     assert (frame.color[inside] == (20, 20, 30)).all()
     assert (frame.depth[inside] == 2).all()  # 5000 units a meter
     assert frame.T_world_camera is not None
@@ -66,18 +66,18 @@ def test_frame_matches_files(folder: Path) -> None:
     assert frame.camera == PUBLISHED[Intrinsics.FREIBURG1].camera
 
 
-def test_tum_recording_is_mapped(folder: Path) -> None:
+def test_tum_rgbd_recording_is_mapped(folder: Path) -> None:
     places = f"dataset.root={folder.parent}", f"dataset.scene={folder.name}"
     result, points_world = mapped(opened("tum_rgbd", *places, "dataset.stop=2", "dataset.undistort=false"))
     assert (result.frames, result.frames_skipped, result.frames_lost) == (2, 0, 0)
     np.testing.assert_allclose(points_world[:, 2], 2, atol=1e-6)
-    # the first pixel of each frame lies left of the camera, which walks along x
+    # the first pixel of each frame is left of the camera, which moves along x
     lefts = points_world[:: 640 * 480, 0]
     np.testing.assert_allclose(lefts, (0 - 318.6) / 517.3 * 2 + np.arange(2) / 30, atol=1e-4)
 
 
-def test_published_distortion_is_removed(folder: Path) -> None:
-    """A checker board's corners lie where OpenCV says that the lens' pixels belong."""
+def test_tum_rgbd_published_distortion_is_removed(folder: Path) -> None:
+    """The corners of a checkerboard are where OpenCV places the pixels of the lens."""
     board = np.kron(np.indices((15, 20)).sum(axis=0) % 2, np.full((32, 32), 200)).astype(np.uint8)
     path = next((folder / "rgb").glob("*.png"))
     cv2.imwrite(str(path), np.stack([board] * 3, axis=-1))
@@ -91,13 +91,13 @@ def test_published_distortion_is_removed(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_folder_name_selects_camera(folder: Path, number: int) -> None:
+def test_tum_rgbd_folder_name_selects_camera(folder: Path, number: int) -> None:
     renamed = folder.rename(folder.parent / f"rgbd_dataset_freiburg{number}_long_office")
     assert TumRgbd(renamed).camera == PUBLISHED[Intrinsics[f"FREIBURG{number}"]].camera
     assert TumRgbd(renamed, intrinsics=Intrinsics.ROS_DEFAULT).camera == PUBLISHED[Intrinsics.ROS_DEFAULT].camera
 
 
-def test_unknown_folder_name_requires_intrinsics(folder: Path) -> None:
+def test_tum_rgbd_unknown_folder_name_requires_intrinsics(folder: Path) -> None:
     mine = folder.rename(folder.parent / "my_desk")
     with pytest.raises(
         ConfigError, match=r"dataset\.intrinsics: expected freiburg1.* in the folder's name, got my_desk"
@@ -110,7 +110,7 @@ def test_unknown_folder_name_requires_intrinsics(folder: Path) -> None:
 OWN = {"width": 640, "height": 480, "fx": 600.0, "fy": 601.0, "cx": 310.0, "cy": 250.0, "depth_scale": 1000.0}
 
 
-def test_custom_recording_uses_camera_json(folder: Path) -> None:
+def test_tum_rgbd_custom_recording_uses_camera_json(folder: Path) -> None:
     mine = folder.rename(folder.parent / "my_desk")
     (mine / "camera.json").write_text(json.dumps(OWN))
     sequence = TumRgbd(mine)
@@ -121,7 +121,7 @@ def test_custom_recording_uses_camera_json(folder: Path) -> None:
         TumRgbd(shutil.copytree(mine, folder.parent / "nobodys", ignore=shutil.ignore_patterns("camera.json")))
 
 
-def test_camera_json_lens_is_applied_and_invalid_value_raises(folder: Path) -> None:
+def test_tum_rgbd_camera_json_lens_is_applied_or_raises(folder: Path) -> None:
     mine = folder.rename(folder.parent / "my_desk")
     (mine / "camera.json").write_text(json.dumps(OWN | {"distortion": [0.1, 0, 0, 0, 0]}))
     assert TumRgbd(mine).contents.distortion == Distortion(k1=0.1)
@@ -131,7 +131,7 @@ def test_camera_json_lens_is_applied_and_invalid_value_raises(folder: Path) -> N
         TumRgbd(mine)
 
 
-def test_published_camera_overrides_camera_json(folder: Path) -> None:
+def test_tum_rgbd_published_camera_overrides_camera_json(folder: Path) -> None:
     (folder / "camera.json").write_text("no JSON")
     assert TumRgbd(folder).camera == PUBLISHED[Intrinsics.FREIBURG1].camera
     mine = folder.rename(folder.parent / "my_desk")
@@ -141,18 +141,18 @@ def test_published_camera_overrides_camera_json(folder: Path) -> None:
 # Association
 
 
-def test_association_is_closest_first_and_one_to_one() -> None:
-    """Depth 0.015 is nearest to both color images: the closer one gets it, and the other what is left."""
+def test_tum_rgbd_association_is_closest_first_and_one_to_one() -> None:
+    """Depth 0.015 is nearest to both color images: the closer one gets it, the other one the remaining depth."""
     assert associate([0.0, 0.02], [0.015, 0.19], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, 0.035], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, -0.01], 0.02) == [(0, 1), (1, 0)]
 
 
-def test_associated_pairs_are_sorted_by_time() -> None:
+def test_tum_rgbd_associated_pairs_are_sorted_by_time() -> None:
     assert associate([0.2, 0.0, 0.1], [0.11, 0.21, 0.01], 0.02) == [(1, 2), (2, 0), (0, 1)]
 
 
-def test_association_matches_brute_force() -> None:
+def test_tum_rgbd_association_matches_brute_force() -> None:
     rng = np.random.default_rng(0)
     first, second = np.sort(rng.uniform(0, 1, 40)), rng.uniform(0, 1, 50)
     free = np.abs(first[:, None] - second)
@@ -165,7 +165,7 @@ def test_association_matches_brute_force() -> None:
     assert len(expected) > 20
 
 
-def test_color_without_depth_is_dropped_and_counted(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_tum_rgbd_color_without_depth_is_dropped_and_counted(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     color = [color_time(k) for k in range(FRAMES)]
     write_lists(folder, color, [color[0] + DEPTH_DELAY, color[2] + DEPTH_DELAY])
     with caplog.at_level(logging.INFO):
@@ -174,7 +174,7 @@ def test_color_without_depth_is_dropped_and_counted(folder: Path, caplog: pytest
     assert "1 of 3 color images have no depth image" in caplog.text
 
 
-def test_duplicate_image_timestamps_keep_first(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_tum_rgbd_duplicate_image_timestamps_keep_first(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     for name in ("rgb", "depth"):
         path = folder / f"{name}.txt"
         path.write_text(path.read_text() + path.read_text().replace(".png", "_again.png") * 1000)
@@ -184,7 +184,7 @@ def test_duplicate_image_timestamps_keep_first(folder: Path, caplog: pytest.LogC
     assert caplog.text.count("depth.txt: expected unique timestamps; skipped 3000 images") == 1
 
 
-def test_recording_without_image_pairs_raises(folder: Path) -> None:
+def test_tum_rgbd_recording_without_image_pairs_raises(folder: Path) -> None:
     with pytest.raises(DataError, match=r"within dataset\.max_time_difference \(0\.01 s\), got none"):
         TumRgbd(folder, max_time_difference=0.01)
 
@@ -192,7 +192,7 @@ def test_recording_without_image_pairs_raises(folder: Path) -> None:
 # Poses
 
 
-def test_poses_are_interpolated(folder: Path) -> None:
+def test_tum_rgbd_poses_are_interpolated(folder: Path) -> None:
     q_0, q_1 = Rotation.from_rotvec([0.1, 0.2, 0.3]), Rotation.from_rotvec([-0.2, 0.1, 0.5])
     times = [color_time(1) - 0.003, color_time(1) + 0.006]
     lines = [
@@ -207,7 +207,7 @@ def test_poses_are_interpolated(folder: Path) -> None:
     np.testing.assert_allclose(T_world_camera[:3, :3], slerp.as_matrix(), atol=1e-4)
 
 
-def test_pose_beyond_time_tolerance_is_unknown(folder: Path) -> None:
+def test_tum_rgbd_pose_beyond_time_tolerance_is_unknown(folder: Path) -> None:
     write_poses(folder, [f"{color_time(0) + 0.019:.6f} 5 0 0 0 0 0 1", f"{color_time(2) - 0.021:.6f} 6 0 0 0 0 0 1"])
     sequence = TumRgbd(folder)
     first = sequence[0].T_world_camera
@@ -216,19 +216,19 @@ def test_pose_beyond_time_tolerance_is_unknown(folder: Path) -> None:
     assert sequence[2].T_world_camera is None
 
 
-def test_missing_ground_truth_gives_no_pose(folder: Path) -> None:
+def test_tum_rgbd_missing_ground_truth_gives_no_pose(folder: Path) -> None:
     (folder / "groundtruth.txt").unlink()
     assert TumRgbd(folder)[0].T_world_camera is None
 
 
-def test_unreadable_ground_truth_is_not_treated_as_missing(folder: Path) -> None:
+def test_tum_rgbd_unreadable_ground_truth_is_not_missing(folder: Path) -> None:
     (folder / "groundtruth.txt").unlink()
     (folder / "groundtruth.txt").symlink_to("nowhere")
     with pytest.raises(DataError, match=r"groundtruth\.txt"):
         TumRgbd(folder)
 
 
-def test_duplicate_pose_timestamps_keep_first(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_tum_rgbd_duplicate_pose_timestamps_keep_first(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     times = [f"{color_time(k):.6f}" for k in range(FRAMES)]
     write_poses(folder, [f"{time} {x} 0 0 0 0 0 1" for time in times for x in (1, 9)])
     pose = TumRgbd(folder)[1].T_world_camera
@@ -237,7 +237,7 @@ def test_duplicate_pose_timestamps_keep_first(folder: Path, caplog: pytest.LogCa
     assert f"groundtruth.txt: expected unique timestamps; skipped {FRAMES} poses" in caplog.text
 
 
-def test_invalid_pose_raises_for_its_frame(folder: Path) -> None:
+def test_tum_rgbd_invalid_pose_raises_for_its_frame(folder: Path) -> None:
     lines = [f"{color_time(k):.6f} 0 0 0 0 0 0 1" for k in range(FRAMES)]
     lines[1] = f"{color_time(1):.6f} 0 0 0 0 0 0 0"
     write_poses(folder, lines)
@@ -248,7 +248,7 @@ def test_invalid_pose_raises_for_its_frame(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
-def test_missing_image_list_raises(folder: Path, name: str) -> None:
+def test_tum_rgbd_missing_image_list_raises(folder: Path, name: str) -> None:
     (folder / name).unlink()
     with pytest.raises(DataError, match=f"{name}: expected"):
         TumRgbd(folder)
@@ -258,7 +258,7 @@ def test_missing_image_list_raises(folder: Path, name: str) -> None:
     "line",
     ["1305031102.2", "yesterday rgb/1.png", "nan rgb/1.png", "1.5 rgb/\0.png", "1.5 r\bgb/1.png", "1.5 " + "1" * 5000],
 )
-def test_invalid_image_list_line_error_gives_line_number(folder: Path, line: str) -> None:
+def test_tum_rgbd_invalid_image_list_error_gives_line_number(folder: Path, line: str) -> None:
     text = (folder / "rgb.txt").read_text()
     (folder / "rgb.txt").write_text(text + line + "\n")
     with pytest.raises(DataError, match=r"rgb\.txt, line 7: expected `timestamp filename`") as caught:
@@ -267,32 +267,32 @@ def test_invalid_image_list_line_error_gives_line_number(folder: Path, line: str
     assert len(str(caught.value)) < 300
 
 
-def test_invalid_pose_line_error_gives_line_number(folder: Path) -> None:
+def test_tum_rgbd_invalid_pose_line_error_gives_line_number(folder: Path) -> None:
     write_poses(folder, ["1305031102.2 1 2 3"])
     with pytest.raises(DataError, match=r"groundtruth\.txt, line 4: expected 8 numbers"):
         TumRgbd(folder)
 
 
 @pytest.mark.parametrize("content", [b"", b"# color images\n"])
-def test_empty_image_list_raises(folder: Path, content: bytes) -> None:
+def test_tum_rgbd_empty_image_list_raises(folder: Path, content: bytes) -> None:
     (folder / "depth.txt").write_bytes(content)
     with pytest.raises(DataError, match=r"depth\.txt: expected a list of images, got none"):
         TumRgbd(folder)
 
 
-def test_binary_image_list_raises(folder: Path) -> None:
+def test_tum_rgbd_binary_image_list_raises(folder: Path) -> None:
     (folder / "rgb.txt").write_bytes(b"\xff\xfe")
     with pytest.raises(DataError, match=r"rgb\.txt: expected UTF-8 text"):
         TumRgbd(folder)
 
 
-def test_missing_listed_image_raises_for_its_frame(folder: Path) -> None:
+def test_tum_rgbd_missing_listed_image_raises_for_its_frame(folder: Path) -> None:
     path = folder / f"depth/{color_time(1) + DEPTH_DELAY:.6f}.png"
     path.unlink()
     assert f"{path}: cannot be read" in fault_of(TumRgbd(folder), 1)
 
 
-def test_image_size_mismatch_raises(folder: Path) -> None:
+def test_tum_rgbd_image_size_mismatch_raises(folder: Path) -> None:
     write_color(folder / f"rgb/{color_time(1):.6f}.png", (1, 2, 3), (240, 320))
     assert "expected 640x480 px as in dataset.intrinsics=FREIBURG1, got 320x240 px" in fault_of(TumRgbd(folder), 1)
     write_color(folder / f"rgb/{color_time(0):.6f}.png", (1, 2, 3), (240, 320))
@@ -301,7 +301,7 @@ def test_image_size_mismatch_raises(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1.5, float("nan")])
-def test_time_tolerance_out_of_range_raises(folder: Path, value: float) -> None:
+def test_tum_rgbd_time_tolerance_out_of_range_raises(folder: Path, value: float) -> None:
     with pytest.raises(ConfigError, match=r"dataset\.max_time_difference: expected a value in \(0, 1\] s"):
         TumRgbd(folder, max_time_difference=value)
 

@@ -1,4 +1,4 @@
-"""Every layout of candidates against a slow decoding, one number at a time."""
+"""Tests of every candidate layout, compared with a slow decoder."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A detector for rendered rooms logs one warning for images of another domain."""
+"""Tests of the warning of a detector for rendered rooms about images of another domain."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def mapped(detector: Detector, sequence: RGBDSequence) -> None:
     Pipeline(detector, GivenPose(), KeepAll(), GridFuser()).run(sequence)
 
 
-def test_run_outside_domain_warns_once_with_fix(caplog: pytest.LogCaptureFixture) -> None:
+def test_domain_mismatch_in_run_warns_once_with_fix(caplog: pytest.LogCaptureFixture) -> None:
     mapped(OfRooms(), CornerRoom())
     [line] = warnings(caplog)
     assert WARNING_TEXT in line
@@ -55,14 +55,14 @@ def test_run_outside_domain_warns_once_with_fix(caplog: pytest.LogCaptureFixture
 @pytest.mark.parametrize(
     ("detector", "sequence"), [(OfRooms(), RenderedCorner()), (SphereDetector(), CornerRoom())], ids=["rooms", "any"]
 )
-def test_run_inside_domain_does_not_warn(
+def test_domain_match_in_run_does_not_warn(
     detector: Detector, sequence: RGBDSequence, caplog: pytest.LogCaptureFixture
 ) -> None:
     mapped(detector, sequence)
     assert warnings(caplog) == []
 
 
-def test_detection_commands_outside_domain_warn(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_domain_mismatch_in_detection_commands_warns(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_detections(tmp_path / "found.json", OfRooms(), CornerRoom())
     assert [WARNING_TEXT in line for line in warnings(caplog)] == [True]
     caplog.clear()
@@ -75,7 +75,7 @@ def test_detection_commands_outside_domain_warn(tmp_path: Path, caplog: pytest.L
 
 
 @pytest.mark.parametrize(("choice", "lines"), [(["detector=mask_rcnn_rooms"], 1), ([], 0)])
-def test_mapper_warns_because_frames_are_unknown(
+def test_domain_of_mapper_frames_is_unknown_and_warns(
     choice: list[str], lines: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     mapper = Mapper(*choice, "device=cpu", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
@@ -84,7 +84,7 @@ def test_mapper_warns_because_frames_are_unknown(
     assert [WARNING_TEXT in line for line in warnings(caplog)] == [True] * lines
 
 
-def test_only_rooms_detector_has_a_domain(ready: Callable[[str, str], Any], tmp_path: Path) -> None:
+def test_domain_is_set_only_by_rooms_detector(ready: Callable[[str, str], Any], tmp_path: Path) -> None:
     rooms = registered.built("detector", "mask_rcnn_rooms", "device=cpu")
     assert rooms.domain == RENDERED_ROOMS
     assert CachedDetector(rooms, tmp_path).domain == RENDERED_ROOMS
@@ -93,8 +93,8 @@ def test_only_rooms_detector_has_a_domain(ready: Callable[[str, str], Any], tmp_
     assert CachedDetector(SphereDetector(), tmp_path).domain == ""
 
 
-def test_dataset_domain_marks_rendered_images(tmp_path: Path) -> None:
-    """What `synthesize` writes says so; a folder of SceneNN itself does not."""
+def test_domain_of_dataset_marks_rendered_images(tmp_path: Path) -> None:
+    """Folders written by `synthesize` are marked; original SceneNN folders are not."""
     assert Synthetic.domain == RENDERED_ROOMS
     option_files.overrides("dataset", "scenenn", tmp_path)
     assert SceneNN(tmp_path).domain == ""

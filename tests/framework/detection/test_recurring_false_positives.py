@@ -1,4 +1,4 @@
-"""Places that look like something: the same ones from wherever they are seen."""
+"""Tests of recurring false positives, which keep their position in all views."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 
 
 def wall(x: float, names: dict[int, str | None] | None = None, z: float = 3.0) -> Frame:
-    """A wall, z m ahead, seen from x m along it; its left half is instance 1."""
+    """Return a wall z m away, seen from x m along it; its left half is instance 1."""
     pose = np.eye(4)
     pose[0, 3] = x
     ids = np.zeros((120, 160), np.int32)

@@ -1,4 +1,4 @@
-"""Which layout a network's outputs have: told from shapes and values, or refused with the reason."""
+"""Tests of the detection of output layouts from shapes and values."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ ULTRALYTICS = ExportMetadata(author="Ultralytics")
 
 
 def cells():
-    """Boxes of all cells of the strides 8, 16 and 32: center x, y, width, height, px."""
+    """Return the boxes of all cells of the strides 8, 16 and 32: center x, y, width, height, px."""
     rng = np.random.default_rng(0)
     rows = []
     for stride in (8, 16, 32):
@@ -31,14 +31,14 @@ def as_unit(boxes):
 
 
 def dense(boxes, classes=CLASSES, objectness=False):
-    """The table (1, 4 + C + M, K)."""
+    """Return the table (1, 4 + C + M, K)."""
     rng = np.random.default_rng(1)
     numbers = classes + MASKS + objectness
     return np.concatenate([boxes, rng.uniform(1e-6, 0.1, (len(boxes), numbers))], axis=1).T[None].astype(np.float32)
 
 
 def detections(boxes, score, label):
-    """The table (1, K, 6 + M)."""
+    """Return the table (1, K, 6 + M)."""
     rest = np.full((len(boxes), MASKS), 0.5)
     return np.concatenate([boxes, np.full((len(boxes), 1), score), np.full((len(boxes), 1), label), rest], 1)[None]
 
@@ -49,7 +49,7 @@ def prototypes(channels_last=False):
 
 
 def seen(table, maps=None, **given):
-    """The layout, and what the outputs mean in it."""
+    """Return the layout and the outputs in it."""
     outputs = {"output0": np.asarray(table, np.float32), "output1": prototypes() if maps is None else maps}
     arguments = {
         "classes": CLASSES,
@@ -98,7 +98,7 @@ def test_detect_layout_detections_have_one_class_each(unit, count):
 
 @pytest.mark.parametrize("count", [0, 30])
 def test_detect_layout_without_detections_defers_unit(count):
-    """What suppression leaves over is no row, or rows of zeros."""
+    """After suppression there are no rows, or rows of zeros."""
     layout, output = seen(np.zeros((1, count, 6 + MASKS)))
     assert layout.suppressed
     assert layout.unit is None
@@ -119,12 +119,12 @@ def test_detect_layout_inverted_corners_raise():
         seen(detections(boxes, 0.9, 1))
     _, output = seen(detections(boxes, 0.9, 1), boxes=BoxKind.CENTER)
     np.testing.assert_allclose(output.candidates.boxes, as_corners(boxes), atol=1e-4)
-    layout, _ = seen(detections(cells(), 0.9, 1))  # enough of them show it
+    layout, _ = seen(detections(cells(), 0.9, 1))  # enough boxes show it
     assert layout.boxes is BoxKind.CENTER
 
 
 def test_detect_layout_tables_of_equal_width_are_distinguished():
-    """4 + 2 + M = 6 + M: only labels are whole numbers, and only cells are as many as cells."""
+    """4 + 2 + M = 6 + M: only labels are integers, and only cells have the count of cells."""
     layout, _ = seen(dense(cells(), classes=2).transpose(0, 2, 1), classes=2)
     assert not layout.suppressed
     layout, _ = seen(detections(as_corners(cells())[50:60], 0.7, 1), classes=2)

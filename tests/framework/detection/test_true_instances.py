@@ -1,3 +1,5 @@
+"""Tests of the ground-truth instances of a frame."""
+
 import numpy as np
 import pytest
 

@@ -1,4 +1,4 @@
-"""`instancemap doctor` on this machine and on simulated broken ones."""
+"""Tests of the command `doctor` on this machine and on simulated broken ones."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def broken_library(folder: Path, name: str, text: str) -> None:
 
 
 def test_doctor_broken_libraries_are_one_line_errors(tmp_path: Path) -> None:
-    """One library raises, one ends the process that imports it."""
+    """One library raises, and one ends the importing process."""
     broken_library(tmp_path, "torch", "raise ImportError('libtorch.so: no such\\nfile')")
     broken_library(tmp_path, "open3d", "import os, signal\nos.kill(os.getpid(), signal.SIGILL)")
     done = doctor(tmp_path, PYTHONPATH=str(tmp_path), HOME=str(tmp_path))
@@ -59,7 +59,7 @@ def test_doctor_broken_libraries_are_one_line_errors(tmp_path: Path) -> None:
     assert str(tmp_path) not in done.stdout.replace("~", "")
     assert done.stdout.isascii()
     written = {path.name for path in tmp_path.iterdir()} - {"torch", "open3d"}
-    assert written <= {".config", ".cache"}, "matplotlib's own, when it is imported"
+    assert written <= {".config", ".cache"}, "logged by matplotlib when it is imported"
 
 
 def test_doctor_json_lists_every_section(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_doctor_json_lists_every_section(tmp_path: Path) -> None:
     assert found["Compiled kernels"]["default stages"]["detail"].split()[2] == str(len(listed(DEFAULT)))
 
 
-def test_package_wrong_version_or_missing_has_fix(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_package_wrong_version_or_missing_has_fix(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = [Requirement("numpy<1"), Requirement("no-such-library>=2")]
     extras = {"some": [Requirement("numpy"), Requirement("no-such-library")]}
     monkeypatch.setattr(packages, "declared", lambda: (">=3.11", lines, extras))
@@ -92,13 +92,13 @@ def test_package_wrong_version_or_missing_has_fix(monkeypatch: pytest.MonkeyPatc
     assert (extra.status, extra.fix) == (Status.MISSING, "pip install 'instancemap[some]'")
 
 
-def test_package_modules_are_importable() -> None:
+def test_doctor_package_modules_are_importable() -> None:
     modules = [packages.import_statement(line.name).split()[1] for line in packages.declared()[1]]
     assert [module for module in modules if find_spec(module) is None] == []
     assert {"cv2", "sklearn", "torch"} < {*modules}
 
 
-def test_isolated_code_returns_last_line_or_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_isolated_code_returns_last_line_or_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broken_library(tmp_path, "ending", "import os\nos._exit(3)")
     broken_library(tmp_path, "hanging", "import time\ntime.sleep(60)")
     broken_library(tmp_path, "talking", "print('loading')")
@@ -114,7 +114,7 @@ def test_isolated_code_returns_last_line_or_error(tmp_path: Path, monkeypatch: p
     assert "2 s" in isolated.run_all(["import hanging"])["import hanging"][1]
 
 
-def test_failing_check_does_not_stop_the_others() -> None:
+def test_doctor_failing_check_does_not_stop_others() -> None:
     def broken_check() -> list[Check]:
         raise OSError(5, "Input/output error")
 
@@ -123,13 +123,13 @@ def test_failing_check_does_not_stop_the_others() -> None:
     assert run_checks(broken_check, lambda: [good]) == [expected, good]
 
 
-def test_anonymous_removes_home_and_user(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_anonymous_removes_home_and_user(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/alice")
     monkeypatch.setattr(getpass, "getuser", lambda: "alice")
     assert anonymous("/home/alice/.cache in /media/alice/disk") == "~/.cache in /media/USER/disk"
 
 
-def test_missing_library_and_network_have_fixes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_missing_library_and_network_have_fixes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "SYSTEM_LIBRARIES", {"libnone.so.9": ("libnone9", "Open3D")})
     [missing] = machine.system_libraries()
     assert (missing.name, missing.status, missing.fix) == ("libnone9", Status.ERROR, "apt-get install libnone9")
@@ -138,7 +138,7 @@ def test_missing_library_and_network_have_fixes(tmp_path: Path, monkeypatch: pyt
     assert errors == ["maskrcnn2go"], "the default detector"
 
 
-def test_networks_list_every_option_with_weights() -> None:
+def test_doctor_networks_list_every_option_with_weights() -> None:
     named = [result.name for check in CHECKS for result in check()]
     assert len(named) == len(set(named))
     found: set[str] = set()
@@ -151,7 +151,7 @@ def test_networks_list_every_option_with_weights() -> None:
     assert {"with_embeddings", "open_vocabulary.model", "open_vocabulary.mask_model"} < found
 
 
-def test_networks_list_a_new_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_networks_list_a_new_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     detectors = tmp_path / "conf" / "detector"
     detectors.mkdir(parents=True)
     (tmp_path / "conf" / "config.yaml").write_text("defaults:\n  - _self_\n  - detector: own\n")
@@ -171,7 +171,7 @@ def test_networks_list_a_new_option(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     ]
 
 
-def test_hub_model_is_found_when_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_hub_model_is_found_when_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def rf_detr_seg() -> tuple[Status, str]:
         return next(
             (check.status, check.detail) for check in networks.included_and_hub() if check.name == "rf_detr_seg"
@@ -198,7 +198,7 @@ def test_hub_model_is_found_when_complete(tmp_path: Path, monkeypatch: pytest.Mo
     assert rf_detr_seg() == (Status.OK, f"{model}, 1 MB in {anonymous(str(tmp_path))}/huggingface/hub")
 
 
-def test_disk_nearly_full_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_reports_nearly_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.disk_usage", lambda _: type("Usage", (), {"free": 1e8})())
     checks = list(machine.disk())
     assert [check.detail.partition(" in ")[0] for check in checks] == ["0.1 GB free"] * 3

@@ -1,4 +1,4 @@
-"""Scenes of rectangles whose counts follow by hand."""
+"""Tests of detection statistics on rectangles with manual results."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_detection_faults_of_ground_truth_are_zero() -> None:
 
 
 def test_detection_faults_of_oversized_mask_lower_iou() -> None:
-    """Of the chair's 400 px 300 are covered by 500: IoU 300 / 600."""
+    """The chair has 400 px, of which 300 are in a mask of 500: IoU 300 / 600."""
     table = counted(detections((block(5, 0, 25, 20), 0, 0.8), (BED, 0, 0.6)))
     assert table["mask IoU"] == pytest.approx((300 / 600 + 1) / 2)
     assert table["fraction of the mask on the object"] == pytest.approx((300 / 500 + 1) / 2)
@@ -87,7 +87,7 @@ def test_detection_faults_count_false_detections() -> None:
 
 
 def test_detection_faults_summarize_objects_over_frames() -> None:
-    """The chair is always found and once another class; the bed once in eight frames."""
+    """The chair is always detected, once as another class; the bed is detected once in eight frames."""
     frames = [detections((CHAIR, int(k == 3), 0.5), *([(BED, 1, 0.5)] if k == 0 else [])) for k in range(8)]
     table = counted(*frames)
     assert table["found"] == pytest.approx(9 / 16)
@@ -96,7 +96,7 @@ def test_detection_faults_summarize_objects_over_frames() -> None:
     assert table["correct class"] == pytest.approx(8 / 9)
 
 
-def test_overlaps_match_whole_image_counts() -> None:
+def test_detection_faults_overlaps_match_whole_image_counts() -> None:
     rng = np.random.default_rng(0)
     ids = rng.integers(0, 5, SHAPE).astype(np.int32) * 7
     masks = rng.random((4, *SHAPE)) < 0.3

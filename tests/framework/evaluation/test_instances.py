@@ -1,4 +1,4 @@
-"""Instance AP on cases small enough to compute by hand."""
+"""Tests of instance AP on cases with manual results."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from framework.data import SceneTruth
 from framework.errors import DataError
 from framework.evaluation.instances import Outcome, PredictedInstances, Transfer, average_precision, evaluate, judge
 
-SPACING = 0.2  # m between the points of a scene: more than twice the transfer distance, so points never mix
+SPACING = 0.2  # m between the points of a scene, more than twice the transfer distance, so that points do not mix
 
 
 def line(count: int, offset: float = 0.0) -> np.ndarray:
-    """(count, 3) points along x."""
+    """Return points (count, 3) along x."""
     points = np.zeros((count, 3), np.float32)
     points[:, 0] = SPACING * np.arange(count)
     points[:, 1] = offset
@@ -24,7 +24,7 @@ def line(count: int, offset: float = 0.0) -> np.ndarray:
 
 
 def scene(runs: Sequence[tuple[int, int]], class_names: Mapping[int, str | None]) -> SceneTruth:
-    """Points on a line, labeled by runs of (instance id, points)."""
+    """Return points on a line, labeled by runs of (instance id, points)."""
     ids = np.repeat([k for k, _ in runs], [n for _, n in runs]).astype(np.int32)
     return SceneTruth(line(len(ids)), ids, class_names)
 
@@ -32,7 +32,7 @@ def scene(runs: Sequence[tuple[int, int]], class_names: Mapping[int, str | None]
 def prediction(
     truth: SceneTruth, runs: Sequence[tuple[int, int]], claims: Mapping[int, tuple[str, float]]
 ) -> PredictedInstances:
-    """The truth's points labeled anew; `claims` give class and confidence of each predicted id."""
+    """Return the truth's points with new labels; `claims` are class and confidence of each predicted id."""
     ids = np.repeat([k for k, _ in runs], [n for _, n in runs]).astype(np.int32)
     return PredictedInstances(
         truth.points_world[: len(ids)],
@@ -88,7 +88,7 @@ def test_ap_decreases_with_false_positive_ranked_first():
 
 
 def test_evaluate_matches_each_true_instance_once():
-    """A truth split in two equal halves: both reach IoU 0.5, the second one is a false positive."""
+    """A true instance is split into halves: both have IoU 0.5, and the second one is a false positive."""
     truth = scene([(1, 100)], {1: "chair"})
     result = evaluate(prediction(truth, [(5, 50), (6, 50)], {5: ("chair", 0.5), 6: ("chair", 0.6)}), truth)
     score = result.by_class[0.5]["chair"]
@@ -107,7 +107,7 @@ def test_ap_requires_class_match_except_agnostic_ap():
     assert "instances.ap50.table" not in result.metrics()
 
 
-def test_class_absent_from_scene_lowers_precision_without_ap():
+def test_evaluate_absent_class_lowers_precision_without_ap():
     truth = scene([(1, 100), (0, 100)], {1: "chair"})
     metrics = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("chair", 0.9), 6: ("tv", 1.0)}), truth).metrics()
     assert metrics["instances.ap50"] == 1.0
@@ -118,7 +118,7 @@ def test_class_absent_from_scene_lowers_precision_without_ap():
 @pytest.mark.parametrize(
     ("class_name", "points"), [(None, 150), ("chair", 99)], ids=["class not known", "under 100 points"]
 )
-def test_match_with_ignored_instance_is_not_counted(class_name, points):
+def test_evaluate_does_not_count_match_with_ignored_instance(class_name, points):
     truth = scene([(1, 100), (2, points)], {1: "chair", 2: class_name})
     metrics = evaluate(
         prediction(truth, [(5, 100), (6, points)], {5: ("chair", 0.5), 6: ("chair", 0.9)}), truth
@@ -128,19 +128,19 @@ def test_match_with_ignored_instance_is_not_counted(class_name, points):
     assert metrics["instances.true_count"] == 1
 
 
-def test_prediction_mostly_on_unknown_instances_is_ignored():
-    """It covers several unknown instances, none of them well: IoU 0.2 with each, yet all of it is unknown."""
+def test_evaluate_ignores_prediction_on_unknown_instances():
+    """The prediction covers several unknown instances with IoU 0.2 each, and nothing else."""
     runs = [(1, 100)] + [(k, 120) for k in range(2, 8)]
     truth = scene(runs, {1: "chair"} | dict.fromkeys(range(2, 8)))
     covered = prediction(truth, [(5, 100), (6, 720)], {5: ("chair", 0.5), 6: ("chair", 0.9)})
     assert evaluate(covered, truth).overall.ignored == 1
     known = replace(truth, instance_ids=np.where(truth.instance_ids >= 5, 0, truth.instance_ids).astype(np.int32))
     score = evaluate(covered, known).overall
-    assert (score.ignored, score.false_positives) == (0, 1), "exactly half of it is unknown: wrong"
+    assert (score.ignored, score.false_positives) == (0, 1), "exactly half is unknown: false positive"
 
 
-def test_prediction_of_unannotated_class_is_ignored():
-    """A right chair, and a right keyboard where only chairs and beds are labeled; a wrong bed stays wrong."""
+def test_evaluate_ignores_prediction_of_unannotated_class():
+    """The chair is correct, and keyboards are not annotated; the wrong bed is a false positive."""
     truth = replace(scene([(1, 100), (0, 300)], {1: "chair"}), classes=("chair", "bed"))
     found = [(1, 100), (2, 100), (0, 100), (3, 100)]
     claims = {1: ("chair", 0.8), 2: ("keyboard", 0.9), 3: ("bed", 0.7)}
@@ -149,18 +149,18 @@ def test_prediction_of_unannotated_class_is_ignored():
     assert result.metrics()["instances.ap50_agnostic"] == 1.0
     assert evaluate(prediction(truth, found, claims), replace(truth, classes=None)).overall.false_positives == 2
     called_otherwise = evaluate(prediction(truth, [(1, 100)], {1: ("bench", 0.8)}), truth)
-    assert called_otherwise.metrics()["instances.ap50_agnostic"] == 1.0, "the object is found, by whatever name"
+    assert called_otherwise.metrics()["instances.ap50_agnostic"] == 1.0, "the object is found with any class"
 
 
-def test_prediction_with_evaluated_match_is_not_ignored():
-    """At IoU 0.25 the prediction finds its truth although more of it lies on an unknown instance."""
+def test_evaluate_keeps_prediction_with_evaluated_match():
+    """At IoU 0.25 the prediction matches its truth although more of it is on an unknown instance."""
     truth = scene([(1, 100), (2, 150)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 250)], {5: ("chair", 0.5)}), truth)
     assert result.by_class[0.25]["chair"].ap == 1.0
     assert result.by_class[0.5]["chair"].ignored == 1
 
 
-def test_predictions_without_near_points_are_false_positives():
+def test_evaluate_distant_prediction_is_false_positive():
     truth = scene([(1, 100)], {1: "chair"})
     claims = {5: ("chair", 0.5), 6: ("chair", 0.9), 7: ("chair", 0.8)}
     near = prediction(truth, [(5, 100)], claims)
@@ -174,7 +174,7 @@ def test_predictions_without_near_points_are_false_positives():
 
 
 @pytest.mark.parametrize(("distance", "iou"), [(0.049, 1.0), (0.051, 0.0)])
-def test_labels_are_transferred_within_5_cm(distance, iou):
+def test_label_transfer_is_limited_to_5_cm(distance, iou):
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     moved = replace(moved, points_world=moved.points_world + np.float32([0, distance, 0]))
@@ -192,8 +192,8 @@ def test_label_transfer_uses_nearest_background_vertex():
     assert evaluate(with_background, truth).best_ious == {1: 0.6}
 
 
-def test_transfer_to_map_counts_map_vertices():
-    """Ten points of background are under the instance, and the map has two vertices at each of them."""
+def test_label_transfer_to_map_counts_map_vertices():
+    """Ten points of background are under the instance; the map has two vertices at each of them."""
     truth = scene([(1, 100), (0, 100)], {1: "chair"})
     dense = prediction(truth, [(5, 110)], {5: ("chair", 1.0)})
     twice = replace(
@@ -218,7 +218,7 @@ def test_evaluate_empty_map_or_truth_is_handled():
     assert evaluate(empty, truth, transfer=Transfer.TO_MAP).metrics()["instances.ap50"] == 0.0
 
 
-def test_inconsistent_predictions_raise():
+def test_evaluate_inconsistent_predictions_raise():
     truth = scene([(1, 100)], {1: "chair"})
     with pytest.raises(DataError, match="expected labels in `ids`, got 6"):
         prediction(truth, [(6, 10)], {5: ("chair", 1.0)})
@@ -227,7 +227,7 @@ def test_inconsistent_predictions_raise():
 
 
 def test_label_transfer_tie_is_independent_of_order():
-    """Each true point lies exactly between two map vertices of different instances."""
+    """Each true point is exactly between two map vertices of different instances."""
     truth = scene([(1, 100)], {1: "chair"})
     up = np.float32([0, 0.03125, 0])
     both = PredictedInstances(
@@ -245,20 +245,20 @@ def test_label_transfer_tie_is_independent_of_order():
     assert len(results) == 1
 
 
-def test_unknown_instance_match_is_ignored_only_above_threshold():
-    """40 of its 100 points on an unknown instance of 40: IoU 0.4, enough at 0.25 and not at 0.5."""
+def test_evaluate_ignores_unknown_match_only_above_threshold():
+    """Of its 100 points, 40 are on an unknown instance of 40: IoU 0.4, enough at 0.25 but not at 0.5."""
     truth = scene([(1, 100), (2, 40), (0, 60)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("chair", 0.5), 6: ("chair", 0.9)}), truth)
     assert result.by_class[0.25]["chair"].ignored == 1
     assert result.by_class[0.5]["chair"].false_positives == 1
 
 
-def test_three_predictions_on_two_chairs_match_manual_result():
-    """All as confident: 11 with 70 of 120 points (IoU 7/12), 12 with the other 50 (5/12), 13 with the second chair.
+def test_evaluate_three_predictions_match_manual_result():
+    """Equal confidences: 11 with 70 of 120 points (IoU 7/12), 12 with the other 50 (5/12), 13 with the second chair.
 
     At 0.5: right, wrong, right; precision 1, 1/2, 2/3; AP (1 + 2/3) / 2 = 5/6; F1 4/5; PQ (7/12 + 1) / 2.5 = 19/30.
-    From 0.6 on: wrong, wrong, right; AP (1/3) / 2. Over the thresholds: (2 * 5/6 + 8 * 1/6) / 10 = 3/10.
-    At 0.25 the second one comes to a chair that is taken: as at 0.5.
+    From 0.6 on: wrong, wrong, right; AP (1/3) / 2. Over the thresholds: (2 * 5/6 + 8 * 1/6) / 10 = 3/10. At 0.25 the
+    second prediction matches a chair that is already matched, as at 0.5.
     """
     truth = scene([(1, 120), (2, 100)], {1: "chair", 2: "chair"})
     claims = {11: ("chair", 0.9), 12: ("chair", 0.9), 13: ("chair", 0.9)}
@@ -269,8 +269,11 @@ def test_three_predictions_on_two_chairs_match_manual_result():
         assert metrics[f"instances.{name}"] == pytest.approx(value), name
 
 
-def test_equal_confidences_are_ranked_by_id():
-    """As above, but for 11 and 12: wrong, right, right at 0.5, AP 2/3. At 0.25 the small piece takes the chair: 5/6."""
+def test_evaluate_ranks_equal_confidences_by_id():
+    """The scene has three predictions on two chairs, with ids 11 and 12 exchanged.
+
+    At 0.5: wrong, right, right; AP 2/3. At 0.25 the small piece matches the chair: AP 5/6.
+    """
     truth = scene([(1, 120), (2, 100)], {1: "chair", 2: "chair"})
     claims = {11: ("chair", 0.9), 12: ("chair", 0.9), 13: ("chair", 0.9)}
     result = evaluate(prediction(truth, [(12, 70), (11, 50), (13, 100)], claims), truth)
@@ -278,8 +281,11 @@ def test_equal_confidences_are_ranked_by_id():
     assert result.ap(0.25) == pytest.approx(5 / 6)
 
 
-def test_metrics_by_class_match_manual_result():
-    """Two chairs: one with IoU 3/4, one missed. A bed found with 3/5 behind a wrong one. A table that nobody found."""
+def test_evaluate_metrics_by_class_match_manual_result():
+    """One of two chairs has IoU 3/4, the other is missed.
+
+    A bed with 3/5 ranks after a wrong one. The table is missed.
+    """
     truth = scene(
         [(1, 100), (2, 100), (3, 150), (4, 100), (0, 200)], {1: "chair", 2: "chair", 3: "bed", 4: "dining table"}
     )
@@ -313,8 +319,8 @@ def test_metrics_by_class_match_manual_result():
     assert not [name for name in metrics if name.endswith(".tv")]
 
 
-def test_transfers_differ_with_vertex_density():
-    """80 of the chair's 100 points and 20 of the wall. The map has three vertices on each of the chair's, one else.
+def test_label_transfers_differ_with_vertex_density():
+    """The prediction has 80 of the chair's 100 points and 20 of the wall; the map has 3 vertices per chair point.
 
     To the truth: 80 / (100 + 20) = 2/3, a match at 4 of the 10 thresholds. To the map: 240 / (300 + 20) = 3/4, at 6.
     """
@@ -335,8 +341,8 @@ def test_transfers_differ_with_vertex_density():
 
 
 @pytest.mark.parametrize("transfer", Transfer)
-def test_transfer_distance_limit_is_inclusive(transfer):
-    """Distances that floats hold exactly: 5/64 m as the hypotenuse of 3/64 and 4/64."""
+def test_label_transfer_distance_limit_is_inclusive(transfer):
+    """The distance is exact in floating point: 5/64 m as the hypotenuse of 3/64 and 4/64."""
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     moved = replace(moved, points_world=moved.points_world + np.float32([0, 3 / 64, 4 / 64]))
@@ -345,8 +351,8 @@ def test_transfer_distance_limit_is_inclusive(transfer):
     assert evaluate(moved, truth, transfer=transfer, max_distance=below).best_ious == {1: 0.0}
 
 
-def test_judge_outcomes_match_evaluation_counts():
-    """Right, taken for another class, a second one on the same object, on nothing, and where nobody knows."""
+def test_evaluate_judge_outcomes_match_counts():
+    """The predictions are correct, of another class, a duplicate, on nothing, and on an unknown instance."""
     names = {1: "chair", 2: "bed", 3: "chair", 4: None, 5: "book"}
     truth = scene([(1, 120), (2, 100), (3, 100), (4, 100), (5, 100), (0, 100)], names)
     runs = [(11, 80), (12, 40), (13, 100), (0, 100), (14, 100), (0, 100), (15, 100)]

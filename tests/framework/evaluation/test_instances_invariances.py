@@ -1,4 +1,4 @@
-"""What must hold of instance AP in any scene, and a slow reference that agrees in all of them."""
+"""Invariants of instance AP in random scenes, and a slow reference."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from tests.support.slow_evaluation import slow_metrics
 
 MIN_POINTS = 12  # of a true instance: scenes are small
 CLASSES = ("chair", "bed", "couch")
-CLEAR = 1e-5  # m by which no nearest neighbor is a matter of rounding
+CLEAR = 1e-5  # m, margin of every nearest neighbor, larger than rounding
 
 examples = settings(derandomize=True, deadline=None, max_examples=30)
 
 
 @dataclass
 class Drawn:
-    """A truth of slabs along x with their own borders in the map, some classes unknown, and the map's own points."""
+    """A truth of slabs along x with other borders in the map, some classes unknown, and the map's points."""
 
     truth: SceneTruth
     predictions: PredictedInstances
@@ -75,7 +75,7 @@ def _slabs(points: np.ndarray, ids: np.ndarray, borders: np.ndarray) -> np.ndarr
 
 
 def clear(points: np.ndarray, targets: np.ndarray) -> bool:
-    """Whether each target's nearest point is so, and is within the transfer distance or not, whatever the rounding."""
+    """Return True where the nearest point and its distance limit do not depend on rounding."""
     distances = np.sort(np.linalg.norm(points[None].astype(np.float64) - targets[:, None], axis=2), axis=1)
     return bool(
         (distances[:, 1] - distances[:, 0] > CLEAR).all() and (np.abs(distances[:, 0] - MAX_DISTANCE) > CLEAR).all()
@@ -90,7 +90,7 @@ def is_clear(drawn: Drawn) -> bool:
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes())
-def test_metrics_match_slow_reference(transfer: Transfer, drawn: Drawn) -> None:
+def test_instance_metrics_match_slow_reference(transfer: Transfer, drawn: Drawn) -> None:
     assume(is_clear(drawn))
     fast = drawn.evaluate(transfer).metrics()
     slow = slow_metrics(drawn.predictions, drawn.truth, transfer, MAX_DISTANCE, MIN_POINTS)
@@ -100,7 +100,7 @@ def test_metrics_match_slow_reference(transfer: Transfer, drawn: Drawn) -> None:
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes())
-def test_metrics_are_invariant_to_input_order(transfer: Transfer, drawn: Drawn) -> None:
+def test_instance_metrics_are_invariant_to_input_order(transfer: Transfer, drawn: Drawn) -> None:
     truth, predictions, rng = drawn.truth, drawn.predictions, drawn.rng
     p, v, t = (rng.permutation(len(x)) for x in (predictions.ids, predictions.points_world, truth.points_world))
     shuffled = PredictedInstances(
@@ -117,8 +117,8 @@ def test_metrics_are_invariant_to_input_order(transfer: Transfer, drawn: Drawn) 
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes())
-def test_metrics_are_invariant_to_id_values(transfer: Transfer, drawn: Drawn) -> None:
-    """As long as their order stays, by which ties are broken."""
+def test_instance_metrics_are_invariant_to_id_values(transfer: Transfer, drawn: Drawn) -> None:
+    """The order of the ids is kept, because it breaks ties."""
     truth, predictions = drawn.truth, drawn.predictions
     renamed = replace(predictions, ids=predictions.ids**2 + 6, instance_ids=_renamed(predictions.instance_ids))
     true_names = {k**2 + 6: name for k, name in truth.class_names.items()}
@@ -133,7 +133,7 @@ def _renamed(ids: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes())
-def test_metrics_are_invariant_to_rigid_motion(transfer: Transfer, drawn: Drawn) -> None:
+def test_instance_metrics_are_invariant_to_rigid_motion(transfer: Transfer, drawn: Drawn) -> None:
     assume(is_clear(drawn))
     R, t = Rotation.random(random_state=drawn.rng).as_matrix(), drawn.rng.uniform(-3, 3, 3)
     moved = Drawn(
@@ -146,8 +146,8 @@ def test_metrics_are_invariant_to_rigid_motion(transfer: Transfer, drawn: Drawn)
 
 @examples
 @given(drawn=scenes())
-def test_metrics_are_invariant_to_source_point_density(drawn: Drawn) -> None:
-    """Points there again change nothing; all points twice on the side that is counted change no share."""
+def test_instance_metrics_are_invariant_to_source_density(drawn: Drawn) -> None:
+    """Repeated points change nothing; doubling all counted points changes no fraction."""
     truth, predictions = drawn.truth, drawn.predictions
     again = drawn.rng.choice(len(predictions.points_world), 60)
     denser_map = replace(
@@ -171,9 +171,7 @@ def test_metrics_are_invariant_to_source_point_density(drawn: Drawn) -> None:
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes(), confidence=st.sampled_from([0.0, 0.3, 1.0]))
-def test_additional_false_positive_does_not_increase_scores(
-    transfer: Transfer, drawn: Drawn, confidence: float
-) -> None:
+def test_instance_metrics_do_not_rise_with_false_positive(transfer: Transfer, drawn: Drawn, confidence: float) -> None:
     predictions = drawn.predictions
     one_more = replace(
         predictions,
@@ -192,7 +190,7 @@ def test_additional_false_positive_does_not_increase_scores(
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes())
-def test_metrics_are_within_bounds(transfer: Transfer, drawn: Drawn) -> None:
+def test_instance_metrics_are_within_bounds(transfer: Transfer, drawn: Drawn) -> None:
     metrics = drawn.evaluate(transfer).metrics()
     for name, value in metrics.items():
         assert value >= 0
@@ -207,8 +205,8 @@ def test_metrics_are_within_bounds(transfer: Transfer, drawn: Drawn) -> None:
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes(unknown=False))
-def test_ap_decreases_with_threshold_without_unknown_instances(transfer: Transfer, drawn: Drawn) -> None:
-    """Not so with ignored instances: a loose match of a prediction that is else ignored can take another's place."""
+def test_instance_ap_falls_with_threshold_without_unknown(transfer: Transfer, drawn: Drawn) -> None:
+    """With ignored instances, a loose match of an otherwise ignored prediction can replace another match."""
     found = drawn.evaluate(transfer, min_points=1)
     agnostic = [found.agnostic[threshold].ap for threshold in (0.25, *IOU_THRESHOLDS)]
     by_class = [found.ap(threshold) for threshold in (0.25, *IOU_THRESHOLDS)]
@@ -219,8 +217,8 @@ def test_ap_decreases_with_threshold_without_unknown_instances(transfer: Transfe
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes())
-def test_ground_truth_as_prediction_has_all_scores_one(transfer: Transfer, drawn: Drawn) -> None:
-    """Also where a prediction lies on each ignored instance, and the map is denser than the truth in places."""
+def test_instance_metrics_of_ground_truth_are_one(transfer: Transfer, drawn: Drawn) -> None:
+    """Predictions may be on ignored instances, and the map may be denser than the truth."""
     truth, rng = drawn.truth, drawn.rng
     ids = np.unique(truth.instance_ids[truth.instance_ids > 0])
     again = rng.choice(len(truth.points_world), 60)

@@ -1,4 +1,4 @@
-"""Cases whose average precision follows by hand."""
+"""Tests of mask AP on cases with manual results."""
 
 from __future__ import annotations
 

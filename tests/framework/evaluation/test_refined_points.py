@@ -1,4 +1,4 @@
-"""What a refiner did to clusters, on frames small enough to count by hand."""
+"""Tests of the evaluation of refiners, on frames with manual results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIZE = 10  # px
 
 
 def frame(instance_ids: np.ndarray | None = None, names: dict[int, str | None] | None = None) -> Frame:
-    """A wall 2 m away; without names, every object is a chair."""
+    """Return a wall 2 m away; without names, every object is a chair."""
     truth = None
     if instance_ids is not None:
         truth = FrameTruth(instance_ids, names or {int(i): "chair" for i in np.unique(instance_ids) if i})
@@ -26,7 +26,7 @@ def frame(instance_ids: np.ndarray | None = None, names: dict[int, str | None] |
 
 
 def clusters(*masks: np.ndarray) -> PointClusters:
-    """One cluster a mask (SIZE, SIZE)."""
+    """Return one cluster per mask (SIZE, SIZE)."""
     places = [np.argwhere(mask)[:, ::-1] for mask in masks]
     pixels = np.concatenate([np.zeros((0, 2), np.int64), *places]).astype(np.int32)
     n = len(masks)
@@ -41,7 +41,7 @@ def clusters(*masks: np.ndarray) -> PointClusters:
 
 
 def rows(first: int, last: int) -> np.ndarray:
-    """Some rows of the image."""
+    """Return some rows of the image."""
     mask = np.zeros((SIZE, SIZE), np.bool_)
     mask[first:last] = True
     return mask
@@ -114,7 +114,7 @@ def test_refinement_assigns_parts_by_largest_overlap() -> None:
 
 @dataclass
 class Counting(ClusterRefiner):
-    """Takes every second point away, and counts how often it is asked."""
+    """Removes every second point, and counts its calls."""
 
     def __post_init__(self) -> None:
         self.calls = 0

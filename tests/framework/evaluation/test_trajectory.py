@@ -1,4 +1,4 @@
-"""Trajectory errors of known motions, and beside evo."""
+"""Tests of trajectory errors on known motions, and compared with evo."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ rng = np.random.default_rng(3)
 
 
 def walk(count: int, seed: int = 0) -> list[np.ndarray]:
-    """A random walk of `count` poses, T_world_camera."""
+    """Return a random walk of `count` poses, T_world_camera."""
     generator = np.random.default_rng(seed)
     poses = [exp_se3(generator.normal(0, 1, 6))]
     for _ in range(count - 1):
@@ -33,7 +33,7 @@ def test_trajectory_error_of_rigid_motion_is_zero():
 
 
 def test_trajectory_alignment_does_not_correct_scale():
-    """Points on a line at -1, 0, 1 m, estimated at -1.1, 0, 1.1: residuals 0.1, 0, 0.1 m; each step 0.1 m too long."""
+    """Points at -1, 0, 1 m are estimated at -1.1, 0, 1.1 m: residuals 0.1, 0, 0.1 m; each step is 0.1 m too long."""
     true = [exp_se3(np.array([x, 0, 0, 0, 0, 0])) for x in (-1.0, 0.0, 1.0)]
     estimated = [Pose(exp_se3(np.array([1.1 * x, 0, 0, 0, 0, 0]))) for x in (-1.0, 0.0, 1.0)]
     error = evaluate(true, estimated)
@@ -42,14 +42,14 @@ def test_trajectory_alignment_does_not_correct_scale():
 
 
 def test_rpe_measures_rotation_drift_per_step():
-    """The camera stands still and the estimate turns by 0.02 rad a frame: no ATE, RPE 0.02 rad."""
+    """The camera stands still and the estimate rotates by 0.02 rad per frame: no ATE, RPE 0.02 rad."""
     error = evaluate([np.eye(4)] * 10, [Pose(exp_se3(np.array([0, 0, 0, 0, 0.02 * i, 0]))) for i in range(10)])
     assert error.ate_rmse_m == 0.0
     assert error.rpe_rotation_rmse_rad == pytest.approx(0.02, abs=1e-12)
 
 
 def test_umeyama_returns_rotation_for_mirrored_points():
-    """A mirrored shape must not be matched by a reflection."""
+    """The alignment must not be a reflection."""
     x = rng.normal(size=(10, 3))
     R, _ = umeyama(x, x * [1, 1, -1])
     assert np.linalg.det(R) == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Meshes made light."""
+"""Tests of mesh decimation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.exporting.decimation import clustered, decimated, with_finer_obje
 
 
 def wavy_plane(n: int = 120) -> InstanceMesh:
-    """1 m by 1 m, red on one half, blue on the other; a square in the middle is an object."""
+    """Return a plane of 1 m by 1 m, half red and half blue; a square in the middle is an object."""
     x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
     vertices = np.stack([x, y, 0.02 * np.sin(12 * x) * np.cos(9 * y)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
@@ -63,7 +63,7 @@ def test_decimation_keeps_small_mesh_unchanged() -> None:
     assert areas(light.vertices, light.triangles).sum() == areas(mesh.vertices, mesh.triangles).sum()
 
 
-def test_clustered_reduces_triangle_soup_to_size_limit() -> None:
+def test_decimation_clustered_reduces_soup_to_size_limit() -> None:
     mesh = wavy_plane()
     corners = mesh.triangles.ravel()
     triangles = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
@@ -82,7 +82,7 @@ def test_clustered_reduces_triangle_soup_to_size_limit() -> None:
 
 
 def test_decimation_of_flat_surface_keeps_color_pattern() -> None:
-    """A chequerboard on a plane: for the surface alone two triangles would do, and 0.85 of the area would be right."""
+    """The plane has a checkerboard: for geometry alone two triangles suffice, with 0.85 of the area correct."""
     mesh = wavy_plane(101)
     x, y, _ = mesh.vertices.T
     white = (np.floor(5 * x) + np.floor(5 * y)) % 2 == 0
@@ -103,7 +103,7 @@ def test_decimation_of_flat_surface_keeps_color_pattern() -> None:
 
 @pytest.mark.parametrize("asked", [1, 4, 12])
 def test_decimation_to_few_triangles_keeps_object_volume(asked: int) -> None:
-    """Clustered for so few, all of it would be in one cube."""
+    """Clustering to so few triangles would merge the object into one cube."""
     ball = trimesh.creation.icosphere(6, 0.1)
     n = len(ball.vertices)
     mesh = InstanceMesh(

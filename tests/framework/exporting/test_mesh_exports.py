@@ -1,4 +1,4 @@
-"""Scenes and objects as other programs read them: where they stand, how large they are, what colors they have."""
+"""Tests of the mesh exports: positions, sizes and colors of objects."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TABLE_SIZE, CUBE_SIZE = (1.2, 0.8, 0.75), (0.2, 0.2, 0.2)
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """In a world whose y is up, and whose origin is not on the floor."""
+    """Return a run in a world with y up and its origin above the floor."""
     return TURNED.write(tmp_path_factory.mktemp("runs") / "turned")
 
 
@@ -44,7 +44,7 @@ def room(run: Path) -> UprightRoom:
 
 
 def header(data: bytes) -> dict[str, Any]:
-    """The JSON of a GLB file."""
+    """Return the JSON of a GLB file."""
     return dict(json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")]))
 
 
@@ -108,7 +108,7 @@ def test_exported_scene_contains_all_objects_in_place(run: Path, tmp_path: Path)
         assert found.area == pytest.approx(original.area, rel=1e-4)
 
 
-def test_triangles_between_objects_belong_to_room(room: UprightRoom) -> None:
+def test_export_triangles_between_objects_belong_to_room(room: UprightRoom) -> None:
     ids = np.where(room.mesh.vertices[:, 0] > 2.02, 1, 2).astype(np.int32)
     mesh = replace(room.mesh, instance_ids=ids)
     box = room.objects[0].box
@@ -122,7 +122,7 @@ def test_triangles_between_objects_belong_to_room(room: UprightRoom) -> None:
 
 
 @pytest.mark.parametrize(("degrees", "yaw", "swapped"), [(80, -10, True), (10, 10, False), (190, 10, False)])
-def test_facing_aligns_box_with_room_x_axis(degrees: float, yaw: float, swapped: bool) -> None:
+def test_export_facing_aligns_box_with_room_x_axis(degrees: float, yaw: float, swapped: bool) -> None:
     angle = np.radians(degrees)
     rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     found = facing(Box(np.zeros(3), np.array([1.0, 2.0, 3.0]), rotation))
@@ -150,7 +150,7 @@ def test_glb_colors_are_linear_with_16_bits(room: UprightRoom) -> None:
     view = found["bufferViews"][accessor["bufferView"]]
     start = 28 + int.from_bytes(data[12:16], "little") + view["byteOffset"]
     color = np.frombuffer(data, "<u2", 4, start) / 65535
-    # IEC 61966-2-1: 220 is ((220 / 255 + 0.055) / 1.055)^2.4, 30 likewise
+    # IEC 61966-2-1: the linear value of 220 is ((220 / 255 + 0.055) / 1.055)^2.4
     np.testing.assert_allclose(color, (0.715694, 0.012983, 0.012983, 1), atol=2e-5)
     every = linear(np.arange(256, dtype=np.uint8))
     assert (every[0], every[255]) == (0, 1)
@@ -158,7 +158,7 @@ def test_glb_colors_are_linear_with_16_bits(room: UprightRoom) -> None:
 
 
 @pytest.mark.parametrize("coloring", [Coloring.INSTANCE, Coloring.CLASS])
-def test_export_coloring_by_instance_or_class(coloring: Coloring, tmp_path: Path) -> None:
+def test_export_colors_one_object_uniformly(coloring: Coloring, tmp_path: Path) -> None:
     two = ExportedRoom(things={"cube": [(1, 1, 0, 1.2, 1.2, 0.2)], "other": [(2, 2, 0, 2.2, 2.2, 0.2)]})
     run = two.write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
@@ -174,7 +174,7 @@ def test_export_coloring_by_instance_or_class(coloring: Coloring, tmp_path: Path
 
 
 def test_exported_meshes_are_readable_by_open3d_and_trimesh(run: Path, tmp_path: Path) -> None:
-    """Of the run's own mesh.ply and of what is exported: the same properties, by the same writer."""
+    """The run's mesh.ply and the exported meshes have the same properties, from the same writer."""
     export(run, [ExportFormat.PLY, ExportFormat.OBJ], tmp_path)
     for path in (run / "mesh.ply", tmp_path / "scene.ply"):
         mesh = read_mesh(path)
@@ -250,7 +250,7 @@ def test_convex_hull_faces_outward() -> None:
 
 
 def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom) -> None:
-    """Also where triangles have no area, which Khronos' validator calls an error."""
+    """Triangles without area have unit normals, which Khronos' validator requires."""
     mesh = replace(room.mesh, vertices=room.mesh.vertices.copy())
     own = room.objects[1].vertices
     mesh.vertices[own[:50]] = mesh.vertices[own[0]]
@@ -263,8 +263,8 @@ def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom)
         np.testing.assert_allclose(np.linalg.norm(part.vertex_normals, axis=1), 1, atol=1e-5)
 
 
-def test_small_fragments_belong_to_room_instead_of_object(tmp_path: Path) -> None:
-    """Labels leak through edges of depth; a leg is no speck."""
+def test_export_small_fragments_belong_to_room_not_object(tmp_path: Path) -> None:
+    """Labels leak at depth edges; a table leg is larger than such fragments."""
     table = [(0.8, 1.0, 0.7, 2.0, 1.8, 0.75), (0.8, 1.0, 0, 0.85, 1.05, 0.65)]
     speck = (3.5, 2.5, 0.9, 3.51, 2.51, 0.91)
     run = ExportedRoom(things={"dining table": [*table, speck]}).write(tmp_path / "run")
@@ -276,7 +276,7 @@ def test_small_fragments_belong_to_room_instead_of_object(tmp_path: Path) -> Non
     assert len(read_mesh(whole).triangles) == len(read_mesh(run / "mesh.ply").triangles)
 
 
-def test_decimated_parts_keep_shape_colors_and_labels(room: UprightRoom) -> None:
+def test_export_decimated_parts_keep_shape_colors_and_labels(room: UprightRoom) -> None:
     fewer = parts(room, 400)
     assert 200 < sum(len(part.mesh.triangles) for part in fewer) <= 420
     for full, part in zip(parts(room), fewer, strict=True):
@@ -287,7 +287,7 @@ def test_decimated_parts_keep_shape_colors_and_labels(room: UprightRoom) -> None
     assert decimated(room.mesh, len(room.mesh.triangles)) is room.mesh
 
 
-def test_decimation_shows_progress_bar_in_terminal(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_decimation_shows_progress_bar_in_terminal(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TQDM_DISABLE", raising=False)
     with terminal_stderr(100, monkeypatch) as shown:
         parts(room, 400)
@@ -333,7 +333,7 @@ def test_export_escapes_invalid_unicode_class_names(tmp_path: Path) -> None:
 
 
 def test_exported_instance_colors_match_overview(tmp_path: Path) -> None:
-    """Also in its own file, and where another one is unlikely, or is not exported."""
+    """The color is the same in its own file and if another object is unlikely or not exported."""
     run = ExportedRoom().write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
     entries[0]["confidence"] = 0.1
@@ -350,7 +350,7 @@ def test_exported_instance_colors_match_overview(tmp_path: Path) -> None:
                 np.testing.assert_array_equal(np.unique(colors, axis=0), [expected[key]])
 
 
-def test_export_object_with_three_vertices(tmp_path: Path) -> None:
+def test_export_object_with_three_vertices_is_written(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     mesh = read_mesh(run / "mesh.ply")
     ids = np.where(mesh.instance_ids == 2, 0, mesh.instance_ids).astype(np.int32)
@@ -367,7 +367,7 @@ def test_export_object_with_three_vertices(tmp_path: Path) -> None:
 
 
 def test_export_mesh_without_triangles_writes_object_vertices(tmp_path: Path) -> None:
-    """Of a mesh without triangles: every vertex would be a speck."""
+    """Without triangles, every vertex would be a fragment."""
     run = ExportedRoom().write(tmp_path / "run")
     mesh = read_mesh(run / "mesh.ply")
     write_mesh(run / "mesh.ply", replace(mesh, triangles=mesh.triangles[:0]))
@@ -418,8 +418,8 @@ def test_export_up_option_replaces_missing_up_direction(tmp_path: Path, caplog: 
     assert "expected an up direction, got none" in caplog.text
     assert read_mesh(tmp_path / "as_it_is" / "scene.ply").vertices[:, 1].max() == pytest.approx(1.25, abs=1e-5)
     caplog.clear()
-    export(run, [ExportFormat.PLY], tmp_path / "told", up=(0, 2, 0), floor=-1.25)
+    export(run, [ExportFormat.PLY], tmp_path / "given", up=(0, 2, 0), floor=-1.25)
     assert not caplog.text
-    assert read_mesh(tmp_path / "told" / "scene.ply").vertices[:, 2].min() == pytest.approx(0, abs=1e-5)
+    assert read_mesh(tmp_path / "given" / "scene.ply").vertices[:, 2].min() == pytest.approx(0, abs=1e-5)
     with pytest.raises(DataError, match="up: expected a direction of 3 numbers"):
         read_room(run, up=(0, 0, 0))

@@ -1,4 +1,4 @@
-"""Floor plans, ROS maps and scene graphs of rooms whose every centimeter is known."""
+"""Tests of floor plans, ROS maps and scene graphs on exact rooms."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def room(run: Path) -> UprightRoom:
 
 @pytest.fixture(scope="module")
 def low(room: UprightRoom) -> Plan:
-    """For a robot that drives under the table."""
+    """Return a plan for a robot that fits under the table."""
     return plan(room, RESOLUTION, 0.5)
 
 
@@ -53,7 +53,7 @@ def high(room: UprightRoom) -> Plan:
 
 
 def at(found: Plan, x: float, y: float) -> tuple[bool, bool]:
-    """Whether a place is occupied, and free."""
+    """Return if a position is occupied, and if it is free."""
     [[row, column]] = found.cells(np.array([[x + OFF, y + OFF]]))
     return bool(found.occupied[row, column]), bool(found.free[row, column])
 
@@ -86,13 +86,13 @@ def test_plan_cells_are_occupied_at_object_footprints(low: Plan, high: Plan) -> 
     inside = (slice(2, -2),) * 2
     assert low.shape == (33, 43)  # 3 x 4 m, and a margin
     assert at(low, 0.825, 1.025) == (True, False)  # a leg
-    assert at(low, 1.4, 1.4) == (False, False)  # under the table, where no camera looked through
+    assert at(low, 1.4, 1.4) == (False, False)  # under the table, which is not observed
     assert at(high, 1.4, 1.4) == (True, False)
     legs = [(0.825, 1.025), (1.975, 1.025), (0.825, 1.775), (1.975, 1.775)]
     assert all(at(low, *leg)[0] for leg in legs)
     assert 4 <= low.occupied[inside].sum() <= 16  # a leg of 5 cm is in one to four cells
     table = high.occupied[inside].sum() * RESOLUTION**2
-    assert 1.2 * 0.8 <= table <= 1.4 * 1.0  # and what of cells its edges touch
+    assert 1.2 * 0.8 <= table <= 1.4 * 1.0  # and cells that its edges touch
     assert low.occupied[1, 1:-1].all()
     assert not low.occupied[0].any()
 
@@ -103,7 +103,6 @@ def test_plan_observed_space_under_table_is_free(tmp_path: Path) -> None:
 
 
 def test_plan_highest_object_per_cell_is_order_independent(low: Plan, tmp_path: Path) -> None:
-    """In whichever order they are."""
     turned = plan(stored(tmp_path, things={"cube": CUBE, "table": TABLE}, shift=(OFF, OFF, 0.0)), RESOLUTION, 0.5)
     for (x, y), key in (((1.3, 1.3), 2), ((1.0, 1.2), 1), ((3.5, 1.0), 0)):
         [[row, column]] = low.cells(np.array([[x + OFF, y + OFF]]))
@@ -113,7 +112,7 @@ def test_plan_highest_object_per_cell_is_order_independent(low: Plan, tmp_path: 
 
 def test_plan_wall_cells_match_room_walls(low: Plan) -> None:
     assert low.wall[1:-1, [1, -2]].all()
-    assert low.wall[[1, -2], 1:-1].sum() >= 76  # but behind the picture
+    assert low.wall[[1, -2], 1:-1].sum() >= 76  # except behind the picture
     assert low.wall.sum() == low.wall[1:-1, [1, -2]].sum() + low.wall[[1, -2], 2:-2].sum()
 
 
@@ -126,8 +125,8 @@ def test_plan_free_cells_are_observed_floor(room: UprightRoom, low: Plan) -> Non
     np.testing.assert_array_equal(blind.occupied, low.occupied)
 
 
-def test_looked_through_excludes_occluded_points(room: UprightRoom) -> None:
-    """From one camera before a wall of the table's height, exactly on its optical axis and beyond."""
+def test_plan_looked_through_excludes_occluded_points(room: UprightRoom) -> None:
+    """The points are on the optical axis of a camera that faces the cube."""
     pose = np.eye(4)
     pose[:3, :3] = looking(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     pose[:3, 3] = (0.4, 1.35, 0.85)
@@ -221,7 +220,7 @@ def test_relations_cube_is_on_table_and_table_on_floor(room: UprightRoom, low: P
 
 
 def test_relations_stacked_object_is_on_upper_object(tmp_path: Path) -> None:
-    """The lower one's top is not seen: it has none in the mesh."""
+    """The top of the lower object is hidden and missing in the mesh."""
     lower, upper = (1.2, 1.2, 0.75, 1.4, 1.4, 0.85), (1.2, 1.2, 0.85, 1.4, 1.4, 0.95)
     room = stored(tmp_path, things={"dining table": TABLE, "book": [lower], "other": [upper]})
     found = relations(room, None)
@@ -279,7 +278,7 @@ ARMS: list[Block] = [(1.0, 1.0, 0.4, 1.1, 1.7, 0.7), (1.9, 1.0, 0.4, 2.0, 1.7, 0
 
 @pytest.mark.parametrize("seat", [SEAT, SEAT + ARMS])
 def test_relations_pillow_is_on_couch(seat: list[Block], tmp_path: Path) -> None:
-    """Whose top is not what it stands on."""
+    """The top of the couch is its back instead of its seat."""
     things = {"couch": seat, "pillow": [(1.3, 1.3, 0.4, 1.7, 1.6, 0.6)]}
     assert expected(relations(stored(tmp_path, things=things), None), 2) == [("on", 1)]
 
@@ -306,7 +305,7 @@ def test_scene_graph_matches_schema(run: Path, tmp_path: Path) -> None:
 
 
 def divided(door: float) -> list[Block]:
-    """Two rooms of 4 x 3 m, as their walls are seen from inside, and what is between them at a door of some width."""
+    """Return two rooms of 4 x 3 m, as seen from inside, with a door of some width between them."""
     low, high = 1.5 - door / 2, 1.5 + door / 2
     return [(4.0, 0.0, 0.0, 4.1, low, 2.5), (4.0, high, 0.0, 4.1, 3.0, 2.5)]
 
@@ -339,7 +338,7 @@ def test_rooms_wide_opening_does_not_separate(tmp_path: Path) -> None:
 
 
 def by_hand(text: str) -> Plan:
-    """A plan with cells of 0.5 m: # wall, . free, o occupied, and nothing known."""
+    """Return a plan with cells of 0.5 m: # wall, . free, o occupied, unknown elsewhere."""
     rows = np.array([list(row) for row in text.split("\n")])[::-1]
     free, wall, occupied = rows == ".", rows == "#", rows == "o"
     return Plan(0.5, np.zeros(2), occupied | wall, free, free, wall, np.zeros(rows.shape, np.int32))

@@ -1,4 +1,4 @@
-"""The pictures of experiments: which runs are in them, what is said of the others, and the two files."""
+"""Tests of the figures of experiments: included runs, notes about missing runs, and the two files."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ ROWS = {"part": ["dataset.stop=8"], "whole": []}
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Panels of few pixels, which are drawn quickly."""
+    """Use small panels, which are drawn quickly."""
     monkeypatch.setattr(map_figure, "PDF_DPI", 40)
 
 
 def list_objects(directory: Path, class_name: str, vertices: list[int]) -> None:
-    """An instances.json with an object for each number of vertices."""
+    """Write an instances.json with an object for each number of vertices."""
     expected = {"class": class_name, "confidence": 0.9, "class_probabilities": {class_name: 1.0}, "observations": 5}
     box = {"center": [0, 0, 0], "extent": [1, 1, 1], "rotation": np.eye(3).tolist()}
     expected |= {"first_frame": 0, "last_frame": 9, "centroid": [0, 0, 0], "obb": box}
@@ -46,7 +46,7 @@ def list_objects(directory: Path, class_name: str, vertices: list[int]) -> None:
 
 
 def run(root: Path, row: str, scene: str, frames: int = 20) -> Path:
-    """The record of a run that found both boxes."""
+    """Write the outputs of a run that found both boxes."""
     directory = root / f"dataset.scene={scene},row={row},seed=0"
     directory.mkdir(parents=True)
     room = {"_target_": "tests.support.scenes.boxes_room.BoxesRoom", "scene": scene}
@@ -75,7 +75,7 @@ def experiment(root: Path, **figure: Any) -> Path:
 
 
 def texts(root: Path) -> list[str]:
-    """All that is written on the page, diagrams included."""
+    """Return all texts of the page, including those of diagrams."""
     pictured = Pictured.below(root)
     page = DRAWN[pictured.choice.kind](pictured)
     found = [*page.figure.texts, *(text for axes in page.figure.axes for text in axes.texts)]
@@ -84,7 +84,7 @@ def texts(root: Path) -> list[str]:
 
 @pytest.fixture
 def maps(tmp_path: Path) -> Path:
-    """Two sequences, of the second of which the first row's run has failed."""
+    """Return runs of two sequences; the run of the first row failed in the second sequence."""
     root = experiment(tmp_path / "figure4", kind="maps", names={"part": "in progress"})
     run(root, "part", "011", frames=8)
     run(root, "whole", "011")
@@ -243,11 +243,11 @@ def test_figures_command_prints_paths_and_errors(
     assert message.err.splitlines()[-1] == f"error: {maps / 'nowhere'}: expected a folder of runs, got no folder"
 
 
-@pytest.mark.parametrize("error", [None, RuntimeError("a worker died"), KeyboardInterrupt()])
+@pytest.mark.parametrize("error", [None, RuntimeError("a worker failed"), KeyboardInterrupt()])
 def test_sweep_writes_figure_except_after_ctrl_c(
     maps: Path, error: BaseException | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("signal.signal", lambda *_: None)  # what a sweep changes for its process
+    monkeypatch.setattr("signal.signal", lambda *_: None)  # settings of the process changed by a sweep
     monkeypatch.setenv("PYTHONWARNINGS", "")
     with suppress(InstanceMapError, KeyboardInterrupt), sweep_in(maps, with_table=False, with_figure=True):
         if error is not None:

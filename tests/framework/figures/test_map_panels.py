@@ -1,4 +1,4 @@
-"""Maps side by side: the same object in the same color at the same place."""
+"""Tests of map panels: an object has the same color and position in all panels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SIZE = (160, 120)
 
 
 def stored(ids: Mapping[int, int]) -> StoredMap:
-    """The room's map with the ids (0 room, 1 red box, 2 blue box) named anew."""
+    """Return the room's map with new ids for 0 (room), 1 (red box) and 2 (blue box)."""
     mesh = furnished()
     labels = np.array([ids.get(k, 0) for k in range(3)], np.int32)[mesh.instance_ids]
     names = {key: f"thing {key}" for key in ids.values() if key}
@@ -29,7 +29,7 @@ def stored(ids: Mapping[int, int]) -> StoredMap:
 
 
 def hue(color: np.ndarray) -> np.ndarray:
-    """Without brightness, which is the light's."""
+    """Return the colors without brightness, which depends on the light."""
     direction = color - color.min()
     return direction / np.linalg.norm(direction)
 
@@ -41,7 +41,7 @@ def truth() -> SceneTruth:
 
 @pytest.fixture(scope="module")
 def line(truth: SceneTruth) -> PanelLine:
-    """Swapped ids and a missed box; the same length, so no paths."""
+    """Return a panel line of maps with swapped ids and a missed box; their lengths are equal, so there are no paths."""
     return panel_line([stored({1: 7, 2: 3}), None, stored({1: 5}), stored({1: 2, 2: 1})], truth, SIZE, zoom=True)
 
 
@@ -59,7 +59,7 @@ def test_panel_line_uses_same_object_color_in_all_columns(line: PanelLine) -> No
             np.testing.assert_allclose(panel.image[place], line.truth.image[place], atol=2)
     assert second is not None
     np.testing.assert_allclose(second.image[red], line.truth.image[red], atol=2)
-    assert np.ptp(second.image[blue].astype(int)) < 12, "what is not found there is background"
+    assert np.ptp(second.image[blue].astype(int)) < 12, "missed objects are background"
     assert (np.abs(hue(line.truth.image[red].astype(float)) - hue(line.truth.image[blue].astype(float)))).max() > 0.3
 
 

@@ -1,4 +1,4 @@
-"""The panels of a ray-cast view, on a wall that is seen exactly."""
+"""Tests of the panels of a ray-cast view, on a wall with a known view."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ CENTERS = {3: np.zeros(3), 12: np.ones(3)}
 
 
 def wall(depth: float = 2.0) -> View:
-    """A wall in front of a turned camera; the left edge is not mapped, and the id 99 is no listed object."""
+    """Return a wall in front of a rotated camera; the left edge is unmapped, and id 99 is not a listed object."""
     T = pose(0.5, -0.2, 0.1, (0.0, 0.3, 0.0))
     depths = np.full(CAMERA.shape, depth, np.float32)
     depths[:, :8] = 0
@@ -45,7 +45,7 @@ def test_raycast_page_labels_five_panels() -> None:
     page = raycast_page(wall(), NAMES, CENTERS, "kitchen, frame 7")
     assert {"depth", "normals", "vertices", "RGB", "object indices", "kitchen, frame 7"} <= set(titles(page))
     assert {"90% of the pixels are mapped", "2 objects"} <= set(titles(page))
-    assert len(page.figure.axes) == 5 + 1, "and the colorbar"
+    assert len(page.figure.axes) == 5 + 1, "panels and colorbar"
     names = {text.get_text() for axes in page.figure.axes for text in axes.texts}
     assert names == {"3 chair", "12 cup"}
 
@@ -57,7 +57,7 @@ def test_raycast_page_colorbar_is_in_meters() -> None:
     assert bar.get_ylim() == (1.0, 2.0), "unmapped pixels have no depth"
 
 
-def test_raycast_texts_are_on_the_page() -> None:
+def test_raycast_page_contains_texts() -> None:
     page = raycast_page(wall(1e3), NAMES, CENTERS, "a long note " * 30)
     renderer = FigureCanvasAgg(page.figure).get_renderer()
     width, height = page.figure.bbox.size
@@ -72,7 +72,9 @@ def test_raycast_texts_are_on_the_page() -> None:
 def test_raycast_colors_match_geometry() -> None:
     view = wall()
     mapped = view.depth > 0
-    assert np.abs(normal_colors(view)[mapped].astype(int) - (128, 128, 255)).max() <= 1, "towards the camera"
+    assert np.abs(normal_colors(view)[mapped].astype(int) - (128, 128, 255)).max() <= 1, (
+        "normals point towards the camera"
+    )
     positions = np.stack([view.depth, -view.depth, 0 * view.depth], axis=-1).astype(np.float64)
     colors = position_colors(positions, np.array([0.0, -2.0, 0.0]), np.array([4.0, 2.0, 0.0]))
     assert (colors[mapped] == (128, 0, 0)).all()

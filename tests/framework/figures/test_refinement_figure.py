@@ -1,4 +1,4 @@
-"""Refinement figure: marks and layout on synthetic frames with known answers."""
+"""Tests of the refinement figure: marks and layout on synthetic frames with known results."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Masks = list[np.ndarray]
 
 
 def two_walls(height: int = 48, width: int = 64) -> Frame:
-    """The left half of the picture is 2 m away, the right half 3 m; all gray."""
+    """Return a gray frame: the left half is 2 m away, the right half 3 m."""
     depth = np.full((height, width), 2.0, np.float32)
     depth[:, width // 2 :] = 3.0
     camera = Camera(width, height, 60.0, 60.0, (width - 1) / 2, (height - 1) / 2)
@@ -90,7 +90,7 @@ def test_cluster_marks_separate_dropped_and_added_pixels() -> None:
     a, b = box(frame, 0, 10, 0, 20), box(frame, 0, 10, 15, 30)
     grown = box(frame, 0, 14, 0, 15)
     marks = ClusterMarks.after(refined(frame, [a, b], [grown, b]))
-    assert not marks.dropped.any(), "columns 15 to 19 went to the second cluster, which had them already"
+    assert not marks.dropped.any(), "columns 15 to 19 were already in the second cluster"
     np.testing.assert_array_equal(marks.added, box(frame, 10, 14, 0, 15))
     marks = ClusterMarks.after(refined(frame, [a, b], [box(frame, 0, 10, 0, 5), b]))
     np.testing.assert_array_equal(marks.dropped, box(frame, 0, 10, 5, 15))
@@ -116,7 +116,7 @@ def test_cluster_marks_keep_colors_and_add_colors_for_parts() -> None:
     many = ClusterMarks.before(refined(frame, [a] * 100, [a] * 100)).colors.astype(int)
     assert many.shape == (100, 3)
     apart = np.abs(many - np.array(DROPPED)).sum(axis=1)
-    assert apart.min() > 100, "nothing looks like what was dropped"
+    assert apart.min() > 100, "no pixel has the mark of dropped points"
 
 
 def test_refinement_image_is_tinted_and_hatched() -> None:

@@ -1,4 +1,4 @@
-"""Stage times: the mathematics of the curves and of their labels."""
+"""Tests of the curves of stage times and of their labels."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_spread_keeps_label_order_distance_and_mean(places: list[float], gap: fl
     assert (np.diff(np.array(found)[order]) >= gap - 1e-9).all()
     if places:
         assert np.mean(found) == pytest.approx(np.mean(places), abs=1e-9)  # least squares moves all by 0 in sum
-    assert np.abs(np.array(spread(found, gap)) - found).max(initial=0) < 1e-9, "what is apart stays"
+    assert np.abs(np.array(spread(found, gap)) - found).max(initial=0) < 1e-9, "distant labels are not moved"
 
 
 def test_spread_moves_overlapping_labels_equally() -> None:

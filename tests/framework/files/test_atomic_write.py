@@ -1,4 +1,4 @@
-"""What every reader of whole files does with one that is too large, or begins with a byte order mark."""
+"""Tests of the file readers (oversized files, byte order marks, pipes) and of atomic writes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from framework.vocabulary.label_spaces import COCO, read_labels
         (read_uint16, 2**28),
     ],
 )
-def test_oversized_file_raises_before_reading(tmp_path: Path, read: Callable[[Path], object], most: int) -> None:
+def test_reader_oversized_file_raises_before_reading(tmp_path: Path, read: Callable[[Path], object], most: int) -> None:
     with (tmp_path / "large").open("wb") as file:
         file.truncate(most + 1)
     with pytest.raises(DataError, match=rf"large: expected at most {most} bytes, got {most + 1}") as caught:
@@ -70,7 +70,7 @@ def test_oversized_file_raises_before_reading(tmp_path: Path, read: Callable[[Pa
         (lambda path: read_results(path, COCO, CategoryIds.FROM_ONE), b"[]"),
     ],
 )
-def test_byte_order_mark_is_ignored(tmp_path: Path, read: Callable[[Path], object], content: bytes) -> None:
+def test_reader_ignores_byte_order_mark(tmp_path: Path, read: Callable[[Path], object], content: bytes) -> None:
     plain, marked = tmp_path / "plain", tmp_path / "marked"
     plain.write_bytes(content)
     marked.write_bytes(BOM_UTF8 + content)
@@ -87,8 +87,10 @@ READERS = (
 
 @pytest.mark.parametrize("read", READERS)
 @pytest.mark.parametrize("kind", ["pipe", "/dev/zero", "/dev/null", "folder"])
-def test_non_regular_file_raises_without_blocking(tmp_path: Path, read: Callable[[Path], object], kind: str) -> None:
-    """A pipe to which nobody writes would be waited for, and zeros never end."""
+def test_reader_non_regular_file_raises_without_blocking(
+    tmp_path: Path, read: Callable[[Path], object], kind: str
+) -> None:
+    """Reading a pipe without a writer would block, and /dev/zero never ends."""
     path = tmp_path / "name"
     if kind == "pipe":
         os.mkfifo(path)
@@ -103,14 +105,14 @@ def test_non_regular_file_raises_without_blocking(tmp_path: Path, read: Callable
     assert "\n" not in str(caught.value)
 
 
-def test_labels_from_named_pipe_raise(tmp_path: Path) -> None:
+def test_read_labels_from_named_pipe_raises(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "labels.txt")
     with pytest.raises(ConfigError, match=r"labels: expected one of .*, or a text file with one name per line"):
         read_labels(str(tmp_path / "labels.txt"))
 
 
 @pytest.mark.parametrize("kind", ["pipe", "/dev/full", "/dev/null", "folder"])
-def test_writing_to_non_regular_file_raises(tmp_path: Path, kind: str) -> None:
+def test_atomic_write_to_non_regular_file_raises(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "out.json"
     if kind == "pipe":
         os.mkfifo(path)
@@ -125,7 +127,7 @@ def test_writing_to_non_regular_file_raises(tmp_path: Path, kind: str) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_write_follows_symbolic_link(tmp_path: Path) -> None:
+def test_atomic_write_follows_symbolic_link(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     for target in (tmp_path / "real" / "there.txt", tmp_path / "real" / "not_yet.txt"):
         link = tmp_path / f"to_{target.name}"
@@ -138,8 +140,8 @@ def test_write_follows_symbolic_link(tmp_path: Path) -> None:
         assert not target.is_symlink()
 
 
-def test_failed_write_error_names_requested_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not its temporary name: on a disk that is only to be read it cannot be removed either."""
+def test_atomic_write_failure_names_requested_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error does not name the temporary file, which may not be removable on a read-only disk."""
 
     def refused(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")

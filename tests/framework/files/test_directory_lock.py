@@ -1,4 +1,4 @@
-"""A locked directory keeps others out, as long as its holder lives."""
+"""Tests of directory locks, which last as long as their process."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from framework.files.directory_lock import HOLDER, is_locked, locked, new_direct
 pytestmark = pytest.mark.integration
 
 
-def test_second_lock_error_names_holder(tmp_path: Path) -> None:
+def test_directory_lock_second_lock_error_names_holder(tmp_path: Path) -> None:
     place = tmp_path / "new" / "sweep"
     with locked(place), pytest.raises(DataError, match=rf"sweep: in use by process {os.getpid()} on "), locked(place):
-        pytest.fail("two are in one place")
+        pytest.fail("two processes hold the lock")
     with locked(place):
         pass
 
@@ -35,14 +35,14 @@ def test_is_locked_reports_lock_state(tmp_path: Path) -> None:
     assert not is_locked(tmp_path)
 
 
-def test_lock_is_released_on_error(tmp_path: Path) -> None:
+def test_directory_lock_is_released_on_error(tmp_path: Path) -> None:
     with pytest.raises(ZeroDivisionError), locked(tmp_path):
         raise ZeroDivisionError
     with locked(tmp_path):
         pass
 
 
-def test_waiting_lock_is_acquired_after_release(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_directory_lock_waiting_is_acquired_after_release(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     order: list[str] = []
 
     def second() -> None:
@@ -59,7 +59,7 @@ def test_waiting_lock_is_acquired_after_release(tmp_path: Path, caplog: pytest.L
     assert f"in use by process {os.getpid()}" in caplog.text
 
 
-def test_lock_of_killed_process_is_released(tmp_path: Path) -> None:
+def test_directory_lock_of_killed_process_is_released(tmp_path: Path) -> None:
     code = f"""
 from pathlib import Path
 from framework.files.directory_lock import locked
@@ -71,13 +71,13 @@ with locked(Path({str(tmp_path)!r})):
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"locked\n"
         with pytest.raises(DataError, match=f": in use by process {holder.pid} on "), locked(tmp_path):
-            pytest.fail("two are in one place")
+            pytest.fail("two processes hold the lock")
         holder.kill()
     with locked(tmp_path):
         pass
 
 
-def test_file_system_without_locks_logs_warning(
+def test_directory_lock_unsupported_file_system_logs_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> None:
@@ -89,26 +89,26 @@ def test_file_system_without_locks_logs_warning(
     assert "cannot be locked (No locks available)" in caplog.text
 
 
-def test_named_pipe_as_lock_file_raises(tmp_path: Path) -> None:
-    """Opening one waits for somebody who reads it."""
+def test_directory_lock_named_pipe_as_file_raises(tmp_path: Path) -> None:
+    """Opening a pipe without a reader would block."""
     os.mkfifo(tmp_path / HOLDER)
     with pytest.raises(DataError, match=rf"{HOLDER}: expected a regular file, got a device, a pipe"), locked(tmp_path):
-        pytest.fail("nobody can be told who has it")
+        pytest.fail("the holder cannot be reported")
 
 
-def test_invalid_holder_file_still_raises_in_use(tmp_path: Path) -> None:
+def test_directory_lock_invalid_holder_file_raises_in_use(tmp_path: Path) -> None:
     with locked(tmp_path):
         for make in (os.mkfifo, Path.mkdir, lambda path: path.write_bytes(b"\xff\xfe")):
             (tmp_path / HOLDER).unlink()
             make(tmp_path / HOLDER)
             with pytest.raises(DataError, match="in use by another process"), locked(tmp_path):
-                pytest.fail("two are in one place")
+                pytest.fail("two processes hold the lock")
             if (tmp_path / HOLDER).is_dir():
                 (tmp_path / HOLDER).rmdir()
                 (tmp_path / HOLDER).touch()
 
 
-def test_concurrent_new_directories_are_distinct(tmp_path: Path) -> None:
+def test_new_directory_concurrent_calls_are_distinct(tmp_path: Path) -> None:
     wanted = str(tmp_path / "outputs" / "now")
     with ThreadPoolExecutor(8) as processes:
         made = list(processes.map(new_directory, [wanted] * 40))
@@ -116,7 +116,7 @@ def test_concurrent_new_directories_are_distinct(tmp_path: Path) -> None:
     assert len(made) == len(list((tmp_path / "outputs").iterdir())) == 40
 
 
-def test_directory_creation_failure_raises(tmp_path: Path) -> None:
+def test_new_directory_creation_failure_raises(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match=r"run: directory cannot be created: "):
         new_directory(str(tmp_path / "file" / "run"))

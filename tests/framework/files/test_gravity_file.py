@@ -1,4 +1,4 @@
-"""Directions of gravity in a file: what is written is read, and what is none is said."""
+"""Tests of gravity files: round trips and invalid lines."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UPS = [np.array([0.0, -1.0, 0.0]), None, np.array([0.6, 0.0, -0.8])]
 CONTENT = b"# x y z\n0 -1 0\nnan nan nan\n0.6 0.0 -0.8\n"
 
 
-def test_gravity_round_trip_preserves_directions(tmp_path: Path) -> None:
+def test_gravity_file_round_trip_preserves_directions(tmp_path: Path) -> None:
     write_gravity(tmp_path / "gravity.txt", UPS)
     first, second, third = read_gravity(tmp_path / "gravity.txt")
     np.testing.assert_allclose(first, UPS[0], atol=1e-9)
@@ -26,7 +26,7 @@ def test_gravity_round_trip_preserves_directions(tmp_path: Path) -> None:
     np.testing.assert_allclose(third, UPS[2], atol=1e-9)
 
 
-def test_gravity_in_m_s2_is_normalized(tmp_path: Path) -> None:
+def test_gravity_file_in_m_s2_is_normalized(tmp_path: Path) -> None:
     (tmp_path / "gravity.txt").write_text("# a header\n\n0.0 -9.81 0.0  # at rest\n-1.#IND nan NaN\n")
     up, unknown = read_gravity(tmp_path / "gravity.txt")
     np.testing.assert_allclose(up, [0, -1, 0])
@@ -44,7 +44,7 @@ def test_gravity_in_m_s2_is_normalized(tmp_path: Path) -> None:
         ("1 2 up", "expected 3 numbers .* got 'up'"),
     ],
 )
-def test_invalid_gravity_line_raises_one_line(tmp_path: Path, line: str, message: str) -> None:
+def test_gravity_file_invalid_line_raises_one_line_error(tmp_path: Path, line: str, message: str) -> None:
     (tmp_path / "gravity.txt").write_text(f"0 -1 0\n{line}\n")
     with pytest.raises(DataError, match=rf"gravity\.txt, line 2: {message}"):
         read_gravity(tmp_path / "gravity.txt")
@@ -52,7 +52,7 @@ def test_invalid_gravity_line_raises_one_line(tmp_path: Path, line: str, message
 
 @examples(max_examples=EXAMPLES, deadline=None)
 @given(damaged(CONTENT, (b"nan", b"inf", b"1e-320", b"#")))
-def test_fuzzed_gravity_file_is_read_or_raises_one_line(
+def test_gravity_file_fuzzed_is_read_or_raises_one_line_error(
     tmp_path_factory: pytest.TempPathFactory, content: bytes
 ) -> None:
     path = tmp_path_factory.mktemp("gravity") / "gravity.txt"

@@ -1,4 +1,4 @@
-"""Digests are of what arrays and folders hold, and those that records keep stay what they are."""
+"""Tests of the hashes of arrays and folders; stored hashes must not change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""JPEG and PNG files: whole ones are read to the pixel, damaged ones are refused."""
+"""Tests of JPEG and PNG files: valid ones are read exactly, damaged ones raise."""
 
 import io
 
@@ -37,21 +37,21 @@ def test_jpeg_pixels_match_opencv(parameters: tuple[int, int]) -> None:
     np.testing.assert_array_equal(decode_color("x", data.tobytes()), cv2.imdecode(data, cv2.IMREAD_COLOR_RGB))
 
 
-def test_gray_jpeg_has_three_equal_channels() -> None:
+def test_jpeg_gray_has_three_equal_channels() -> None:
     gray = cv2.imencode(".jpg", PICTURE[..., 0])[1]
     np.testing.assert_array_equal(decode_color("x", gray.tobytes()), cv2.imdecode(gray, cv2.IMREAD_COLOR_RGB))
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
-def test_truncated_jpeg_with_end_marker_raises(share: float) -> None:
-    """OpenCV gives a picture that is gray from the cut on."""
+def test_jpeg_truncated_with_end_marker_raises(share: float) -> None:
+    """OpenCV would return an image that is gray after the truncation."""
     data = JPEG[: int(share * len(JPEG))] + END
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
     assert message(data).startswith("picture.jpg: damaged image: ")
 
 
 def test_jpeg_with_corrupt_block_raises() -> None:
-    """Of its entropy-coded data: noise that is no code, ends too late, or has markers in it."""
+    """The entropy-coded data contain invalid codes, end late or contain markers."""
     first = JPEG.index(START_OF_SCAN) + 14
     seen = 0
     for seed in range(40):
@@ -65,8 +65,8 @@ def test_jpeg_with_corrupt_block_raises() -> None:
     assert seen >= 36, "noise may be valid code by chance: a JPEG has no checksums"
 
 
-def test_animated_png_raises() -> None:
-    """OpenCV takes another of its pictures than Pillow does."""
+def test_png_animated_raises() -> None:
+    """OpenCV and Pillow read different images of the animation."""
     pictures = [Image.new("RGB", (8, 6), color) for color in ("red", "lime", "blue")]
     written = io.BytesIO()
     pictures[0].save(written, "PNG", save_all=True, append_images=pictures[1:], default_image=True)

@@ -1,4 +1,4 @@
-"""JSON that is no JSON, too deep or too large is refused in one line."""
+"""Tests of JSON files: invalid, too deep or too large files raise a one-line error."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_json_round_trip_is_exact(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("marked", [b"\xef\xbb\xbf[1]", b"\xff\xfe[\x001\x00]\x00"])
-def test_byte_order_mark_is_ignored(marked: bytes) -> None:
+def test_json_byte_order_mark_is_ignored(marked: bytes) -> None:
     assert parse_json("here", marked) == [1]
 
 
@@ -36,7 +36,7 @@ def test_byte_order_mark_is_ignored(marked: bytes) -> None:
         (b'[{"fx": 1, "fy": 2, "fx": 3}]', "duplicate key 'fx' in an object"),
     ],
 )
-def test_invalid_json_raises_one_line_with_source(content: bytes, message: str) -> None:
+def test_json_invalid_raises_one_line_error_with_source(content: bytes, message: str) -> None:
     with pytest.raises(DataError, match=message) as caught:
         parse_json("results.json", content)
     assert str(caught.value).startswith(
@@ -45,7 +45,7 @@ def test_invalid_json_raises_one_line_with_source(content: bytes, message: str) 
     assert len(str(caught.value)) < 300
 
 
-def test_maximum_nesting_depth_is_read(tmp_path: Path) -> None:
+def test_json_maximum_nesting_depth_is_read(tmp_path: Path) -> None:
     (tmp_path / "deep.json").write_text("[" * DEEPEST + "]" * DEEPEST)
     found = read_json(tmp_path / "deep.json")
     for _ in range(DEEPEST - 1):

@@ -1,4 +1,4 @@
-"""Matrices in text files: what is published is read, and what is wrong is named with its line."""
+"""Tests of matrices in text files: published formats, and errors with line numbers."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ QUARTER_TURN = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 
 ROWS = "0 -1 0 1\n1 0 0 2\n0 0 1 3\n0 0 0 1\n"
 
 
-def test_matrix_of_four_lines_is_read(tmp_path: Path) -> None:
+def test_matrix_file_of_four_lines_is_read(tmp_path: Path) -> None:
     path = tmp_path / "pose.txt"
     path.write_text("\n" + ROWS.replace(" ", "\t ").replace("\n", "\t\r\n"))
     np.testing.assert_array_equal(read_matrix(path).values, QUARTER_TURN)
     np.testing.assert_allclose(read_matrix(path).pose(), QUARTER_TURN, atol=1e-15)
 
 
-def test_one_matrix_per_line_is_read(tmp_path: Path) -> None:
+def test_matrix_file_of_one_matrix_per_line_is_read(tmp_path: Path) -> None:
     path = tmp_path / "traj.txt"
     path.write_text(ROWS.replace("\n", " ") + "\n\n" + "1e0 0 0 7 0 1 0 8 0 0 1 9 0 0 0 nan\n")
     first, second = read_matrix_lines(path)
@@ -36,13 +36,13 @@ def test_one_matrix_per_line_is_read(tmp_path: Path) -> None:
     ("text", "message"),
     [("1 2 3", "line 1: expected 16 numbers, got 3"), (ROWS.replace("\n", " x "), "line 1: .* got 20")],
 )
-def test_invalid_matrix_line_error_gives_line_number(tmp_path: Path, text: str, message: str) -> None:
+def test_matrix_file_invalid_line_error_gives_line_number(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "traj.txt").write_text(text)
     with pytest.raises(DataError, match=rf"traj\.txt, {message}"):
         read_matrix_lines(tmp_path / "traj.txt")
 
 
-def test_missing_file_raises_and_empty_file_gives_no_matrix(tmp_path: Path) -> None:
+def test_matrix_file_missing_raises_and_empty_has_no_matrix(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"missing.txt: expected a text file, got no such file"):
         read_matrix(tmp_path / "missing.txt")
     (tmp_path / "empty.txt").touch()

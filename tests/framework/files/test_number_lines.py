@@ -1,4 +1,4 @@
-"""Lines of numbers: what is wrong with one is said in one line, however long the file's is."""
+"""Tests of lines of numbers: formats, and one-line errors for lines of any length."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from framework.errors import DataError
 from framework.files.number_lines import numbers, read_lines
 
 
-def test_python_number_formats_are_read() -> None:
+def test_number_lines_python_number_formats_are_read() -> None:
     np.testing.assert_array_equal(numbers("here", ["1", "-2.5", "1e-3", "nan"], 4), [1, -2.5, 1e-3, np.nan])
 
 
 @pytest.mark.parametrize(
     "word", ["-1.#IND", "1.#IND00", "1.#QNAN", "-1.#QNAN0", "1.#INF", "-1.#INF000000", "-nan(ind)", "nan(snan)", "-nan"]
 )
-def test_microsoft_nan_and_inf_formats_are_read_as_nan(word: str) -> None:
+def test_number_lines_microsoft_nan_and_inf_are_nan(word: str) -> None:
     assert np.isnan(numbers("here", [word], 1)).all()
 
 
 @pytest.mark.parametrize("word", ["1.#", "1#IND", "2.#IND", "nan(", "nan()", "nan(a b)", "1.#IND-"])
-def test_nan_lookalike_raises(word: str) -> None:
+def test_number_lines_nan_lookalike_raises(word: str) -> None:
     with pytest.raises(DataError, match="expected 1 numbers"):
         numbers("here", [word], 1)
 
@@ -37,13 +37,13 @@ def test_nan_lookalike_raises(word: str) -> None:
         (["1", "2", "\x9b3\u2028"], r"got '\\x9b3\\u2028'"),
     ],
 )
-def test_invalid_number_raises_one_line(words: list[str], message: str) -> None:
+def test_number_lines_invalid_number_raises_one_line_error(words: list[str], message: str) -> None:
     with pytest.raises(DataError, match=f"{message}$") as caught:
         numbers("here", words, 3, "x y z")
     assert str(caught.value).isprintable()
 
 
-def test_binary_or_missing_file_raises(tmp_path: Path) -> None:
+def test_number_lines_binary_or_missing_file_raises(tmp_path: Path) -> None:
     (tmp_path / "binary.txt").write_bytes(b"\xff\xfe")
     with pytest.raises(DataError, match=r"binary.txt: expected UTF-8 text"):
         read_lines(tmp_path / "binary.txt")

@@ -1,4 +1,4 @@
-"""PLY: every encoding holds the same mesh, and what is wrong is named with its line or byte."""
+"""Tests of PLY files: all encodings give the same mesh, and errors give the line or byte."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ end_header
 
 
 def encoded(encoding: str, coordinate: str, count: str, index: str, polygons: list[list[int]]) -> bytes:
-    """VERTICES, LABELS and polygons, among elements and properties that nobody asked for."""
+    """Return VERTICES, LABELS and polygons, among unused elements and properties."""
     codes = {"float": "f", "float64": "d", "uchar": "B", "int32": "i", "int": "i", "short": "h", "uint": "I"}
     order = ">" if encoding == "binary_big_endian" else "<"
     header = f"""ply
@@ -157,7 +157,7 @@ def test_ply_writer_matches_reference_bytes(tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == expected + struct.pack("<Biii", 3, 0, 1, 2)
 
 
-def test_written_ply_is_read_by_open3d(tmp_path):
+def test_ply_written_file_is_read_by_open3d(tmp_path):
     import open3d as o3d
 
     write_ply(tmp_path / "a.ply", VERTICES, np.array(FANS, np.int32), {"label": LABELS})
@@ -215,7 +215,7 @@ def test_written_ply_is_read_by_open3d(tmp_path):
         ),
     ],
 )
-def test_invalid_ascii_ply_error_gives_line_number(tmp_path, old, new, message):
+def test_ply_invalid_ascii_error_gives_line_number(tmp_path, old, new, message):
     path = written(tmp_path / "a.ply", TRIANGLE.replace(old, new, 1))
     with pytest.raises(DataError, match=f"a.ply(, |: the header's |: ).*({message})") as caught:
         read_ply(path)
@@ -267,16 +267,16 @@ SECOND = FACES + len(GOOD)
         ),
     ],
 )
-def test_invalid_binary_ply_error_gives_byte_offset(tmp_path, vertices, faces, message):
+def test_ply_invalid_binary_error_gives_byte_offset(tmp_path, vertices, faces, message):
     with pytest.raises(DataError, match=f"a.ply, {message}"):
         read_ply(written(tmp_path / "a.ply", binary(vertices, faces)))
 
 
-def test_line_end_after_last_row_is_accepted(tmp_path):
+def test_ply_line_end_after_last_row_is_accepted(tmp_path):
     assert len(read_ply(written(tmp_path / "a.ply", binary(THREE, GOOD * 2 + b"\r\n"))).triangles) == 2
 
 
-def test_missing_ply_raises(tmp_path):
+def test_ply_missing_file_raises(tmp_path):
     with pytest.raises(DataError, match=r"a.ply: cannot be read: No such file"):
         read_ply(tmp_path / "a.ply")
 
@@ -295,15 +295,15 @@ def test_missing_ply_raises(tmp_path):
         ({"comments": ["a\nend_header"]}, "comment"),
     ],
 )
-def test_writing_invalid_mesh_raises_and_leaves_no_file(tmp_path, change, message):
+def test_ply_writing_invalid_mesh_raises_and_leaves_no_file(tmp_path, change, message):
     mesh = {"vertices": VERTICES, "triangles": np.array(FANS, np.int32), "properties": {}} | change
     with pytest.raises(DataError, match=f"a.ply: .*{message}"):
         write_ply(tmp_path / "a.ply", **mesh)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_mesh_arrays_do_not_reference_file_buffer(tmp_path):
-    """A mesh of some MB that held on to a file of hundreds would be a surprise."""
+def test_ply_arrays_do_not_reference_file_buffer(tmp_path):
+    """Otherwise a mesh of some MB would keep hundreds of MB in memory."""
     write_ply(tmp_path / "a.ply", VERTICES, np.array(FANS, np.int32), {"label": LABELS})
     mesh = read_ply(tmp_path / "a.ply")
     assert isinstance(mesh, PlyMesh)

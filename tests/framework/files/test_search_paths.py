@@ -1,4 +1,4 @@
-"""Where relative paths are looked for."""
+"""Tests of the resolution of relative paths."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from framework.files.search_paths import PROJECT_ROOT, folder_of
 
 
-def test_relative_folder_prefers_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_of_relative_path_prefers_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
     assert folder_of(Path("framework")) == PROJECT_ROOT / "framework"

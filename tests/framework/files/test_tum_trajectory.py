@@ -1,4 +1,4 @@
-"""TUM files: what is written is read back, and what is wrong is named with its line."""
+"""Tests of TUM trajectories: round trips, and errors with line numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from framework.geometry import exp_se3
 GOOD = "0.0 1 2 3 0 0 0 1\n"
 
 
-def test_tum_round_trip_preserves_trajectory(tmp_path):
+def test_tum_trajectory_round_trip_preserves_poses(tmp_path):
     rng = np.random.default_rng(0)
     poses = [exp_se3(rng.normal(0, 2, 6)) for _ in range(20)]
     timestamps = 1.7e9 + np.arange(20) / 30
@@ -23,8 +23,8 @@ def test_tum_round_trip_preserves_trajectory(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["trajectory.txt"]
 
 
-def test_tum_line_gives_known_pose(tmp_path):
-    """A quarter turn about z: x goes to y."""
+def test_tum_trajectory_line_gives_known_pose(tmp_path):
+    """A quarter turn about z maps x to y."""
     path = tmp_path / "t.txt"
     path.write_text(f"# {'timestamp tx ty tz qx qy qz qw'}\n\n 0.5 1 2 3 0 0 {np.sqrt(0.5)} {np.sqrt(0.5)}\r\n")
     timestamps, poses = read_tum(path)
@@ -32,7 +32,7 @@ def test_tum_line_gives_known_pose(tmp_path):
     np.testing.assert_allclose(poses[0], [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-15)
 
 
-def test_comments_after_pose_are_ignored(tmp_path):
+def test_tum_trajectory_comments_after_pose_are_ignored(tmp_path):
     path = tmp_path / "t.txt"
     path.write_text("#\n0.5 1 2 3 0 0 0 1# found # by ICP\n#0.6 1\n0.7 1 2 3 0 0 0 1.#IND # lost\n")
     first, second = read_tum_lines(path)
@@ -41,7 +41,7 @@ def test_comments_after_pose_are_ignored(tmp_path):
         second.pose()
 
 
-def test_empty_trajectory_round_trip(tmp_path):
+def test_tum_trajectory_empty_round_trip_is_exact(tmp_path):
     write_tum(tmp_path / "t.txt", [], [])
     timestamps, poses = read_tum(tmp_path / "t.txt")
     assert (timestamps.shape, poses.shape) == ((0,), (0, 4, 4))
@@ -59,14 +59,14 @@ def test_empty_trajectory_round_trip(tmp_path):
         ("1.0 1 2 3 0 0 0 1\n0.5 1 2 3 0 0 0 1\n", "line 4: expected a timestamp > 1 s, got 0.5 s"),
     ],
 )
-def test_invalid_tum_line_error_gives_file_and_line(tmp_path, bad, message):
+def test_tum_trajectory_invalid_line_error_gives_file_and_line(tmp_path, bad, message):
     path = tmp_path / "t.txt"
     path.write_text("# comment\n" + GOOD + bad)
     with pytest.raises(DataError, match=f"t.txt, {message}"):
         read_tum(path)
 
 
-def test_missing_or_binary_tum_file_raises(tmp_path):
+def test_tum_trajectory_missing_or_binary_file_raises(tmp_path):
     with pytest.raises(DataError, match="expected a trajectory in TUM format, got no such file"):
         read_tum(tmp_path / "missing.txt")
     (tmp_path / "binary.txt").write_bytes(b"\xff\xfe\x00")
@@ -74,7 +74,7 @@ def test_missing_or_binary_tum_file_raises(tmp_path):
         read_tum(tmp_path / "binary.txt")
 
 
-def test_failed_write_leaves_no_file(tmp_path):
+def test_tum_trajectory_failed_write_leaves_no_file(tmp_path):
     with pytest.raises(DataError, match="pose 1"):
         write_tum(tmp_path / "t.txt", [0.0, 1.0], [np.eye(4), 2 * np.eye(4)])
     with pytest.raises(DataError, match="expected a timestamp for each pose, got 1 for 2 poses"):

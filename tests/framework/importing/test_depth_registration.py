@@ -1,4 +1,4 @@
-"""Depth moved into a camera beside: exact where the geometry is."""
+"""Tests of depth registration to a second camera, on exact geometry."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def loops(registration: DepthRegistration, depth: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(found), found, 0)
 
 
-def test_registration_matches_reference_loops() -> None:
+def test_depth_registration_matches_reference_loops() -> None:
     rng = np.random.default_rng(0)
     small = DepthRegistration(DEPTH.scaled(0.1), COLOR.scaled(0.1), T_COLOR_DEPTH)
     depth = rng.choice([0, 0.3, 1, 2.5], small.depth.shape).astype(np.float32)
@@ -34,7 +34,7 @@ def test_registration_matches_reference_loops() -> None:
     np.testing.assert_allclose(found, loops(small, depth), rtol=1e-6)
 
 
-def test_registered_room_matches_target_camera_view() -> None:
+def test_depth_registration_of_room_matches_target_view() -> None:
     registration = DepthRegistration(DEPTH, COLOR, T_COLOR_DEPTH)
     target = registration.target
     assert target.fx <= FINEST * DEPTH.fx + 1
@@ -42,25 +42,25 @@ def test_registered_room_matches_target_camera_view() -> None:
     truth = look(target, np.eye(4))[0]
     assert (found > 0).mean() > 0.97
     error = np.abs(found - truth)[found > 0]
-    assert np.median(error) < 0.004  # a reading is up to half a pixel beside its new one
+    assert np.median(error) < 0.004  # a depth value is up to half a pixel from its new pixel
     assert (error > 0.03).mean() < 0.03
     turned_back = DepthRegistration(DEPTH, COLOR, np.linalg.inv(T_COLOR_DEPTH))
     wrong = turned_back.apply(look(DEPTH, T_COLOR_DEPTH)[0].astype(np.float32))
     assert np.median(np.abs(wrong - truth)[wrong > 0]) > 2 * np.median(error)
 
 
-def test_registration_keeps_nearer_of_two_surfaces() -> None:
+def test_depth_registration_keeps_nearer_of_two_surfaces() -> None:
     camera = Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
     shifted = np.eye(4)
     shifted[0, 3] = 0.5
     depth = np.full((30, 40), 4.0, np.float32)
-    depth[:, :10] = 1.0  # moves by 20 px, before what is far and moves by 5
+    depth[:, :10] = 1.0  # moves by 20 px, in front of the far surface, which moves by 5
     found = DepthRegistration(camera, camera, shifted).apply(depth)
     assert set(np.unique(found)) == {0, 1, 4}
     assert (found[:, 18:26] == 1).all()
 
 
-def test_points_behind_camera_are_dropped() -> None:
+def test_depth_registration_drops_points_behind_camera() -> None:
     camera = Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
     behind = np.eye(4)
     behind[2, 3] = -3.0

@@ -1,4 +1,4 @@
-"""Coarse depth brought to color's pixels: exact on planes, never between two surfaces."""
+"""Tests of depth upsampling to the color image: exact on planes, no values between two surfaces."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ONE = np.full((240, 320, 3), 90, np.uint8)
 
 
 def loops(depth, guide, u, v, color):
-    """What `_upsample` says it does, a pixel at a time."""
+    """Upsample pixel by pixel as documented in `_upsample`."""
     found = np.zeros((len(v), len(u)))
     h, w = depth.shape
     for row, column in np.ndindex(found.shape):
@@ -40,7 +40,7 @@ def loops(depth, guide, u, v, color):
     return found
 
 
-def test_upsampling_matches_reference_loops() -> None:
+def test_depth_upsampling_matches_reference_loops() -> None:
     rng = np.random.default_rng(0)
     depth = rng.choice([0, 1.0, 1.02, 2.0], (9, 12)).astype(np.float32)
     camera, target = Camera(48, 36, 40.0, 40.0, 23.1, 17.2), Camera(31, 25, 27.3, 26.0, 15.0, 12.5)
@@ -57,8 +57,8 @@ def test_upsampling_matches_reference_loops() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.25, 0.5, 0.8])
-def test_upsampling_is_exact_on_planes_and_sharp_at_edges(factor: float) -> None:
-    """The pixel centers of both sizes are where `Camera.scaled` says."""
+def test_depth_upsampling_is_exact_on_planes_and_sharp_at_edges(factor: float) -> None:
+    """The pixel centers of both sizes are those of `Camera.scaled`."""
     coarse = COLOR.scaled(factor)
     truth, _, color, ids = look(COLOR, np.eye(4))
     depth = look(coarse, np.eye(4))[0].astype(np.float32)
@@ -74,8 +74,8 @@ def test_upsampling_is_exact_on_planes_and_sharp_at_edges(factor: float) -> None
     assert (np.abs(found - truth) > 0.05).mean() < 0.02 / factor
 
 
-def test_color_selects_surface_at_depth_edge() -> None:
-    """A step amid a coarse pixel: the nearest reading would be wrong by up to half of it."""
+def test_depth_upsampling_selects_surface_by_color_at_edge() -> None:
+    """The step is inside a coarse pixel: the nearest depth would be wrong by up to half of it."""
     camera = Camera(40, 40, 40.0, 40.0, 19.5, 19.5)
     truth = np.where(np.arange(40) < 22, 1.0, 2.0)[None].repeat(40, axis=0)
     color = np.where(truth == 1, 40, 200)[..., None].repeat(3, axis=-1).astype(np.uint8)
@@ -86,7 +86,7 @@ def test_color_selects_surface_at_depth_edge() -> None:
     assert (found != truth).mean() < wrong.mean()
 
 
-def test_upsampling_preserves_holes() -> None:
+def test_depth_upsampling_preserves_holes() -> None:
     camera = COLOR
     depth = np.full((60, 80), 2.0, np.float32)
     depth[20:30, 40:60] = 0
@@ -96,12 +96,12 @@ def test_upsampling_preserves_holes() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-def test_upsampling_at_color_size_is_identity() -> None:
+def test_depth_upsampling_at_color_size_is_identity() -> None:
     depth = np.random.default_rng(0).choice([0, 1, 2, 2.01, 3.5], (240, 320)).astype(np.float32)
     np.testing.assert_allclose(upsampled(depth, ONE, COLOR, COLOR, ONE), depth, rtol=1e-6)
 
 
-def test_pixel_outside_depth_view_has_zero_depth() -> None:
+def test_depth_upsampling_outside_depth_view_is_zero() -> None:
     wider = Camera(320, 240, 150.0, 150.0, 157.0, 118.0)
     found = upsampled(np.full((60, 80), 1.0, np.float32), ONE, COLOR, wider, ONE)
     assert (found > 0).mean() == pytest.approx(0.25, abs=0.01)

@@ -1,4 +1,4 @@
-"""What is written of a source, and when nothing is."""
+"""Tests of the written RGB-D folder, and of the errors that leave no folder."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def source(*frames: DeviceFrame | DataError, posed: bool = True) -> Source:
     return Source("a test", map(reading, frames), len(frames), posed)
 
 
-def test_unusable_frames_are_counted_and_others_written(tmp_path: Path) -> None:
+def test_folder_writer_skips_and_counts_unusable_frames(tmp_path: Path) -> None:
     stored = source(frame(0), FrameError("one is torn"), frame(2, T_world_camera=None), frame(3))
     written = write_folder(stored, tmp_path / "out", Writing())
     assert written.errors == ["one is torn", "frame 2: expected a pose, got none"]
@@ -45,19 +45,19 @@ def test_unusable_frames_are_counted_and_others_written(tmp_path: Path) -> None:
     assert [seen.timestamp for seen in RgbdFolder(tmp_path / "out")] == pytest.approx([0, 0.1])
 
 
-def test_frames_without_poses_write_no_pose_file(tmp_path: Path) -> None:
+def test_folder_writer_frames_without_poses_write_no_pose_file(tmp_path: Path) -> None:
     write_folder(source(*(frame(k, T_world_camera=None) for k in range(3)), posed=False), tmp_path / "out", Writing())
     assert not (tmp_path / "out/poses.txt").exists()
     assert len(RgbdFolder(tmp_path / "out")) == 3
 
 
-def test_source_without_usable_frame_leaves_no_folder(tmp_path: Path) -> None:
+def test_folder_writer_without_usable_frame_leaves_no_folder(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected usable frames, got none; first error: one is torn"):
         write_folder(source(FrameError("one is torn")), tmp_path / "out", Writing())
     assert not (tmp_path / "out").exists()
 
 
-def test_nonempty_output_folder_raises(tmp_path: Path) -> None:
+def test_folder_writer_nonempty_output_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     write_folder(source(frame(0)), tmp_path / "empty", Writing())
     before = sorted(tmp_path.rglob("*"))
@@ -67,7 +67,7 @@ def test_nonempty_output_folder_raises(tmp_path: Path) -> None:
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_interrupted_import_has_no_camera_json(tmp_path: Path) -> None:
+def test_folder_writer_interrupted_import_has_no_camera_json(tmp_path: Path) -> None:
     def frames():
         yield lambda: frame(0)
         raise KeyboardInterrupt
@@ -91,12 +91,12 @@ def test_interrupted_import_has_no_camera_json(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_inconsistent_frame_data_raises(changed: dict[str, object], message: str) -> None:
+def test_folder_writer_inconsistent_frame_data_raises(changed: dict[str, object], message: str) -> None:
     with pytest.raises(FrameError, match=f"frame 1: {message}"):
         frame(1, **changed)
 
 
-def test_depth_above_uint16_range_is_zero(tmp_path: Path) -> None:
+def test_folder_writer_depth_above_uint16_range_is_zero(tmp_path: Path) -> None:
     depth = np.full((12, 16), 70.0, np.float32)
     depth[:6] = 65.5
     write_folder(source(frame(0, depth=depth)), tmp_path / "out", Writing())
@@ -105,12 +105,12 @@ def test_depth_above_uint16_range_is_zero(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("bad", [{"width": -1}, {"stride": 0}, {"confidence": 3}, {"turn": 45}])
-def test_writing_option_out_of_range_raises(bad: dict[str, int]) -> None:
+def test_folder_writer_option_out_of_range_raises(bad: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=f"--{next(iter(bad))}: expected"):
         Writing(**bad)
 
 
-def test_longer_side_is_limited_to_640_without_upscaling() -> None:
+def test_folder_writer_limits_longer_side_without_upscaling() -> None:
     portrait = Camera(1440, 1920, 1400.0, 1400.0, 724.0, 963.0)
     assert Writing().camera(portrait) == portrait.scaled(1 / 3)
     assert Writing(width=720).camera(portrait) == portrait.scaled(0.5)
@@ -118,8 +118,8 @@ def test_longer_side_is_limited_to_640_without_upscaling() -> None:
     assert Writing().camera(CAMERA) == CAMERA
 
 
-def test_image_of_other_size_is_resampled_to_first_camera(tmp_path: Path) -> None:
-    """A later frame with images twice as large shows the same."""
+def test_folder_writer_resamples_images_to_first_camera(tmp_path: Path) -> None:
+    """A later frame with twice the size shows the same image."""
     stripes = np.kron(np.arange(8) % 2, np.full(8, 200))[None, :, None].repeat(48, axis=0).repeat(3, axis=2)
     other = frame(1, camera=CAMERA.scaled(2), color=stripes.astype(np.uint8).repeat(2, axis=0).repeat(2, axis=1))
     write_folder(source(frame(0, color=stripes.astype(np.uint8)), other), tmp_path / "out", Writing())
@@ -128,14 +128,14 @@ def test_image_of_other_size_is_resampled_to_first_camera(tmp_path: Path) -> Non
     np.testing.assert_array_equal(first.depth, second.depth)
 
 
-def test_unknown_format_error_lists_formats(tmp_path: Path) -> None:
+def test_open_source_unknown_format_error_lists_formats(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"expected a supported format, got an unknown format; supported: stray"):
         open_source(tmp_path)
     with pytest.raises(DataError, match="expected a recording, got no such file or folder"):
         open_source(tmp_path / "nowhere")
 
 
-def test_nested_export_folder_is_found(tmp_path: Path) -> None:
+def test_open_source_finds_nested_export_folder(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "outer/2026_11_23", room_frames(1))
     assert open_source(tmp_path / "outer").format == "3D Scanner App"
     (tmp_path / "outer/other").mkdir()
@@ -143,7 +143,7 @@ def test_nested_export_folder_is_found(tmp_path: Path) -> None:
         open_source(tmp_path / "outer")
 
 
-def test_zip_file_raises_with_unpack_hint(tmp_path: Path) -> None:
+def test_open_source_zip_file_raises_with_unpack_hint(tmp_path: Path) -> None:
     (tmp_path / "scan.zip").touch()
     with pytest.raises(DataError, match=r"scan\.zip: expected a folder or recording, got a zip archive; unpack it"):
         open_source(tmp_path / "scan.zip")

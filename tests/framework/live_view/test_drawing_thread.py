@@ -1,4 +1,4 @@
-"""The thread that draws: the loop does not wait for it, and what must be told is told."""
+"""Tests of the drawing thread, which must not block the loop and logs each failure once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EXACT = SphereDetector()
 
 @dataclass
 class Notebook:
-    """A drawing that keeps what it was given; may wait, or fail, at the first frames."""
+    """A drawing that records its input; it may wait or fail at the first frames."""
 
     waits_for: threading.Event | None = None
     fails: bool = False
@@ -83,7 +83,7 @@ def test_drawing_thread_does_not_block_and_draws_newest_image(room: CornerRoom) 
     book.waits_for = going_on
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
-    while not book.threads:  # it has begun to draw, and is stuck
+    while not book.threads:  # it has begun to draw, and blocks
         time.sleep(0.001)
     for frame in list(room)[1:]:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
@@ -144,7 +144,7 @@ def test_drawing_thread_map_error_does_not_end_run(room: CornerRoom, caplog: pyt
 
 
 def test_drawing_thread_draws_last_frame_without_successor(room: CornerRoom) -> None:
-    """A live video that stands still."""
+    """In a live video the next frame may never come."""
     book = Notebook()
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     for frame in room:
@@ -173,7 +173,7 @@ def did(paced: Pace, clock: Clock, seconds: float) -> None:
 
 
 @pytest.mark.parametrize(("seconds", "next_after"), [(0.001, 1.0), (0.2, 4.0)])
-def test_pace_waits_for_interval_and_time_share(clock: Clock, seconds: float, next_after: float) -> None:
+def test_pace_waits_for_interval_and_time_fraction(clock: Clock, seconds: float, next_after: float) -> None:
     paced = Pace(1.0, 0.05, lambda: clock.now)
     assert paced.due()
     did(paced, clock, seconds)

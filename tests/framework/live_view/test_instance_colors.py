@@ -1,4 +1,4 @@
-"""An instance keeps its color, and near ones differ."""
+"""Tests of instance colors: constant over time, distinct between neighbors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_instance_colors_paint_only_instance_vertices() -> None:
 
 
 def room_mesh() -> InstanceMesh:
-    """The first frame's readings as vertices, of the spheres 1 and 2 and of the room."""
+    """Return the depth of the first frame as vertices of the spheres 1 and 2 and of the room."""
     depth, _, color, ids = look(CAMERA, pose_at(0))
     v, u = np.nonzero(depth > 0)
     points = back_project(CAMERA, np.stack([u, v], 1).astype(np.int32), depth[v, u])

@@ -1,4 +1,4 @@
-"""A mesh in regions is the mesh, and only what has changed is told."""
+"""Tests of mesh regions, which together equal the mesh and report only changes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from framework.live_view.mesh_regions import MeshPart, MeshRegions, Region
 
 
 def sheet(width: int, height: int, spacing: float = 0.1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A grid of vertices about the origin, its triangles, and colors."""
+    """Return a grid of vertices about the origin, its triangles, and colors."""
     x, y = np.meshgrid(np.arange(width) - width // 2, np.arange(height) - height // 2, indexing="ij")
     vertices = (np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) * spacing).astype(np.float32)
     corner = (np.arange(width - 1)[:, None] * height + np.arange(height - 1)).ravel()
@@ -18,7 +18,7 @@ def sheet(width: int, height: int, spacing: float = 0.1) -> tuple[np.ndarray, np
 
 
 def corners(vertices: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """(F, 18) positions and colors of each triangle's corners, sorted."""
+    """Return (F, 18) positions and colors of each triangle's corners, sorted."""
     rows = np.concatenate([vertices, colors.astype(np.float32)], axis=1)[triangles].reshape(len(triangles), -1)
     return rows[np.lexsort(rows.T)]
 
@@ -42,7 +42,6 @@ def test_mesh_regions_together_equal_mesh(side: float) -> None:
 
 
 def test_mesh_regions_support_more_than_16_bit_numbers() -> None:
-    """More of them than 16 bits can number."""
     vertices, triangles, colors = sheet(40, 40, spacing=10.0)
     parts = changed(MeshRegions(1.0), vertices, triangles, colors)
     assert len(parts) == len(triangles)

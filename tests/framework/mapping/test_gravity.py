@@ -1,4 +1,4 @@
-"""Which way is up: exact in rooms that are known, within a degree or so in real ones."""
+"""Tests of the up direction: exact in synthetic rooms, within about a degree in real ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from framework.mapping.storage.map_header import MapHeader
 
 
 def rectangle(origin: Float64, a: Float64, b: Float64, cells: int = 12) -> tuple[Float32, Int32]:
-    """A wall or a floor from `origin` along a and b, its normal along a x b."""
+    """Return a wall or a floor from `origin` along a and b, its normal along a x b."""
     s, t = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1), indexing="ij")
     vertices = origin + s.reshape(-1, 1) * a + t.reshape(-1, 1) * b
     corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
@@ -35,7 +35,7 @@ X, Y, Z = np.eye(3)
 
 
 def room() -> tuple[Float32, Int32]:
-    """Floor at z = 0, a table, and two large walls, which have more surface."""
+    """Return a floor at z = 0, a table, and two large walls, which have more surface."""
     return joined(
         rectangle(np.zeros(3), 3 * X, 4 * Y),
         rectangle(np.array([1.0, 1, 0.7]), X, Y),
@@ -45,7 +45,7 @@ def room() -> tuple[Float32, Int32]:
 
 
 def held(turned: Float64, downwards: float = 0.5) -> GravityEstimator:
-    """By who walks through the room, turned as the world is, and looks downwards, rad."""
+    """Return the estimator of a hand-held camera that looks down by an angle (rad), in the rotated world."""
     gravity = GravityEstimator()
     for k in range(8):
         heading = Rotation.from_euler("z", k / 8 * 3)
@@ -69,15 +69,15 @@ def test_gravity_up_is_found_in_any_orientation(seed: int) -> None:
 
 
 def test_gravity_upward_faces_select_axis() -> None:
-    """A camera that is held askew, over a table among walls, with what leans along x, as TUM's freiburg1_rpy is."""
+    """A tilted camera sees a table, walls and a surface inclined along x, as in TUM's freiburg1_rpy."""
     vertices, triangles = joined(
         rectangle(np.zeros(3), 2 * X, 2 * Y),
-        rectangle(2 * X, 2 * Z, 2 * Y),  # the wall that the camera, leaning to x, looks at: it faces away from x
+        rectangle(2 * X, 2 * Z, 2 * Y),  # the wall in front of the camera, which is tilted to x: it faces away from x
         rectangle(2 * Y, 1.5 * X, 1.5 * Z),
-        rectangle(3 * Y, X, Y + Z),  # a lid that leans, along x
+        rectangle(3 * Y, X, Y + Z),  # a lid inclined along x
     )
     askew = GravityEstimator()
-    askew.camera_up = np.array([0.68, 0.2, 0.7])  # nearer to x than to z but for 1 degree
+    askew.camera_up = np.array([0.68, 0.2, 0.7])  # 1 degree from being nearer to x than to z
     up = askew.estimate(vertices, triangles).up
     assert up is not None
     assert np.degrees(np.arccos(min(up @ Z, 1.0))) < 0.1
@@ -104,7 +104,7 @@ def test_gravity_without_evidence_is_none() -> None:
 
 
 def test_floor_height_of_unseen_floor_is_none() -> None:
-    """Only a table, with its legs and what lies below."""
+    """Only a table, its legs and objects below it are visible."""
     table = rectangle(np.array([0, 0, 0.7]), X, Y)
     legs = [rectangle(np.array([0.1 * k, 0, 0.0]), 0.3 * Y, 0.6 * Z, 4) for k in range(5)]
     vertices, triangles = joined(table, *legs)
@@ -112,7 +112,7 @@ def test_floor_height_of_unseen_floor_is_none() -> None:
     assert floor_height(*rectangle(np.zeros(3), Y, Z), Z) is None
 
 
-def test_faces_have_triangle_normals_and_areas() -> None:
+def test_gravity_faces_have_triangle_normals_and_areas() -> None:
     vertices = np.float32([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 0]])
     normals, areas, centers = faces(vertices, np.int32([[0, 1, 2], [0, 3, 1]]))  # the second has no area
     np.testing.assert_allclose(normals, [[0, 0, 1]])
@@ -123,7 +123,7 @@ def test_faces_have_triangle_normals_and_areas() -> None:
 def sensing(
     turned: Float64, noise: float = 0.0, bias: float = 0.0, frames: int = 40, seed: int = 0
 ) -> GravityEstimator:
-    """As `held`, by a camera with an accelerometer, noise and bias in rad, whose heading changes."""
+    """Return the estimator of a camera with changing heading, and accelerometer noise and bias in rad."""
     gravity, chosen = GravityEstimator(), np.random.default_rng(seed)
     for k in range(frames):
         looking = Rotation.from_matrix(np.stack([X, -Z, Y], axis=1)) * Rotation.from_euler("x", -0.5)
@@ -142,7 +142,7 @@ def degrees(up: Float64 | None, expected: Float64) -> float:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_gravity_sensor_is_used_without_level_surfaces(seed: int) -> None:
-    """Over a slanted table alone, in a world that lies anyhow."""
+    """Only a slanted table is visible, in an arbitrarily rotated world."""
     turned = Rotation.random(random_state=seed).as_matrix()
     vertices, triangles = rectangle(np.zeros(3), 2 * X, 2 * (np.cos(0.35) * Y + np.sin(0.35) * Z))
     vertices = (vertices @ turned.T).astype(np.float32)
@@ -155,14 +155,14 @@ def test_gravity_sensor_is_used_without_level_surfaces(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_gravity_sensor_noise_and_bias_average_out(seed: int) -> None:
-    """The noise of 40 frames; a bias about the camera's x points elsewhere with each heading."""
+    """There is noise in 40 frames, and a bias about the camera's x, which changes direction with the heading."""
     noise, bias = np.radians(3), np.radians(2)
     assert degrees(sensing(np.eye(3), noise, seed=seed).sensed(), Z) < 3 * np.degrees(noise) / np.sqrt(40)
     assert degrees(sensing(np.eye(3), 0, bias, seed=seed).sensed(), Z) < 1e-3
 
 
 def test_gravity_contradictory_sensor_is_ignored(caplog: pytest.LogCaptureFixture) -> None:
-    """As of one in other axes than the camera's."""
+    """The sensor's axes may differ from the camera's."""
     vertices, triangles = room()
     gravity = held(np.eye(3))
     for k in range(8):
@@ -209,7 +209,7 @@ def test_upright_box_recovers_rotated_box(seed: int) -> None:
     assert (within <= box.extent / 2 + 1e-4).all()
 
 
-def test_box_around_degenerate_points_is_valid() -> None:
+def test_upright_box_of_degenerate_points_is_valid() -> None:
     for points in (np.zeros((1, 3)), np.array([[0, 0, 0], [1, 0, 0]]), np.array([[0, 0, 0], [0, 0, 2]])):
         box = box_around(points.astype(np.float32), Z)
         assert np.isfinite(box.center).all()

@@ -1,4 +1,4 @@
-"""Mesh, instances, saving and loading of a small map with two objects."""
+"""Tests of the mesh, instances, saving and loading of a small map with two objects."""
 
 import json
 import re
@@ -21,7 +21,7 @@ CLASSES = ("chair", "bed")
 
 
 def true_detections(frame: Frame) -> Detections:
-    """One exact mask for each visible instance of the analytic scene."""
+    """Return one exact mask for each visible instance of the analytic scene."""
     assert frame.truth is not None
     ids = [i for i in frame.truth.class_names if (frame.truth.instance_ids == i).any()]
     masks = np.array([frame.truth.instance_ids == i for i in ids]).reshape(len(ids), *frame.depth.shape)
@@ -47,14 +47,14 @@ def scene_map() -> InstanceMap:
     return mapped(room()).scene
 
 
-def test_mesh_lies_on_true_surface(scene_map: InstanceMap) -> None:
+def test_instance_map_mesh_lies_on_true_surface(scene_map: InstanceMap) -> None:
     mesh = scene_map.mesh()
     distance = room().distance(mesh.vertices.astype(np.float64))
     assert np.median(distance) < 0.1 * scene_map.volume.voxel_size
     assert np.quantile(distance, 0.95) < 0.5 * scene_map.volume.voxel_size
 
 
-def test_triangles_face_the_camera(scene_map: InstanceMap) -> None:
+def test_instance_map_triangles_face_camera(scene_map: InstanceMap) -> None:
     mesh = scene_map.mesh()
     a, b, c = (mesh.vertices[mesh.triangles[:, i]].astype(np.float64) for i in range(3))
     normal = np.cross(b - a, c - a)
@@ -62,7 +62,7 @@ def test_triangles_face_the_camera(scene_map: InstanceMap) -> None:
     assert (towards > 0).mean() > 0.99
 
 
-def test_sphere_is_one_instance_of_correct_size(scene_map: InstanceMap) -> None:
+def test_instance_map_sphere_is_one_instance_of_correct_size(scene_map: InstanceMap) -> None:
     instances = scene_map.instances()
     mesh = scene_map.mesh()
     assert len(instances) == len(room().spheres)
@@ -83,7 +83,7 @@ def test_sphere_is_one_instance_of_correct_size(scene_map: InstanceMap) -> None:
     assert (planes > 0).mean() < 0.05
 
 
-def test_rendered_views_show_instances(scene_map: InstanceMap) -> None:
+def test_instance_map_views_show_instances(scene_map: InstanceMap) -> None:
     T = walk(12)[6]
     frame = room().frame(T)
     assert frame.truth is not None
@@ -93,7 +93,7 @@ def test_rendered_views_show_instances(scene_map: InstanceMap) -> None:
         assert np.bincount(ids).max() > 0.9 * len(ids)
 
 
-def test_save_and_load_round_trip(scene_map: InstanceMap, tmp_path: Path) -> None:
+def test_instance_map_save_and_load_round_trip_is_exact(scene_map: InstanceMap, tmp_path: Path) -> None:
     scene_map.save(tmp_path / "map.npz")
     loaded = InstanceMap.load(tmp_path / "map.npz")
     ours, theirs = scene_map.mesh(), loaded.mesh()
@@ -108,13 +108,13 @@ def test_save_and_load_round_trip(scene_map: InstanceMap, tmp_path: Path) -> Non
     assert np.array_equal(scene_map.render(camera, T).instance_ids, loaded.render(camera, T).instance_ids)
 
 
-def test_saved_map_file_is_reproducible(scene_map: InstanceMap, tmp_path: Path) -> None:
+def test_instance_map_saved_file_is_reproducible(scene_map: InstanceMap, tmp_path: Path) -> None:
     scene_map.save(tmp_path / "map.npz")
     InstanceMap.load(tmp_path / "map.npz").save(tmp_path / "again.npz")
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
 
 
-def test_damaged_map_file_raises(scene_map: InstanceMap, tmp_path: Path) -> None:
+def test_instance_map_damaged_file_raises(scene_map: InstanceMap, tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     scene_map.save(path)
     whole = path.read_bytes()
@@ -140,8 +140,8 @@ def test_damaged_map_file_raises(scene_map: InstanceMap, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
-def test_map_file_of_other_format_raises(other: int, tmp_path: Path) -> None:
-    """Before anything else is expected of it: other versions have other arrays."""
+def test_instance_map_file_of_other_format_raises(other: int, tmp_path: Path) -> None:
+    """The version is checked first, because other versions have other arrays."""
     path = tmp_path / "map.npz"
     np.savez(path, header=np.frombuffer(json.dumps({"format": other}).encode(), np.uint8))
     expected = re.escape(f"{path}: expected map format {FORMAT}, got {other}; map again")
@@ -150,7 +150,7 @@ def test_map_file_of_other_format_raises(other: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("threshold", [{"min_observations": 13}, {"min_confidence": 0.95}, {"min_area": 4.0}])
-def test_instances_below_threshold_are_not_counted(
+def test_instance_map_excludes_instances_below_threshold(
     scene_map: InstanceMap, tmp_path: Path, threshold: dict[str, float]
 ) -> None:
     scene_map.save(tmp_path / "map.npz")
@@ -172,8 +172,8 @@ def test_oriented_box_of_few_vertices_is_valid(points: int) -> None:
     assert np.allclose(np.sort(box.extent), [0, 0, 2 if points > 1 else 0], atol=1e-5)
 
 
-def test_mapping_after_loading_matches_uninterrupted_map(tmp_path: Path) -> None:
-    """A map that was saved, loaded and mapped into further equals the one that was never saved."""
+def test_instance_map_continued_after_loading_is_identical(tmp_path: Path) -> None:
+    """A map that is saved, loaded and extended equals one that was never saved."""
     whole, resumed = (assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0) for _ in range(2))
     for k, T in enumerate(walk(4)):
         if k == 2:
@@ -187,7 +187,7 @@ def test_mapping_after_loading_matches_uninterrupted_map(tmp_path: Path) -> None
         assert np.array_equal(getattr(ours, name), getattr(theirs, name))
 
 
-def test_empty_map_has_empty_mesh(tmp_path: Path) -> None:
+def test_instance_map_without_frames_has_empty_mesh(tmp_path: Path) -> None:
     scene = BayesianTsdf().scene
     assert len(scene.mesh().vertices) == 0
     assert len(scene.instances()) == 0

@@ -1,4 +1,4 @@
-"""What changed between two visits: what was taken, added or moved in a known room, and nothing where nothing was."""
+"""Tests of changes between two visits: objects removed, added or moved in a known room."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def visit(sequence: RGBDSequence, *overrides: str) -> Visit:
 def changed_room(
     start: int, without: tuple[int, ...] = (), moved: Mapping[int, tuple[float, float]] | None = None
 ) -> Synthetic:
-    """Every ninth frame of the walk, the room without some things, or with some of them elsewhere by (x, y) m."""
+    """Return every ninth frame of the walk, without some objects or with some moved by (x, y) m."""
     room = copy(office())
     shift = moved or {}
     objects = [
@@ -61,14 +61,14 @@ def before() -> Visit:
     return visit(changed_room(0), "detector=ground_truth")
 
 
-CHAIR, TABLE = 5, 6  # of this room, seen well; the ids of its truth
+CHAIR, TABLE = 5, 6  # ids of well visible objects of this room
 
 
 def expected(found: list, kind: Kind) -> list[str]:
     return sorted(change.name for change in found if change.kind is kind)
 
 
-def test_office_contains_expected_objects() -> None:
+def test_changes_office_contains_expected_objects() -> None:
     names = office().class_names
     assert (names[CHAIR], names[TABLE]) == ("chair", "dining table")
 
@@ -111,7 +111,7 @@ def test_changes_with_noisy_detector_are_empty() -> None:
 
 
 def test_changes_between_halves_of_real_recording_are_empty(shared_data: Path) -> None:
-    """A flat, by 2Go: every other frame each; what one half found and the other did not, stands where it stood."""
+    """The halves are alternate frames of a flat, detected by 2Go; objects missed in one half have not moved."""
     halves = [
         visit(RgbdFolder(shared_data / "replica_floor2", start=k, stop=40, stride=2), "fuser.voxel_size=0.04")
         for k in (0, 1)
@@ -128,12 +128,12 @@ def test_probability_gone_follows_evidence() -> None:
     def gone(there: int, through: int, matched: bool, confidence: float = 0.8) -> float:
         return probability_gone(confidence, *bits(there, through), matched)
 
-    assert gone(0, 2, False) == pytest.approx(1 - STAYS), "too little was seen to change one's mind"
+    assert gone(0, 2, False) == pytest.approx(1 - STAYS), "too little was visible to decide"
     assert gone(10, 0, True) < 0.01
     assert gone(0, 10, False) > 0.8
     assert gone(0, 10, False) > gone(5, 5, False) > gone(10, 0, False)
     assert gone(8, 2, False) > gone(8, 2, True)
-    assert gone(0, 10, False, confidence=0.1) < gone(0, 10, False, confidence=0.9), "it was seldom found before, too"
+    assert gone(0, 10, False, confidence=0.1) < gone(0, 10, False, confidence=0.9), "it was rarely found before"
 
 
 def test_look_for_separates_surface_from_free_space(before: Visit) -> None:
@@ -146,10 +146,10 @@ def test_look_for_separates_surface_from_free_space(before: Visit) -> None:
     assert through.mean() > 0.6
     assert there.mean() < 0.1
     outside = (camera + 3 * (vertices - camera)).astype(np.float32)
-    assert not np.logical_or(*look_for(before, outside)).any(), "what is behind walls is not known"
+    assert not np.logical_or(*look_for(before, outside)).any(), "surfaces behind walls are unknown"
 
 
-def test_visit_without_poses_raises(before: Visit) -> None:
+def test_changes_visit_without_poses_raises(before: Visit) -> None:
     with pytest.raises(DataError, match="visit: expected at least one pose"):
         Visit(before.scene, np.zeros((0, 4, 4)))
 

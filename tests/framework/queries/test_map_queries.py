@@ -1,4 +1,4 @@
-"""What a map answers, while it grows and once it is stored."""
+"""Tests of map queries, on growing and on stored maps."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_map_nearest_returns_object_with_nearest_surface(asked: Map) -> None:
 
 
 def test_map_at_pixel_matches_view(asked: Map) -> None:
-    """And nothing is shown that nobody can ask for."""
+    """All displayed objects can be queried."""
     frame = CornerRoom()[3]
     assert frame.T_world_camera is not None
     view = asked.view(frame.camera, frame.T_world_camera)
@@ -92,7 +92,7 @@ def test_map_at_pixel_matches_view(asked: Map) -> None:
 
 
 def test_map_view_hides_unconfirmed_instances() -> None:
-    """After one frame the map holds objects that a single detection has made."""
+    """After one frame the map contains objects of a single detection."""
     mapper = Mapper(*STAGES, "fuser.min_observations=3")
     frame = CornerRoom()[0]
     mapper.add(frame)
@@ -137,7 +137,7 @@ def test_mapper_add_reports_new_and_removed_instances() -> None:
 
 
 def test_mapper_add_arrays_equals_add_frame() -> None:
-    """Color, depth, pose and camera make the map that the frames of a sequence make."""
+    """Color, depth, pose and camera give the same map as frames of a sequence."""
     by_hand, by_frame = Mapper(*STAGES, "detector=none"), Mapper(*STAGES, "detector=none")
     for k, frame in enumerate(CornerRoom()):
         by_frame.add(frame)
@@ -171,7 +171,7 @@ def test_mapper_accepts_keyword_parameters(value: str) -> None:
 
 
 def test_mapper_and_command_line_maps_are_identical(tmp_path: Path) -> None:
-    """The beginning of the demo, tracked and labeled by the network."""
+    """The beginning of the demo is tracked and labeled by the network."""
     asked = ("fuser.voxel_size=0.02", "seed=3")
     line = [sys.executable, "-m", "framework", "dataset=desk", "dataset.stop=6", *asked, "hydra.run.dir=run"]
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Objects by words: with embeddings, and by names and measured colors."""
+"""Tests of text queries: by embeddings, and by class names and colors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PROBABILITIES = [(0.9, 0.1), (0.2, 0.8), (0.6, 0.4)]
 
 
 def mapped(embeddings: np.ndarray | None, space: str = "words@1") -> Map:
-    """The analytic room's three objects: chair, bed and, less surely, chair."""
+    """Map the analytic room's three objects: chair, bed and, less surely, chair."""
     fuser: MapFuser = registered.built("fuser", "bayesian_tsdf", "fuser.voxel_size=0.08")
     for k, T in enumerate(walk(4)):
         frame = room().frame(T, k)
@@ -57,7 +57,7 @@ def run_without(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_by_embedding_ranks_by_similarity(embedded: Map) -> None:
+def test_query_by_embedding_ranks_by_similarity(embedded: Map) -> None:
     found = by_embedding(embedded, np.float32([0, 1]))
     assert [(one.instance.id, round(one.similarity, 4)) for one in found] == [(2, 0.8), (1, 0.0)]
     assert found[0].name == "bed"
@@ -67,14 +67,14 @@ def test_by_embedding_ranks_by_similarity(embedded: Map) -> None:
         by_embedding(embedded, np.float32([0, 1, 0]))
 
 
-def test_by_names_ranks_by_class_probability(embedded: Map) -> None:
+def test_query_by_names_ranks_by_class_probability(embedded: Map) -> None:
     found = by_names(embedded, "the chairs")
     assert [one.instance.id for one in found] == [1, 3]
     assert found[0].similarity > found[1].similarity
     assert by_names(embedded, "a bed")[0].instance.id == 2
 
 
-def test_color_fit_is_surface_share(embedded: Map) -> None:
+def test_color_fit_is_fraction_of_surface(embedded: Map) -> None:
     whole, instance = embedded.mesh(), embedded.instances()[1]
     half = len(instance.vertices) // 2
     colors = np.full_like(whole.colors, 255)
@@ -87,7 +87,7 @@ def test_color_fit_is_surface_share(embedded: Map) -> None:
     assert color_fit(painted, instance, ["yellow"]) == pytest.approx(0, abs=1e-3)
 
 
-def test_by_names_accepts_color_without_class(embedded: Map) -> None:
+def test_query_by_names_accepts_color_without_class(embedded: Map) -> None:
     for color in {one.color for one in by_names(embedded, "beds or chairs")}:
         found = by_names(embedded, color)
         assert [one.similarity for one in found] == sorted((one.similarity for one in found), reverse=True)
@@ -95,7 +95,7 @@ def test_by_names_accepts_color_without_class(embedded: Map) -> None:
 
 
 @pytest.mark.parametrize("query", ["a blob", "a wooden chair", "the"])
-def test_by_names_unknown_words_raise(embedded: Map, query: str) -> None:
+def test_query_by_names_unknown_words_raise(embedded: Map, query: str) -> None:
     with pytest.raises(DataError, match="objects: bed, chair; colors: black, gray") as refused:
         by_names(embedded, query)
     assert "'chair'" not in str(refused.value)
@@ -149,7 +149,7 @@ def test_query_command_error_is_one_line(
 def test_query_command_with_embeddings_requires_model(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The fixture's are of no model that there is."""
+    """The fixture's embeddings are of no existing model."""
     status, _, err = asked(monkeypatch, capsys, str(run), "a red chair")
     assert (status, len(err.splitlines())) == (1, 1)
     assert "expected the model of the embeddings in detector.model, got none; set --model" in err
@@ -188,7 +188,7 @@ def test_query_with_embeddings_uses_model_of_run(
 
 
 def test_query_accepts_directory_name_and_map(embedded: Map, run: Path, run_without: Path) -> None:
-    """A directory, its name, or a map; by names where there are no embeddings, and that is told."""
+    """The target is a directory, its name, or a map; without embeddings, names are used and this is logged."""
     assert query is instancemap.query
     answers = [query(run_without, "chairs"), query(str(run_without), "chairs"), query(embedded, "chairs", by="names")]
     assert [answer.by for answer in answers] == ["names"] * 3

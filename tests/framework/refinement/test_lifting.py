@@ -1,4 +1,4 @@
-"""Masks lifted to point clusters, in a room whose every pixel is known."""
+"""Tests of masks lifted to point clusters, in a room with known geometry."""
 
 from __future__ import annotations
 

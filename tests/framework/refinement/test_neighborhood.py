@@ -1,4 +1,4 @@
-"""Rings around masks, beside slow obvious references."""
+"""Tests of the rings around masks, compared with slow references."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def clusters_of(masks: np.ndarray, frame: Frame) -> PointClusters:
 
 
 def neighborhoods(clusters: PointClusters, frame: Frame, *ring: float, **named: float) -> Neighborhoods:
-    """All points of masks and rings."""
+    """Return all points of masks and rings."""
     return surroundings(clusters, frame, Ring(*ring, **named)).sampled(10**9)
 
 
 def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
-    """Five blobs, some at the image's border and overlapping, over a depth image with holes."""
+    """Return five overlapping blobs, some at the image border, over a depth image with holes."""
     rng = np.random.default_rng(seed)
     masks = np.zeros((5, 40, 60), np.uint8)
     for mask in masks:
@@ -48,7 +48,7 @@ def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
 
 
 @pytest.mark.parametrize("make", [np.asarray, np.sort, lambda cluster: cluster[:0]])
-def test_grouped_is_a_stable_sort(make):
+def test_neighborhood_grouped_is_stable_sort(make):
     cluster = make(np.random.default_rng(0).integers(-1, 4, 200).astype(np.int32))
     order, firsts = grouped(cluster, 5)
     expected = np.argsort(cluster, kind="stable")[(cluster < 0).sum() :]
@@ -57,7 +57,7 @@ def test_grouped_is_a_stable_sort(make):
 
 
 @pytest.mark.parametrize("make", [np.asarray, np.sort])
-def test_members_of_sorted_clusters_is_slice(make):
+def test_neighborhood_members_of_sorted_clusters_is_slice(make):
     masks, frame = random_scene(0)
     whole = clusters_of(masks, frame)
     cluster = make(np.where(np.arange(len(whole.cluster)) % 7 == 0, -1, whole.cluster).astype(np.int32))
@@ -68,7 +68,7 @@ def test_members_of_sorted_clusters_is_slice(make):
     np.testing.assert_array_equal(firsts, expected_firsts)
 
 
-def test_thread_schedule_balances_costs():
+def test_neighborhood_thread_schedule_balances_costs():
     threads = numba.get_num_threads()
     for costs in ([5, 1, 9, 4, 3, 2], [7], [0, 0, 0], []):
         order, starts = thread_schedule(np.array(costs, np.int64))
@@ -79,8 +79,8 @@ def test_thread_schedule_balances_costs():
         assert max(loads) <= sum(costs) / threads + max(costs, default=0), "Graham's bound"
 
 
-def test_structure_pixels_are_excluded_from_ring_and_border():
-    """As if it had no reading, except for the clusters' own points."""
+def test_neighborhood_excludes_structure_from_ring_and_border():
+    """They are treated as missing depth, except for the clusters' own points."""
     masks, frame = random_scene(0)
     structure = np.random.default_rng(1).random((40, 60)) < 0.5
     clusters = clusters_of(masks, frame)
@@ -95,11 +95,11 @@ def test_structure_pixels_are_excluded_from_ring_and_border():
         expected = np.concatenate([inside[own], -outside[ring]]) / 3
         np.testing.assert_allclose(found.depth_in_mask[part], expected, rtol=1e-6)
         assert (found.points_camera[part, 2] > 0).all()
-    assert (structure & in_a_mask & (frame.depth > 0)).any(), "there was something to tell apart"
+    assert (structure & in_a_mask & (frame.depth > 0)).any(), "the input must differ"
 
 
 def test_depth_in_mask_equals_chamfer_distance():
-    """To the nearest reading outside of the cluster inside of it, to the cluster around it; exactly."""
+    """Inside the cluster it is the distance to the nearest pixel with depth outside; outside, to the cluster."""
     for seed in range(5):
         masks, frame = random_scene(seed)
         around = neighborhoods(clusters_of(masks, frame), frame, ring_fraction=0.25, min_ring=6, max_ring=8)
@@ -147,7 +147,7 @@ def test_neighborhood_matches_back_projection_and_distances():
 
 
 def _chamfer_reference(mask: np.ndarray) -> np.ndarray:
-    """3-4 chamfer distance by relaxation until nothing changes."""
+    """Compute the 3-4 chamfer distance by relaxation until nothing changes."""
     distance = np.where(mask, 0, 10**6)
     while True:
         padded = np.pad(distance, 1, constant_values=10**6)
@@ -167,7 +167,7 @@ def test_depth_in_mask_ignores_pixels_without_depth():
     mask = np.zeros((1, 40, 60), bool)
     mask[0, 10:31, 20:41] = True
     depth = np.ones((40, 60))
-    depth[20, 30] = 0  # a hole in the middle of the mask is no border
+    depth[20, 30] = 0  # a hole in the middle of the mask is not a border
     frame = frame_of(depth)
     around = neighborhoods(clusters_of(mask, frame), frame, 0.25, 4, 12)
     inside = np.zeros((40, 60))
@@ -177,7 +177,7 @@ def test_depth_in_mask_ignores_pixels_without_depth():
     assert around.depth_in_mask.min() == -around.ring_widths[0]
 
 
-def test_sampled_keeps_every_nth_point():
+def test_neighborhood_sampled_keeps_every_nth_point():
     masks, frame = random_scene(1)
     around = neighborhoods(clusters_of(masks, frame), frame, 0.25, 4, 12)
     thin = surroundings(clusters_of(masks, frame), frame, Ring()).sampled(50)
@@ -199,6 +199,6 @@ def test_neighborhood_without_clusters_or_depth_is_empty():
     assert around.mask_counts.tolist() == around.ring_counts.tolist() == [0, 0]
 
 
-def test_ring_out_of_range_raises() -> None:
+def test_neighborhood_ring_out_of_range_raises() -> None:
     with pytest.raises(ConfigError, match=r"Ring\.max_ring: expected a value in \[20, 80\], got 12"):
         Ring(min_ring=20)

@@ -1,4 +1,4 @@
-"""The light that reaches what a picture shows, where planes say how much that is."""
+"""Tests of ambient occlusion on planes, whose openness is known."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RAYS = np.stack([X, Y, np.ones_like(X)], axis=-1)
 
 
 def plane(normal: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """The depth and the normals of the plane of points p with normal @ p = -distance."""
+    """Return the depth and the normals of the plane of points p with normal @ p = -distance."""
     return np.float32(-distance / (RAYS @ normal)), np.tile(normal.astype(np.float32), (*CAMERA.shape, 1))
 
 
@@ -29,7 +29,7 @@ def test_openness_of_plane_is_one(angle: float) -> None:
 
 
 def test_openness_in_corner_matches_ray_casting() -> None:
-    """Two planes at right angles that meet 2 m before the camera: a ray meets the other one or nothing."""
+    """Two planes meet at right angles 2 m in front of the camera; a ray meets the other plane or nothing."""
     depth = np.float32(2 / (1 + np.abs(Y)))
     normals = np.stack([np.zeros_like(Y), -np.sign(Y), -np.ones_like(Y)], axis=-1).astype(np.float32) / np.sqrt(2)
     found = openness(CAMERA, depth, normals)

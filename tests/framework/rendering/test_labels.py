@@ -1,4 +1,4 @@
-"""Where names stand in a picture: on large objects, beside small ones, never over each other."""
+"""Tests of label placement: on large objects, next to small ones, without overlap."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def placed(labels: list[Label]) -> dict[str, Label]:
     return {label.text: label for label in labels}
 
 
-def test_labels_are_on_large_objects_and_beside_small_objects() -> None:
+def test_labels_are_on_large_and_next_to_small_objects() -> None:
     ids = np.zeros((300, 400), np.int32)
     ids[50:250, 20:220] = 1
     ids[50:250, 20:100] = 0  # what is left of the table is 120 px wide: its middle is at 159.5

@@ -1,4 +1,4 @@
-"""A lit surface in its own colors and in its instances': on planes the picture is known exactly."""
+"""Tests of the shaded view in surface and instance colors, on planes with a known image."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from framework.rendering.lit_view_kernels import AMBIENT, DIFFUSE, LAMP
 from framework.rendering.surface import Surface
 
 CAMERA = Camera(40, 20, 20.0, 20.0, 19.5, 9.5)
-LIGHT = AMBIENT - DIFFUSE * LAMP[2] / np.linalg.norm(LAMP)  # on what is turned straight to the camera
+LIGHT = AMBIENT - DIFFUSE * LAMP[2] / np.linalg.norm(LAMP)  # on surfaces facing the camera
 
 
 def quad(left: float, right: float) -> np.ndarray:
-    """The corners of a plane 1 m before the camera that is higher than the picture; m."""
+    """Return the corners (m) of a plane 1 m in front of the camera that is higher than the picture."""
     return np.array([[left, -2, 1], [left, 2, 1], [right, 2, 1], [right, -2, 1]], np.float32)
 
 
 @pytest.fixture(scope="module")
 def view() -> LitView:
-    """Instance 1, 10 columns wide, one of 10 columns without an id, and 10 columns of nothing on either side."""
+    """Return a view with instance 1, 10 columns wide, 10 columns without an id, and 10 empty columns on either side."""
     triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
     return LitView(Surface(np.concatenate([quad(-0.5, 0), quad(0, 0.5)]), triangles), CAMERA, np.eye(4))
 
@@ -50,7 +50,7 @@ def test_lit_view_in_instances_has_colors_and_dark_borders(view: LitView) -> Non
     np.testing.assert_allclose(image[:, 19], np.tile(painted * (1 + 0.45) / 2, (20, 1)), atol=1)
     np.testing.assert_allclose(image[:, 20], pale * (1 + 0.45) / 2, atol=1)
     np.testing.assert_allclose(image[:, 10], np.tile(painted * (1 + 0.45) / 2, (20, 1)), atol=1)
-    np.testing.assert_allclose(image[:, 29], pale, atol=1)  # where the map ends is no border of what has no id
+    np.testing.assert_allclose(image[:, 29], pale, atol=1)  # the end of the map is not a border of the unnamed part
 
 
 def test_lit_view_is_invariant_to_world_rotation() -> None:

@@ -1,4 +1,4 @@
-"""The picture of a map: what is drawn where, on surfaces that are known exactly."""
+"""Tests of the overview image of a map, on surfaces with a known image."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_front_sides_depth_is_exact() -> None:
     hits = FrontSides(Surface(mesh.vertices, mesh.triangles), eye).seen_by(camera, R)
     assert hits.depth[12, 16] == pytest.approx(0.5 - -0.6, abs=1e-5)  # the red box's side
     assert hits.nearest(mesh.instance_ids)[12, 16] == 1
-    assert hits.depth[12, 0] == pytest.approx(2.5, abs=1e-4)  # past it, the wall: depth is along z, not the ray
+    assert hits.depth[12, 0] == pytest.approx(2.5, abs=1e-4)  # behind it, the wall: depth is along z, not along the ray
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, eye
     pixels = project(camera, transform(inverse(T), hits.points_world.astype(np.float64)))

@@ -1,4 +1,4 @@
-"""What a camera sees of a mesh is what rays meet, pixel by pixel."""
+"""Tests of the rasterizer, compared with ray casting per pixel."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from framework.synthetic.ray_caster import RayCaster, image_rays, pixel_rays
 from framework.synthetic.walk import look
 
 CAMERA = Camera(96, 64, 80.0, 85.0, 47.3, 31.1)
-ASIDE = 2e-3  # px: rays this far apart that meet vertices alike say that the answer is no matter of rounding
+ASIDE = 2e-3  # px: if rays this far apart meet the same vertex, the result does not depend on rounding
 
 
 def drawn(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """(H, W) the index of the nearest vertex, -1 = nothing."""
+    """Return (H, W) the index of the nearest vertex, -1 = nothing."""
     numbered = np.arange(1, len(vertices) + 1, dtype=np.int32)
     return Rasterizer(vertices, triangles).draw(camera, T).nearest(triangles, numbered) - 1
 
 
 def met_by_rays(caster: RayCaster, triangles: np.ndarray, T: np.ndarray, du: float, dv: float) -> np.ndarray:
-    """The same of rays (du, dv) px aside of the pixel centers."""
+    """Return the vertex indices of rays (du, dv) px away from the pixel centers."""
     u, v = np.arange(CAMERA.width)[None, :] + du, np.arange(CAMERA.height)[:, None] + dv
     hits = caster.cast(pixel_rays(CAMERA, T, u, v))
     weights = np.stack([1 - hits.uv.sum(axis=-1), hits.uv[..., 0], hits.uv[..., 1]], axis=-1)
@@ -43,7 +43,7 @@ def assert_sees_what_rays_meet(vertices: np.ndarray, triangles: np.ndarray, T: n
 
 
 def confetti(rng: np.random.Generator, size: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of this size (m) all around the origin."""
+    """Return triangles of this size (m) around the origin."""
     centers = rng.uniform(-3, 3, (count, 1, 3))
     vertices = (centers + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3).astype(np.float32)
     return vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
@@ -52,7 +52,7 @@ def confetti(rng: np.random.Generator, size: float, count: int) -> tuple[np.ndar
 @pytest.mark.parametrize(("size", "count"), [(0.02, 40 * CHUNK + 7), (0.2, 500), (3.0, 6)])
 @pytest.mark.parametrize("seed", range(3))
 def test_rasterizer_matches_ray_casting(size: float, count: int, seed: int) -> None:
-    """Small triangles and such as reach from before the camera to behind it, from any pose among them."""
+    """Some triangles are small, and some reach from the front of the camera to its back; poses are random."""
     rng = np.random.default_rng([seed, count])
     vertices, triangles = confetti(rng, size, count)
     assert_sees_what_rays_meet(vertices, triangles, exp_se3(rng.normal(0, 1, 6)))
@@ -70,7 +70,7 @@ def test_rasterizer_depth_and_weights_match_ray_casting(size: float) -> None:
     assert same.sum() > 1000
     u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
-    points = T[:3, 3] + buffer.depth[..., None] * (rays @ T[:3, :3].T)  # where the corners' weighted mean must be, too
+    points = T[:3, 3] + buffer.depth[..., None] * (rays @ T[:3, :3].T)  # the weighted mean of the corners must be equal
     weights = np.concatenate([1 - buffer.uv.sum(axis=-1, keepdims=True), buffer.uv], axis=-1)
     mean = np.einsum("nk,nkc->nc", weights[same], vertices[triangles[buffer.triangle[same]]].astype(float))
     np.testing.assert_allclose(mean, points[same], atol=1e-5)
@@ -81,7 +81,7 @@ def test_rasterizer_depth_and_weights_match_ray_casting(size: float) -> None:
 
 
 def test_rasterized_closed_surface_has_no_gaps() -> None:
-    """A ball of triangles about the camera: each pixel sees one, even where rays fall on edges and corners."""
+    """The camera is inside a triangulated ball: every pixel shows one triangle, also at edges and corners."""
     side = 40
     theta, phi = np.meshgrid(
         np.linspace(0, np.pi, side), np.linspace(0, 2 * np.pi, side, endpoint=False), indexing="ij"
@@ -96,7 +96,7 @@ def test_rasterized_closed_surface_has_no_gaps() -> None:
 
 
 def test_rasterizer_includes_pixels_on_edges_and_corners() -> None:
-    """The square from (1, 1) to (5, 4) px at 2 m, in two triangles: its border belongs to it, exactly."""
+    """The square from (1, 1) to (5, 4) px at 2 m has two triangles and includes its border."""
     camera = Camera(8, 6, 4.0, 4.0, 0.0, 0.0)
     vertices = np.array([[1, 1], [5, 1], [5, 4], [1, 4]], np.float32) / 4 * 2
     vertices = np.column_stack([vertices, np.full(4, 2, np.float32)])

@@ -1,4 +1,4 @@
-"""A surface in a picture: its kernels against slow references that are obvious."""
+"""Tests of the surface kernels, compared with slow references."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EYE, R = np.array([0.1, -0.2, -4.0]), looking(np.array([0.05, 0.1, 1.0]), np.arr
 
 @pytest.fixture(scope="module")
 def surface() -> Surface:
-    """Triangles that share vertices, any side of them to the front."""
+    """Return triangles that share vertices, with random orientation."""
     rng = np.random.default_rng(0)
     return Surface(rng.uniform(-1, 1, (40, 3)).astype(np.float32), rng.integers(0, 40, (30, 3), np.int32))
 
@@ -35,7 +35,7 @@ def test_surface_normals_match_cross_products(surface: Surface) -> None:
         np.testing.assert_allclose(normal, around / max(np.linalg.norm(around), 1e-12), atol=1e-5)
 
 
-def test_hits_show_front_faces_with_exact_interpolation(surface: Surface, hits: Hits) -> None:
+def test_surface_hits_show_front_faces_with_exact_values(surface: Surface, hits: Hits) -> None:
     assert 0.05 < hits.seen.mean() < 0.95
     labels = np.arange(100, 100 + len(surface.vertices), dtype=np.int32)
     nearest, points = hits.nearest(labels), hits.points_world
@@ -56,7 +56,7 @@ def test_hits_show_front_faces_with_exact_interpolation(surface: Surface, hits: 
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_subsampled_hits_match_subsampled_camera(hits: Hits, n: int) -> None:
+def test_surface_subsampled_hits_match_subsampled_camera(hits: Hits, n: int) -> None:
     some = hits.subsampled(n)
     np.testing.assert_array_equal(some.depth, hits.depth[::n, ::n])
     np.testing.assert_array_equal(some.points_world, hits.points_world[::n, ::n])

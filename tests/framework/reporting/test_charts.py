@@ -1,4 +1,4 @@
-"""Charts as SVG: their content, and degenerate input."""
+"""Tests of the SVG charts: content and degenerate input."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def parsed(picture: str) -> ElementTree.Element:
-    """The picture's XML. Fails for numbers that are none."""
+    """Return the XML of the picture. Fails for invalid numbers."""
     assert "nan" not in picture
     assert "inf" not in picture
     return ElementTree.fromstring(picture)
@@ -66,7 +66,7 @@ def test_top_view_escapes_object_names() -> None:
     picture, share = top_view([PlottedPath(circle(0.1))], [], [Footprint(corners, "<cup>", "#ff0000")], UP)
     [shape] = paths(picture, "chart-object-0")
     shape = shape[:4]
-    sides = np.linalg.norm(shape - np.roll(shape, 1, axis=0), axis=1)  # turned, so that the way is level
+    sides = np.linalg.norm(shape - np.roll(shape, 1, axis=0), axis=1)  # rotated, so that the path is horizontal
     assert sorted(sides / sides.min()) == pytest.approx([1, 1, 2, 2], rel=0.01)
     assert picture.count("&lt;cup&gt;") == 2, "tooltip and label"
     assert share < 0.1
@@ -81,7 +81,7 @@ def test_top_view_of_degenerate_path_is_valid(positions: np.ndarray) -> None:
         parsed(top_view([PlottedPath(positions)], [positions], objects, UP)[0])
 
 
-def test_position_errors_are_in_millimeters() -> None:
+def test_chart_position_errors_are_in_millimeters() -> None:
     picture = position_errors([0, 50, 100], np.array([0.0, 0.010, 0.005]))
     [line] = paths(picture, "chart-errors")
     heights = line[0, 1] - line[:, 1]
@@ -126,7 +126,7 @@ def test_stage_areas_of_one_frame_is_valid() -> None:
     parsed(stage_areas(StageTimes(np.array([3]), {"tracking": np.array([np.nan])})))
 
 
-def test_growth_ends_with_all_objects_and_surface() -> None:
+def test_chart_growth_ends_with_all_objects_and_surface() -> None:
     picture = growth([0, 10, 20], np.array([0.2, 0.5, 1.0]), [0, 4, 12], 20)
     [seen], [objects] = paths(picture, "chart-seen"), paths(picture, "chart-objects")
     assert seen[-1] == pytest.approx(objects[-1], abs=0.02)

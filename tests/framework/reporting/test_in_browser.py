@@ -1,4 +1,4 @@
-"""The page as a browser shows it: without network, clicked on, by keys, and what the canvas shows."""
+"""Tests of the report page in a browser without network: clicks, keys and the canvas."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Those of two runs, and that which compares them; an object of the second has a hostile name."""
+    """Return the pages of two runs and their comparison; an object of the second run has a hostile name."""
     folder = tmp_path_factory.mktemp("runs")
     first = write_run(folder / "first")
     second = Path(shutil.copytree(first, folder / "second"))
@@ -56,7 +56,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture
 def opened(browser: Any) -> Iterator[Any]:
-    """Opens a page, without network. At the end nothing was asked for, and nothing went wrong."""
+    """Open a page without network. At the end there are no requests and no errors."""
     contexts, faults = [], []
 
     def open_page(path: Path, **options: Any) -> Any:
@@ -80,14 +80,14 @@ def opened(browser: Any) -> Iterator[Any]:
 
 
 def canvas(page: Any) -> np.ndarray:
-    """What the map's place shows, (H, W, 3)."""
+    """Return the image of the map's canvas (H, W, 3)."""
     page.wait_for_timeout(150)  # for the next frame
     picture = page.locator("#canvas").screenshot()
     return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
 
 
 def colored(image: np.ndarray) -> float:
-    """The share of the pixels that have a color."""
+    """Return the fraction of colored pixels."""
     return float((np.ptp(image, axis=2) > 60).mean())
 
 
@@ -127,7 +127,7 @@ def test_report_view_buttons_change_map_colors(pages: list[Path], opened: Any) -
     assert np.abs(instances - own).max() > 60
     page.locator("#confidence").fill("1")
     assert page.inner_text("#confidence-value") == "1.00"
-    assert colored(canvas(page)) < 0.5 * colored(instances), "nothing is as likely as that"
+    assert colored(canvas(page)) < 0.5 * colored(instances), "no object is that likely"
     page.get_by_role("button", name="Classes").click()
     assert page.locator("#legend button").count() == 0
     page.locator("#confidence").fill("0")
@@ -170,7 +170,7 @@ def test_report_table_is_sorted_searched_and_selected_by_keys(pages: list[Path],
     while page.evaluate("Boolean(window.report.viewer.flight)"):  # wait_for_function is eval, which the policy forbids
         page.wait_for_timeout(50)
     after = page.evaluate("window.report.viewer.camera.position.toArray()")
-    assert np.linalg.norm(np.subtract(after, before)) > 0.05, "it does not fly there"
+    assert np.linalg.norm(np.subtract(after, before)) > 0.05, "the camera does not move"
     page.locator("#search").fill(str(chosen))
     assert rows.count() >= 1
     page.locator("#search").fill("no such thing")

@@ -1,4 +1,4 @@
-"""Pages escape all values and restrict scripts."""
+"""Tests of the page markup: values are escaped, and scripts are restricted."""
 
 from __future__ import annotations
 

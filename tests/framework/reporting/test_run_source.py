@@ -1,4 +1,4 @@
-"""The recording of a run found again."""
+"""Tests of the recording of a stored run."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def directory(mapped: Path, tmp_path: Path) -> Path:
-    """A copy of a run of six frames."""
+    """Return a copy of a run of six frames."""
     return Path(shutil.copytree(mapped, tmp_path / "run"))
 
 
 def change_config(directory: Path, **dataset: Any) -> None:
-    """As if the run had been of another dataset."""
+    """Change the stored config to that of another dataset."""
     config = OmegaConf.load(directory / "config.yaml")
     config.dataset = dataset
     OmegaConf.save(config, directory / "config.yaml")

@@ -1,4 +1,4 @@
-"""Maps as GLB files."""
+"""Tests of maps as GLB files."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_scene_glb_has_linear_colors_and_first_seen_times() -> None:
 
 
 def test_scene_glb_is_y_up() -> None:
-    """Whatever is up in the map: glTF's y."""
+    """The map's up direction becomes y, as glTF requires."""
     up = np.array([0.6, 0.0, -0.8])
     content = scene_glb(two_squares(), np.zeros(8, np.float32), {}, up)
     scene = trimesh.load_scene(io.BytesIO(content), file_type="glb")

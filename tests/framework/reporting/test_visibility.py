@@ -1,4 +1,4 @@
-"""What a trajectory's cameras saw of a map."""
+"""Tests of the visibility of a map from the cameras of a trajectory."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def at(x: float) -> np.ndarray:
 def test_sightings_first_seen_is_first_visible_pose() -> None:
     mesh = wall()
     found = sightings(mesh, mesh.instance_ids, np.array([at(-1.0), at(-0.2), at(0.2)]), CAMERA, {})
-    half = 2 * 100 / 150  # m, that the camera sees to either side
+    half = 2 * 100 / 150  # m, visible to either side of the camera
     x = mesh.vertices[:, 0]
     assert found.chosen == [0, 1, 2]
     assert (found.first_seen[x < -1.0 + half - 0.05] == 0).all()
     assert (found.first_seen[(x > -1.0 + half + 0.05) & (x < -0.2 + half - 0.05)] == 1).all()
-    assert (found.first_seen[x > 0.2 + half + 0.05] == 3).all(), "never in sight"
+    assert (found.first_seen[x > 0.2 + half + 0.05] == 3).all(), "never visible"
     assert found.growth[-1] == 1
     assert (np.diff(found.growth) > 0).all()
 
@@ -45,7 +45,7 @@ def test_sightings_first_seen_is_first_visible_pose() -> None:
 def test_sightings_best_pose_shows_whole_object() -> None:
     mesh = wall()
     near = at(-1.0)
-    near[2, 3] = 1.0  # it sees more of the object's pixels, but 0.59 of the object
+    near[2, 3] = 1.0  # it shows more pixels, but only 0.59 of the object
     poses = np.array([at(-3.2), near, at(-1.4), at(0.0), at(1.7)])
     assert sightings(mesh, mesh.instance_ids, poses, CAMERA, {}).best == {3: 2, 4: 4}
 

@@ -1,4 +1,4 @@
-"""What a record is resumed by beside its config."""
+"""Tests of the hash of the inputs, which decides with the config if a run is resumed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_inputs_sha256_follows_symlinked_folders(tmp_path: Path) -> None:
     (tmp_path / "disk" / "0.png").write_bytes(b"new")
     assert inputs_sha256(config) != before
     (tmp_path / "disk" / "around").symlink_to(tmp_path / "root")
-    assert inputs_sha256(config) == inputs_sha256(config), "a circle has an end"
+    assert inputs_sha256(config) == inputs_sha256(config), "cyclic links are followed once"
 
 
 @pytest.mark.parametrize("scene", ["", "scene0000_00"])

@@ -1,4 +1,4 @@
-"""The mesh of a run, read back."""
+"""Tests of the stored mesh of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The directory that a run leaves behind."""
+"""Tests of the run directory."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ Run = Callable[..., RunResult]
 
 @pytest.fixture
 def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRecord:
-    """A record without its picture, which has its own tests."""
+    """Write a run directory without its picture, which has its own tests."""
     monkeypatch.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
     return RunRecord.begin(tmp_path / "run", CONFIG, CHOICES)
 
@@ -176,7 +176,7 @@ def test_record_recreates_removed_directory(record: RunRecord, room: CornerRoom)
 
 
 def test_rpe_ignores_steps_over_skipped_frames(room: CornerRoom) -> None:
-    """1 cm of drift a frame, of which frame 2 was skipped: RPE is 1 cm, and not that of steps of 1, 2 and 1 cm."""
+    """The drift is 1 cm per frame and frame 2 is skipped: RPE is 1 cm, not that of steps of 1, 2 and 1 cm."""
     true = np.eye(4)
     tracked = []
     for position in (0, 1, 3, 4):
@@ -279,7 +279,7 @@ def test_timings_csv_matches_stage_metrics(record: RunRecord, room: CornerRoom) 
 
 
 def test_pose_source_comes_from_tracker(room: CornerRoom) -> None:
-    """Whatever the poses are: a tracker's first one is the true one, and lost ones are no one's."""
+    """It does not depend on the poses: the first tracked pose is the true one, and lost poses have no source."""
     one_frame = CornerRoom(frames=1)
     given = [mapped(room), mapped(room, lost_from=1, lost_to=99), mapped(one_frame)]
     assert [run_metrics(result)["pose_source"] for result in given] == ["ground_truth"] * 3
@@ -352,7 +352,7 @@ def test_code_version_of_installed_package_is_unknown(tmp_path: Path, monkeypatc
 
 
 def read_ply(path: Path) -> InstanceMesh:
-    """A PLY reader that goes by the header alone."""
+    """Read a PLY file by its header alone."""
     content = path.read_bytes()
     header, _, body = content.partition(b"end_header\n")
     lines = header.decode().splitlines()

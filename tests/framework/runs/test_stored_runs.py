@@ -1,4 +1,4 @@
-"""Records read back: whole, broken, missing."""
+"""Tests of stored runs: complete, damaged, missing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CONFIG = {"seed": 3, "fuser": {"voxel_size": 0.02, "far": 1e-9, "storage": "EXAC
 
 @pytest.fixture
 def directory(tmp_path: Path) -> Path:
-    """A complete record."""
+    """Return a complete run directory."""
     directory = tmp_path / "run"
     directory.mkdir()
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(CONFIG)))
@@ -138,7 +138,7 @@ def test_is_recorded_same_config_is_true(directory: Path, caplog: pytest.LogCapt
 
 
 def test_is_recorded_logs_missing_map_files(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Who needs the disk may have removed it, and the figures are still those of the run."""
+    """They may have been removed to save disk space; the metrics are still those of the run."""
     (directory / "map.npz").unlink()
     (directory / "mesh.ply").unlink()
     assert is_recorded(directory, OmegaConf.create(CONFIG))
@@ -170,7 +170,7 @@ MACHINE = {"environment.processor": "a", "environment.cpus": 4}
 
 
 def record_of(directory: Path, config: dict[str, object], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A complete record of this config, on a machine like this."""
+    """Write a complete run directory of this config, measured on this machine."""
     monkeypatch.setattr(stored_runs, "environment", lambda: MACHINE)
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     write(directory, config_hash=config_hash(config), inputs_sha256=inputs_sha256(config), **MACHINE)

@@ -1,4 +1,4 @@
-"""Which runs a sweep was asked for, as Hydra's record of it says."""
+"""Tests of the requested runs of a sweep, read from Hydra's record."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_asked_runs_command_line_overrides_experiment() -> None:
 def test_sweep_rows_resolves_interpolations() -> None:
     config = {"rows": {"third": ["dataset.stop=${sequences.in_progress}"], "whole": []}, "hydra": {"x": "${hydra:y}"}}
     assert sweep_rows(config | {"sequences": {"in_progress": 80}}) == {"third": ["dataset.stop=80"], "whole": []}
-    assert sweep_rows(config) == config["rows"], "as it stands there, where nobody knows"
+    assert sweep_rows(config) == config["rows"], "unresolved values are unchanged"
     assert sweep_rows({}) == {}
     with pytest.raises(ConfigError, match="rows: expected names with overrides"):
         sweep_rows({"rows": ["a"]})

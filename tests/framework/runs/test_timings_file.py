@@ -1,4 +1,4 @@
-"""timings.csv: what a run wrote, read back."""
+"""Tests of timings.csv."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cores for the thread ahead and for the mapping: what the latest frames cost decides."""
+"""Tests of the CPU budget: the latest frames divide the cores between prefetching and mapping."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from framework.runtime.cpu_budget import RECENT, CoreSharing
 
 @pytest.fixture
 def thread_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], None]]:
-    """A clock of CPU time that passes when it is told to."""
+    """Replace the CPU clock by one that advances only when requested."""
     now = [0.0]
     monkeypatch.setattr(time, "thread_time", lambda: now[0])
 
@@ -26,7 +26,7 @@ def thread_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], N
 
 @pytest.fixture(params=[1, 2, 4])
 def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> CoreSharing:
-    """Among so many cores; numba may have fewer here, and gets as many as it is told to in a variable of its own."""
+    """Return a budget of several cores; numba's own limit is replaced by a variable."""
     threads = [request.param]
     monkeypatch.setattr(numba, "get_num_threads", lambda: threads[0])
     monkeypatch.setattr(numba, "set_num_threads", lambda number: threads.__setitem__(0, number))
@@ -34,7 +34,7 @@ def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def pass_frames(sharing: CoreSharing, passes: Callable[[float], None], ahead: float, mapping: float) -> None:
-    """Some frames that take so much work; the mapping's loops are spread perfectly."""
+    """Process some frames with this load; the mapping's loops scale perfectly."""
     for _ in range(RECENT):
         with sharing.ahead():
             passes(ahead)
@@ -42,16 +42,16 @@ def pass_frames(sharing: CoreSharing, passes: Callable[[float], None], ahead: fl
             passes(mapping / numba.get_num_threads())
 
 
-def test_core_sharing_splits_equal_load_evenly(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
-    assert sharing.cores_ahead() == sharing.cores // 2  # nothing is known yet
+def test_cpu_budget_splits_equal_load_evenly(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+    assert sharing.cores_ahead() == sharing.cores // 2  # no measurements yet
     pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
     assert sharing.cores_ahead() == sharing.cores // 2
 
 
-def test_core_sharing_assigns_all_cores_to_loaded_side(
+def test_cpu_budget_assigns_all_cores_to_loaded_side(
     sharing: CoreSharing, thread_time: Callable[[float], None]
 ) -> None:
-    pass_frames(sharing, thread_time, ahead=0.1, mapping=1.0)  # as without a network: a frame is read
+    pass_frames(sharing, thread_time, ahead=0.1, mapping=1.0)  # without a network, prefetching only reads a frame
     assert sharing.cores_ahead() == 0
     with sharing.mapping():
         assert numba.get_num_threads() == sharing.cores
@@ -64,26 +64,26 @@ def test_core_sharing_assigns_all_cores_to_loaded_side(
         assert numba.get_num_threads() == 1
 
 
-def test_core_sharing_divides_share_among_workers(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+def test_cpu_budget_is_divided_among_workers(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=20.0, mapping=1.0)
     with sharing.ahead(workers=2):
         assert numba.get_num_threads() == max(sharing.cores // 2, 1)
 
 
-def test_core_sharing_ignores_single_slow_frame(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+def test_cpu_budget_ignores_single_slow_frame(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
     with sharing.mapping():
         thread_time(100.0)  # kernels are compiled
     assert sharing.cores_ahead() == sharing.cores // 2
 
 
-def test_core_sharing_restores_thread_count_after_exception(sharing: CoreSharing) -> None:
+def test_cpu_budget_restores_thread_count_after_exception(sharing: CoreSharing) -> None:
     with pytest.raises(RuntimeError, match="lost"), sharing.mapping():
         raise RuntimeError("lost")
     assert numba.get_num_threads() == sharing.cores
 
 
-def test_core_sharing_is_thread_safe() -> None:
+def test_cpu_budget_is_thread_safe() -> None:
     sharing = CoreSharing()
 
     def side(around: Callable[[], object]) -> None:

@@ -1,4 +1,4 @@
-"""Live videos in the loop: the newest frame counts, the rest is dropped and counted, and being stopped is their end."""
+"""Tests of live videos: the newest frame is mapped, others are dropped and counted, and a stop ends the run."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from tests.support.scenes.corner_room import (
 )
 
 PATIENCE_S = 10.0
-SLOW_S = 0.03  # as long as a stage takes that is too slow for the video
+SLOW_S = 0.03  # duration of a stage that is too slow for the video
 
 
 @dataclass
 class Handed(LiveVideo):
-    """Frames that a test hands over, as numbers: `come` waits until the listener has them."""
+    """Frames that a test passes as numbers: `come` waits until the listener has them."""
 
     def __post_init__(self) -> None:
         self.name = "handed"
@@ -54,7 +54,7 @@ class Handed(LiveVideo):
 
     def come(self, *numbers: int) -> None:
         self.coming.extend(numbers)
-        for _ in range(3):  # rounds of the listener, the last of them whole
+        for _ in range(3):  # iterations of the listener, the last of them complete
             while self.asked.acquire(blocking=False):
                 pass
             assert self.asked.acquire(timeout=PATIENCE_S)
@@ -76,7 +76,7 @@ def test_live_frames_return_newest_and_count_dropped() -> None:
         video.come(4)
         video.come(5)
         video.over = True
-        assert (taken(stream), stream.dropped) == (5, 3), "the last one is not lost where the video ends"
+        assert (taken(stream), stream.dropped) == (5, 3), "the last frame is kept at the end of the video"
         assert taken(stream) is None
         assert taken(stream) is None
 
@@ -92,7 +92,7 @@ def test_live_frames_take_waits_for_frame_or_end() -> None:
         waiting.join(PATIENCE_S)
         assert found == [7, None]
         video.come(8)
-        assert taken(stream) is None, "what comes after the end is not mapped"
+        assert taken(stream) is None, "frames after the end are not mapped"
 
 
 def test_live_frames_raise_video_error_after_last_frame() -> None:
@@ -113,7 +113,7 @@ def test_live_frames_exit_closes_device() -> None:
     assert threading.active_count() == before
 
 
-def test_stream_of_unsupported_video_raises() -> None:
+def test_frame_stream_of_unsupported_video_raises() -> None:
     class Neither(RGBDVideo):
         name = "neither"
 
@@ -122,7 +122,7 @@ def test_stream_of_unsupported_video_raises() -> None:
 
 
 @PREFETCH
-def test_slow_live_video_is_mapped_without_drops(prefetch: int) -> None:
+def test_live_video_at_slow_rate_is_mapped_without_drops(prefetch: int) -> None:
     threads, video = working_threads(), LiveRoom(unreadable=2)
     result = pipeline(prefetch).run(video)
     assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
@@ -144,7 +144,7 @@ def test_live_video_detects_every_nth_mapped_frame(prefetch: int) -> None:
 
 
 @PREFETCH
-def test_fast_live_video_drops_and_counts_frames(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_live_video_at_fast_rate_drops_and_counts_frames(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
     video = LiveRoom(frames_sent=60, period_s=SLOW_S / 6)
     result = pipeline(prefetch, fuser=GridFuser(slow_s=SLOW_S)).run(video)
     assert result.live is not None
@@ -152,12 +152,12 @@ def test_fast_live_video_drops_and_counts_frames(prefetch: int, caplog: pytest.L
     assert result.frames < 40
     indices = [frame.index for frame in result.tracked]
     assert indices == sorted(set(indices))
-    assert indices[-1] == 59, "the last frame is the newest for good"
+    assert indices[-1] == 59, "the last frame stays the newest"
     assert caplog.messages == [f"{result.live.frames_dropped} frames dropped because mapping fell behind"]
 
 
 def test_live_video_frames_are_not_queued() -> None:
-    """However far the loop may look prefetch in a recording: a queue would add its length to each latency."""
+    """The prefetch of recordings does not apply: a queue would add its length to each latency."""
     video, waiting = LiveRoom(frames_sent=200, period_s=0.002), []
 
     @dataclass
@@ -188,7 +188,7 @@ def test_recorded_run_has_no_live_metrics(room: CornerRoom) -> None:
 
 
 @PREFETCH
-def test_ctrl_c_ends_live_video_normally(prefetch: int) -> None:
+def test_live_video_ctrl_c_ends_normally(prefetch: int) -> None:
     video, threads = LiveRoom(frames_sent=1000), working_threads()
     result = pipeline(prefetch, tracker=PressesCtrlC(at=0)).run(video)
     assert result.stopped_by is None
@@ -197,8 +197,8 @@ def test_ctrl_c_ends_live_video_normally(prefetch: int) -> None:
     assert working_threads() == threads
 
 
-def test_second_ctrl_c_interrupts_live_video() -> None:
-    """In the middle of a frame: what is left is not whole."""
+def test_live_video_second_ctrl_c_interrupts_frame() -> None:
+    """The frame is interrupted, so that the record is partial."""
     video = LiveRoom(frames_sent=1000)
     result = pipeline(tracker=PressesCtrlC(at=2, times=2)).run(video)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
@@ -206,7 +206,7 @@ def test_second_ctrl_c_interrupts_live_video() -> None:
     assert video.closed
 
 
-def test_ctrl_c_before_first_live_frame_raises() -> None:
+def test_live_video_ctrl_c_before_first_frame_raises() -> None:
     """The worker waits for a first frame that never comes."""
 
     @dataclass
@@ -221,7 +221,7 @@ def test_ctrl_c_before_first_live_frame_raises() -> None:
         pipeline().run(Silent())
 
 
-def test_failed_live_video_keeps_partial_map() -> None:
+def test_live_video_failure_keeps_partial_map() -> None:
     result = pipeline().run_to_any_end(LiveRoom(fails_after=3))
     assert isinstance(result.stopped_by, DataError)
     assert result.frames == 3

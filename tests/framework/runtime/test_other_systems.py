@@ -1,4 +1,4 @@
-"""The program runs where Python lacks what only Linux, or no Windows, has."""
+"""Tests without Python's Linux-specific and POSIX modules."""
 
 from __future__ import annotations
 

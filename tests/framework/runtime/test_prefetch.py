@@ -1,4 +1,4 @@
-"""Work ahead: in order, bounded, beside the consumer, and its turns."""
+"""Tests of prefetching: order, bounds, concurrency and turns."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_map_ahead_is_bounded_and_ordered() -> None:
 
 
 def test_map_ahead_overlaps_with_consumer() -> None:
-    """Each side waits for the other: without a worker thread this would never end."""
+    """Both sides wait for each other: without a worker thread this would never end."""
     fusing, detected = threading.Event(), threading.Event()
 
     def detect(k: int) -> int:

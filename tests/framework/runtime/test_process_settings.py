@@ -1,4 +1,4 @@
-"""What the top of the config says to the libraries."""
+"""Tests of the settings of libraries in the main config."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_frozen_garbage_collector_is_restored() -> None:
     try:
         with frozen_garbage_collector():
             pass
-        assert gc.get_freeze_count() > 10_000, "as it was"
+        assert gc.get_freeze_count() > 10_000, "the previous state is restored"
     finally:
         gc.unfreeze()
 
@@ -171,7 +171,7 @@ print(time.process_time() - done)
 
 
 def test_matrix_product_threads_do_not_spin_when_idle() -> None:
-    """They would take 0.02 s and more of the CPU time of a process that sleeps."""
+    """Spinning threads would take 0.02 s or more of CPU time in a sleeping process."""
     environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_THREAD_TIMEOUT"}
     line = [sys.executable, "-c", IDLE_AFTER_A_PRODUCT]
     done = subprocess.run(line, cwd=CHECKOUT, env=environment, capture_output=True, text=True, check=True)

@@ -1,4 +1,4 @@
-"""Signs of life: where there is a terminal, where there is none, and where nobody wants them."""
+"""Tests of the progress display: in a terminal, without one, and disabled."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.terminals import terminal_stderr
 
 
 class Clock:
-    """Stands still until it is set."""
+    """A clock that is set by the test."""
 
     now = 100.0
 

@@ -1,4 +1,4 @@
-"""Signals are heard once the step in work is done, and then at once; who handles them otherwise goes on to do so."""
+"""Tests of deferred signals: the first one takes effect after the current step, the second one at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from framework.runtime.signals import ENDING, Interrupted, raise_on_signals, sig
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
-    """Those of before, afterwards."""
+    """Restore the signal handlers after the test."""
     before = {number: signal.getsignal(number) for number in ENDING}
     yield
     for number, handler in before.items():
@@ -22,7 +22,9 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", ENDING)
-def test_first_signal_is_deferred_and_second_raises(number: signal.Signals, capfd: pytest.CaptureFixture[str]) -> None:
+def test_signals_deferred_first_waits_and_second_raises(
+    number: signal.Signals, capfd: pytest.CaptureFixture[str]
+) -> None:
     signal.signal(number, signal.SIG_DFL)
     with signals_deferred(*ENDING) as interruption:
         interruption.check()
@@ -30,7 +32,7 @@ def test_first_signal_is_deferred_and_second_raises(number: signal.Signals, capf
             signal.raise_signal(number)
         assert interruption.asked is not None
         assert interruption.asked.number == number
-        signal.raise_signal(number)  # between two steps: what the first has made must reach the second
+        signal.raise_signal(number)  # between two steps: the result of the first must reach the second
         with pytest.raises(Interrupted) as second, interruption.second_ends_at_once("after the outputs are written"):
             signal.raise_signal(number)
         assert second.value.number == number
@@ -42,8 +44,8 @@ def test_first_signal_is_deferred_and_second_raises(number: signal.Signals, capf
 
 
 @pytest.fixture(autouse=True)
-def nobody_else_handles_signals() -> Iterator[None]:
-    """Libraries that other tests load in this process, such as Ray, have handlers of their own."""
+def default_signal_handlers() -> Iterator[None]:
+    """Reset the signal handlers of libraries that other tests loaded, such as Ray."""
     before = {number: signal.getsignal(number) for number in ENDING}
     for number in ENDING:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
@@ -52,7 +54,7 @@ def nobody_else_handles_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def test_nested_signals_deferred_returns_outer_context() -> None:
+def test_signals_deferred_nested_returns_outer_context() -> None:
     with signals_deferred(signal.SIGINT, signal.SIGTERM) as outer:
         with signals_deferred(signal.SIGINT) as inner:
             assert inner is outer
@@ -62,16 +64,16 @@ def test_nested_signals_deferred_returns_outer_context() -> None:
         assert later.asked is None
 
 
-def test_existing_signal_handlers_are_kept() -> None:
-    """Scripts start what is in the background with Ctrl-C ignored; submitit handles SIGTERM in its jobs."""
-    heard: list[int] = []
+def test_signals_deferred_keeps_existing_handlers() -> None:
+    """Scripts ignore Ctrl-C in background processes; submitit handles SIGTERM in its jobs."""
+    received: list[int] = []
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda number, _: heard.append(number))
+    signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
     raise_on_signals()
     with signals_deferred(*ENDING) as interruption:
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGTERM)
-    assert (interruption.asked, heard) == (None, [signal.SIGTERM])
+    assert (interruption.asked, received) == (None, [signal.SIGTERM])
 
 
 def test_raise_on_signals_raises_for_each_signal() -> None:

@@ -1,4 +1,4 @@
-"""The noise of depth is that of Nguyen et al., whoever asks."""
+"""Tests of the depth noise model of Nguyen et al."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from numba import njit
 from framework.sensors.noise_models import axial_sigma, axial_sigma_at_angle, axial_sigma_single
 
 
-def test_noise_rounding_is_independent_of_caller() -> None:
+def test_depth_noise_rounding_is_independent_of_caller() -> None:
     """Without its own setting, numba would inherit fast math from the first calling kernel."""
 
     @njit(fastmath=True)

@@ -1,4 +1,4 @@
-"""Ten rooms, each with what its role promises; without a picture of any."""
+"""Tests of the ten benchmark rooms and of their roles, without rendering."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def classes_of(pieces) -> Counter:
     return Counter(piece.class_name for piece in pieces)
 
 
-def test_scenes_have_unique_names_and_repeated_classes() -> None:
+def test_benchmark_scenes_have_unique_names_and_class_repeats() -> None:
     assert list(SCENES) == ROOMS
     assert not any(name.isdigit() for name in SCENES), "a number would be taken for a sequence of SceneNN"
     promised = Counter(name for spec in SCENES.values() for name in spec.holds)
@@ -48,7 +48,7 @@ def test_scenes_have_unique_names_and_repeated_classes() -> None:
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.acceptance) for seed in SEEDS[1:])])
 @pytest.mark.parametrize("name", ROOMS)
-def test_scene_has_declared_objects(name: str, seed: int) -> None:
+def test_benchmark_scene_has_declared_objects(name: str, seed: int) -> None:
     rng = np.random.default_rng([seed, ROOMS.index(name)])
     found = classes_of(piece for make in SCENES[name].groups for piece in make(rng).pieces)
     assert all(found[class_name] >= least for class_name, least in SCENES[name].holds.items())
@@ -77,7 +77,7 @@ def test_cluttered_groups_place_objects_on_furniture(make, seed: int) -> None:
 
 
 def gap(piece, other) -> float:
-    """Between two boxes, m; negative is how deep they are in each other."""
+    """Return the distance between two boxes, m; negative is the depth of their overlap."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(np.maximum(low - other_high, other_low - high).max())
 
@@ -100,7 +100,7 @@ def test_row_groups_place_identical_pieces_in_contact(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("make", [laid_table_group, lambda rng: desk_row(rng, 1)], ids=["table", "desk"])
-def test_chairs_are_pushed_under_tables_without_intersection(make, seed: int) -> None:
+def test_benchmark_chairs_under_tables_do_not_intersect(make, seed: int) -> None:
     table, *others = make(np.random.default_rng(seed)).pieces
     chairs = [piece for piece in others if piece.class_name == "chair"]
     under = [chair for chair in chairs if gap(chair, table) < 0]
@@ -114,8 +114,8 @@ def test_chairs_are_pushed_under_tables_without_intersection(make, seed: int) ->
             inside = ((at > board.min(axis=0)) & (at < board.max(axis=0))).all(axis=1)
             assert not inside.any(), "nothing is in the table's wood"
         top = boards[0]
-        beside = at[(at[:, 2] > top[:, 2].min() - 0.1) & (at[:, 2] < top[:, 2].max() + 0.1)]
-        assert 0 <= beside[:, 1].min() - front < 0.1
+        near = at[(at[:, 2] > top[:, 2].min() - 0.1) & (at[:, 2] < top[:, 2].max() + 0.1)]
+        assert 0 <= near[:, 1].min() - front < 0.1
     assert all(gap(chair, table) < 0 or 0 < gap(chair, table) <= TOUCHING[1] for chair in chairs)
 
 
@@ -167,7 +167,7 @@ def test_strew_places_objects_in_contact_and_keeps_walkway(seed: int) -> None:
     for k, thing in enumerate(new):
         others = [piece for piece in [*before, *new[:k]] if piece.kind != "rug"]
         gaps = [gap(thing, other) for other in others]
-        assert min(gaps) > -1e-3, "it stands in nothing"
+        assert min(gaps) > -1e-3, "it does not intersect other objects"
         assert min(gaps) < 2 * CONTACT, "it touches something"
         assert -0.01 < thing.bounds()[0][2] < 0.02, "it stands on the floor or on a rug"
         half = np.array([layout.width, layout.depth]) / 2

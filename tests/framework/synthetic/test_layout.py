@@ -1,4 +1,4 @@
-"""Nothing stands in anything else, and everything stands in the room."""
+"""Tests of the layout: furniture does not collide and stays inside the room."""
 
 import itertools
 
@@ -10,7 +10,7 @@ from tests.support.scenes.labeled_furniture import LABELED
 
 
 @pytest.mark.parametrize(("kind", "seed"), [(RoomKind.STUDIO, 0), (RoomKind.STUDIO, 1), *((k, 2) for k in RoomKind)])
-def test_furniture_does_not_collide(kind, seed):
+def test_layout_furniture_does_not_collide(kind, seed):
     room = furnish(kind, np.random.default_rng(seed))
     half = np.array([room.layout.width, room.layout.depth]) / 2
     pieces = [piece for instance, piece in room.objects if instance and piece.kind != "rug"]
@@ -25,7 +25,7 @@ def test_furniture_does_not_collide(kind, seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_studio_contains_all_classes_and_adjacent_chairs(seed):
+def test_layout_studio_has_all_classes_and_adjacent_chairs(seed):
     room = furnish(RoomKind.STUDIO, np.random.default_rng(seed))
     assert {piece.class_name for _, piece in room.objects} >= set(LABELED)
     chairs = [piece.bounds() for _, piece in room.objects if piece.class_name == "chair"]

@@ -1,4 +1,4 @@
-"""Blur is as long as the path of a pixel, and nothing where the camera stands still."""
+"""Tests of motion blur: its length is the motion of a pixel, and zero for a still camera."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ POSE = look(np.array([0.3, -0.2, 1.4]), 0.4, -0.2, 0.1)
 
 
 def moved(right=0.0, down=0.0, ahead=0.0, turn=0.0):
-    """POSE (4, 4) moved by meters along the camera's axes, then turned by `turn` rad about its y axis."""
+    """Return POSE (4, 4) moved by meters along the camera's axes, then rotated by `turn` rad about its y axis."""
     T = np.eye(4)
     T[:3, 3] = right, down, ahead
     c, s = np.cos(turn), np.sin(turn)
@@ -43,7 +43,7 @@ def test_motion_blur_width_equals_pixel_displacement(path):
     between = np.flatnonzero((row > 0) & (row < 200))
     assert abs(len(between) - path) <= 1
     assert (np.diff(row) >= 0).all()
-    assert abs(between.mean() - 47.5) <= 0.5, "the picture stays where it is"
+    assert abs(between.mean() - 47.5) <= 0.5, "the image does not move"
     assert np.diff(row).max() < 1.5 * 200 / path, "evenly"
 
 
@@ -60,7 +60,7 @@ def test_motion_blur_decreases_with_distance():
 
 
 def test_motion_blur_averages_samples_along_pixel_path():
-    """Against the projection of each pixel's point into the poses at the shutter's ends, one pixel at a time."""
+    """The reference projects each pixel's point into the poses at both ends of the exposure."""
     rng = np.random.default_rng(1)
     color, depth = noise(), rng.uniform(0.8, 4, CAMERA.shape)
     depth[rng.random(CAMERA.shape) < 0.05] = 0

@@ -1,4 +1,4 @@
-"""The renderer's geometry, to float precision."""
+"""Tests of the renderer's geometry, to float precision."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def scene(*solids):
     return assemble(objects)
 
 
-def test_rendered_depth_of_slanted_plane_is_exact():
+def test_renderer_depth_of_slanted_plane_is_exact():
     wall = panel(60.0, 60.0, 5.0).moved(z=-30).turned("x", 0.5).turned("z", 0.4)
     renderer = Renderer(scene(wall), [globe(np.array([0.0, 2.0, 0.0]), 0.1, (1, 1, 1))])
     T = look(np.array([0.3, 2.0, 0.2]), -1.9, -0.2, 0.1)
@@ -44,7 +44,7 @@ def test_rendered_depth_of_slanted_plane_is_exact():
     expected = n @ (wall.vertices[0] - T[:3, 3]) / (ray @ n)
     assert (picture.depth > 0).all()
     np.testing.assert_allclose(picture.depth, expected, rtol=2e-6)
-    shifted = np.abs(np.diff(expected, axis=1)).min() / 2  # what half a pixel would amount to
+    shifted = np.abs(np.diff(expected, axis=1)).min() / 2  # effect of half a pixel
     assert shifted > 50 * np.abs(picture.depth - expected).max()
     cosine = np.abs(ray @ n) / np.linalg.norm(ray, axis=-1)
     np.testing.assert_allclose(picture.incidence, cosine, atol=1e-5)
@@ -58,7 +58,7 @@ def test_renderer_background_has_zero_depth_and_id():
     picture = renderer.render(camera, look(np.array([-3.0, 0, 0]), 0.0, 0.0, 0.0))
     assert picture.instance_ids[4, 4] == 1
     assert picture.depth[4, 4] == np.float32(2.5)
-    assert picture.depth[0, 4] == 0  # above the box there is nothing
+    assert picture.depth[0, 4] == 0  # nothing above the box
     assert picture.instance_ids[0, 4] == 0
     assert picture.color[0, 4].tolist() == [0, 0, 0]
     assert picture.instance_ids[6, 0] == 0
@@ -84,11 +84,11 @@ def test_tone_curve_rises_from_black_to_white():
     assert (np.diff(gray) >= 0).all()
 
 
-# The kernels against the obvious
+# Kernels compared with slow references
 
 
 def furnished():
-    """Things before each other, some of them with steps of depth inside one part, and nothing beyond."""
+    """Return overlapping objects, some with depth steps inside one part, without a background."""
     floor = panel(3.0, 3.0).turned("x", np.pi / 2).moved(y=1.5, z=-0.5)
     return Renderer(
         scene(floor, rounded_box(0.5, 0.6, 0.7, 0.05), rounded_box(0.3, 0.2, 1.5, 0.02).moved(x=0.6, y=0.3)),
@@ -109,7 +109,7 @@ def test_image_rays_equal_vectorized_reference():
 
 
 def light_along(renderer, rays):
-    """The light (N, 3) that comes back along rays (N, 6), and the cosines (N,): hit by hit, from the definitions."""
+    """Return the light (N, 3) along rays (N, 6), and the cosines (N,), hit by hit from the definitions."""
     s, irradiance, hits = renderer.surfaces, renderer._lit.irradiance, renderer.caster.cast(rays)
     light, cosines = np.zeros((len(rays), 3)), np.zeros(len(rays))
     for n, f in enumerate(hits.triangle):
@@ -128,7 +128,7 @@ def light_along(renderer, rays):
     return light, cosines
 
 
-def test_rendered_image_matches_per_ray_shading():
+def test_renderer_image_matches_per_ray_shading():
     renderer = furnished()
     T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
     picture = renderer.render(CAMERA, T)
@@ -167,7 +167,7 @@ def test_rendered_image_matches_per_ray_shading():
     np.testing.assert_array_equal(cast_ids(renderer.surfaces, renderer.caster, CAMERA, T), picture.instance_ids)
 
 
-def test_material_table_changes_only_colors():
+def test_renderer_material_table_changes_only_colors():
     renderer = furnished()
     T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
     table = renderer.surfaces.material_table.copy()
@@ -179,7 +179,7 @@ def test_material_table_changes_only_colors():
     assert (other.color[seen][:, 0] < picture.color[seen][:, 0]).all()
 
 
-def test_unread_share_depends_on_darkness_and_incidence():
+def test_renderer_unread_depends_on_darkness_and_incidence():
     wall = panel(60.0, 60.0, 5.0).moved(z=-30).turned("x", 0.5).turned("z", 0.4)
     T = look(np.array([0.3, 2.0, 0.2]), -1.9, -0.2, 0.1)
     lamp = [globe(np.array([0.0, 2.0, 0.0]), 0.1, (1, 1, 1))]

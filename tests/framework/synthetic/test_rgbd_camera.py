@@ -1,4 +1,4 @@
-"""The readings have the published statistics."""
+"""Tests of the depth sensor's statistics, compared with the publication."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_depth_sensor_box_casts_projector_shadow_on_left():
     assert (missing[150 - int(shadow) + 2 : 149] > 0.99).all()
     assert (missing[: 150 - int(shadow) - 3] < 0.01).all()
     assert (missing[203:] < 0.01).all()
-    assert 0.2 < missing[199:201].mean() < 0.8  # the right edge drops readings by chance
+    assert 0.2 < missing[199:201].mean() < 0.8  # the right edge drops depth at random
 
 
 def test_depth_sensor_edge_on_surface_has_no_reading():
@@ -94,11 +94,11 @@ def test_normal_quantiles_and_random_bits_are_unbiased():
     np.testing.assert_array_equal(bits, random_bits((100, 101, 3), np.random.default_rng(0)))
 
 
-# The kernels against the same arithmetic on whole images
+# Kernels compared with the same arithmetic on whole images
 
 
 def jagged(seed):
-    """Depth (H, W) m with steps, slants and holes, and cosines (H, W) from 0 to a little over 1, as rounding has it."""
+    """Return depth (H, W) m with steps, slants and holes, and cosines (H, W) from 0 to slightly over 1."""
     rng = np.random.default_rng(seed)
     blocks = rng.uniform(0.2, 7, (CAMERA.height // 8, CAMERA.width // 8)).astype(np.float32)
     depth = np.kron(blocks, np.ones((8, 8), np.float32))
@@ -110,23 +110,23 @@ def jagged(seed):
 
 
 def slow_measure(depth, incidence, noise, max_range, rng):
-    """The readings, one operation on the whole image after the other."""
+    """Return the measured depth, with one operation on the whole image after another."""
     exact = np.where(depth <= max_range, depth, np.float32(0))
     disparity = np.where(depth > 0, np.float32(CAMERA.fx * 0.075) / np.maximum(depth, np.float32(0.1)), 0)
     place = np.arange(CAMERA.width, dtype=np.float32)[None, :] - disparity
     hidden = place > np.minimum.accumulate(place[:, ::-1], axis=1)[:, ::-1] + np.float32(1)
-    beside = np.zeros(depth.shape, np.bool_)
+    at_step = np.zeros(depth.shape, np.bool_)
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         step = np.abs(depth[a] - depth[b]) > np.float32(0.05) * np.minimum(depth[a], depth[b])
-        beside[a] |= step
-        beside[b] |= step
+        at_step[a] |= step
+        at_step[b] |= step
     theta = np.arccos(np.minimum(incidence, np.float32(1)))
     bits = random_bits((*depth.shape, 4), rng)
     chance = bits[..., 0] / np.float32(65536)
     lateral_v, lateral_u, axial = (normal_quantiles()[bits[..., k] >> 4] for k in (1, 2, 3))
     start, end = np.deg2rad(80.0), np.deg2rad(88.0)
     grazing = (theta - np.float32(start)) / np.float32(end - start)
-    lost = chance < min(noise, 1.0) * np.maximum(np.where(beside, np.float32(0.5), np.float32(0)), grazing)
+    lost = chance < min(noise, 1.0) * np.maximum(np.where(at_step, np.float32(0.5), np.float32(0)), grazing)
     pixel = np.float32(noise * 0.8 * CAMERA.width / 640)
     v = np.clip(np.arange(CAMERA.height)[:, None] + np.rint(pixel * lateral_v).astype(int), 0, CAMERA.height - 1)
     u = np.clip(np.arange(CAMERA.width)[None, :] + np.rint(pixel * lateral_u).astype(int), 0, CAMERA.width - 1)
@@ -171,9 +171,9 @@ def measure_unread(unread, noise=1.0, seed=0):
 
 
 def slow_loss(unread, noise, seed):
-    """Whether each pixel loses its reading: bilinear normal numbers, divided by their deviation, below a quantile."""
+    """Return the pixels without depth: bilinear normal numbers, divided by their deviation, below a quantile."""
     rng = np.random.default_rng([seed])
-    random_bits((*FRONT.shape, 4), rng)  # the sensor's own noise comes first
+    random_bits((*FRONT.shape, 4), rng)  # the sensor's own dropout comes first
     cell = PATCH * CAMERA.width / 640
     rows, columns = (int(side / cell) + 2 for side in FRONT.shape)
     nodes = normal_quantiles()[random_bits((rows, columns), rng) >> 4].astype(float)
@@ -193,15 +193,15 @@ def test_material_dropout_matches_slow_reference(noise):
         found = measure_unread(unread, noise, seed)
         expected = np.where(slow_loss(unread, noise, seed), 0, without)
         assert 0.2 < (expected > 0).mean() < 0.9
-        assert (found != expected).mean() < 1e-4, "but for rounding at the quantile"
+        assert (found != expected).mean() < 1e-4, "except for rounding at the quantile"
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_material_dropout_has_given_share_and_forms_patches(share):
+def test_material_dropout_has_given_rate_and_forms_patches(share):
     lost = np.array([measure_unread(share, seed=seed) == 0 for seed in range(20)])
     assert lost.mean() == pytest.approx(share, abs=0.02)
-    beside = (lost[:, :, 1:] == lost[:, :, :-1]).mean()
-    assert beside > 1 - 0.3 * 2 * share * (1 - share), "neighbors are lost together"
+    equal_neighbors = (lost[:, :, 1:] == lost[:, :, :-1]).mean()
+    assert equal_neighbors > 1 - 0.3 * 2 * share * (1 - share), "neighbors are lost together"
 
 
 def test_material_dropout_removes_only_unreadable_surfaces():

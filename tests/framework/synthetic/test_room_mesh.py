@@ -1,4 +1,4 @@
-"""Small triangles of the same surface, and of these what is seen."""
+"""Tests of the tessellation of room surfaces and of their visible parts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AHEAD = look(np.array([0.0, 0.0, 0.0]), 0.0, 0.0, 0.0)  # from the origin along 
 
 
 def scene(*solids):
-    """Surfaces of solids, the first of which is the shell and the others instances 1, 2, ..."""
+    """Return surfaces of solids: the first is the shell, the others are instances 1, 2, ..."""
     objects = []
     for instance, solid in enumerate(solids):
         piece = Furniture("thing", "chair" if instance else None)
@@ -32,7 +32,7 @@ def scene(*solids):
 
 
 def wall(distance: float):
-    """A wall of 6 m x 6 m that faces the camera."""
+    """Return a wall of 6 m x 6 m that faces the camera."""
     return panel(6.0, 6.0, 0.5).moved(z=-3.0).turned("z", np.pi / 2).moved(x=distance)
 
 
@@ -131,7 +131,7 @@ def test_visible_mesh_excludes_screen_and_surface_behind_it():
     surfaces = assemble(objects)
     np.testing.assert_array_equal(surfaces.unreadable, surfaces.instance_ids == 1)
     mesh = visible_mesh(surfaces, RayCaster(surfaces.vertices, surfaces.triangles), CAMERA, [AHEAD], (0.4, 6.0), 0.05)
-    assert not mesh.instance_ids[mesh.triangles].any(), "of the screen at most points on its border are left"
+    assert not mesh.instance_ids[mesh.triangles].any(), "at most border points of the screen remain"
     across = np.abs(mesh.vertices[:, 1:]).max(axis=1)
     np.testing.assert_allclose(across[mesh.instance_ids == 1], 0.5, atol=1e-6)
     assert across.min() == pytest.approx(0.5, abs=0.05)

@@ -1,4 +1,4 @@
-"""Several processes write the same bytes as one, and go on where they stopped."""
+"""Tests of scene writing by several processes, which resume and write the same bytes as one."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_write_scenes_killed_process_raises_one_line_error(tmp_path: Path) -> No
         write_scenes(tmp_path / "rooms", {"666": deadly}, RECORDING, jobs=1)
 
 
-def test_choose_prefers_own_scene_then_untouched_scene(tmp_path: Path) -> None:
+def test_write_scenes_choose_prefers_own_then_untouched_scene(tmp_path: Path) -> None:
     recording = BenchmarkSettings(frames=3 * FRAMES_AT_ONCE, width=64)
     first, second = (_Scene(tmp_path / name, SPEC, recording) for name in ("007", "008"))
     scenes = [first, second]
@@ -127,7 +127,7 @@ def test_choose_prefers_own_scene_then_untouched_scene(tmp_path: Path) -> None:
     second.take()
     for _ in range(3):
         first.take()
-    assert first.ready == 0, "the walk waits for what other processes still write"
+    assert first.ready == 0, "the scene waits for files that other processes write"
     assert _choose(scenes, first) is second
     first.running = 0
     assert first.ready == 1

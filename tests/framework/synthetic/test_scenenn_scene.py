@@ -1,4 +1,4 @@
-"""A room as SceneNN's files: what is written is what the renderer saw."""
+"""Tests of a rendered room as SceneNN files, compared with the renderer."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def poses(scene: SceneNNScene):
     return read_trajectory_log(trajectory_file(scene.folder)).poses
 
 
-def test_scene_files_follow_scenenn_naming(scene: SceneNNScene) -> None:
+def test_scenenn_scene_files_follow_scenenn_naming(scene: SceneNNScene) -> None:
     names = {str(path.relative_to(scene.folder)) for path in scene.folder.rglob("*.*")}
     numbered = {f"{kind}/{kind}{k + 1:05d}.png" for k in SHOWN for kind in ("image", "depth")}
     assert names == numbered | {"007.ply", "007.xml", "timestamp.txt", "trajectory.log"}
@@ -69,18 +69,18 @@ def test_scene_files_follow_scenenn_naming(scene: SceneNNScene) -> None:
     assert len(lines) == RECORDING.frames
 
 
-def test_scene_poses_are_rigid_and_world_is_y_up(scene: SceneNNScene) -> None:
+def test_scenenn_scene_poses_are_rigid_and_world_is_y_up(scene: SceneNNScene) -> None:
     found = poses(scene)
     assert list(found) == list(range(RECORDING.frames))
     for index, T_world_camera in found.items():
         check_rigid(f"pose {index}", T_world_camera)
         np.testing.assert_allclose(inverse(T_YUP_ZUP) @ T_world_camera, scene.path.pose(index), atol=1e-6)
-        assert 1.2 < T_world_camera[1, 3] < 1.8, "eyes above the floor"
+        assert 1.2 < T_world_camera[1, 3] < 1.8, "camera height above the floor"
         assert T_world_camera[1, 1] < -0.8, "the camera's y points down"
     assert np.linalg.det(T_YUP_ZUP) == 1.0
 
 
-def test_scene_floor_is_at_zero_without_instance(mesh: PlyMesh) -> None:
+def test_scenenn_scene_floor_is_at_zero_without_instance(mesh: PlyMesh) -> None:
     floor = np.abs(mesh.vertices[:, 1]) < 1e-4
     assert floor.sum() > 1000
     assert (mesh.properties["label"][floor] == 0).mean() > 0.95
@@ -88,7 +88,7 @@ def test_scene_floor_is_at_zero_without_instance(mesh: PlyMesh) -> None:
     assert mesh.vertices[:, 1].max() < 2.6
 
 
-def test_scene_annotation_labels_match_mesh(scene: SceneNNScene, mesh: PlyMesh) -> None:
+def test_scenenn_scene_annotation_labels_match_mesh(scene: SceneNNScene, mesh: PlyMesh) -> None:
     annotated = read_annotation(scene.folder / "007.xml")
     labels = mesh.properties["label"]
     assert sorted(one.id for one in annotated) == sorted(set(labels.tolist()) - {0})
@@ -101,7 +101,7 @@ def test_scene_annotation_labels_match_mesh(scene: SceneNNScene, mesh: PlyMesh) 
         points = mesh.vertices[labels == one.id]
         np.testing.assert_allclose(one.aabb, [points.min(axis=0), points.max(axis=0)], atol=1e-6)
     of_pieces = [scene.room.surfaces.class_names[k] for k in np.argsort(scene.labels)[1:]]
-    assert of_pieces != sorted(of_pieces, key=str), "the order of ids says nothing"
+    assert of_pieces != sorted(of_pieces, key=str), "the order of ids is random"
 
 
 def test_clutter_names_exclude_evaluated_classes() -> None:
@@ -109,7 +109,7 @@ def test_clutter_names_exclude_evaluated_classes() -> None:
 
 
 @pytest.mark.parametrize("index", SHOWN)
-def test_scene_mesh_matches_rendered_depth_and_labels(scene: SceneNNScene, mesh: PlyMesh, index: int) -> None:
+def test_scenenn_scene_mesh_matches_rendered_depth_and_labels(scene: SceneNNScene, mesh: PlyMesh, index: int) -> None:
     picture = scene.renderer.render(scene.camera, scene.path.pose(index))
     depth, instance_ids = picture.depth, picture.instance_ids
     hits = RayCaster(mesh.vertices, mesh.triangles).cast(image_rays(scene.camera, poses(scene)[index]))
@@ -122,7 +122,7 @@ def test_scene_mesh_matches_rendered_depth_and_labels(scene: SceneNNScene, mesh:
 
 
 @pytest.mark.parametrize("index", SHOWN)
-def test_scene_depth_in_millimeters_matches_mesh(scene: SceneNNScene, mesh: PlyMesh, index: int) -> None:
+def test_scenenn_scene_depth_in_millimeters_matches_mesh(scene: SceneNNScene, mesh: PlyMesh, index: int) -> None:
     color_file, depth_file = frame_files(scene.folder, index)
     depth_mm = read_uint16(depth_file).astype(np.float64)
     assert depth_mm.max() <= 6000
@@ -151,10 +151,10 @@ def test_benchmark_settings_out_of_range_raise(wrong: dict[str, float]) -> None:
         BenchmarkSettings(**wrong)
 
 
-def test_halved_frame_rate_equals_every_second_frame(
+def test_scenenn_scene_half_rate_equals_every_second_frame(
     scene: SceneNNScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scenenn_scene, "NOISE", 0.0)  # of color: a frame's grain is its own
+    monkeypatch.setattr(scenenn_scene, "NOISE", 0.0)  # of color: each frame has its own grain
     (tmp_path / "image").mkdir()
     (tmp_path / "depth").mkdir()
     half = replace(RECORDING, rate=RECORDING.rate / 2)

@@ -1,4 +1,4 @@
-"""A rendered room as a sequence: exact poses, repeatable, walked through as a person would."""
+"""Tests of a rendered room as a sequence: exact poses, repeatable, with hand-held motion."""
 
 import hashlib
 import os
@@ -48,7 +48,7 @@ def test_synthetic_frames_are_complete(bedroom):
 
 
 def test_synthetic_images_have_gradient_on_all_surfaces(bedroom):
-    """Photometric alignment needs texture in every part of the image, walls and floor included."""
+    """Photometric alignment needs texture in every part of the image, including walls and floor."""
     for k in (0, 80, 160):
         gray = bedroom[k].color.astype(float).mean(axis=2)
         tiles = gray.reshape(6, 20, 8, 20).transpose(0, 2, 1, 3).reshape(48, -1)
@@ -63,7 +63,7 @@ def test_synthetic_frames_are_independent_of_order_and_threads(bedroom):
     assert one_by_one == at_once
 
 
-def test_frame_fraction_skips_frames_without_changing_others(bedroom):
+def test_synthetic_frame_fraction_keeps_remaining_frames(bedroom):
     share = Synthetic(seed=1, frame_fraction=0.1, **SMALL)
     assert len(share) == 24
     indices = [share[k].index for k in (0, 9, 23)]
@@ -101,7 +101,7 @@ def test_synthetic_room_depends_on_seed_and_scene(bedroom):
 
 
 def test_synthetic_frames_agree_after_reprojection(exact):
-    """Exact poses and pixel convention: a surface point lies in both pictures at its depth and in its color."""
+    """Poses and pixel convention are exact: a point has the same depth and color in both images."""
     a, b = exact[60], exact[72]
     v, u = np.nonzero(a.depth > 0)
     pixels = np.stack([u, v], axis=1).astype(np.int32)
@@ -118,7 +118,7 @@ def test_synthetic_frames_agree_after_reprojection(exact):
     # The inverse of depth is linear over the image of a plane, so interpolating it is exact there.
     inverse_depth = sum(w / np.maximum(b.depth[y + j, x + i], 1e-6) for w, i, j in weights)
     error = np.abs(1 / inverse_depth - z)[same]
-    visible = error < 0.05  # the others are hidden in b
+    visible = error < 0.05  # the other points are hidden in b
     assert visible.mean() > 0.9
     assert np.median(error) < 1e-5
     assert np.quantile(error[visible], 0.9) < 1e-3
@@ -154,7 +154,7 @@ def test_walk_keeps_distance_from_walls_and_furniture(bedroom, exact):
                 assert np.linalg.norm(outside, axis=1).min() >= 0.5, piece.kind
 
 
-def test_scene_truth_lies_on_exact_surface(exact):
+def test_synthetic_scene_truth_lies_on_exact_surface(exact):
     truth = Synthetic(seed=1, noise=0.0, kind=RoomKind.KITCHEN, width=160, height=120, stride=60).scene_truth()
     assert truth.class_names == exact.class_names
     import open3d as o3d

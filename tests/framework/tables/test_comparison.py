@@ -1,4 +1,4 @@
-"""What a table shows, and what it refuses to."""
+"""Tests of the content and the validation of comparison tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables from records: what stands in them, in three formats."""
+"""Tests of experiment tables in three formats."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def sweep(tmp_path: Path) -> Path:
     return root
 
 
-def test_write_tables_figures_match_manual_result(sweep: Path) -> None:
+def test_write_tables_values_match_manual_result(sweep: Path) -> None:
     text = write_tables(sweep)
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[0] == "# ablation_x"
@@ -79,7 +79,7 @@ def test_write_tables_figures_match_manual_result(sweep: Path) -> None:
 
 
 def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
-    """By scene the differences are 0.3 and 0.1: mean 0.2, error 0.1, whatever the number of seeds."""
+    """By scene the differences are 0.3 and 0.1: mean 0.2, error 0.1, for any number of seeds."""
     table = {"average_over": ["seed", "scene"], "columns": ["instances.ap50"]}
     rows = {"chain": [], "other": ["refiner=other"]}
     (tmp_path / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": table, "rows": rows}))
@@ -122,7 +122,7 @@ def test_table_notes_list_requested_runs_without_record(sweep: Path) -> None:
 
 
 def test_table_code_note_names_later_evaluation_commit(sweep: Path) -> None:
-    """A table of two evaluators must say so."""
+    """The values of the table come from two versions of the evaluation."""
     path = sweep / "row=chain,seed=1" / "metrics.json"
     again = {"evaluation.git_commit": "fedcba9876", "evaluation.git_dirty": True}
     path.write_text(json.dumps(json.loads(path.read_text()) | again))
@@ -173,7 +173,7 @@ RUN_TIMES = {
 
 
 def of_dataset(sweep: Path, dataset: str, annotation: str | None = None, only: str = "") -> None:
-    """What the runs, or those of one row, say that they were measured on."""
+    """Set the dataset of all runs, or of those of one row."""
     for path in sweep.glob(f"row={only}*/metrics.json"):
         expected = {"choice.dataset": dataset, "annotation_release": annotation}
         path.write_text(json.dumps(json.loads(path.read_text()) | expected))
@@ -187,7 +187,7 @@ def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str |
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[2] == "| row | runs | Hz | refinement (ms) | frames lost | poses |"
     assert "| the paper (published) | – | 10.8 | not known | – | tracked |" in lines
-    assert "Voxblox++ (published)" not in text, "a line that says nothing"
+    assert "Voxblox++ (published)" not in text, "an uninformative line"
     assert "- Published, the paper: DDNS 2020, article 2528954; all components on every frame of 640x480" in text
     unknown = [line for line in lines if "Published results not looked up" in line]
     assert unknown == [
@@ -219,8 +219,8 @@ def test_table_on_other_data_has_no_published_numbers(
     assert "- Published numbers are for the real SceneNN data (sequences=scenenn) and omitted" in text
 
 
-def test_published_row_without_column_values_is_only_named(sweep: Path) -> None:
-    """The paper's own is known in Hz, not here by stage, and it has no word about lost frames."""
+def test_table_published_row_without_values_is_only_named(sweep: Path) -> None:
+    """The paper's times are known in Hz, not by stage, and it does not report lost frames."""
     of_dataset(sweep, "scenenn")
     for columns, named in ((["stage_ms.refinement.median"], True), (["frames_lost"], False)):
         table = RUN_TIMES | {"columns": columns}
@@ -230,8 +230,8 @@ def test_published_row_without_column_values_is_only_named(sweep: Path) -> None:
         assert ("not looked up: the paper (DDNS 2020" in text) is named
 
 
-def test_split_row_is_compared_with_matching_baseline(tmp_path: Path) -> None:
-    """Rows that the command line split in two: voxels of one size are compared with each other."""
+def test_table_split_row_is_compared_with_matching_baseline(tmp_path: Path) -> None:
+    """The command line splits rows in two: voxels of one size are compared with each other."""
     root = tmp_path / "x"
     root.mkdir()
     (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": TABLE, "rows": ROWS})))
@@ -258,7 +258,7 @@ def test_table_unknown_metric_is_dash(sweep: Path) -> None:
 
 
 def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
-    """With the columns that there are figures for: recordings of one's own have no true instances."""
+    """Only columns with values are shown: your own recordings have no true instances."""
     poses = {"trajectory.ate_rmse_m": 0.012, "frames_lost": 2, "fps": 21.5}
     for name in ("a", "b"):
         run(tmp_path, name, 0, None, 1.0, **poses)

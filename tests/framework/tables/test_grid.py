@@ -1,4 +1,4 @@
-"""Cells as Markdown and LaTeX."""
+"""Tests of table cells in Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def test_latex_grid_escapes_cells_and_separates_groups() -> None:
     ]
 
 
-def test_decimals_depend_on_largest_value() -> None:
+def test_grid_decimals_depend_on_largest_value() -> None:
     assert [decimals([value, 0.1, math.nan]) for value in (-1.9, 2.0, 199.0, 200.0)] == [3, 2, 1, 0]
     assert decimals([math.nan]) == 3
 
 
-def test_figure_includes_known_spread_and_sign() -> None:
+def test_grid_value_includes_known_spread_and_sign() -> None:
     assert figure(0.25, 0.0625, 2) == "0.25 ± 0.06"
     assert figure(0.25, math.nan, 3, signed=True) == "+0.250"
     assert figure(-1e-9, math.nan, 3, signed=True) == "+0.000"

@@ -1,4 +1,4 @@
-"""Tables over sequences from records made by hand: the paper's Tables 2 and 3, and what must never be averaged."""
+"""Tests of tables over sequences (the paper's Tables 2 and 3), and of values that must not be averaged."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def experiment(root: Path, table: dict[str, Any]) -> None:
 
 
 def run(root: Path, row: str, scene: str, seed: int, tracker: str = "ground_truth", **expected: Any) -> Path:
-    """Leaves a record; `told` are figures of metrics.json, or `data` and `release`."""
+    """Write a run directory; keywords are values of metrics.json, or `data` and `release`."""
     directory = root / f"dataset.scene={scene},row={row},seed={seed},tracker={tracker}{len(expected.get('data', ''))}"
     directory.mkdir()
     config = {
@@ -59,7 +59,7 @@ def run(root: Path, row: str, scene: str, seed: int, tracker: str = "ground_trut
 
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
-    """Three rows, two scenes, two seeds, one failed run."""
+    """Return three rows, two scenes, two seeds and one failed run."""
     root = tmp_path / "table3"
     root.mkdir()
     experiment(root, ACROSS)
@@ -73,7 +73,7 @@ def sweep(tmp_path: Path) -> Path:
 
 
 def grids(text: str) -> list[list[str]]:
-    """The lines of each of a text's tables, without padding."""
+    """Return the lines of each table of a text, without padding."""
     blocks = [block.splitlines() for block in text.split("\n\n") if block.startswith("|")]
     return [[" ".join(line.split()) for line in block] for block in blocks]
 
@@ -134,12 +134,12 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
     assert "- Published, Voxblox++ with Detectron2 panoptic: Han et al., ICRA 2021" in text
     assert "not looked up: the paper (DDNS 2020" in text
     assert "- Sequences without a complete run: dataset.scene=030,061,078,086,096,206,223,255." in text
-    assert "seed=0 dataset.scene=255" not in text  # told once, not for each row and seed
+    assert "seed=0 dataset.scene=255" not in text  # listed once instead of for each row and seed
 
 
 @pytest.mark.parametrize("table", [ACROSS | {"published": "table3"}, BY | {"published": "table2"}])
 def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: dict[str, Any]) -> None:
-    """Nor columns or groups for sequences that only the publication has."""
+    """There are no columns or groups of sequences that only the publication has."""
     experiment(sweep, table)
     run(sweep, "ours", "016", 2, release="synthetic 1, seed 0, 240 frames", **{AP50: 0.5})
     text = write_tables(sweep)
@@ -149,7 +149,7 @@ def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: d
 
 
 def test_table_compares_rows_of_same_pose_source(sweep: Path) -> None:
-    """Better poses make no better system: the base of a tracked row is tracked, too, and so is who it competes with."""
+    """Better poses do not improve the method: a tracked row is compared and ranked only with tracked rows."""
     for row, value in (("ours", 0.2), ("prior", 0.3)):
         run(sweep, row, "011", 0, tracker="icp", **{AP50: value})
     first, second = grids(write_tables(sweep))
@@ -167,7 +167,7 @@ def test_table_compares_rows_of_same_pose_source(sweep: Path) -> None:
     assert second[-1] == "| Prior (re-implementation) | tracked (icp) | made up | -0.100 | missing | -0.100 | 1 |"
 
 
-def test_tracked_row_without_tracked_baseline_is_not_compared(sweep: Path) -> None:
+def test_table_tracked_row_needs_tracked_baseline(sweep: Path) -> None:
     for path in sweep.glob("*row=other*/metrics.json"):
         path.unlink()
     run(sweep, "other", "078", 0, tracker="icp", **{AP50: 0.9})
@@ -188,7 +188,7 @@ def test_tracked_row_without_tracked_baseline_is_not_compared(sweep: Path) -> No
 def test_table_separates_other_data_and_annotations(
     sweep: Path, changed: dict[str, Any], usual: str, other: str, annotation: str
 ) -> None:
-    """Neither inside of a row nor between rows."""
+    """They are neither averaged in a row nor compared between rows."""
     for path in sweep.glob("*row=other*/metrics.json"):
         path.unlink()
     run(sweep, "ours", "078", 0, **{AP50: 0.9}, **changed)
@@ -232,8 +232,8 @@ def test_sequence_groups_table_has_expected_lines(sweep: Path) -> None:
     assert second[2] == "| Prior (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
 
-def test_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
-    """The tracked row with the most sequences has fewer than those with given poses, and wins all the same."""
+def test_table_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
+    """The best tracked row has fewer sequences than the rows with given poses."""
     experiment(sweep, BY)
     for row, scene, value in (
         ("ours", "011", 0.2),
@@ -252,8 +252,8 @@ def test_bold_mean_is_among_equal_sequence_counts(sweep: Path) -> None:
 
 
 @pytest.mark.parametrize("table", [ACROSS, BY])
-def test_bold_mean_is_among_equal_run_counts(sweep: Path, table: dict[str, Any]) -> None:
-    """A mean of fewer runs says so, also where no sequence is missing."""
+def test_table_bold_mean_is_among_equal_run_counts(sweep: Path, table: dict[str, Any]) -> None:
+    """A mean of fewer runs is marked, even if all sequences are present."""
     experiment(sweep, table)
     for path in sweep.glob("*row=other,seed=1*/metrics.json"):
         path.unlink()

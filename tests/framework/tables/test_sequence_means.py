@@ -1,4 +1,4 @@
-"""Means over sequences and seeds, by hand."""
+"""Tests of means over sequences and seeds, compared with manual results."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_mean_by_sequence_is_over_seeds() -> None:
 
 
 def test_mean_over_sequences_deviation_is_over_seed_means() -> None:
-    """Both seeds have the mean 0.55: however much sequences differ, this mean is known exactly."""
+    """Both seeds have the mean 0.55: the deviation is zero although sequences differ."""
     mean = mean_over_sequences(FIGURES)
     assert (mean.value, mean.count) == (pytest.approx(0.55), 2)
     assert mean.deviation == pytest.approx(0, abs=1e-12)

@@ -1,4 +1,4 @@
-"""Plugins that break a contract in one way each, and the test of the contract that says so."""
+"""Tests of the contracts with plugins that break one rule each."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.integration
 
 
 class Forgetful(SphereDetector):
-    """Finds less every time."""
+    """Detects less in every call."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class Forgetful(SphereDetector):
 
 
 class Sharing(SphereDetector):
-    """Says that it takes several frames at once, and keeps the frame in work for all of them."""
+    """Declares concurrent detection, and keeps one frame for all calls."""
 
     concurrent = True
 
@@ -66,7 +66,7 @@ class Shifting(ClusterRefiner):
 
 @dataclass
 class Dropping(ClusterRefiner):
-    """Leaves nothing."""
+    """Drops all points."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return replace(clusters, cluster=np.full_like(clusters.cluster, -1))
@@ -74,7 +74,7 @@ class Dropping(ClusterRefiner):
 
 @dataclass
 class Writing(PoseTracker):
-    """Writes the map, and begins where it likes."""
+    """Writes to the map, and begins at an arbitrary pose."""
 
     writes: bool = False
 
@@ -85,11 +85,11 @@ class Writing(PoseTracker):
 
 
 class Careless(GridFuser):
-    """Renders its map from whatever it is given for a pose."""
+    """Renders its map from any pose."""
 
 
 class Backwards(CornerRoom):
-    """Gives its frames from the last to the first."""
+    """Returns its frames in reverse order."""
 
     def __getitem__(self, k: int) -> Frame:
         return super().__getitem__(len(self) - 1 - k)
@@ -116,7 +116,7 @@ def test_contract_detects_broken_plugin(contract: type[Any], plugin: object, tes
 
 
 class Late(Viewer):
-    """Looks at the map when the call is over, and notes it in the working folder."""
+    """Reads the map after the call, and writes into the working folder."""
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
         self.scene = scene
@@ -130,7 +130,7 @@ class Late(Viewer):
 
 
 class Painting(Viewer):
-    """Paints into the frame."""
+    """Writes into the frame."""
 
     def show(self, frame: Frame, *_: object) -> None:
         frame.color[0, 0] = 255 - frame.color[0, 0]
@@ -160,7 +160,7 @@ def test_viewer_contract_detects_broken_viewer(
 
 
 def option(folder: Path, text: str) -> OptionContract:
-    """The contract of a refiner's option with this YAML."""
+    """Return the contract of a refiner's option with this YAML."""
     (folder / "refiner").mkdir()
     (folder / "refiner" / "own.yaml").write_text(text)
 

@@ -1,4 +1,4 @@
-"""Exact matches give the exact pose; what does not determine one gives None."""
+"""Tests of the absolute pose: exact matches give the exact pose, and ambiguous ones give None."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ T_WORLD_CAMERA = exp_se3(np.array([0.4, -0.2, 1.0, 0.3, -0.6, 0.2]))
 
 
 def matches(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels, points in the world and depths that agree exactly."""
+    """Return pixels, world points and depths that agree exactly."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((-1, -1, 1), (1, 1, 4), (count, 3))
     points[:, :2] *= 0.4 * points[:, 2:]
@@ -23,7 +23,7 @@ def matches(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def test_absolute_pose_from_exact_matches_is_exact() -> None:
-    """With the half-pixel convention mixed up, the camera would be turned by a milliradian."""
+    """A wrong half-pixel convention would rotate the camera by a milliradian."""
     pixels, points_world, depth = matches(100)
     found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, depth)
     assert found is not None
@@ -46,7 +46,7 @@ def test_absolute_pose_rejects_outliers() -> None:
 
 
 def test_absolute_pose_is_deterministic_for_given_seed() -> None:
-    """Matches so noisy that other random samples lead to other inliers."""
+    """The matches are so noisy that other random samples give other inliers."""
     rng = np.random.default_rng(2)
     pixels, points_world, _ = matches(120)
     pixels += rng.normal(0, 4, pixels.shape)
@@ -89,7 +89,7 @@ def test_absolute_pose_ignores_non_finite_matches() -> None:
 def test_absolute_pose_rejects_matches_with_inconsistent_depth() -> None:
     pixels, points_world, depth = matches(100)
     depth[:30] *= 1.2
-    depth[30:50] = 0  # no reading: neither for nor against
+    depth[30:50] = 0  # missing depth counts neither for nor against
     found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, depth)
     assert found is not None
     assert found.inliers.tolist() == [False] * 30 + [True] * 70

@@ -1,4 +1,4 @@
-"""One step of the alignment, term by term and level by level, between two exact views of a scene."""
+"""Tests of one alignment step, term by term and level by level, between two exact views of a scene."""
 
 import dataclasses
 from collections.abc import Callable
@@ -28,9 +28,9 @@ def step(
     brightness: float = 0.0,
     seen: Callable[[ModelView], ModelView] = lambda model: model,
 ) -> tuple[np.ndarray, NormalEquations]:
-    """The Gauss-Newton step (6,) from T_view_camera at a level, and its equations.
+    """Return the Gauss-Newton step (6,) from T_view_camera at a level, and its equations.
 
-    The model is seen from T_VIEW, as `seen` has it.
+    The model is seen from T_VIEW.
     """
     model, intensities = model_of(scene)
     pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
@@ -55,7 +55,7 @@ def model_of(scene: Scene) -> tuple[ModelView, list[np.ndarray]]:
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_color_alignment_at_true_pose_has_zero_step(level: int) -> None:
-    """A shift of half a pixel between the levels of frame and model would be a step of several millimeters."""
+    """An offset of half a pixel between the levels of frame and model would be a step of several millimeters."""
     T = pose(0.03, -0.02, 0.01, (0.01, 0.02, -0.01))
     xi, equations = step(WALL, WALL.frame(T), level, inverse(T_VIEW) @ T, COLOR)
     assert equations.matched > 0.5 * CAMERA.width * CAMERA.height / 4**level
@@ -84,7 +84,7 @@ def test_color_alignment_compensates_exposure_change() -> None:
     _, second = step(WALL, brighter, 0, truth, COLOR, first.brightness)
     _, alike = step(WALL, darker, 0, truth, COLOR, plain.brightness)
     assert second.brightness == first.brightness
-    assert second.matched == pytest.approx(alike.matched, rel=0.01), "what is brighter all over is no outlier"
+    assert second.matched == pytest.approx(alike.matched, rel=0.01), "a uniform brightness change is no outlier"
     np.testing.assert_allclose(second.A, alike.A, rtol=0.05, atol=0.01 * np.abs(alike.A).max())
 
 
@@ -102,7 +102,7 @@ def test_depth_alignment_step_recovers_motion_between_planes(level: int) -> None
 
 
 def test_depth_alignment_rejects_points_with_different_normals() -> None:
-    """A wall against the same wall turned by 60 degrees: near each other along the axis, and not one surface."""
+    """A wall meets the same wall rotated by 60 degrees: near its axis, points are close but on another surface."""
     n = np.array([np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)])
     turned = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.5]))])
     _, equations = step(WALL, turned.frame(T_VIEW), 0, np.eye(4), DEPTH)
@@ -113,7 +113,7 @@ def test_depth_alignment_rejects_points_with_different_normals() -> None:
 
 
 def with_noisy_normals(model: ModelView) -> ModelView:
-    """As a map of one frame has them, a few meters away."""
+    """Return normals as in a map of one frame, a few meters away."""
     noisy = model.normals + np.random.default_rng(0).normal(0, 0.5, model.normals.shape).astype(np.float32)
     noisy /= np.linalg.norm(noisy, axis=0)
     return model._replace(normals=np.where(model.depth > 0, noisy, 0).astype(np.float32))
@@ -121,7 +121,7 @@ def with_noisy_normals(model: ModelView) -> ModelView:
 
 @pytest.mark.parametrize("level", [1, 2])
 def test_smoothed_normals_allow_motion_along_wall(level: int) -> None:
-    """A wall says nothing about motions along it, a slanted one at the border of the picture says it all."""
+    """A wall does not determine motions along it; a slanted one at the image border determines them."""
     room = Scene(planes=[(np.array([0, 0, -1.0]), -2.0), (np.array([-0.8, 0, -0.6]), -1.95)])
     T = T_VIEW @ exp_se3(np.array([0.02, 0, 0, 0, 0, 0]))
     weights = DEPTH._replace(max_distance=np.float32(0.3), geometric_scale=np.float32(16))
@@ -131,7 +131,7 @@ def test_smoothed_normals_allow_motion_along_wall(level: int) -> None:
         return float(xi[0] / 0.02)
 
     assert share_found(lambda model: model) == pytest.approx(1, abs=0.02)
-    assert share_found(with_noisy_normals) < 0.8, "this case does not show what it is for"
+    assert share_found(with_noisy_normals) < 0.8, "the case must have outliers"
     assert share_found(lambda model: smoothed(with_noisy_normals(model), level)) == pytest.approx(1, abs=0.1)
 
 
@@ -210,7 +210,7 @@ def slow_equations(
 @pytest.mark.parametrize("level", [0, 1, 2])
 @pytest.mark.parametrize("dropped", [{}, {"color_weight": 0}, {"depth_weight": 0}], ids=["both", "depth", "color"])
 def test_linear_weights_match_slow_reference(level: int, dropped: dict[str, int]) -> None:
-    """Weights of all sizes, and points beyond each maximum; at this pose, no projection is on a pixel's border."""
+    """Weights have all sizes, and some points exceed each maximum; no projection is on a pixel border."""
     weights = VOXEL_HASHING._replace(**{name: np.float32(value) for name, value in dropped.items()})
     T = exp_se3(np.array([0.011, -0.007, 0.06, 0.003, -0.005, 0.002]))
     frame = CORNER.frame(T_VIEW @ exp_se3(np.array([0.05, -0.03, 0.02, 0.02, -0.03, 0.01])))
@@ -228,7 +228,7 @@ def test_linear_weights_match_slow_reference(level: int, dropped: dict[str, int]
 
 
 def test_linear_weight_is_zero_at_maximum_depth() -> None:
-    """On a wall 1.5 m away, seen from its true pose, the distance is 0 and all depths are nearly equal."""
+    """The wall is 1.5 m away and seen from its true pose, so that the distance is 0 and all depths are similar."""
     frame = WALL.frame(T_VIEW)
     model, intensities = model_of(WALL)
     level = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)[0]

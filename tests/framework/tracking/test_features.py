@@ -1,4 +1,4 @@
-"""Features lie where the image has them, at the depth of their surface, and matching follows its definition."""
+"""Tests of features: subpixel positions, the depth of their surface, and matching by definition."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 
 
 def blobs(camera: Camera, centers: np.ndarray, sigma: float) -> Frame:
-    """White Gaussian blobs on gray, 2 m away."""
+    """Return white Gaussian blobs on gray, 2 m away."""
     v, u = np.mgrid[: camera.height, : camera.width]
     squared = (u - centers[:, 0, None, None]) ** 2 + (v - centers[:, 1, None, None]) ** 2
     gray = 60 + 160 * np.exp(-squared / (2 * sigma**2)).sum(axis=0)

@@ -1,4 +1,4 @@
-"""Keyframes on a papered room where every pose is known, and on real video."""
+"""Tests of keyframes in a textured room with known poses, and on real video."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_keyframes_skip_near_frames_after_featureless_frame() -> None:
 
 
 def slowed(keyframes: Keyframes, seconds: float) -> None:
-    """Has features take longer to be found."""
+    """Delay the feature extraction."""
     extract = keyframes.extractor.extract
 
     def slow(frame: Frame) -> Features:
@@ -95,7 +95,7 @@ def slowed(keyframes: Keyframes, seconds: float) -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, 0.05])
 def test_keyframes_are_independent_of_extraction_time(seconds: float) -> None:
-    """A walk in steps of all sizes, half of it before nothing to be seen, through more places than are remembered."""
+    """The camera moves in steps of all sizes, half of them without texture, past more keyframes than are kept."""
     rng = np.random.default_rng(3)
     at_once, later = (Keyframes(max_keyframes=4, min_distance=0.2) for _ in range(2))
     slowed(later, seconds)
@@ -126,7 +126,7 @@ def test_keyframes_add_waits_only_for_relevant_features() -> None:
     keyframes.extractor.extract = held
     keyframes.add(papered_frame(pose(0)), pose(0))
     keyframes.add(papered_frame(pose(0.04)), pose(0.04))
-    assert not may_end.is_set(), "and here we are"
+    assert not may_end.is_set(), "the camera is at this keyframe"
     threading.Timer(0.1, may_end.set).start()
     keyframes.add(papered_frame(pose(0.1)), pose(0.1))
     assert may_end.is_set(), "near enough for a keyframe, not for a frame with too few features"
@@ -191,7 +191,7 @@ def test_relocalize_unknown_place_returns_none(keyframes: Keyframes) -> None:
         assert keyframes.relocalize(replace(frame, color=np.ascontiguousarray(color))) is None
     assert keyframes.relocalize(papered_frame(pose(0), paper=1)) is None, "another room"
     twice_as_far = replace(frame, depth=frame.depth * 2)
-    assert keyframes.relocalize(twice_as_far) is None, "a picture of the room is not the room"
+    assert keyframes.relocalize(twice_as_far) is None, "a photo of the room is at another depth"
     assert Keyframes().relocalize(frame) is None
 
 

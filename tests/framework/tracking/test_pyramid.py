@@ -1,4 +1,4 @@
-"""Halved images."""
+"""Tests of the image pyramid."""
 
 from types import SimpleNamespace
 
@@ -44,12 +44,12 @@ def test_model_intensities_close_single_pixel_holes() -> None:
     view = SimpleNamespace(color=np.repeat(gray[..., None], 3, axis=2), depth=(gray > 0).astype(np.float32))
     full, half, quarter = model_intensities(view, 3)
     np.testing.assert_allclose(full, np.where(gray > 0, gray / 255, -1), atol=1e-6)
-    np.testing.assert_allclose(half, [[25 / 255, 40 / 255], [-1, -1]], atol=1e-6)  # one mapped pixel is too few
+    np.testing.assert_allclose(half, [[25 / 255, 40 / 255], [-1, -1]], atol=1e-6)  # a single mapped pixel is not enough
     np.testing.assert_allclose(quarter, [[32.5 / 255]], atol=1e-6)
 
 
 def slope(step: float, nearest: float) -> np.ndarray:
-    """Depth (120, 160) m from `nearest` to 4 m, in whole steps, 0 = as it is."""
+    """Return depth (120, 160) m from `nearest` to 4 m, in whole steps, 0 = unchanged."""
     depth = np.broadcast_to(np.linspace(nearest, 4, 160), (120, 160)) + np.linspace(0, 0.02, 120)[:, None]
     return (np.floor(depth / step) * step if step else depth).astype(np.float32)
 

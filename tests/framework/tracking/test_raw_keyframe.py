@@ -1,4 +1,4 @@
-"""The raw keyframe as a model of the alignment, on exact views of a scene."""
+"""Tests of the raw keyframe as an alignment model, on exact views of a scene."""
 
 from __future__ import annotations
 

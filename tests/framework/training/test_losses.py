@@ -1,4 +1,4 @@
-"""Targets against hand-made cases, and against the functions that they invert."""
+"""Tests of training targets, compared with manual cases and with inverse functions."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ def test_box_iou_matches_manual_result() -> None:
     assert iou.tolist() == [[pytest.approx(0.5), pytest.approx(1 / 3), 0.0]]
 
 
-def test_match_assigns_object_background_or_ignored() -> None:
+def test_anchor_match_assigns_object_background_or_ignored() -> None:
     iou = torch.tensor([[0.8, 0.1], [0.5, 0.2], [0.1, 0.2], [0.75, 0.9]])
     assert match(iou, 0.7, 0.3, each_object=False).tolist() == [0, IGNORED, BACKGROUND, 1]
 
 
-def test_match_each_object_assigns_best_box() -> None:
+def test_anchor_match_each_object_assigns_best_box() -> None:
     iou = torch.tensor([[0.2, 0.0], [0.1, 0.0], [0.0, 0.0]])
     assert match(iou, 0.7, 0.3, each_object=True).tolist() == [0, BACKGROUND, BACKGROUND], "nor one that it misses"
 
 
-def test_match_without_objects_is_background() -> None:
+def test_anchor_match_without_objects_is_background() -> None:
     assert match(torch.zeros(3, 0), 0.7, 0.3, each_object=True).tolist() == [BACKGROUND] * 3
 
 
-def test_sample_is_seeded_and_keeps_shares() -> None:
+def test_anchor_sample_is_seeded_and_keeps_fractions() -> None:
     own = torch.tensor([0] * 50 + [BACKGROUND] * 50 + [IGNORED] * 50)
     positive, negative = sample(own, 40, 0.25, torch.Generator().manual_seed(1))
     again, _ = sample(own, 40, 0.25, torch.Generator().manual_seed(1))
@@ -44,7 +44,7 @@ def test_sample_is_seeded_and_keeps_shares() -> None:
     assert len(torch.unique(negative)) == 30
 
 
-def test_encode_is_inverse_of_decode() -> None:
+def test_box_encode_is_inverse_of_decode() -> None:
     rng = np.random.default_rng(0)
     low = rng.uniform(0, 50, (2, 20, 2))
     a, b = (np.concatenate([p, p + rng.uniform(5, 60, (20, 2))], axis=1).astype(np.float32) for p in low)

@@ -1,4 +1,4 @@
-"""One rendered room: seeded, complete, as it was written."""
+"""Tests of the images of one rendered room: seeded, complete, exact round trip."""
 
 from __future__ import annotations
 

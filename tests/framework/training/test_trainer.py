@@ -1,4 +1,4 @@
-"""A tiny network on tiny pictures: it learns, and a run that was stopped goes on as if it had not been."""
+"""Tests of training with a tiny network; a resumed run equals an uninterrupted one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m framework train-detector` from its config to a network that the detector loads."""
+"""Tests of the command `train-detector`, from its config to a usable network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Label spaces: complete, of one mind, and exact arithmetic when one is turned into another."""
+"""Tests of the label spaces: completeness, consistency, and exact conversion."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Queries taken apart, and the names of colors."""
+"""Tests of parsed text queries and of color names."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Tests of detector=ground_truth and detector=none."""
+
 import numpy as np
 import pytest
 
@@ -29,14 +31,14 @@ def test_ground_truth_masks_of_known_classes_are_exact():
     assert detections.class_probabilities[1, COCO.index("tv")] == 1
 
 
-def test_empty_frame_has_no_detections_and_missing_truth_raises():
+def test_ground_truth_empty_frame_is_valid_and_missing_raises():
     empty = FrameTruth(np.zeros((30, 40), np.int32), {})
     assert len(GroundTruthDetector().detect(frame_with(empty))) == 0
     with pytest.raises(DataError, match="expected instance ground truth"):
         GroundTruthDetector().detect(frame_with(None))
 
 
-def test_invalid_parameter_raises():
+def test_ground_truth_invalid_parameter_raises():
     with pytest.raises(ConfigError, match=r"detector\.min_pixels: expected at least 1 px, got 0"):
         GroundTruthDetector(min_pixels=0)
 

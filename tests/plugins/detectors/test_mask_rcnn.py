@@ -1,4 +1,4 @@
-"""detector=mask_rcnn on a tiny network of random weights, and on one that is built to find a known object."""
+"""Tests of detector=mask_rcnn with random tiny networks, and with one that finds a known object."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -36,8 +36,8 @@ def detector(path):
     return MaskRCNNDetector(weights=path, device="cpu")
 
 
-def test_score_includes_background_and_class_row_excludes_it(path):
-    """Without suppression across classes, each detection is a label of a proposal with that proposal's softmax."""
+def test_mask_rcnn_class_row_excludes_background(path):
+    """Without suppression across classes, each detection is one label of a proposal, with its softmax."""
     detector, frame = MaskRCNNDetector(weights=path, device="cpu", agnostic_nms_iou=1.0), noise(0)
     seen = []
     classify = detector._network.classify
@@ -55,7 +55,7 @@ def test_score_includes_background_and_class_row_excludes_it(path):
     assert (found.scores > detector.score_threshold).all()
 
 
-def test_detections_meet_contract(detector):
+def test_mask_rcnn_detections_meet_contract(detector):
     frame = noise(1)
     found = detector.detect(frame)
     assert found.classes == detector.classes == TINY.classes
@@ -70,7 +70,7 @@ def test_detections_meet_contract(detector):
     assert iou.max() <= detector.agnostic_nms_iou
 
 
-def test_detection_is_repeatable_and_keeps_input(detector):
+def test_mask_rcnn_detection_is_repeatable_and_keeps_input(detector):
     frame = noise(2)
     before = frame.color.copy()
     first = detector.detect(frame)
@@ -82,13 +82,13 @@ def test_detection_is_repeatable_and_keeps_input(detector):
 
 
 @pytest.mark.parametrize("shape", [(120, 160), (33, 57), (24, 400), (1, 1), (3, 700)])
-def test_blank_image_of_any_size_is_valid(detector, shape):
+def test_mask_rcnn_blank_image_of_any_size_is_valid(detector, shape):
     for value in (0, 255):
         found = detector.detect(picture(np.full((*shape, 3), value, np.uint8)))
         assert found.masks.shape == (len(found), *shape)
 
 
-def test_proposal_and_detection_limits_are_respected(path, monkeypatch):
+def test_mask_rcnn_proposal_and_detection_limits_are_respected(path, monkeypatch):
     given = []
     propose = mask_rcnn.propose
     monkeypatch.setattr(mask_rcnn, "propose", lambda *a: given.append(propose(*a)) or given[-1])
@@ -102,7 +102,7 @@ def test_proposal_and_detection_limits_are_respected(path, monkeypatch):
     assert len(given[1]) <= 5, "one a level"
 
 
-def test_sides_default_to_network_settings(path):
+def test_mask_rcnn_sides_default_to_network_settings(path):
     frame = noise(5, (120, 160))
     assert MaskRCNNDetector(weights=path, device="cpu")._resize(frame).shape[2:] == (96, 128)
     assert MaskRCNNDetector(weights=path, device="cpu", short_side=60)._resize(frame).shape[2:] == (60, 80)
@@ -113,7 +113,7 @@ def test_sides_default_to_network_settings(path):
 
 
 def known_object(folder, monkeypatch, extent, resized):
-    """A detector, at a scale, whose every proposal is a "chair" over the given box x1 y1 x2 y2 of a 160 x 120 image."""
+    """Return a detector at a scale; every proposal is a chair in the box x1 y1 x2 y2 of a 160 x 120 image."""
     network = tiny_network(replace(TINY, short_side=resized, long_side=4 * resized))
     for parameter in network.roi_heads.parameters():
         parameter.data.zero_()
@@ -128,8 +128,8 @@ def known_object(folder, monkeypatch, extent, resized):
 
 
 @pytest.mark.parametrize("resized", [60, 96, 120, 300])
-def test_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch, resized):
-    """Pixels u = 20..59, v = 30..89 have the borders 20..60, 30..90 in every resized image: nothing shifts."""
+def test_mask_rcnn_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch, resized):
+    """Pixels u = 20..59, v = 30..89 have the borders 20..60, 30..90 in every resized image."""
     found = known_object(tmp_path, monkeypatch, (20, 30, 60, 90), resized).detect(noise(6))
     assert len(found) == 1
     expected = np.zeros((120, 160), bool)
@@ -140,15 +140,15 @@ def test_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch, resized):
 
 
 @pytest.mark.parametrize("short_side", [32, 40, 80])
-def test_resize_keeps_ramp_position(path, short_side):
-    """A pixel's value is 5 times its place: after resizing, the one at u' is of the place (u' + 0.5) / scale - 0.5."""
+def test_mask_rcnn_resize_keeps_ramp_position(path, short_side):
+    """A pixel's value is 5 times its position: after resizing, pixel u' shows (u' + 0.5) / scale - 0.5."""
     ramp = np.repeat(np.tile(5 * np.arange(50, dtype=np.uint8), (40, 1))[..., None], 3, axis=2)
     image = MaskRCNNDetector(weights=path, device="cpu", short_side=short_side, long_side=400)._resize(picture(ramp))
     places = (np.arange(image.shape[3]) + 0.5) * 40 / short_side - 0.5
     np.testing.assert_allclose(image[0, 0, 5, 2:-2].numpy(), 5 * places[2:-2], atol=0.51)  # rounded to whole numbers
 
 
-def test_overflow_raises(tmp_path):
+def test_mask_rcnn_overflow_raises(tmp_path):
     network = tiny_network()
     network.roi_heads.box_head.fc6.weight.data.fill_(3e38)
     save_network(network, tmp_path / "wild.safetensors", {})
@@ -159,13 +159,13 @@ def test_overflow_raises(tmp_path):
         detector.detect(noise(7))
 
 
-def test_no_proposals_give_no_detections(detector, monkeypatch):
+def test_mask_rcnn_without_proposals_detects_nothing(detector, monkeypatch):
     monkeypatch.setattr(mask_rcnn, "propose", lambda *_: np.zeros((0, 4), np.float32))
     assert len(detector.detect(noise(8))) == 0
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA here: half precision is not compared")
-def test_half_precision_agrees_with_single_precision(path):
+def test_mask_rcnn_half_precision_agrees_with_single(path):
     frame = noise(9)
     half, single = (
         MaskRCNNDetector(weights=path, device="cuda", half_precision=half).detect(frame) for half in (True, False)
@@ -193,12 +193,12 @@ def test_half_precision_agrees_with_single_precision(path):
         ({"device": "tpu"}, r"detector\.device: expected auto, cpu or cuda"),
     ],
 )
-def test_invalid_parameter_raises(path, parameters, fault):
+def test_mask_rcnn_invalid_parameter_raises(path, parameters, fault):
     with pytest.raises(ConfigError, match=fault):
         MaskRCNNDetector(**({"weights": path, "device": "cpu"} | parameters))
 
 
-def test_missing_or_damaged_weights_raise_one_line(tmp_path, monkeypatch):
+def test_mask_rcnn_unusable_weights_raise_one_line_error(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
         DataError, match=r"^detector\.weights: .*: expected a file or one of .*resnet50_fpn_coco"
@@ -210,6 +210,6 @@ def test_missing_or_damaged_weights_raise_one_line(tmp_path, monkeypatch):
         MaskRCNNDetector(weights=Path("bad.safetensors"), device="cpu")
 
 
-def test_weights_attribute_is_resolved_path(path, monkeypatch):
+def test_mask_rcnn_weights_attribute_is_resolved_path(path, monkeypatch):
     monkeypatch.chdir(path.parent)
     assert MaskRCNNDetector(weights=Path(path.name), device="cpu").weights == path.resolve()

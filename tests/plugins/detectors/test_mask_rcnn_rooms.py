@@ -1,4 +1,4 @@
-"""The network that comes with the project, on rooms that it was never trained on."""
+"""Tests of the included network, on rooms that were not used in training."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_bundled_network_is_small_and_has_model_card(detector: MaskRCNNDetector)
 
 @pytest.mark.acceptance
 def test_bundled_network_detects_objects_in_unseen_rooms(detector: MaskRCNNDetector, tmp_path: Path) -> None:
-    """Few pictures, so a loose bound: what it reaches on many is in its card."""
+    """There are few images, so the bound is loose; the model card has the full results."""
     render_rooms(tmp_path, ROOMS, 2, 10, 1)
     pictures = RoomPictures(tmp_path, ROOMS, 2)
     found = []

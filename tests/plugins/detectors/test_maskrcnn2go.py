@@ -1,4 +1,4 @@
-"""Mask R-CNN 2Go: the real network on real pictures, in integers and in float."""
+"""Tests of Mask R-CNN 2Go: the published network on real images, in integers and in float."""
 
 import json
 from pathlib import Path
@@ -62,14 +62,14 @@ def best_scores(detections):
         ("mit76", 3, {"couch": 0.9, "chair": 0.8}),
     ],
 )
-def test_real_images_have_expected_objects(detector, scene, index, expected):
+def test_maskrcnn2go_detects_expected_objects_in_real_images(detector, scene, index, expected):
     found = best_scores(detector.detect(shared_picture(scene, index)))
     missing = {name: score for name, score in expected.items() if found.get(name, 0) < score}
     assert not missing, f"found only {found}"
 
 
-def test_bed_mask_overlaps_ground_truth(detector):
-    """Replica's rendering has instance ground truth: the detection that is sure of a bed covers the labeled bed."""
+def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
+    """The confident detection of a bed covers the labeled bed of Replica's ground truth."""
     root = SHARED / "data" / "replica_floor2"
     if not root.is_dir():
         pytest.skip(f"{root} is absent")
@@ -82,11 +82,11 @@ def test_bed_mask_overlaps_ground_truth(detector):
             if score > 0.7 and COCO[row.argmax()] == "bed":
                 ious.append(max((mask & (ids == i)).sum() / (mask | (ids == i)).sum() for i in beds))
     assert len(ious) >= 5
-    assert np.median(ious) > 0.7  # its pillows carry labels of their own
+    assert np.median(ious) > 0.7  # its pillows have their own labels
 
 
-def test_mask_grids_match_full_graph():
-    """The shortcut computes one class a detection; the graph all 81."""
+def test_maskrcnn2go_mask_grids_match_full_graph():
+    """The shortcut computes one class per detection; the full graph computes all 81."""
     detector = MaskRCNN2Go(device="cpu", int8=False)
     graph, tensors, _ = _read_network(WEIGHTS)
     whole = network_between(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
@@ -98,8 +98,8 @@ def test_mask_grids_match_full_graph():
 
 
 @in_integers
-def test_int8_detections_agree_with_float():
-    """The sure detections of real pictures: as many, of the same classes, with masks that agree."""
+def test_maskrcnn2go_int8_detections_agree_with_float():
+    """The confident detections of real images have the same number, classes and similar masks."""
     integers, real = MaskRCNN2Go(device="cpu"), MaskRCNN2Go(device="cpu", int8=False)
     agreements = []
     for scene, index in (("redkitchen", 0), ("redkitchen", 290), ("mit76", 0), ("replica_floor2", 40)):
@@ -115,7 +115,7 @@ def test_int8_detections_agree_with_float():
 
 
 @in_integers
-def test_missing_int8_kernels_fall_back_to_float(monkeypatch, caplog):
+def test_maskrcnn2go_without_int8_kernels_uses_float(monkeypatch, caplog):
     here = MaskRCNN2Go(device="cpu").fingerprint()
     monkeypatch.setattr(maskrcnn2go, "has_int8_kernels", lambda: False)
     caplog.set_level("INFO")
@@ -129,7 +129,7 @@ def test_missing_int8_kernels_fall_back_to_float(monkeypatch, caplog):
 
 
 @in_integers
-def test_int8_uses_one_thread_and_restores_thread_count(monkeypatch):
+def test_maskrcnn2go_int8_restores_thread_count(monkeypatch):
     seen = []
     detector = MaskRCNN2Go(device="cpu")
     inner = detector._resize
@@ -143,7 +143,7 @@ def test_int8_uses_one_thread_and_restores_thread_count(monkeypatch):
         torch.set_num_threads(before)
 
 
-def test_detections_meet_contract(detector):
+def test_maskrcnn2go_detections_meet_contract(detector):
     frame = shared_picture("redkitchen", 290)
     detections = detector.detect(frame)
     assert detections.classes == detector.classes == COCO
@@ -156,7 +156,7 @@ def test_detections_meet_contract(detector):
     assert detections.masks.any(axis=(1, 2)).all()
 
 
-def test_detection_is_repeatable_and_keeps_input(detector):
+def test_maskrcnn2go_detection_is_repeatable_and_keeps_input(detector):
     frame = shared_picture("mit76", 0)
     before = frame.color.copy()
     first = detector.detect(frame)
@@ -167,7 +167,7 @@ def test_detection_is_repeatable_and_keeps_input(detector):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
-def test_agnostic_nms_removes_duplicate_masks(detector):
+def test_maskrcnn2go_agnostic_nms_removes_duplicate_masks(detector):
     frame = shared_picture("redkitchen", 0)
     found = detector.detect(frame)
     overlaps = mask_overlaps(found.masks, found.boxes)
@@ -179,13 +179,13 @@ def test_agnostic_nms_removes_duplicate_masks(detector):
 
 
 @pytest.mark.parametrize("shape", [(480, 640), (33, 57), (240, 1280), (1, 1), (5, 2000)])
-def test_blank_image_of_any_size_is_valid(detector, shape):
+def test_maskrcnn2go_blank_image_of_any_size_is_valid(detector, shape):
     for value in (0, 255):
         detections = detector.detect(picture(np.full((*shape, 3), value, np.uint8)))
         assert detections.masks.shape == (len(detections), *shape)
 
 
-def test_resized_image_has_same_objects(detector):
+def test_maskrcnn2go_detects_same_objects_in_resized_image(detector):
     frame = shared_picture("redkitchen", 290)
     small = picture(cv2.resize(frame.color, (400, 300), interpolation=cv2.INTER_AREA))
     found = best_scores(detector.detect(small))
@@ -193,7 +193,7 @@ def test_resized_image_has_same_objects(detector):
     assert found["chair"] > 0.8
 
 
-def test_default_weights_load_from_any_working_folder(tmp_path, monkeypatch):
+def test_maskrcnn2go_default_weights_load_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert MaskRCNN2Go(device="cpu").classes == COCO
 
@@ -201,7 +201,7 @@ def test_default_weights_load_from_any_working_folder(tmp_path, monkeypatch):
 # Faults
 
 
-def test_missing_weights_raise_one_line_with_path(tmp_path, monkeypatch):
+def test_maskrcnn2go_missing_weights_error_has_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(DataError) as caught:
         MaskRCNN2Go(weights=Path("no/such/folder"), device="cpu")
@@ -214,7 +214,7 @@ def test_missing_weights_raise_one_line_with_path(tmp_path, monkeypatch):
         MaskRCNN2Go(weights=tmp_path, device="cpu")
 
 
-def test_damaged_weights_raise(tmp_path):
+def test_maskrcnn2go_damaged_weights_raise(tmp_path):
     for name in SHA256:
         (tmp_path / name).write_bytes((WEIGHTS / name).read_bytes())
     damaged = tmp_path / "maskrcnn2go_coco_int8.npz"
@@ -238,7 +238,7 @@ def test_damaged_weights_raise(tmp_path):
         {"device": "tpu"},
     ],
 )
-def test_invalid_parameter_raises(parameters):
+def test_maskrcnn2go_invalid_parameter_raises(parameters):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         MaskRCNN2Go(**parameters)

@@ -1,4 +1,4 @@
-"""Box detectors from ONNX files: known networks on known rooms, and YOLOX-nano on real pictures."""
+"""Tests of box detectors from ONNX files: known networks on known rooms, and YOLOX-nano on real images."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +23,9 @@ WEIGHTS = Path("weights") / "yolox_nano" / "yolox_nano.onnx"
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 CUP = np.zeros((120, 160), np.bool_)
 CUP[30:70, 40:60] = True
-BOX = np.array([19.0, 14.0, 31.0, 36.0])  # x1 y1 x2 y2 in the input: two pixels of the image around the cup
+BOX = np.array([19.0, 14.0, 31.0, 36.0])  # x1 y1 x2 y2 in the input: the cup with two pixels of the image around it
 SHAPE = (60, 80)
-LABELS = ("chair", "cup", "wall")  # nyu40 has the wall, which means no object
+LABELS = ("chair", "cup", "wall")  # nyu40 has the class wall, which is not an object
 
 
 def frame(index=0):
@@ -38,7 +38,7 @@ def center_size(box):
 
 
 def outputs_of(layout):
-    """One real candidate, the cup: 0.6 cup, 0.2 chair; one that is a wall; one that is too weak."""
+    """Return outputs of a cup (0.6 cup, 0.2 chair), a wall, and a weak candidate."""
     boxes = np.array([BOX, BOX + 20, BOX - 10])
     scores = np.array([[0.2, 0.6, 0.0], [0.1, 0.1, 0.9], [0.01, 0.02, 0.0]])
     rows = np.array([center_size(box) for box in boxes])
@@ -80,7 +80,7 @@ def tiny(folder, layout, **parameters):
 
 
 @pytest.mark.parametrize("layout", OutputLayout)
-def test_known_network_detects_cup_in_each_layout(tmp_path, layout):
+def test_onnx_boxes_known_network_detects_cup_in_each_layout(tmp_path, layout):
     detector = tiny(tmp_path, layout)
     assert detector.classes == ("cup", "chair")  # COCO's order
     found = detector.detect(frame())
@@ -92,8 +92,8 @@ def test_known_network_detects_cup_in_each_layout(tmp_path, layout):
 
 
 @pytest.mark.parametrize("placement", Placement)
-def test_image_placement_is_inverted(tmp_path, placement):
-    """The input is taller than the image: the box is the cup's own in each placement."""
+def test_onnx_boxes_image_placement_is_inverted(tmp_path, placement):
+    """The input is taller than the image: the box is that of the cup in each placement."""
     top, scale = {Placement.top_left: (0, 0.5), Placement.center: (20, 0.5), Placement.stretch: (0, 5 / 6)}[placement]
     box = np.array([BOX[0], BOX[1] / 0.5 * scale + top, BOX[2], BOX[3] / 0.5 * scale + top])
     weights = constant_network(
@@ -110,7 +110,7 @@ def test_image_placement_is_inverted(tmp_path, placement):
         device="cpu",
         min_readings=1.0,
     )
-    # at this significance everything in the box is foreground: the mask is the box
+    # at this significance, everything in the box is foreground, so that the mask is the box
     flat = replace(frame(), depth=np.ones((120, 160), np.float32))
     (mask,) = detector.detect(flat).masks
     expected = np.zeros_like(mask)
@@ -118,7 +118,7 @@ def test_image_placement_is_inverted(tmp_path, placement):
     np.testing.assert_array_equal(mask, expected)
 
 
-def test_box_without_depth_is_dropped_and_logged_once(tmp_path, caplog):
+def test_onnx_boxes_without_depth_are_dropped_and_logged_once(tmp_path, caplog):
     caplog.set_level("WARNING")
     detector = tiny(tmp_path, OutputLayout.yolo)
     blind = replace(frame(7), depth=np.zeros((120, 160), np.float32))
@@ -129,7 +129,7 @@ def test_box_without_depth_is_dropped_and_logged_once(tmp_path, caplog):
     assert caplog.messages == ["frame 7: dropped 1 of 1 boxes with too little depth for a mask, 1 so far"]
 
 
-def test_nms_keeps_better_of_overlapping_boxes(tmp_path):
+def test_onnx_boxes_nms_keeps_better_of_overlapping_boxes(tmp_path):
     boxes = np.stack([center_size(BOX), center_size(BOX) + 0.5])
     rows = np.concatenate([boxes, [[0.2, 0.6, 0.0], [0.5, 0.4, 0.0]]], axis=1)
     labels = tmp_path / "labels.txt"
@@ -146,7 +146,7 @@ def test_nms_keeps_better_of_overlapping_boxes(tmp_path):
     np.testing.assert_allclose(OnnxBoxes(**parameters, agnostic_nms_iou=1.0).detect(frame()).scores, [0.6, 0.5])
 
 
-def test_unsupported_network_shape_or_label_raises(tmp_path):
+def test_onnx_boxes_unsupported_network_shape_or_label_raises(tmp_path):
     weights = constant_network(tmp_path / "n.onnx", (1, 3, *SHAPE), {"y": np.zeros((1, 6, 9))})
     with pytest.raises(DataError, match="84 columns"):
         OnnxBoxes(weights=weights, sha256="", layout=OutputLayout.yolo, device="cpu")
@@ -173,7 +173,7 @@ def test_unsupported_network_shape_or_label_raises(tmp_path):
         {"device": "tpu"},
     ],
 )
-def test_invalid_parameter_raises(parameters, tmp_path):
+def test_onnx_boxes_invalid_parameter_raises(parameters, tmp_path):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         OnnxBoxes(weights=tmp_path / "absent.onnx", **parameters)
@@ -223,13 +223,13 @@ def test_yolox_nano_output_matches_opencv(shared, nano):
     np.testing.assert_allclose(found, reference.forward(), atol=1e-3)
 
 
-def test_config_defaults_fit_yolox_nano(shared, nano):
+def test_onnx_boxes_config_defaults_fit_yolox_nano(shared, nano):
     detector = registered.built("detector", "onnx_boxes", "device=cpu", f"detector.weights={shared / WEIGHTS}")
     assert detector.classes == nano.classes == COCO
     found = detector.detect(shared_frame(shared, "redkitchen", 0))
     np.testing.assert_array_equal(found.scores, nano.detect(shared_frame(shared, "redkitchen", 0)).scores)
 
 
-def test_missing_weights_parameter_raises_with_url():
+def test_onnx_boxes_missing_weights_parameter_raises_with_url():
     with pytest.raises(ConfigError, match=r"got none; set detector\.weights=\.\.\.; yolox_nano\.onnx .* https://"):
         registered.built("detector", "onnx_boxes")

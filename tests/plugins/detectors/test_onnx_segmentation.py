@@ -1,4 +1,4 @@
-"""YOLO-style segmentation on networks whose boxes, scores and masks are known."""
+"""Tests of YOLO-style segmentation networks with known boxes, scores and masks."""
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ def frame():
 
 
 def outputs(objectness=False, transposed=False):
-    """A cup in the left and a chair in the lower half of their boxes; prototypes: column - 10.4, and row - 25.4."""
+    """Return a cup in the left and a chair in the lower half of their boxes; prototypes are linear in the pixel."""
     cells = SIZE // CELL
     prototypes = np.stack(
         [np.tile(np.arange(cells) - 10.4, (cells, 1)), np.tile(np.arange(cells) - 25.4, (cells, 1)).T]
@@ -57,7 +57,7 @@ class TestContract(DetectorContract):
 
 
 @pytest.mark.parametrize(("objectness", "transposed"), [(False, False), (True, True)])
-def test_known_network_gives_expected_boxes_scores_and_masks(tmp_path, objectness, transposed):
+def test_onnx_segmentation_known_network_gives_expected_output(tmp_path, objectness, transposed):
     check_cup_and_chair(tiny(tmp_path, objectness, transposed).detect(frame()))
 
 
@@ -72,7 +72,7 @@ def check_cup_and_chair(found):
     np.testing.assert_allclose(found.class_probabilities, [[6 / 7, 1 / 7], [1 / 9, 8 / 9]], rtol=1e-5)
 
 
-def test_tensorflow_export_with_channels_last_is_decoded(tmp_path):
+def test_onnx_segmentation_channels_last_export_is_decoded(tmp_path):
     table, prototypes = outputs().values()
     table[:, :4] /= SIZE
     (tmp_path / "labels.txt").write_text("\n".join(LABELS))
@@ -83,13 +83,13 @@ def test_tensorflow_export_with_channels_last_is_decoded(tmp_path):
     check_cup_and_chair(detector.detect(frame()))
 
 
-def test_tflite_file_error_names_converter(tmp_path):
+def test_onnx_segmentation_tflite_file_error_names_converter(tmp_path):
     with pytest.raises(ConfigError, match=r"detector\.weights: expected an ONNX file; .* tf2onnx .*n\.tflite"):
         OnnxSegmentation(weights=tmp_path / "n.tflite", device="cpu")
 
 
 def suppressed(folder, **parameters):
-    """The same candidates in a network with suppression inside, where each has one class."""
+    """Return the same candidates from a network with internal suppression and one class each."""
     table, prototypes = outputs(transposed=True).values()
     (folder / "labels.txt").write_text("\n".join(LABELS))
     center, size, scores = table[0, :, :2], table[0, :, 2:4], table[0, :, 4:7]
@@ -100,8 +100,8 @@ def suppressed(folder, **parameters):
 
 
 @pytest.mark.parametrize(("spread", "expected"), [(1.0, [0.6, 0.5]), (0.5, [0.8, 0.7]), (0.0, [1.0, 1.0])])
-def test_single_class_output_spreads_remaining_probability(tmp_path, spread, expected, caplog):
-    """A score of 0.4 is less than the even share of two classes, with spread 1."""
+def test_onnx_segmentation_single_class_spreads_remaining_mass(tmp_path, spread, expected, caplog):
+    """A score of 0.4 is less than the equal probability of two classes, with spread 1."""
     with caplog.at_level("INFO"):
         found = suppressed(tmp_path, class_spread=spread).detect(frame())
     assert "n.onnx reports one class per detection" in caplog.text
@@ -113,7 +113,7 @@ def test_single_class_output_spreads_remaining_probability(tmp_path, spread, exp
     np.testing.assert_allclose(found.class_probabilities.sum(axis=1), 1)
 
 
-def test_different_class_names_in_file_are_logged(tmp_path, caplog):
+def test_onnx_segmentation_different_class_names_are_logged(tmp_path, caplog):
     tiny(tmp_path)
     assert not caplog.text
     model = onnx.load(tmp_path / "tiny.onnx")
@@ -138,7 +138,7 @@ def test_different_class_names_in_file_are_logged(tmp_path, caplog):
         ({"more": np.zeros((1, 2))}, r"got output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
     ],
 )
-def test_unsupported_network_shape_raises(tmp_path, changed, message):
+def test_onnx_segmentation_unsupported_network_shape_raises(tmp_path, changed, message):
     (tmp_path / "labels.txt").write_text("\n".join(LABELS))
     weights = constant_network(tmp_path / "n.onnx", (1, 3, SIZE, SIZE), {**outputs(), **changed})
     with pytest.raises(DataError, match=message):
@@ -159,7 +159,7 @@ def test_unsupported_network_shape_raises(tmp_path, changed, message):
         {"device": "tpu"},
     ],
 )
-def test_invalid_parameter_raises(tmp_path, parameters):
+def test_onnx_segmentation_invalid_parameter_raises(tmp_path, parameters):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         OnnxSegmentation(**{"weights": tmp_path / "absent.onnx", **parameters})
@@ -170,7 +170,7 @@ IMAGES = ("mit76/color/000000.jpg", "redkitchen/color/000240.jpg", "replica_floo
 
 @pytest.fixture(scope="module")
 def yolo(shared):
-    """A real network, as its exporter wrote it."""
+    """Return a real network in its exporter's format."""
     path = shared / "weights" / "yolo11n_seg" / "yolo11n_seg.onnx"
     if not path.is_file():
         pytest.skip(f"{path} is not there")
@@ -179,7 +179,7 @@ def yolo(shared):
 
 @pytest.fixture(scope="module")
 def photographs(shared_data):
-    """Frames of three real videos."""
+    """Return frames of three real videos."""
     colors = [cv2.cvtColor(cv2.imread(str(shared_data / name)), cv2.COLOR_BGR2RGB) for name in IMAGES]
     cameras = [Camera(c.shape[1], c.shape[0], 500.0, 500.0, 0.0, 0.0) for c in colors]
     return [Frame(k, 0.0, c, np.ones(c.shape[:2], np.float32), cameras[k]) for k, c in enumerate(colors)]
@@ -191,7 +191,7 @@ def expected(yolo, photographs):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_yolo_detections_agree_in_all_layouts(tmp_path, yolo, photographs, expected, layout):
+def test_onnx_segmentation_yolo_agrees_in_all_layouts(tmp_path, yolo, photographs, expected, layout):
     detector = OnnxSegmentation(weights=rewritten(yolo, layout, tmp_path / "n.onnx"), device="cpu")
     assert detector._layout.suppressed == ("suppressed" in layout or "best rows" in layout)
     for photograph, wanted in zip(photographs, expected, strict=True):

@@ -1,4 +1,4 @@
-"""Objects named in words: what networks say at known places comes out in pixels, whatever the image's shape."""
+"""Tests of detection by text: boxes and masks of fake networks are mapped to pixels for any image shape."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def picture(shape: tuple[int, int]) -> Frame:
 
 
 class Saying:
-    """In place of OWLv2: these boxes in px, with these probabilities of the words."""
+    """Replaces OWLv2: returns these boxes in px with these probabilities of the queries."""
 
     dtype = torch.float32
 
@@ -58,7 +58,7 @@ class Saying:
 
 
 class Filling:
-    """In place of a SAM: everything in the prompted box, in a grid of a quarter of the input's size."""
+    """Replaces SAM: fills the prompted box, in a grid of a quarter of the input's size."""
 
     dtype = torch.float32
 
@@ -73,7 +73,7 @@ class Filling:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_boxes_map_from_square_input_to_image(owlv2: Path, shape: tuple[int, int]) -> None:
+def test_open_vocabulary_boxes_map_from_square_input_to_image(owlv2: Path, shape: tuple[int, int]) -> None:
     boxes = TextPromptedBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half_precision=False)
     wanted = [[4.5, 9.5, 24.5, 39.5], [30, 2, 55, 58]]
     boxes._network = Saying(shape, wanted, [[0.8, 0.1], [0.3, 0.6]])
@@ -82,7 +82,7 @@ def test_boxes_map_from_square_input_to_image(owlv2: Path, shape: tuple[int, int
     np.testing.assert_allclose(probabilities, [[0.8, 0.1], [0.3, 0.6]], atol=1e-6)
 
 
-def test_image_is_padded_with_gray_at_lower_right(owlv2: Path) -> None:
+def test_open_vocabulary_pads_image_with_gray_at_lower_right(owlv2: Path) -> None:
     boxes = TextPromptedBoxes(str(owlv2), "main", ("bed",), CPU, half_precision=False)
     seen: list[torch.Tensor] = []
     saying = Saying((32, 64), [[0, 0, 9, 9]], [[0.5]])
@@ -98,7 +98,7 @@ def test_image_is_padded_with_gray_at_lower_right(owlv2: Path) -> None:
     np.testing.assert_allclose(seen[0][0, 0, 33:], (128 / 255 - 0.48145466) / 0.26862954, atol=1e-5)
 
 
-def test_boxes_agree_with_transformers(owlv2: Path) -> None:
+def test_open_vocabulary_boxes_agree_with_transformers(owlv2: Path) -> None:
     from transformers import AutoTokenizer, Owlv2ForObjectDetection
 
     color = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3)).astype(np.uint8)
@@ -118,7 +118,7 @@ def test_boxes_agree_with_transformers(owlv2: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_masks_lie_in_prompt_boxes(sam: Path, shape: tuple[int, int]) -> None:
+def test_open_vocabulary_masks_lie_in_prompt_boxes(sam: Path, shape: tuple[int, int]) -> None:
     masks = BoxPromptedMasks(str(sam), "main", CPU, half_precision=False)
     frame = picture(shape)
     random = masks(frame.color, np.float32([[5, 5, 30, 30]]))
@@ -128,14 +128,14 @@ def test_masks_lie_in_prompt_boxes(sam: Path, shape: tuple[int, int]) -> None:
     expected = np.zeros((2, *shape), np.bool_)
     expected[0, 20:50, 10:30] = expected[1, :10, :60] = True
     overlap = (found & expected).sum(axis=(1, 2)) / (found | expected).sum(axis=(1, 2))
-    assert (overlap > 0.9).all(), "but for what the grid rounds"
+    assert (overlap > 0.9).all(), "except for the rounding of the grid"
     for mask, wanted in zip(found, expected, strict=True):
         center, middle = (np.argwhere(area).mean(axis=0) for area in (mask, wanted))
         np.testing.assert_allclose(center, middle, atol=0.5)
     assert masks(frame.color, np.zeros((0, 4), np.float32)).shape == (0, *shape)
 
 
-def test_word_distribution_uses_odds_and_has_other_class() -> None:
+def test_open_vocabulary_distribution_uses_odds_and_other_class() -> None:
     rows = word_distributions(np.float32([[0.1, 0.1], [0.5, 0.1], [0.9, 0.001]]), 0.1)
     np.testing.assert_allclose(rows.sum(axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(rows[0], [1 / 3] * 3, atol=1e-6)
@@ -145,7 +145,7 @@ def test_word_distribution_uses_odds_and_has_other_class() -> None:
 
 
 @pytest.mark.parametrize("masks", ["sam", "depth"])
-def test_detections_combine_boxes_and_masks(owlv2: Path, masks: str, tmp_path: Path) -> None:
+def test_open_vocabulary_detections_combine_boxes_and_masks(owlv2: Path, masks: str, tmp_path: Path) -> None:
     folder = str(write_sam(tmp_path / "sam", "sam2")) if masks == "sam" else ""
     detector = OpenVocabulary(["red chair", "bed"], str(owlv2), mask_model=folder, score_threshold=0.2, device="cpu")
     assert detector.classes == ("red chair", "bed", SOMETHING_ELSE)
@@ -172,12 +172,12 @@ def test_detections_combine_boxes_and_masks(owlv2: Path, masks: str, tmp_path: P
         ("3", "text_queries"),
     ],
 )
-def test_empty_or_duplicate_text_queries_raise(words: str, fault: str) -> None:
+def test_open_vocabulary_empty_or_duplicate_text_queries_raise(words: str, fault: str) -> None:
     with pytest.raises(ConfigError, match=fault):
         registered.built("detector", "open_vocabulary", f"detector.text_queries={words}")
 
 
-def test_unsupported_model_type_raises(owlv2: Path, tmp_path: Path) -> None:
+def test_open_vocabulary_unsupported_model_type_raises(owlv2: Path, tmp_path: Path) -> None:
     siglip = str(write_image_text(tmp_path / "siglip"))
     with pytest.raises(ConfigError, match=r"detector\.model: expected OWLv2, got .* \(siglip\)"):
         OpenVocabulary(model=siglip, mask_model="", device="cpu")
@@ -191,8 +191,8 @@ def test_unsupported_model_type_raises(owlv2: Path, tmp_path: Path) -> None:
         (owlv2 / "away.json").rename(owlv2 / "config.json")
 
 
-def test_tokenizer_loads_from_vocab_and_merges_files(tmp_path: Path) -> None:
-    """vocab.json and merges.txt: google/owlv2-base-patch16-ensemble has no tokenizer.json."""
+def test_open_vocabulary_tokenizer_loads_from_vocab_and_merges(tmp_path: Path) -> None:
+    """google/owlv2-base-patch16-ensemble has vocab.json and merges.txt, but no tokenizer.json."""
     (write_owlv2(tmp_path) / "tokenizer.json").unlink()
     letters = sorted(set("aphotofcuprbe"))
     words = ["!", *letters, *(f"{letter}</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]

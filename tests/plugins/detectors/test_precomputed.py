@@ -1,4 +1,4 @@
-"""Anybody's detections: every form of a COCO result, folders of masks, and what is refused."""
+"""Tests of precomputed detections: all formats of COCO results, mask folders, and rejected files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def frame(index: int = 0, camera: Camera = CAMERA) -> Frame:
 
 
 def entry(**changes: Any) -> dict[str, Any]:
-    """One result; a change to None leaves the key out."""
+    """Return one result; a value of None removes the key."""
     segmentation = {"size": [6, 8], "counts": PACKED}
     result = {"image_id": 0, "category_name": "chair", "segmentation": segmentation, "score": 0.6} | changes
     return {key: value for key, value in result.items() if value is not None}
@@ -62,19 +62,19 @@ def detected(folder: Path, *entries: Any, **parameters: Any) -> Detections:
     ],
     ids=["packed", "list", "polygon", "polygons"],
 )
-def test_all_segmentation_formats_are_read(tmp_path: Path, segmentation: Any) -> None:
+def test_precomputed_all_segmentation_formats_are_read(tmp_path: Path, segmentation: Any) -> None:
     found = detected(tmp_path, entry(segmentation=segmentation))
     np.testing.assert_array_equal(found.masks, MASK[None])
     np.testing.assert_array_equal(found.boxes, [[2, 1, 6, 3]])  # no bbox: the mask's
 
 
 @pytest.mark.parametrize("image_id", [12, "000012", "12", "color/000012.png", "frame/000012.color.png"[6:12]])
-def test_all_image_id_formats_are_read(tmp_path: Path, image_id: Any) -> None:
+def test_precomputed_all_image_id_formats_are_read(tmp_path: Path, image_id: Any) -> None:
     detector = Precomputed(write(tmp_path, entry(image_id=image_id)))
     assert [len(detector.detect(frame(k))) for k in (12, 0, 11)] == [1, 0, 0]
 
 
-def test_label_and_score_give_class_distribution(tmp_path: Path) -> None:
+def test_precomputed_label_and_score_give_class_distribution(tmp_path: Path) -> None:
     [row] = detected(tmp_path, entry(score=0.6)).class_probabilities
     expected = np.full(80, 0.4 / 79)
     expected[CHAIR] = 0.6
@@ -84,16 +84,16 @@ def test_label_and_score_give_class_distribution(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("spread", "score", "own"), [(0.0, 0.6, 1.0), (0.5, 0.6, 0.8), (1.0, 1.0, 1.0), (1.0, 0, 1 / 80)]
 )
-def test_class_spread_sets_probability_of_other_classes(
+def test_precomputed_class_spread_sets_other_probabilities(
     tmp_path: Path, spread: float, score: float, own: float
 ) -> None:
-    """Never so much that the label is no longer the best."""
+    """The label always remains the most likely class."""
     [row] = detected(tmp_path, entry(score=score), class_spread=spread).class_probabilities
     assert row[CHAIR] == pytest.approx(own)
     np.testing.assert_allclose(np.delete(row, CHAIR), (1 - own) / 79, rtol=1e-5, atol=1e-9)
 
 
-def test_full_distribution_is_kept_exactly(tmp_path: Path) -> None:
+def test_precomputed_full_distribution_is_kept_exactly(tmp_path: Path) -> None:
     row = np.random.default_rng(0).random(80).astype(np.float32)
     row /= row.sum()
     as_list = [float(p) for p in row]
@@ -102,7 +102,7 @@ def test_full_distribution_is_kept_exactly(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.class_probabilities, [row, row])
 
 
-def test_partial_distribution_is_normalized(tmp_path: Path) -> None:
+def test_precomputed_partial_distribution_is_normalized(tmp_path: Path) -> None:
     found = detected(tmp_path, entry(class_probabilities={"chair": 0.66, "couch": 0.32}))
     expected = np.zeros(80)
     expected[CHAIR], expected[COCO.index("couch")] = 0.66 / 0.98, 0.32 / 0.98
@@ -120,14 +120,18 @@ def test_partial_distribution_is_normalized(tmp_path: Path) -> None:
         (CategoryIds.FROM_ONE, "nyu40", 5, "chair"),
     ],
 )
-def test_category_id_maps_to_label(tmp_path: Path, ids: CategoryIds, labels: str, category_id: int, name: str) -> None:
+def test_precomputed_category_id_maps_to_label(
+    tmp_path: Path, ids: CategoryIds, labels: str, category_id: int, name: str
+) -> None:
     numbered = entry(category_name=None, category_id=category_id)
     found = detected(tmp_path, numbered, category_ids=ids, label_space=labels)
     assert found.classes[int(found.class_probabilities[0].argmax())] == name
 
 
-def test_foreign_labels_map_to_coco_or_are_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A wall is no object: dropped, and told."""
+def test_precomputed_foreign_labels_map_to_coco_or_are_dropped(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A wall is not an object: it is dropped and logged."""
     entries = [entry(category_name="sofa", score=0.9), entry(category_name="wall", score=0.8)]
     with caplog.at_level(logging.INFO):
         found = detected(tmp_path, *entries, label_space="nyu40")
@@ -136,7 +140,7 @@ def test_foreign_labels_map_to_coco_or_are_dropped(tmp_path: Path, caplog: pytes
     assert "dropped 1 of 2 detections of classes that COCO does not have: wall" in caplog.text
 
 
-def test_detections_are_sorted_and_filtered_by_score(tmp_path: Path) -> None:
+def test_precomputed_sorts_and_filters_detections_by_score(tmp_path: Path) -> None:
     entries = [entry(score=s, bbox=[k, 0, 1, 1]) for k, s in enumerate((0.2, 0.9, 0.05, 0.9))]
     found = detected(tmp_path, *entries, score_threshold=0.1)
     np.testing.assert_array_equal(found.scores, np.array([0.9, 0.9, 0.2], np.float32))
@@ -144,7 +148,7 @@ def test_detections_are_sorted_and_filtered_by_score(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.boxes[:, 2] - found.boxes[:, 0], 1)
 
 
-# What framework.commands.running.detect writes
+# Output of framework.commands.running.detect
 
 
 @pytest.mark.parametrize(
@@ -152,7 +156,7 @@ def test_detections_are_sorted_and_filtered_by_score(tmp_path: Path) -> None:
     [SimulatedDetector(min_pixels=1, false_positives=3.0), GroundTruthDetector(min_pixels=1), SphereDetector()],
     ids=lambda detector: type(detector).__name__,
 )
-def test_detection_file_round_trip_is_exact(tmp_path: Path, detector: Any) -> None:
+def test_precomputed_detection_file_round_trip_is_exact(tmp_path: Path, detector: Any) -> None:
     path, room = tmp_path / "results.json", CornerRoom()
     expected = [detector.detect(one) for one in room]
     assert write_detections(path, detector, room) == sum(map(len, expected)) > 6
@@ -171,7 +175,7 @@ def test_detection_file_round_trip_is_exact(tmp_path: Path, detector: Any) -> No
 
 
 def write_folder(folder: Path, ids: np.ndarray | None = None, listed: Any = None, name: str = "000003") -> Path:
-    """Instance 7 is a chair over MASK, 300 a tv in the corner, 9 is not listed."""
+    """Write instance 7 as a chair over MASK, 300 as a tv in the corner, and an unlisted instance 9."""
     image = np.where(MASK, 7, 0).astype(np.uint16)
     image[0, 0], image[5, 7] = 300, 9
     cv2.imwrite(str(folder / f"{name}.png"), image if ids is None else ids)
@@ -180,13 +184,13 @@ def write_folder(folder: Path, ids: np.ndarray | None = None, listed: Any = None
     return folder
 
 
-def test_byte_order_mark_is_ignored(tmp_path: Path) -> None:
+def test_precomputed_byte_order_mark_is_ignored(tmp_path: Path) -> None:
     path = write_folder(tmp_path) / "000003.json"
     path.write_text(path.read_text(), encoding="utf-8-sig")
     assert len(Precomputed(tmp_path).detect(frame(3))) == 2
 
 
-def test_mask_folder_is_read(tmp_path: Path) -> None:
+def test_precomputed_mask_folder_is_read(tmp_path: Path) -> None:
     found = Precomputed(write_folder(tmp_path)).detect(frame(3))
     corner = np.zeros_like(MASK)
     corner[0, 0] = True
@@ -212,13 +216,13 @@ def test_mask_folder_is_read(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_invalid_mask_folder_entry_raises(tmp_path: Path, listed: Any, message: str) -> None:
+def test_precomputed_invalid_mask_folder_entry_raises(tmp_path: Path, listed: Any, message: str) -> None:
     with pytest.raises(DataError, match=message) as raised:
         Precomputed(write_folder(tmp_path, listed=listed))
     assert "000003.json" in str(raised.value)
 
 
-def test_mask_folder_with_unpaired_file_raises(tmp_path: Path) -> None:
+def test_precomputed_mask_folder_with_unpaired_file_raises(tmp_path: Path) -> None:
     (write_folder(tmp_path) / "000003.json").rename(tmp_path / "000004.json")
     with pytest.raises(DataError, match=r"000003\.json: cannot be read"):
         Precomputed(tmp_path)
@@ -228,7 +232,7 @@ def test_mask_folder_with_unpaired_file_raises(tmp_path: Path) -> None:
         Precomputed(tmp_path)
 
 
-def test_mask_folder_with_duplicate_frame_raises(tmp_path: Path) -> None:
+def test_precomputed_mask_folder_with_duplicate_frame_raises(tmp_path: Path) -> None:
     write_folder(write_folder(tmp_path), name="3")
     with pytest.raises(DataError, match=r"3\.png: expected one image of frame .*, got 000003\.png as well"):
         Precomputed(tmp_path)
@@ -237,12 +241,14 @@ def test_mask_folder_with_duplicate_frame_raises(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("ids", "error"), [(np.zeros((6, 9), np.uint16), DataError), (np.zeros((6, 8), np.uint8), FrameError)]
 )
-def test_mask_image_with_wrong_size_or_type_raises(tmp_path: Path, ids: np.ndarray, error: type[DataError]) -> None:
+def test_precomputed_mask_image_with_wrong_size_or_type_raises(
+    tmp_path: Path, ids: np.ndarray, error: type[DataError]
+) -> None:
     with pytest.raises(error, match=r"000003\.(png|json).*(8x6 px \(as the frame\), got 9x6 px|uint8)"):
         Precomputed(write_folder(tmp_path, ids)).detect(frame(3))
 
 
-# What is refused
+# Rejected files
 
 
 @pytest.mark.parametrize(
@@ -275,7 +281,7 @@ def test_mask_image_with_wrong_size_or_type_raises(tmp_path: Path, ids: np.ndarr
         ({"class_probabilities": {"sofa": 1.0}}, "'sofa'"),
     ],
 )
-def test_invalid_result_entry_raises_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_precomputed_invalid_entry_raises_one_line_error(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(DataError) as raised:
         Precomputed(write(tmp_path, entry(), entry(**changes)))
     assert message in str(raised.value)
@@ -292,7 +298,7 @@ def test_invalid_result_entry_raises_one_line(tmp_path: Path, changes: dict[str,
         ("[3]", "entry 0"),
     ],
 )
-def test_invalid_or_missing_result_file_raises(tmp_path: Path, content: str, message: str) -> None:
+def test_precomputed_invalid_or_missing_result_file_raises(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "results.json").write_text(content)
     with pytest.raises(DataError, match=message):
         Precomputed(tmp_path / "results.json")
@@ -300,7 +306,7 @@ def test_invalid_or_missing_result_file_raises(tmp_path: Path, content: str, mes
         Precomputed(tmp_path / "absent.json")
 
 
-def test_result_file_with_two_sequences_raises(tmp_path: Path) -> None:
+def test_precomputed_result_file_with_two_sequences_raises(tmp_path: Path) -> None:
     path = write(tmp_path, entry(image_id="kitchen/000002.png"), entry(image_id="hall/000002.png"))
     with pytest.raises(
         DataError,
@@ -309,7 +315,7 @@ def test_result_file_with_two_sequences_raises(tmp_path: Path) -> None:
         Precomputed(path)
 
 
-def test_mask_with_wrong_frame_size_raises(tmp_path: Path) -> None:
+def test_precomputed_mask_with_wrong_frame_size_raises(tmp_path: Path) -> None:
     detector = Precomputed(write(tmp_path, entry()))
     with pytest.raises(DataError, match=r"entry 0: frame 0: mask: expected 16x12 px \(as the frame\), got 8x6 px"):
         detector.detect(frame(camera=CAMERA.scaled(2)))
@@ -320,7 +326,7 @@ def test_mask_with_wrong_frame_size_raises(tmp_path: Path) -> None:
         detector.detect(frame())
 
 
-def test_result_file_of_other_sequence_raises(tmp_path: Path) -> None:
+def test_precomputed_result_file_of_other_sequence_raises(tmp_path: Path) -> None:
     path = write(tmp_path, entry(image_id=2), entry(image_id=5))
     strange = Precomputed(path)
     for index in (0, 1, 3, 4):
@@ -334,7 +340,7 @@ def test_result_file_of_other_sequence_raises(tmp_path: Path) -> None:
     assert [len(fitting.detect(frame(k))) for k in (2, 6, 900)] == [1, 0, 0]
 
 
-def test_possible_sequence_mismatch_warns_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_precomputed_possible_sequence_mismatch_warns_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     detector = Precomputed(write(tmp_path, entry(image_id=5000)))
     for index in range(100):
         detector.detect(frame(index))
@@ -342,18 +348,18 @@ def test_possible_sequence_mismatch_warns_once(tmp_path: Path, caplog: pytest.Lo
     assert "none for the first 30 frames" in caplog.text
 
 
-def test_coco_91_ids_with_other_label_space_raise(tmp_path: Path) -> None:
+def test_precomputed_coco_91_ids_with_other_label_space_raise(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="FROM_ONE or FROM_ZERO"):
         Precomputed(write(tmp_path, entry(category_name=None, category_id=1)), label_space="nyu40")
 
 
-def test_invalid_parameter_raises(tmp_path: Path) -> None:
+def test_precomputed_invalid_parameter_raises(tmp_path: Path) -> None:
     for wrong in ({"class_spread": 1.5}, {"score_threshold": -0.1}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             Precomputed(write(tmp_path, entry()), **wrong)
 
 
-def test_no_usable_class_or_duplicate_label_raises(tmp_path: Path) -> None:
+def test_precomputed_unusable_or_duplicate_label_raises(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected detections of COCO's classes, got none of 1"):
         Precomputed(write(tmp_path, entry(category_name="wall")), label_space="nyu40")
     (tmp_path / "labels.txt").write_text("chair\nchair\n")

@@ -1,6 +1,6 @@
-"""Whatever a file of detections says: they are used, or the file is refused in one line.
+"""Fuzz tests of detection files: a file is used, or raises a one-line error.
 
-`INSTANCEMAP_FUZZ=2000 pytest tests/plugins/detectors/test_precomputed_fuzzing.py` tries so many of each format.
+`INSTANCEMAP_FUZZ=2000 pytest tests/plugins/detectors/test_precomputed_fuzzing.py` tries 2000 cases per format.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def use(path: Path) -> None:
 
 
 def use_folder(description: Path) -> None:
-    """Its faults name the file, or the folder."""
+    """Read the folder; errors name the file or the folder."""
     try:
         use(description.parent)
     except DataError as error:
@@ -67,7 +67,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "000000.json"
 
 
-def test_unchanged_results_are_valid(tmp_path: Path, folder: Path) -> None:
+def test_precomputed_unchanged_results_are_valid(tmp_path: Path, folder: Path) -> None:
     assert check(use, tmp_path / "results.json", json.dumps(ENTRIES).encode()) == ""
     assert len(Precomputed(tmp_path / "results.json").detect(FRAME)) == len(ENTRIES)
     (tmp_path / "results.json").unlink()
@@ -76,19 +76,23 @@ def test_unchanged_results_are_valid(tmp_path: Path, folder: Path) -> None:
 
 @fuzzed
 @given(content=changed_json(ENTRIES))
-def test_changed_results_load_or_raise_one_line(content: Any, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_precomputed_changed_file_raises_only_one_line_errors(
+    content: Any, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     path = tmp_path_factory.getbasetemp() / "results.json"
     check(use, path, json.dumps(content).encode())
 
 
 @fuzzed
 @given(content=damaged(json.dumps(ENTRIES).encode(), TOKENS))
-def test_damaged_results_load_or_raise_one_line(content: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_precomputed_damaged_file_raises_only_one_line_errors(
+    content: bytes, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     check(use, tmp_path_factory.getbasetemp() / "results.json", content)
 
 
 @fuzzed
 @given(content=st.one_of(changed_json(LISTED).map(lambda found: json.dumps(found).encode()),
                          damaged(json.dumps(LISTED).encode(), TOKENS)))  # fmt: skip
-def test_changed_mask_folder_loads_or_raises_one_line(content: bytes, folder: Path) -> None:
+def test_precomputed_mask_folder_raises_only_one_line_errors(content: bytes, folder: Path) -> None:
     check(use_folder, folder, content)

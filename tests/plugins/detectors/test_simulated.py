@@ -1,4 +1,4 @@
-"""The simulated detector: without errors it is the ground truth, and each error has the statistics that it promises."""
+"""Tests of the simulated detector: without errors it is the ground truth; each error has its configured statistics."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ IDS = np.zeros((120, 160), np.int32)
 IDS[20:60, 20:60] = 5  # a chair in the open
 IDS[20:60, 60:100] = 6  # a couch that touches it
 IDS[70:90, 40:60] = 9  # a small cup
-IDS[80:120, 100:160] = 12  # a bed that the image's corner cuts
+IDS[80:120, 100:160] = 12  # a bed cut by the image corner
 IDS[0:10, 0:10] = 30  # of no known class
 TRUTH = FrameTruth(IDS, {5: "chair", 6: "couch", 9: "cup", 12: "bed", 30: None})
 
@@ -59,16 +59,16 @@ def same(a, b):
 
 
 def count_of(detector, mask, frames=400):
-    """In how many frames a detection's center pixel lies in `mask`."""
+    """Return the number of frames with a detection whose center pixel is in `mask`."""
     return sum(bool((d.masks & mask).any()) for d in (detector.detect(frame(k)) for k in range(frames)))
 
 
-def test_zero_error_rates_give_ground_truth():
+def test_simulated_zero_error_rates_give_ground_truth():
     for index in range(3):
         assert same(PERFECT.detect(frame(index)), GroundTruthDetector().detect(frame(index)))
 
 
-def test_default_detections_meet_contract():
+def test_simulated_default_detections_meet_contract():
     detector = SimulatedDetector(false_positives=3)
     for index in range(30):
         detections = detector.detect(frame(index))
@@ -80,7 +80,7 @@ def test_default_detections_meet_contract():
         np.testing.assert_array_equal(detections.boxes, tight_boxes(detections.masks))
 
 
-def test_results_depend_on_seed_and_frame_but_not_call_order():
+def test_simulated_results_depend_on_seed_and_frame_not_order():
     detector = SimulatedDetector(seed=3)
     forward = [detector.detect(frame(k)) for k in range(6)]
     backward = [SimulatedDetector(seed=3).detect(frame(k)) for k in reversed(range(6))][::-1]
@@ -89,8 +89,8 @@ def test_results_depend_on_seed_and_frame_but_not_call_order():
     assert not same(forward[0], SimulatedDetector(seed=4).detect(frame(0)))
 
 
-def test_error_types_have_independent_random_streams():
-    """More misses take detections away; those that stay are the same, to the pixel."""
+def test_simulated_error_types_have_independent_random_streams():
+    """A higher miss rate only removes detections; the others are identical."""
     few = SimulatedDetector(miss_rate=0.0, false_positives=0, merge_rate=0)
     many = replace(few, miss_rate=0.5)
     for index in range(20):
@@ -98,7 +98,7 @@ def test_error_types_have_independent_random_streams():
         assert {m.tobytes() for m in b.masks} <= {m.tobytes() for m in a.masks}
 
 
-def test_miss_rates_match_parameters():
+def test_simulated_miss_rates_match_parameters():
     chair, cup, bed = IDS == 5, IDS == 9, IDS == 12
     assert count_of(replace(PERFECT, miss_rate=0.3), chair) == pytest.approx(400 * 0.7, abs=30)  # 3 sigma
     smaller = replace(PERFECT, small_side=20.0)
@@ -109,7 +109,7 @@ def test_miss_rates_match_parameters():
     assert count_of(truncated, bed) == pytest.approx(400 * 0.6, abs=30)
 
 
-def test_split_object_gives_two_parts_at_split_rate():
+def test_simulated_split_object_gives_two_parts_at_split_rate():
     detections = replace(PERFECT, split_rate=1.0).detect(frame())
     assert len(detections) == 8
     assert (detections.masks.sum(axis=0) == np.isin(IDS, (5, 6, 9, 12))).all()
@@ -118,7 +118,7 @@ def test_split_object_gives_two_parts_at_split_rate():
     assert rate == pytest.approx(0.25, abs=0.05)
 
 
-def test_only_touching_neighbors_merge_at_merge_rate():
+def test_simulated_only_touching_neighbors_merge_at_merge_rate():
     detections = replace(PERFECT, merge_rate=1.0).detect(frame())
     assert len(detections) == 3
     assert sum((mask == np.isin(IDS, (5, 6))).all() for mask in detections.masks) == 1
@@ -126,14 +126,14 @@ def test_only_touching_neighbors_merge_at_merge_rate():
     assert rate == pytest.approx(0.3, abs=0.08)
 
 
-def test_depth_step_separates_neighbors():
+def test_simulated_depth_step_separates_neighbors():
     flat = frame()
     assert touching_pairs(flat).tolist() == [[5, 6]]
     depth = np.where(IDS == 6, 2.0, 1.0).astype(np.float32)
     assert touching_pairs(replace(flat, depth=depth)).shape == (0, 2)
 
 
-def test_bleed_grows_mask_by_given_pixels():
+def test_simulated_bleed_grows_mask_by_given_pixels():
     for bleed, side in ((3.0, 46), (-4.0, 32)):
         detections = replace(PERFECT, bleed=bleed).detect(frame())
         (box,) = [b for b, m in zip(detections.boxes, detections.masks, strict=True) if m[40, 40] and not m[40, 90]]
@@ -142,7 +142,7 @@ def test_bleed_grows_mask_by_given_pixels():
     assert bed[119, 159], "a mask must not shrink away from the image's border"
 
 
-def test_shift_and_boundary_noise_have_given_deviation():
+def test_simulated_shift_and_border_noise_have_given_deviation():
     detector = replace(PERFECT, shift=2.0)
     centers = []
     for k in range(200):
@@ -168,7 +168,7 @@ def test_signed_distance_of_half_plane_is_exact():
     np.testing.assert_allclose(signed_distance(mask)[2], np.arange(10) - 3.5)
 
 
-def test_coarse_mask_grid_keeps_square_and_blurs_comb():
+def test_simulated_coarse_mask_grid_keeps_square_and_blurs_comb():
     fine, coarse = PERFECT.detect(frame()), replace(PERFECT, mask_grid=28).detect(frame())
     assert (fine.masks ^ coarse.masks).mean() < 1e-3
     comb = np.zeros((120, 160), np.int32)
@@ -189,7 +189,7 @@ def test_confusion_kernel_is_normalized_and_favors_lookalikes():
 
 
 def distributions(detector, frames):
-    """The rows of the couch, found by its place."""
+    """Return the class rows of the couch, found by its position."""
     rows = []
     for k in range(frames):
         detections = detector.detect(frame(k))
@@ -198,7 +198,7 @@ def distributions(detector, frames):
     return np.array(rows)
 
 
-def test_confused_class_rows_average_to_confusion_kernel():
+def test_simulated_class_rows_average_to_confusion_kernel():
     couch = COCO.index("couch")
     detector = replace(PERFECT, confusion=0.3, confusion_concentration=3.0, confusion_consistency=0.0)
     rows = distributions(detector, 600)
@@ -209,7 +209,7 @@ def test_confused_class_rows_average_to_confusion_kernel():
     assert steady == pytest.approx(np.tile(confusion_kernel(COCO, 0.3)[couch], (20, 1)), abs=0.01)
 
 
-def test_consistent_confusion_repeats_in_all_frames():
+def test_simulated_consistent_confusion_repeats_in_all_frames():
     detector = replace(PERFECT, confusion=0.3, confusion_consistency=1.0)
     assert np.ptp(distributions(detector, 10), axis=0).max() == 0
     half = distributions(replace(detector, confusion_consistency=0.5), 300)
@@ -217,7 +217,7 @@ def test_consistent_confusion_repeats_in_all_frames():
     assert counts.max() / 300 == pytest.approx(0.5, abs=0.09)
 
 
-def test_scores_correlate_with_detection_quality():
+def test_simulated_scores_correlate_with_detection_quality():
     detector = replace(PERFECT, score_concentration=20.0, boundary_noise=6.0, bleed=4.0, confusion=0.2)
     scores, quality = [], []
     for k in range(150):
@@ -230,7 +230,7 @@ def test_scores_correlate_with_detection_quality():
     assert np.mean(scores) == pytest.approx(np.mean(quality), abs=0.02)
 
 
-def test_false_positives_have_given_rate_and_score():
+def test_simulated_false_positives_have_given_rate_and_score():
     detector = replace(PERFECT, false_positives=1.5, score_concentration=20.0)
     empty = replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {}))
     found = [detector.detect(replace(empty, index=k)) for k in range(200)]
@@ -245,7 +245,7 @@ THING[80:110, 20:50] = 32  # one that touches nothing
 ROOM = FrameTruth(THING, {5: "chair", **dict.fromkeys(range(31, 200))})
 
 
-def test_attached_neighbor_is_same_in_all_frames():
+def test_simulated_attached_neighbor_is_same_in_all_frames():
     taken = []
     for seed in range(200):
         detector = replace(PERFECT, attach_rate=0.3, seed=seed)
@@ -260,7 +260,7 @@ def test_attached_neighbor_is_same_in_all_frames():
     np.testing.assert_array_equal(alone.masks[0], large == 5)
 
 
-def test_clutter_has_same_class_in_all_frames():
+def test_simulated_clutter_has_same_class_in_all_frames():
     detector = replace(PERFECT, clutter_rate=0.4, score_concentration=20.0)
     taken = 0
     for thing in range(31, 200):
@@ -273,7 +273,7 @@ def test_clutter_has_same_class_in_all_frames():
     assert taken / 169 == pytest.approx(0.4, abs=0.12)
 
 
-def test_miss_spread_varies_miss_rate_between_objects():
+def test_simulated_miss_spread_varies_miss_rate_between_objects():
     alike = replace(PERFECT, miss_rate=0.5)
     apart = replace(alike, miss_spread=2.0)
 
@@ -290,7 +290,7 @@ def test_miss_spread_varies_miss_rate_between_objects():
     assert ((uneven < 0.1) | (uneven > 0.9)).mean() == pytest.approx(0.27, abs=0.15)
 
 
-def test_recurring_false_positives_keep_world_position():
+def test_simulated_false_positives_keep_world_position():
     detector = replace(PERFECT, false_positives=1.0, recurring_fraction=1.0)
     wall = np.full((120, 160), 2.0, np.float32)
     places, classes = [], []
@@ -310,7 +310,7 @@ def test_recurring_false_positives_keep_world_position():
     assert np.ptp(first) < 0.55, "a place is 0.5 m wide, and its visible part has its middle in it"
 
 
-def test_recurring_false_positives_need_poses():
+def test_simulated_recurring_false_positives_need_poses():
     detector = replace(PERFECT, false_positives=1.0, recurring_fraction=1.0)
     empty = [replace(frame(k), truth=FrameTruth(np.zeros_like(IDS), {})) for k in range(5)]
     found = [detector.detect(one) for one in empty]
@@ -319,11 +319,11 @@ def test_recurring_false_positives_need_poses():
     assert all(same(a, anywhere.detect(one)) for a, one in zip(found, empty, strict=True))
 
 
-def test_score_scale_multiplies_scores():
+def test_simulated_score_scale_multiplies_scores():
     np.testing.assert_allclose(replace(PERFECT, score_scale=0.5).detect(frame()).scores, 0.5)
 
 
-def test_touching_pairs_match_reference():
+def test_simulated_touching_pairs_match_reference():
     for seed in range(5):
         rng = np.random.default_rng(seed)
         ids = np.kron(rng.integers(0, 9, (12, 16)), np.ones((10, 10), int)).astype(np.int32)
@@ -335,21 +335,21 @@ def test_touching_pairs_match_reference():
             expected |= {tuple(sorted(pair)) for pair in zip(ids[here][touch], ids[there][touch], strict=True)}
         seen = replace(frame(), depth=depth, truth=FrameTruth(ids, {}))
         assert touching_pairs(seen).tolist() == sorted(map(list, expected))
-        assert 3 < len(expected) < 36  # of the 36 pairs that there could be
+        assert 3 < len(expected) < 36  # of 36 possible pairs
 
 
 @pytest.mark.parametrize("place", [(80.3, 60.2), (0.0, 0.0), (159.9, 119.9), (3.5, 118.0)])
-def test_ellipse_matches_reference(place):
+def test_simulated_ellipse_matches_reference(place):
     x, y = place
     v, u = np.ogrid[:120, :160]
     for seed, (a, b) in enumerate(((12.0, 80.0), (40.5, 13.0), (79.0, 80.0))):
         wobble = smooth_field(np.random.default_rng(seed), (120, 160), 12.0) * np.float32(0.4)
-        for field in (wobble, wobble + np.float32(3)):  # with the latter nothing is left
+        for field in (wobble, wobble + np.float32(3)):  # the latter leaves nothing
             expected = np.hypot((u - x) / a, (v - y) / b) + field < 1
             np.testing.assert_array_equal(ellipse(x, y, a, b, field), expected)
 
 
-def test_missing_truth_raises_and_empty_truth_gives_none():
+def test_simulated_missing_truth_raises_and_empty_gives_none():
     with pytest.raises(DataError, match="expected instance ground truth"):
         SimulatedDetector().detect(replace(frame(), truth=None))
     assert len(PERFECT.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {})))) == 0
@@ -376,7 +376,7 @@ def test_missing_truth_raises_and_empty_truth_gives_none():
         {"recurring_fraction": 2.0},
     ],
 )
-def test_invalid_parameter_raises(parameters):
+def test_simulated_invalid_parameter_raises(parameters):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name}: expected .*, got"):
         SimulatedDetector(**parameters)

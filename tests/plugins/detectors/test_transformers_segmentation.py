@@ -1,4 +1,4 @@
-"""The transformers detector: on tiny random networks of each family, beside slow decodings and the models' own."""
+"""Tests of the transformers detector on random tiny networks of each family, compared with reference decoders."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from torch.nn import functional
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError
 
-# a detector that any config registers keeps these; here they run on the networks below
+# the contract tests of registered detectors; here they run on the networks below
 from framework.testing.contracts import DetectorContract
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID
 from plugins.detectors.transformers_segmentation import (
@@ -59,19 +59,19 @@ def frame(seed=0, camera=CAMERA):
     return Frame(seed, 0.0, color, np.ones(camera.shape, np.float32), camera)
 
 
-def test_all_model_families_are_covered():
+def test_transformers_all_model_families_are_covered():
     assert set(MODELS) == set(FAMILIES)
 
 
-def test_tiny_networks_return_detections(detector):
+def test_transformers_tiny_networks_return_detections(detector):
     found = [detector.detect(frame(seed)) for seed in range(3)]
-    assert sum(map(len, found)) >= 3, "or the other tests say nothing"
+    assert sum(map(len, found)) >= 3, "otherwise the other tests are meaningless"
     assert detector.classes == CLASSES
     assert not np.array_equal(found[0].masks, found[1].masks)
 
 
 def slow_decoding(detector, kind, image, threshold):
-    """Query by query: (score, mask, class distribution), best first, before masks are compared with each other."""
+    """Decode query by query: (score, mask, class distribution), best first, before suppression."""
     pixels, (down, right) = detector._preprocessing(image.color, torch.device("cpu"))
     output = detector._network(pixel_values=pixels)
     instance = "masks_queries_logits" not in output
@@ -99,7 +99,7 @@ def slow_decoding(detector, kind, image, threshold):
 
 
 @pytest.mark.parametrize("kind", ["mask2former", "maskformer", "detr", "rf_detr"])
-def test_decoding_matches_reference(folders, kind):
+def test_transformers_decoding_matches_reference(folders, kind):
     if kind == "rf_detr" or kind == "detr":
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
     else:
@@ -113,12 +113,12 @@ def test_decoding_matches_reference(folders, kind):
     assert len(expected) > 1
     np.testing.assert_allclose(found.scores, [score for score, _, _ in expected], rtol=1e-4)
     np.testing.assert_allclose(found.class_probabilities, [row for _, _, row in expected], atol=1e-5)
-    if kind != "rf_detr":  # the slow one goes by the network's size, and only there it is that of the image
+    if kind != "rf_detr":  # the slow decoder uses the network's size, which equals the image size only there
         assert np.mean(found.masks == np.array([mask for _, mask, _ in expected])) > 0.999
 
 
-def test_decoding_agrees_with_mask2former_processor(folders):
-    """Each of its (query, label) pairs that is a query's best is ours, with its mask and its score."""
+def test_transformers_decoding_agrees_with_mask2former(folders):
+    """Each (query, label) pair that is the best of its query has the same mask and score."""
     from transformers import Mask2FormerImageProcessorPil
 
     camera = Camera(384, 384, 300.0, 300.0, 191.5, 191.5)  # the size at which it always decodes
@@ -146,7 +146,7 @@ def test_decoding_agrees_with_mask2former_processor(folders):
         assert np.mean(mask == found.masks[k]) > 0.99
 
 
-def test_decoding_agrees_with_eomt_processor(folders):
+def test_transformers_decoding_agrees_with_eomt(folders):
     from transformers import EomtImageProcessorPil
 
     image = frame(3, CAMERA)  # 48 rows on 64: padded below
@@ -180,26 +180,26 @@ def test_decoding_agrees_with_eomt_processor(folders):
         ("EomtImageProcessorPil", {"size": {"shortest_edge": 64, "longest_edge": 64}, "do_pad": True}),
     ],
 )
-def test_preprocessing_agrees_with_transformers(name, numbers, shape):
+def test_transformers_preprocessing_agrees_with_library(name, numbers, shape):
     color = np.random.default_rng(0).integers(64, 192, (*shape, 3), np.uint8)  # bicubic never leaves 0..255
     processor = getattr(transformers, name)(**numbers)
     expected = processor(images=color, return_tensors="pt")["pixel_values"][0].numpy()
     content = {"image_processor_type": name, **numbers}
     pixels, _ = Preprocessing.parse(content, "here")(color, torch.device("cpu"))
     assert pixels.shape[1:] == expected.shape
-    # theirs goes through 8 bits after resizing
+    # theirs is quantized to 8 bits after resizing
     np.testing.assert_allclose(pixels[0].numpy(), expected, atol=2 / 255 / 0.2)
     assert np.abs(pixels[0].numpy() - expected).mean() < 0.6 / 255 / 0.2
 
 
-def test_softmax_head_excludes_no_object_class():
+def test_transformers_softmax_head_excludes_no_object_class():
     logits = np.log(np.array([[0.2, 0.1, 0.7], [0.6, 0.3, 0.1]], np.float32))
     rows, best = class_distributions(logits, 2)
     np.testing.assert_allclose(rows, [[2 / 3, 1 / 3], [2 / 3, 1 / 3]], rtol=1e-6)
     np.testing.assert_allclose(best, [0.2, 0.6], rtol=1e-6)
 
 
-def test_sigmoid_head_is_conditioned_on_exactly_one_class():
+def test_transformers_sigmoid_head_is_conditioned_on_one_class():
     p = np.array([0.9, 0.5, 0.01])
     one = [0.9 * 0.5 * 0.99, 0.1 * 0.5 * 0.99, 0.1 * 0.5 * 0.01]
     rows, best = class_distributions(np.log(p / (1 - p))[None].astype(np.float32), 3)
@@ -207,7 +207,7 @@ def test_sigmoid_head_is_conditioned_on_exactly_one_class():
     np.testing.assert_allclose(best, [0.9], rtol=1e-6)
 
 
-def test_extreme_logits_stay_finite():
+def test_transformers_extreme_logits_stay_finite():
     logits = np.array([[1e4, -1e4, 0.0], [-1e4, -1e4, 1e4]], np.float32)
     for labels in (2, 3):
         rows, best = class_distributions(logits, labels)
@@ -215,26 +215,26 @@ def test_extreme_logits_stay_finite():
         assert ((best >= 0) & (best <= 1)).all()
 
 
-def test_logit_count_different_from_labels_raises():
+def test_transformers_logit_count_different_from_labels_raises():
     with pytest.raises(DataError, match=r"expected 5 class logits .*, got 7"):
         class_distributions(np.zeros((1, 7), np.float32), 5)
 
 
 @pytest.mark.parametrize("shape", [(24, 40), (7, 5), (6, 10)])
-def test_mask_resampling_without_padding_is_bilinear(shape):
+def test_transformers_mask_resampling_is_bilinear(shape):
     grids = torch.randn(3, 6, 10, generator=torch.Generator().manual_seed(0))
     expected = functional.interpolate(grids[None], shape, mode="bilinear", align_corners=False)[0]
     np.testing.assert_allclose(resample_masks(grids, (1.0, 1.0), shape), expected, atol=1e-5)
 
 
-def test_mask_resampling_excludes_padding():
+def test_transformers_mask_resampling_excludes_padding():
     grids = torch.zeros(1, 8, 8)
     grids[:, 4:] = 1  # below the image
     assert resample_masks(grids, (0.5, 1.0), (16, 32))[0, :14].abs().max() < 1e-6
     assert resample_masks(grids, (1.0, 1.0), (16, 32))[0, 10:].min() == 1
 
 
-def test_duplicate_and_weak_detections_are_removed(folders):
+def test_transformers_duplicate_and_weak_detections_are_removed(folders):
     image = frame(1)
     everything = built(folders["mask2former"], score_threshold=0.0, agnostic_nms_iou=1.0).detect(image)
     fewer = built(folders["mask2former"], score_threshold=0.0, agnostic_nms_iou=0.2).detect(image)
@@ -245,7 +245,7 @@ def test_duplicate_and_weak_detections_are_removed(folders):
     assert len(built(folders["mask2former"], score_threshold=0.0, max_detections=2).detect(image)) <= 2
 
 
-def test_non_finite_output_raises(folders):
+def test_transformers_non_finite_output_raises(folders):
     detector = built(folders["mask2former"])
     broken = {"class_queries_logits": torch.full((1, 2, 7), math.nan), "masks_queries_logits": torch.zeros(1, 2, 4, 4)}
     detector._network = lambda pixel_values: broken
@@ -266,7 +266,7 @@ def test_non_finite_output_raises(folders):
         ({"device": "tpu"}, "device"),
     ],
 )
-def test_invalid_parameter_raises(parameters, message):
+def test_transformers_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         built("nowhere", **parameters)
 
@@ -276,7 +276,7 @@ def one_line(caught):
 
 
 @pytest.mark.parametrize("variable", ["HF_HUB_OFFLINE", "INSTANCEMAP_OFFLINE"])
-def test_missing_model_offline_raises_with_advice(monkeypatch, variable):
+def test_transformers_missing_model_offline_raises_with_advice(monkeypatch, variable):
     monkeypatch.delenv("INSTANCEMAP_OFFLINE", raising=False)
     monkeypatch.setenv(variable, "1")
     with pytest.raises(
@@ -288,7 +288,7 @@ def test_missing_model_offline_raises_with_advice(monkeypatch, variable):
 
 
 def coco_rf_detr(folder, names):
-    """A tiny RF-DETR-Seg with the head of those trained on COCO, whose config calls the classes `names`."""
+    """Return a tiny RF-DETR-Seg with a COCO head, whose config names the classes `names`."""
     write_network(folder, "rf_detr", names)
     return built(folder, score_threshold=0.02, agnostic_nms_iou=1.0)
 
@@ -297,8 +297,8 @@ IN_A_ROW = {**dict(enumerate(COCO)), **dict.fromkeys(range(80, 91), "N/A")}
 
 
 @pytest.mark.parametrize("names", [dict(enumerate(COCO_BY_ID)), {k: f"LABEL_{k}" for k in range(91)}, IN_A_ROW])
-def test_rf_detr_uses_coco_91_ids(tmp_path, names):
-    """As transformers' own test of it: number 17 is the cat, 75 the remote; and as its own decoding."""
+def test_transformers_rf_detr_uses_coco_91_ids(tmp_path, names):
+    """As in transformers' test, number 17 is the cat and 75 the remote; the decoding agrees."""
     detector = coco_rf_detr(tmp_path, names)
     assert detector.classes == COCO
     labels = Checkpoint(str(tmp_path), "main").labels
@@ -325,17 +325,17 @@ def test_rf_detr_uses_coco_91_ids(tmp_path, names):
     assert np.mean(found.masks == np.array([mask for _, _, mask in expected])) > 0.999
 
 
-def test_rf_detr_with_other_classes_keeps_them(tmp_path):
+def test_transformers_rf_detr_with_other_classes_keeps_them(tmp_path):
     names = {k: "chair" if k % 2 else "tv" for k in range(91)}
     assert coco_rf_detr(tmp_path, names).classes == ("chair", "tv")
 
 
-def test_resize_of_fixed_size_model_raises(folders):
+def test_transformers_resize_of_fixed_size_model_raises(folders):
     with pytest.raises(ConfigError, match="0, because this model has a fixed input size"):
         built(folders["eomt"], short_side=64, long_side=64)
 
 
-def test_missing_transformers_package_names_extra(monkeypatch):
+def test_transformers_missing_package_error_names_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ConfigError, match=r"pip install instancemap\[transformers\]"):
         built("nowhere")
@@ -343,7 +343,7 @@ def test_missing_transformers_package_names_extra(monkeypatch):
 
 @pytest.fixture
 def copy(folders, tmp_path):
-    """A copy of the mask2former folder, and a way to change its JSON files."""
+    """Return a copy of the mask2former folder, and a function that changes its JSON files."""
     for file in folders["mask2former"].iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
 
@@ -365,7 +365,7 @@ def copy(folders, tmp_path):
         ("config.json", {"id2label": {str(k): f"thing {k}" for k in range(6)}}, "'thing 0', 'thing 1'"),
         ("config.json", {"id2label": {"0": "chair", "1": "bed"}}, "expected the weights in"),
         ("config.json", {"num_queries": 13}, "expected the weights in"),
-        ("config.json", {"model_type": "never heard of"}, "never heard of"),
+        ("config.json", {"model_type": "unknown type"}, "unknown type"),
         (
             "preprocessor_config.json",
             {"size": {"height": 3}},
@@ -381,20 +381,20 @@ def copy(folders, tmp_path):
         ("preprocessor_config.json", {"do_split_image": True}, "semantic"),
     ],
 )
-def test_unusable_model_folder_raises_with_reason(copy, name, values, message):
+def test_transformers_unusable_model_folder_raises_with_reason(copy, name, values, message):
     copy.change(name, **values)
     with pytest.raises((ConfigError, DataError), match=message) as caught:
         built(copy.folder)
     assert one_line(caught)
 
 
-def test_unknown_architecture_raises(tmp_path):
+def test_transformers_unknown_architecture_raises(tmp_path):
     transformers.SegformerConfig().save_pretrained(tmp_path)
     with pytest.raises(ConfigError, match=r"one of mask2former, .*, got .* \(segformer\)"):
         built(tmp_path)
 
 
-def test_incomplete_weights_raise(copy):
+def test_transformers_incomplete_weights_raise(copy):
     from safetensors.torch import load_file, save_file
 
     path = copy.folder / "model.safetensors"
@@ -409,7 +409,7 @@ def test_incomplete_weights_raise(copy):
 
 
 @pytest.mark.parametrize("name", ["config.json", "preprocessor_config.json", "model.safetensors"])
-def test_missing_or_damaged_file_raises_one_line(copy, name):
+def test_transformers_unusable_file_raises_one_line_error(copy, name):
     whole = (copy.folder / name).read_bytes()
     (copy.folder / name).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match=r"detector\.model") as damaged:

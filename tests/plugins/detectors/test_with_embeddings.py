@@ -1,4 +1,4 @@
-"""Detections with embeddings: by random CLIPs and SigLIPs, whose numbers are those of transformers' own code."""
+"""Tests of detections with embeddings of random CLIP and SigLIP models, compared with transformers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def picture(index: int = 0) -> Frame:
     return Frame(index, 0.0, color, np.ones((64, 96), np.float32), camera)
 
 
-def test_image_and_text_embeddings_agree_with_transformers(folder: Path) -> None:
+def test_with_embeddings_vectors_agree_with_transformers(folder: Path) -> None:
     from transformers import AutoModel, AutoTokenizer
 
     model = ImageTextModel(str(folder), "main", "cpu", half_precision=False)
@@ -76,7 +76,7 @@ def test_image_and_text_embeddings_agree_with_transformers(folder: Path) -> None
     assert model.space.startswith(f"{folder.name}@")
 
 
-def test_only_confident_large_detections_have_embeddings(siglip: Path) -> None:
+def test_with_embeddings_skips_weak_or_small_detections(siglip: Path) -> None:
     detector = WithEmbeddings(Blocks(), str(siglip), min_pixels=101, device="cpu")
     frame = picture()
     found = detector.detect(frame)
@@ -92,14 +92,14 @@ def test_only_confident_large_detections_have_embeddings(siglip: Path) -> None:
     assert (nothing.embeddings, nothing.embedding_space) == (None, "")
 
 
-def test_frame_interval_sets_embedded_frames(siglip: Path) -> None:
+def test_with_embeddings_frame_interval_sets_embedded_frames(siglip: Path) -> None:
     detector = WithEmbeddings(Blocks(), str(siglip), frame_interval=3, device="cpu")
     assert [detector.detect(picture(k)).embeddings is not None for k in range(7)] == [True, False, False] * 2 + [True]
     assert "index" in detector.reads
 
 
-def test_background_contrast_controls_background_influence(siglip: Path) -> None:
-    """With surroundings of 0 another background changes nothing, with 1 it does; the object always counts."""
+def test_with_embeddings_contrast_controls_background(siglip: Path) -> None:
+    """With 0, the background has no influence; with 1, it has; the object always has."""
     plain, other = picture(), picture()
     inside = Blocks().detect(plain).masks[0]
     other.color[~inside] = 255 - other.color[~inside]
@@ -111,7 +111,7 @@ def test_background_contrast_controls_background_influence(siglip: Path) -> None
     assert not np.allclose(detector.detect(other).embeddings[0], a, atol=1e-5)
 
 
-def test_crop_is_padded_square_around_box() -> None:
+def test_with_embeddings_crop_is_padded_square_around_box() -> None:
     color = np.zeros((40, 60, 3), np.uint8)
     color[..., 0], color[..., 1] = np.arange(60), np.arange(40)[:, None]
     mask = np.zeros((1, 40, 60), np.bool_)
@@ -130,7 +130,7 @@ def test_crop_is_padded_square_around_box() -> None:
     assert not square_crops(color, np.zeros((1, 40, 60), np.bool_), 8, 1.5).any()
 
 
-def test_fingerprint_depends_on_inner_detector_and_model(siglip: Path, tmp_path: Path) -> None:
+def test_with_embeddings_fingerprint_covers_detector_and_model(siglip: Path, tmp_path: Path) -> None:
     own = identity_of(WithEmbeddings(SphereDetector(), str(siglip), device="cpu"))
     assert own == identity_of(WithEmbeddings(SphereDetector(), str(siglip), device="cpu"))
     clip = write_image_text(tmp_path / "clip", "clip")
@@ -142,7 +142,7 @@ def test_fingerprint_depends_on_inner_detector_and_model(siglip: Path, tmp_path:
     assert len({own, *map(identity_of, others)}) == 4
 
 
-def test_nested_detector_is_built_and_its_errors_name_path(siglip: Path) -> None:
+def test_with_embeddings_nested_detector_error_names_path(siglip: Path) -> None:
     chosen = "detector@detector.detector=ground_truth"
     detector = registered.built("detector", "with_embeddings", chosen, f"detector.model={siglip}", "device=cpu")
     found = detector.detect(CornerRoom()[0])
@@ -166,7 +166,7 @@ def test_nested_detector_is_built_and_its_errors_name_path(siglip: Path) -> None
         ("preprocessor_config.json", "preprocessor_config.json"),
     ],
 )
-def test_damaged_model_raises_one_line(change: str, fault: str, tmp_path: Path) -> None:
+def test_with_embeddings_damaged_model_raises_one_line_error(change: str, fault: str, tmp_path: Path) -> None:
     folder = write_image_text(tmp_path / "model")
     (folder / change).write_bytes(b"{]")
     with pytest.raises(DataError, match=fault) as refused:
@@ -174,7 +174,7 @@ def test_damaged_model_raises_one_line(change: str, fault: str, tmp_path: Path) 
     assert "\n" not in str(refused.value)
 
 
-def test_unsupported_embedding_model_raises(tmp_path: Path) -> None:
+def test_with_embeddings_unsupported_model_raises(tmp_path: Path) -> None:
     from tests.support.networks.tiny_transformers import write_network
 
     with pytest.raises(
@@ -183,7 +183,9 @@ def test_unsupported_embedding_model_raises(tmp_path: Path) -> None:
         WithEmbeddings(Blocks(), str(write_network(tmp_path, "mask2former")), device="cpu")
 
 
-def test_model_id_offline_raises_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_with_embeddings_model_id_offline_raises_one_line_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(

@@ -1,4 +1,4 @@
-"""Association and the table of instances, over every kind of map, on spheres whose masks are known exactly."""
+"""Tests of association and of the instance table with every map, on spheres with exact masks."""
 
 import dataclasses
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def frames() -> list[Frame]:
     return [room().frame(T, k) for k, T in enumerate(walk(10))]
 
 
-def test_instance_ids_do_not_depend_on_detection_order(new_fuser: NewFuser, frames: list[Frame]) -> None:
+def test_fuser_instance_ids_do_not_depend_on_detection_order(new_fuser: NewFuser, frames: list[Frame]) -> None:
     fuser = new_fuser()
     for k, frame in enumerate(frames):
         order = np.roll(np.arange(3), k)
@@ -41,7 +41,7 @@ def test_instance_ids_do_not_depend_on_detection_order(new_fuser: NewFuser, fram
     assert {record.observations for record in fuser.scene.table.records.values()} == {10}
 
 
-def test_weak_detection_updates_but_does_not_create_instance(new_fuser: NewFuser, frames: list[Frame]) -> None:
+def test_fuser_weak_detection_creates_no_instance(new_fuser: NewFuser, frames: list[Frame]) -> None:
     fuser = new_fuser()
     first, second, _ = masks_of(frames[0])
     fuse_masks(fuser, frames[0], [first, second], [0.9, 0.2])
@@ -56,12 +56,12 @@ def test_weak_detection_updates_but_does_not_create_instance(new_fuser: NewFuser
     ("parameters", "updates"),
     [
         ({}, True),
-        ({"overlap_rule": OverlapRule.IOU}, False),  # a part shares little of all that is covered
+        ({"overlap_rule": OverlapRule.IOU}, False),  # a part has a small overlap with the union
         ({"min_class_agreement": 0.9}, True),
-        ({"min_class_agreement": 1.0}, False),  # the floor alone keeps distributions from agreeing wholly
+        ({"min_class_agreement": 1.0}, False),  # only the floor keeps distributions from agreeing completely
     ],
 )
-def test_overlap_rule_and_class_agreement_limit_matches(
+def test_fuser_overlap_rule_and_class_agreement_limit_matches(
     new_fuser: NewFuser, frames: list[Frame], parameters: dict[str, Any], updates: bool
 ) -> None:
     fuser = new_fuser(**parameters)
@@ -73,8 +73,8 @@ def test_overlap_rule_and_class_agreement_limit_matches(
     assert (len(fuser.scene.table.records) == 1) == updates
 
 
-def test_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
-    """A detector splits an object at first and finds it whole afterwards."""
+def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    """A detector splits an object at first and detects it as a whole later."""
     fuser = new_fuser()
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
@@ -91,12 +91,12 @@ def test_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frames: lis
 
 @pytest.mark.parametrize(
     ("fuser_class", "merge_frames"),
-    [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # where a vote is a vote, the other half is soon outvoted
+    [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # with equal votes, the other half is soon outvoted
 )
-def test_instances_often_under_one_cluster_merge(
+def test_fuser_instances_often_under_one_cluster_merge(
     fuser_class: type[MapFuser], merge_frames: int, frames: list[Frame]
 ) -> None:
-    """Weak detections of the whole, which would take long to outvote the voxels of the other half."""
+    """Weak detections of the whole would need long to outvote the voxels of the other half."""
     fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0, merge_overlap=0.5, merge_frames=merge_frames)
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
@@ -123,10 +123,10 @@ def test_instances_often_under_one_cluster_merge(
 @pytest.mark.parametrize(
     ("merge_agreement", "agrees", "merged"), [(0.1, False, False), (0, False, True), (0.1, True, True)]
 )
-def test_supported_object_merges_only_if_classes_agree(
+def test_fuser_merges_supported_object_only_if_classes_agree(
     merge_agreement: float, agrees: bool, merged: bool, frames: list[Frame]
 ) -> None:
-    """The table's mask covers it in every frame; a part of the table in its place would be merged."""
+    """The table's mask covers the object in every frame; a part of the table would be merged."""
     fuser = assemble(
         BayesianTsdf,
         voxel_size=0.02,
@@ -147,7 +147,7 @@ def test_supported_object_merges_only_if_classes_agree(
     assert len(fuser.scene.table.records) == (1 if merged else 2)
 
 
-def test_separate_objects_stay_apart_under_shared_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
+def test_fuser_separate_objects_stay_apart_under_shared_mask(new_fuser: NewFuser, frames: list[Frame]) -> None:
     fuser = new_fuser()
     first, second, _ = masks_of(frames[0])
     for _ in range(5):
@@ -161,7 +161,7 @@ def test_separate_objects_stay_apart_under_shared_mask(new_fuser: NewFuser, fram
     assert 0 not in ids
 
 
-def test_confidence_decreases_without_detections(new_fuser: NewFuser, frames: list[Frame]) -> None:
+def test_fuser_confidence_decreases_without_detections(new_fuser: NewFuser, frames: list[Frame]) -> None:
     fuser = new_fuser()
     for k, frame in enumerate(frames):
         fuse_masks(fuser, frame, masks_of(frame)[:1] if k % 2 == 0 else [], [0.8] if k % 2 == 0 else [])
@@ -171,7 +171,7 @@ def test_confidence_decreases_without_detections(new_fuser: NewFuser, frames: li
     assert record.confidence == pytest.approx(0.4)
 
 
-def test_class_posterior_is_product_of_measurements(new_fuser: NewFuser, frames: list[Frame]) -> None:
+def test_fuser_class_posterior_is_product_of_measurements(new_fuser: NewFuser, frames: list[Frame]) -> None:
     fuser = new_fuser(class_floor=1e-6)
     for frame in frames[:3]:
         fuse_masks(fuser, frame, masks_of(frame)[:1], [0.9])
@@ -179,7 +179,7 @@ def test_class_posterior_is_product_of_measurements(new_fuser: NewFuser, frames:
     assert instance.class_probabilities[0] == pytest.approx(0.7**3 / (0.7**3 + 0.3**3), abs=1e-4)
 
 
-def test_different_label_space_raises(new_fuser: NewFuser, frames: list[Frame]) -> None:
+def test_fuser_different_label_space_raises(new_fuser: NewFuser, frames: list[Frame]) -> None:
     fuser = new_fuser()
     fuse_masks(fuser, frames[0], [], [])
     clusters = dataclasses.replace(
@@ -189,7 +189,7 @@ def test_different_label_space_raises(new_fuser: NewFuser, frames: list[Frame]) 
         fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
 
 
-def test_empty_scene_leaves_map_unchanged(new_fuser: NewFuser) -> None:
+def test_fuser_empty_scene_leaves_map_unchanged(new_fuser: NewFuser) -> None:
     fuser = new_fuser()
     frame = Scene().frame(np.eye(4))
     fuse_masks(fuser, frame, [np.ones(CAMERA.shape, np.bool_)], [0.9])
@@ -197,8 +197,8 @@ def test_empty_scene_leaves_map_unchanged(new_fuser: NewFuser) -> None:
     assert len(fuser.scene.table.records) == 0
 
 
-def test_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFuser, frames: list[Frame]) -> None:
-    """Else its confidence would fall in every frame at whose border or behind whose objects a bit of it shows."""
+def test_fuser_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    """Otherwise its confidence would fall in frames that show only a small part of it."""
     fuser = new_fuser(create_points=50)
     mask = masks_of(frames[0])[0]
     fuse_masks(fuser, frames[0], [mask], [0.9])
@@ -213,8 +213,8 @@ def test_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFuser, fr
 
 
 @pytest.mark.parametrize("voxel_size", [0.01, 0.02, 0.04])
-def test_min_area_does_not_depend_on_voxel_size(new_fuser: NewFuser, voxel_size: float) -> None:
-    """A poster on a wall, of which the area is known."""
+def test_fuser_min_area_does_not_depend_on_voxel_size(new_fuser: NewFuser, voxel_size: float) -> None:
+    """The object is a poster on a wall with a known area."""
     depth, poster = 1.5, np.zeros(CAMERA.shape, np.bool_)
     poster[30:90, 40:120] = True
     area = poster.sum() * depth**2 / (CAMERA.fx * CAMERA.fy)
@@ -241,13 +241,13 @@ def test_min_area_does_not_depend_on_voxel_size(new_fuser: NewFuser, voxel_size:
         {"min_area": -0.001},
     ],
 )
-def test_invalid_shared_parameter_raises(new_fuser: NewFuser, wrong: dict[str, float]) -> None:
+def test_fuser_invalid_shared_parameter_raises(new_fuser: NewFuser, wrong: dict[str, float]) -> None:
     [name] = wrong
     with pytest.raises(ConfigError, match=name):
         new_fuser(**wrong)
 
 
-def test_floored_distribution_is_positive_and_normalized() -> None:
+def test_fuser_floored_distribution_is_positive_and_normalized() -> None:
     p = np.exp(floored_log(np.float32([[1, 0, 0, 0], [0.25, 0.25, 0.25, 0.25]]), 0.2))
     assert np.allclose(p, [[0.85, 0.05, 0.05, 0.05], [0.25, 0.25, 0.25, 0.25]])
     assert floored_log(np.zeros((0, 0), np.float32), 0.2).shape == (0, 0)
@@ -256,10 +256,13 @@ def test_floored_distribution_is_positive_and_normalized() -> None:
 @pytest.mark.parametrize(
     ("lying_on", "same_class", "keeps"), [(0.6, False, True), (1.0, False, False), (0.6, True, False)]
 )
-def test_supported_object_keeps_voxels_under_larger_mask(
+def test_fuser_supported_object_keeps_voxels_under_larger_mask(
     lying_on: float, same_class: bool, keeps: bool, frames: list[Frame]
 ) -> None:
-    """Once it counts: the desk's mask covers it in frames that do not find it. A part of a desk is the desk's."""
+    """The object is confirmed; the desk's mask covers it in frames without its detection.
+
+    Parts of the desk are merged.
+    """
     fuser = assemble(
         BayesianTsdf,
         voxel_size=0.02,

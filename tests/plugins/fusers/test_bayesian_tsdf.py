@@ -1,4 +1,4 @@
-"""The map that the paper's fuser writes: its budget, its rows of evidence, the same with any number of threads."""
+"""Tests of fuser=bayesian_tsdf: map limits, evidence rows, and independence of the thread count."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ def frames() -> list[Frame]:
     return [room().frame(T, k) for k, T in enumerate(walk(10))]
 
 
-def test_full_map_raises_and_keeps_content(frames: list[Frame]) -> None:
+def test_bayesian_tsdf_full_map_raises_and_keeps_content(frames: list[Frame]) -> None:
     fuser = new_fuser(max_blocks=300)
     with pytest.raises(MapFullError, match="300 blocks"):
         fuse_masks(fuser, frames[0], [], [])
@@ -31,7 +31,7 @@ def test_full_map_raises_and_keeps_content(frames: list[Frame]) -> None:
     fuser.scene.mesh()
 
 
-def test_invalid_parameter_raises() -> None:
+def test_bayesian_tsdf_invalid_parameter_raises() -> None:
     for wrong in (
         {"max_weight": 256.0},
         {"class_floor": 0.0},
@@ -42,7 +42,7 @@ def test_invalid_parameter_raises() -> None:
             assemble(BayesianTsdf, **wrong)
 
 
-def test_map_does_not_depend_on_thread_count(frames: list[Frame]) -> None:
+def test_bayesian_tsdf_map_does_not_depend_on_thread_count(frames: list[Frame]) -> None:
     def mapped() -> list[bytes]:
         fuser = new_fuser()
         for frame in frames:
@@ -56,7 +56,7 @@ def test_map_does_not_depend_on_thread_count(frames: list[Frame]) -> None:
     assert by_one == by_two
 
 
-def test_only_created_instances_allocate_evidence_rows(frames: list[Frame]) -> None:
+def test_bayesian_tsdf_only_created_instances_allocate_rows(frames: list[Frame]) -> None:
     fuser = new_fuser()
     first, second, _ = masks_of(frames[0])
     fuse_masks(fuser, frames[0], [second], [0.2])
@@ -69,7 +69,9 @@ def test_only_created_instances_allocate_evidence_rows(frames: list[Frame]) -> N
 
 
 @pytest.mark.parametrize(("on_top", "of_the_book"), [(0.25, True), (0.0, False)])
-def test_small_object_on_top_keeps_voxels_by_area_ratio(frames: list[Frame], on_top: float, of_the_book: bool) -> None:
+def test_bayesian_tsdf_small_object_keeps_voxels_by_area_ratio(
+    frames: list[Frame], on_top: float, of_the_book: bool
+) -> None:
     """Half of the frames miss the book, and the couch's mask always covers it."""
     fuser = new_fuser(occlusion_area_ratio=on_top)
     couch = masks_of(frames[0])[0]

@@ -1,4 +1,4 @@
-"""The fuser of preset=paper, compared with slow float64 references."""
+"""Tests of the fuser of preset=paper, compared with slow float64 references."""
 
 import dataclasses
 from pathlib import Path
@@ -60,7 +60,7 @@ def slow_matches(fuser: BayesianTsdf, frame: Frame, clusters: PointClusters) -> 
     return [matched.get(k, 0) for k in range(len(clusters))]
 
 
-def test_raycast_association_agrees_with_slow_reference(frames: list[Frame]) -> None:
+def test_paper_fuser_association_agrees_with_slow_reference(frames: list[Frame]) -> None:
     fuser = paper_fuser()
     assert fuser.association.association is InstanceSource.RAYCAST
     assert fuser.association.overlap_rule is OverlapRule.SMALLER
@@ -78,8 +78,8 @@ def test_raycast_association_agrees_with_slow_reference(frames: list[Frame]) -> 
 
 
 @pytest.mark.parametrize(("source", "found"), [("RAYCAST", True), ("SURFACE_LOOKUP", False)])
-def test_new_surface_votes_for_raycast_instance_behind(source: str, found: bool) -> None:
-    """A sphere nearer than the mapped one covers it: its readings are not where the map has its surface."""
+def test_paper_fuser_new_surface_votes_for_instance_behind(source: str, found: bool) -> None:
+    """A nearer sphere covers the mapped one: its depth is in front of the mapped surface."""
     behind, front = (Scene([(np.array([0.0, 0.0, -1.0]), -2.5)], [(np.array([0.0, 0.0, z]), 0.35)]) for z in (2.0, 1.6))
     fuser = paper_fuser(f"fuser.association={source}")
     fuse_masks(fuser, behind.frame(pose(), 0), masks_of(behind.frame(pose(), 0)), [0.9])
@@ -158,7 +158,7 @@ def slow_distributions(
 
 
 @pytest.mark.parametrize(("storage", "tolerance"), [("EXACT", 1e-4), ("COMPACT", 0.03)])
-def test_recursions_agree_with_slow_reference(
+def test_paper_fuser_recursions_agree_with_slow_reference(
     frames: list[Frame], storage: str, tolerance: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fuser = paper_fuser(f"fuser.storage={storage}", "fuser.create_score=0.4")
@@ -197,7 +197,7 @@ def test_recursions_agree_with_slow_reference(
     assert several > 50
 
 
-def test_instance_floor_0_divides_rest_of_score(frames: list[Frame]) -> None:
+def test_paper_fuser_instance_floor_0_divides_rest_of_score(frames: list[Frame]) -> None:
     fuser = paper_fuser()
     assert fuser.instance_floor == 0
     at = Pose(pose())
@@ -218,7 +218,7 @@ def roll_classes(scene: InstanceMap, shift: int) -> None:
 
 
 @pytest.mark.parametrize(("source", "changes"), [("VOXELS", True), ("DETECTIONS", False)])
-def test_class_evidence_of_voxels_decides_instance_class(frames: list[Frame], source: str, changes: bool) -> None:
+def test_paper_fuser_voxel_evidence_decides_instance_class(frames: list[Frame], source: str, changes: bool) -> None:
     fuser = paper_fuser(f"fuser.instance_class={source}")
     for frame in frames:
         fuse_masks(fuser, frame, masks_of(frame), SCORES, PROBABILITIES)
@@ -229,7 +229,7 @@ def test_class_evidence_of_voxels_decides_instance_class(frames: list[Frame], so
     assert (before != after) == changes
 
 
-def test_instance_class_is_sum_over_its_voxels(frames: list[Frame], tmp_path: Path) -> None:
+def test_paper_fuser_instance_class_is_sum_over_its_voxels(frames: list[Frame], tmp_path: Path) -> None:
     fuser = paper_fuser()
     for frame in frames:
         fuse_masks(fuser, frame, masks_of(frame), SCORES, PROBABILITIES)
@@ -251,7 +251,7 @@ def test_instance_class_is_sum_over_its_voxels(frames: list[Frame], tmp_path: Pa
             np.testing.assert_allclose(found, sums[k], rtol=1e-12)
 
 
-def test_unmatched_masks_update_classes_only_if_set(frames: list[Frame]) -> None:
+def test_paper_fuser_unmatched_masks_update_classes_only_if_set(frames: list[Frame]) -> None:
     for setting, rows in (("true", True), ("false", False)):
         fuser = paper_fuser(f"fuser.update_unmatched={setting}")
         fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [0.1])
@@ -260,8 +260,8 @@ def test_unmatched_masks_update_classes_only_if_set(frames: list[Frame]) -> None
         assert not fuser.scene.render(frames[0].camera, pose()).instance_ids.any()
 
 
-def test_pixels_of_all_masks_are_listed(frames: list[Frame]) -> None:
-    """The paper updates mask by mask: no mask gives way to a smaller one on top."""
+def test_paper_fuser_pixels_of_all_masks_are_listed(frames: list[Frame]) -> None:
+    """The paper updates mask by mask: overlapping masks all count."""
     fuser = paper_fuser()
     whole, small = masks_of(frames[0])[0], masks_of(frames[0])[0].copy()
     small[:, : int(np.median(np.nonzero(whole)[1]))] = False

@@ -1,4 +1,4 @@
-"""Class-only fusion on analytic scenes, and compared with the recursion of each voxel in float64."""
+"""Tests of class-only fusion on analytic scenes, compared with a float64 recursion per voxel."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def new_fuser(**parameters: object) -> ClassOnlyFusion:
 
 
 def mapped_boxes(boxes: list[box_scene.Box], class_ids: list[int]) -> SemanticMap:
-    """The boxes on the floor, seen from all views under their true masks.
+    """Map the boxes on the floor from all views under their true masks.
 
-    A hidden side of which one view sees a sliver is a piece of its own: `min_area` leaves it out.
+    A hidden side with few visible pixels is a separate component: `min_area` excludes it.
     """
     scene, fuser = BoxScene([[box] for box in boxes]), new_fuser(min_area=0.03)
     for k, T in enumerate(VIEWS):
@@ -54,7 +54,7 @@ def frames() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def mapped(frames: list[Frame]) -> SemanticMap:
-    """The three spheres: the first is detected in all frames, the second in three, the third in none."""
+    """Map three spheres: the first is detected in all frames, the second in three, the third in none."""
     fuser = new_fuser()
     for k, frame in enumerate(frames):
         found = 1 + (k in SECOND_FOUND)
@@ -62,10 +62,10 @@ def mapped(frames: list[Frame]) -> SemanticMap:
     return fuser.scene
 
 
-# What is an instance
+# Components
 
 
-def test_separate_boxes_of_one_class_are_two_instances() -> None:
+def test_class_only_separate_boxes_of_one_class_are_two() -> None:
     instances = mapped_boxes([LEFT, RIGHT], [0, 0]).instances()
     assert list(instances) == [1, 2]
     for instance, box in zip(sorted(instances.values(), key=lambda i: i.aabb.center[0]), [LEFT, RIGHT], strict=True):
@@ -73,12 +73,12 @@ def test_separate_boxes_of_one_class_are_two_instances() -> None:
         assert instance.class_probabilities.argmax() == 0
 
 
-def test_touching_boxes_of_one_class_are_one_instance() -> None:
+def test_class_only_touching_boxes_of_one_class_are_one() -> None:
     [instance] = mapped_boxes([LEFT, TOUCHING], [0, 0]).instances().values()
     assert instance.aabb.extent[0] == pytest.approx(1.0, abs=0.1)
 
 
-def test_touching_boxes_of_two_classes_are_two_instances() -> None:
+def test_class_only_touching_boxes_of_two_classes_are_two() -> None:
     scene = mapped_boxes([LEFT, TOUCHING], [0, 1])
     instances = scene.instances()
     assert sorted(i.class_probabilities.argmax() for i in instances.values()) == [0, 1]
@@ -89,7 +89,7 @@ def test_touching_boxes_of_two_classes_are_two_instances() -> None:
 
 
 @pytest.mark.parametrize("when", [0, 9])
-def test_single_false_detection_is_removed(frames: list[Frame], when: int) -> None:
+def test_class_only_single_false_detection_is_removed(frames: list[Frame], when: int) -> None:
     fuser = new_fuser()
     for k, frame in enumerate(frames):
         found = [masks_of(frame)[0]] if k == when else []
@@ -101,7 +101,7 @@ def test_single_false_detection_is_removed(frames: list[Frame], when: int) -> No
     assert (class_ids >= 0).sum() < 0.01 * masks_of(frames[5])[0].sum(), "on the silhouette, what that frame alone saw"
 
 
-def test_missed_1_ignores_unmasked_frames(frames: list[Frame]) -> None:
+def test_class_only_missed_1_ignores_unmasked_frames(frames: list[Frame]) -> None:
     fuser = new_fuser(missed=1.0)
     for k, frame in enumerate(frames):
         found = [masks_of(frame)[0]] if k == 0 else []
@@ -109,19 +109,19 @@ def test_missed_1_ignores_unmasked_frames(frames: list[Frame]) -> None:
     assert len(fuser.scene.instances()) == 1
 
 
-def test_instance_below_min_area_is_excluded(frames: list[Frame]) -> None:
+def test_class_only_instance_below_min_area_is_excluded(frames: list[Frame]) -> None:
     fuser = new_fuser(min_area=40.0)
     fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [0.6])
     assert not fuser.scene.instances()
     assert (fuser.scene.mesh().class_ids == -1).all()
-    assert (fuser.scene.render(CAMERA, walk(10)[0]).class_ids == 0).any(), "voxels know nothing of areas"
+    assert (fuser.scene.render(CAMERA, walk(10)[0]).class_ids == 0).any(), "voxels have no area limit"
 
 
-# What is said of one
+# Attributes of an instance
 
 
-def test_voxel_evidence_matches_reference(mapped: SemanticMap, frames: list[Frame]) -> None:
-    """Against eq. [7] over classes and background, by projecting the voxel into each frame."""
+def test_class_only_voxel_evidence_matches_reference(mapped: SemanticMap, frames: list[Frame]) -> None:
+    """The reference is eq. [7] over classes and background, with the voxel projected into each frame."""
     grid, evidence, fuser = mapped.volume.voxels.grid, mapped.labels.evidence, new_fuser()
     rows = np.flatnonzero(grid.label_row[: mapped.volume.voxels.block_count] >= 0)
     rng = np.random.default_rng(0)
@@ -159,7 +159,7 @@ def test_voxel_evidence_matches_reference(mapped: SemanticMap, frames: list[Fram
     assert differing <= 6, "pixels on the edge of two, in float32"
 
 
-def test_instance_attributes_match_voxel_reference(mapped: SemanticMap) -> None:
+def test_class_only_instance_attributes_match_voxel_reference(mapped: SemanticMap) -> None:
     grid, evidence, mesh = mapped.volume.voxels.grid, mapped.labels.evidence, mapped.mesh()
     voxels = mapped.volume.surface().voxels
     instances = mapped.instances()
@@ -191,7 +191,7 @@ def test_instance_attributes_match_voxel_reference(mapped: SemanticMap) -> None:
         )
 
 
-def test_detected_spheres_are_instances(mapped: SemanticMap) -> None:
+def test_class_only_detected_spheres_are_instances(mapped: SemanticMap) -> None:
     first, second = sorted(mapped.instances().values(), key=lambda instance: -instance.observations)
     assert (first.observations, first.first_frame, first.last_frame) == (10, 0, 9)
     assert (second.observations, second.first_frame, second.last_frame) == (3, 1, 5)
@@ -200,11 +200,11 @@ def test_detected_spheres_are_instances(mapped: SemanticMap) -> None:
     assert np.quantile(np.abs(np.linalg.norm(points - center, axis=1) - radius), 0.9) < 0.03
     view = mapped.render(CAMERA, walk(10)[5])
     assert (view.class_ids[masks_of(room().frame(walk(10)[5]))[0]] == 0).mean() > 0.9
-    assert not view.instance_ids.any(), "voxels know of no instance"
+    assert not view.instance_ids.any(), "voxels have no instance"
 
 
-def test_score_is_probability_of_best_class(frames: list[Frame]) -> None:
-    """Of a best class of 0.7, score 0.33 leaves the background more than half, and 0.6 a seventh."""
+def test_class_only_score_is_probability_of_best_class(frames: list[Frame]) -> None:
+    """If the best class has 0.7, score 0.33 leaves more than half to the background, and 0.6 a seventh."""
     for score, label in ((0.33, -1), (0.6, 0)):
         fuser = new_fuser()
         fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [score])
@@ -212,10 +212,10 @@ def test_score_is_probability_of_best_class(frames: list[Frame]) -> None:
         assert np.median(view.class_ids[masks_of(frames[0])[0]]) == label
 
 
-# The map as such
+# The map
 
 
-def test_map_does_not_depend_on_thread_count(frames: list[Frame]) -> None:
+def test_class_only_map_does_not_depend_on_thread_count(frames: list[Frame]) -> None:
     def mapped() -> list[bytes]:
         fuser = new_fuser()
         for frame in frames[:5]:
@@ -227,7 +227,7 @@ def test_map_does_not_depend_on_thread_count(frames: list[Frame]) -> None:
     assert by_one == by_two
 
 
-def test_map_file_round_trip_is_exact(mapped: SemanticMap, tmp_path: Path) -> None:
+def test_class_only_map_file_round_trip_is_exact(mapped: SemanticMap, tmp_path: Path) -> None:
     mapped.save(tmp_path / "map.npz")
     loaded = SemanticMap.load(tmp_path / "map.npz")
     for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
@@ -243,7 +243,7 @@ def test_map_file_round_trip_is_exact(mapped: SemanticMap, tmp_path: Path) -> No
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
 
 
-def test_loaded_map_can_be_extended(frames: list[Frame], tmp_path: Path) -> None:
+def test_class_only_loaded_map_can_be_extended(frames: list[Frame], tmp_path: Path) -> None:
     whole, resumed = new_fuser(), new_fuser()
     for k, frame in enumerate(frames[:4]):
         if k == 2:
@@ -256,13 +256,13 @@ def test_loaded_map_can_be_extended(frames: list[Frame], tmp_path: Path) -> None
     assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
-def test_loading_instance_map_raises(tmp_path: Path) -> None:
+def test_class_only_loading_of_instance_map_raises(tmp_path: Path) -> None:
     BayesianTsdf().scene.save(tmp_path / "map.npz")
     with pytest.raises(DataError, match=f"expected map format semantic 4, got {FORMAT}"):
         SemanticMap.load(tmp_path / "map.npz")
 
 
-def test_different_label_space_raises(frames: list[Frame]) -> None:
+def test_class_only_different_label_space_raises(frames: list[Frame]) -> None:
     fuser = new_fuser()
     fuse_masks(fuser, frames[0], [], [])
     assert fuser.scene.classes == CLASSES
@@ -271,7 +271,7 @@ def test_different_label_space_raises(frames: list[Frame]) -> None:
         fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
 
 
-def test_invalid_parameter_raises() -> None:
+def test_class_only_invalid_parameter_raises() -> None:
     for wrong in (
         {"missed": 0.0},
         {"class_floor": 1.0},
@@ -292,7 +292,7 @@ def with_smoothness(mapped: SemanticMap, tmp_path: Path, smoothness: float) -> S
 
 
 def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
-    """Iterated conditional modes vertex by vertex, in float64 and with sets."""
+    """Run iterated conditional modes vertex by vertex, in float64 and with sets."""
     surface, grid, evidence = scene.volume.surface(), scene.volume.voxels.grid, scene.labels.evidence
     class_ids = scene.mesh().class_ids.tolist()
     neighbors: list[set[int]] = [set() for _ in class_ids]
@@ -319,7 +319,7 @@ def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
 
 
 @pytest.mark.parametrize("smoothness", [0.5, 3.0])
-def test_smoothness_equals_iterated_conditional_modes(mapped: SemanticMap, smoothness: float, tmp_path: Path) -> None:
+def test_class_only_smoothness_equals_icm_reference(mapped: SemanticMap, smoothness: float, tmp_path: Path) -> None:
     plain = with_smoothness(mapped, tmp_path, 0.0)
     expected = slowly_smoothed(plain, smoothness)
     smooth = with_smoothness(mapped, tmp_path, smoothness).mesh().class_ids
@@ -327,7 +327,7 @@ def test_smoothness_equals_iterated_conditional_modes(mapped: SemanticMap, smoot
     assert (expected != plain.mesh().class_ids).sum() > 2
 
 
-def test_smoothness_shortens_borders(mapped: SemanticMap, tmp_path: Path) -> None:
+def test_class_only_smoothness_shortens_borders(mapped: SemanticMap, tmp_path: Path) -> None:
     borders = []
     for smoothness in (0.0, 0.3, 3.0):
         mesh = with_smoothness(mapped, tmp_path, smoothness).mesh()

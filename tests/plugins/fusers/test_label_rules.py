@@ -1,4 +1,4 @@
-"""What the fusers make of the same three detections of one object."""
+"""Tests of the label rules of the fusers on three detections of one object."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_fuser_class_probabilities_follow_its_label_rule(
     [instance] = fuser.scene.instances().values()
     assert np.allclose(instance.class_probabilities, expected, atol=1e-5)
     assert (instance.first_frame, instance.last_frame) == (0, 2)
-    # the voxels agree with the table, except that each saw but some of the frames
+    # the voxels agree with the table, except that each was visible in only some of the frames
     view = fuser.scene.render(CAMERA, walk(3)[1])
     classes = view.class_ids[view.instance_ids == instance.id]
     assert np.bincount(classes).argmax() == np.argmax(expected)

@@ -1,4 +1,4 @@
-"""The baseline with one volume per object, on boxes seen by a perfect camera and detector."""
+"""Tests of the baseline with one volume per object, on boxes with exact depth and masks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def new_fuser(**parameters: object) -> ObjectVolumes:
 
 
 def pan(width: float) -> list[Frame]:
-    """Ten views of both boxes, `width` m from the first to the last."""
+    """Return ten views of both boxes, `width` m from the first to the last."""
     places = np.linspace(-width / 2, width / 2, 10)
     return [BOXES.frame(look_from(x, -1.4, 1.5, (0.0, 0.6, 0.2)), k) for k, x in enumerate(places)]
 
@@ -63,10 +63,10 @@ def mapped(frames: list[Frame]) -> ObjectVolumes:
     return fuser
 
 
-# What is mapped
+# Mapped surfaces
 
 
-def test_each_box_is_one_instance_on_its_surface(mapped: ObjectVolumes) -> None:
+def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
     scene = mapped.scene
     mesh, instances = scene.mesh(), scene.instances()
     assert sorted(instances) == [1, 2]
@@ -78,15 +78,15 @@ def test_each_box_is_one_instance_on_its_surface(mapped: ObjectVolumes) -> None:
         assert (owners == key).sum() > 300
 
 
-def test_object_surface_is_fully_labeled(mapped: ObjectVolumes) -> None:
-    """Or the nearest vertex to a true point would be the background's in one case of two."""
+def test_object_volumes_label_whole_object_surface(mapped: ObjectVolumes) -> None:
+    """Otherwise half of the true points would have a background vertex as nearest neighbor."""
     mesh = mapped.scene.mesh()
     owners = BOXES.owners(mesh.vertices.astype(np.float64), VOXEL / 4)
     for key in (1, 2):
         assert (mesh.instance_ids[owners == key] == key).mean() > 0.97
 
 
-def test_rendered_ids_match_ground_truth(mapped: ObjectVolumes, frames: list[Frame]) -> None:
+def test_object_volumes_rendered_ids_match_ground_truth(mapped: ObjectVolumes, frames: list[Frame]) -> None:
     frame = frames[4]
     assert frame.truth is not None
     assert frame.T_world_camera is not None
@@ -95,7 +95,7 @@ def test_rendered_ids_match_ground_truth(mapped: ObjectVolumes, frames: list[Fra
     assert (view.class_ids == np.where(view.instance_ids > 0, 0, -1)).all()
 
 
-def test_statistics_include_all_volumes(mapped: ObjectVolumes) -> None:
+def test_object_volumes_statistics_include_all_volumes(mapped: ObjectVolumes) -> None:
     scene = mapped.scene
     objects = sum(volume.block_count for volume in scene.volumes.values())
     assert scene.statistics.voxels == 512 * (scene.background.voxels.block_count + objects)
@@ -105,24 +105,24 @@ def test_statistics_include_all_volumes(mapped: ObjectVolumes) -> None:
 
 
 def share_of_the_room(fuser: ObjectVolumes) -> float:
-    """The share of the first object's vertices that are the floor's or the wall's, a voxel away from all boxes."""
+    """Return the fraction of the first object's vertices on the floor or wall, a voxel away from all boxes."""
     mesh = fuser.scene.mesh()
     points = mesh.vertices[mesh.instance_ids == 1].astype(np.float64)
     return float((BOXES.owners(points, VOXEL) == 0).mean())
 
 
-def test_single_mask_bleed_is_removed_and_constant_bleed_stays() -> None:
-    """What was never seen without the mask stays in either case: so the camera hardly moves."""
+def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
+    """Voxels always seen under the mask remain in both cases, so the camera moves little."""
     once, always = new_fuser(), new_fuser()
     for k, frame in enumerate(pan(0.1)):
         mask = masks_of(frame)[0]
         fuse(once, frame, [bled(mask, 12) if k == 3 else mask])
         fuse(always, frame, [bled(mask, 12)])
     assert share_of_the_room(once) < 0.02
-    assert share_of_the_room(always) > 0.2, "the weakness: nothing is cleaned, so what is always wrong stays"
+    assert share_of_the_room(always) > 0.2, "a known weakness: constant errors are not removed"
 
 
-def test_bled_voxels_are_removed_after_view_without_mask(frames: list[Frame]) -> None:
+def test_object_volumes_remove_bled_voxels_after_unmasked_view(frames: list[Frame]) -> None:
     """Beta(1 + 1, 1 + 0), then Beta(2, 2), which is not above 1/2."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     mask = masks_of(frame)[0]
@@ -132,7 +132,7 @@ def test_bled_voxels_are_removed_after_view_without_mask(frames: list[Frame]) ->
     assert share_of_the_room(fuser) < 0.02
 
 
-def test_object_volume_changes_only_when_detected(frames: list[Frame]) -> None:
+def test_object_volumes_change_only_when_detected(frames: list[Frame]) -> None:
     fuser = fuse(new_fuser(), frames[0], masks_of(frames[0]))
     first, second = ({k: a.copy() for k, a in v.arrays().items()} for v in fuser.scene.volumes.values())
     fuse(fuser, frames[1], masks_of(frames[1])[:1])
@@ -145,7 +145,7 @@ def test_object_volume_changes_only_when_detected(frames: list[Frame]) -> None:
 
 
 def part_of(mask: np.ndarray, share: float) -> np.ndarray:
-    """The first `share` of a mask's pixels, row by row."""
+    """Return the first `share` of a mask's pixels, row by row."""
     v, u = np.nonzero(mask)
     part = np.zeros_like(mask)
     part[v[: round(share * len(v))], u[: round(share * len(v))]] = True
@@ -162,7 +162,7 @@ def part_of(mask: np.ndarray, share: float) -> np.ndarray:
         (MASK_FUSION, 0.15, 1, False),  # of another class
     ],
 )
-def test_partial_detection_matches_by_overlap_rule(
+def test_object_volumes_partial_detection_matches_by_rule(
     frames: list[Frame], parameters: dict[str, object], share: float, class_id: int, same: bool
 ) -> None:
     fuser = new_fuser(**parameters)
@@ -172,7 +172,7 @@ def test_partial_detection_matches_by_overlap_rule(
     assert len(fuser.scene.table.records) == (1 if same else 2)
 
 
-def test_large_mask_over_small_object_creates_new_instance(frames: list[Frame]) -> None:
+def test_object_volumes_large_mask_creates_new_instance(frames: list[Frame]) -> None:
     whole = masks_of(frames[0])[0]
     for parameters in ({}, MASK_FUSION):
         fuser = new_fuser(**parameters)
@@ -181,7 +181,7 @@ def test_large_mask_over_small_object_creates_new_instance(frames: list[Frame]) 
         assert len(fuser.scene.table.records) == 2
 
 
-def test_detection_matches_object_of_largest_overlap(frames: list[Frame]) -> None:
+def test_object_volumes_detection_matches_largest_overlap(frames: list[Frame]) -> None:
     frame = frames[4]
     left, right = masks_of(frame)
     fuser = fuse(new_fuser(), frame, [left, right])
@@ -189,7 +189,7 @@ def test_detection_matches_object_of_largest_overlap(frames: list[Frame]) -> Non
     assert [record.observations for record in fuser.scene.table.records.values()] == [1, 2]
 
 
-def test_two_detections_of_one_object_are_one_observation(frames: list[Frame]) -> None:
+def test_object_volumes_two_detections_are_one_observation(frames: list[Frame]) -> None:
     frame, fuser = frames[0], new_fuser()
     whole = masks_of(frame)[0]
     fuse(fuser, frame, [whole])
@@ -201,7 +201,7 @@ def test_two_detections_of_one_object_are_one_observation(frames: list[Frame]) -
     assert (counts["foreground"][counts["foreground"] > 0] == 2).mean() > 0.95, "every voxel is in the second mask too"
 
 
-def test_weak_or_distant_detection_creates_no_object(frames: list[Frame]) -> None:
+def test_object_volumes_weak_or_far_detection_creates_none(frames: list[Frame]) -> None:
     frame = frames[0]
     mask = masks_of(frame)[0]
     for fuser in (new_fuser(create_score=0.9), new_fuser(max_depth=0.9)):
@@ -210,10 +210,10 @@ def test_weak_or_distant_detection_creates_no_object(frames: list[Frame]) -> Non
         assert not fuser.scene.volumes
 
 
-# What is known of an object
+# Attributes of an object
 
 
-def test_class_probabilities_are_mean_of_detections(frames: list[Frame]) -> None:
+def test_object_volumes_probabilities_are_mean_of_detections(frames: list[Frame]) -> None:
     fuser = new_fuser(min_observations=1)
     for k, class_id in enumerate([0, 1, 1]):
         fuse(fuser, replace(frames[0], index=k), masks_of(frames[0])[:1], [class_id])
@@ -224,8 +224,8 @@ def test_class_probabilities_are_mean_of_detections(frames: list[Frame]) -> None
     assert set(mesh.class_ids[mesh.instance_ids == 1]) == {1}
 
 
-def test_unconfirmed_object_is_removed_when_visible(frames: list[Frame]) -> None:
-    """Detected once and missed n times it exists with probability 2 / (3 + n), which is below 0.1 from n = 18 on."""
+def test_object_volumes_unconfirmed_is_removed_when_visible(frames: list[Frame]) -> None:
+    """After 1 detection and n misses it exists with probability 2 / (3 + n), below 0.1 from n = 18 on."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     wall = np.zeros(CAMERA.shape, np.bool_)
     wall[10:50, 100:180] = True
@@ -234,7 +234,7 @@ def test_unconfirmed_object_is_removed_when_visible(frames: list[Frame]) -> None
     elsewhere = replace(frame, depth=np.zeros_like(frame.depth))
     for k in range(30):
         fuse(fuser, replace(elsewhere, index=1 + k), [])
-    assert set(fuser.scene.instances()) == {1}, "nobody has looked there"
+    assert set(fuser.scene.instances()) == {1}, "the region is unobserved"
     for k in range(17):
         fuse(fuser, replace(frame, index=31 + k), [])
     assert set(fuser.scene.instances()) == {1}
@@ -246,7 +246,7 @@ def test_unconfirmed_object_is_removed_when_visible(frames: list[Frame]) -> None
     assert set(fuser.scene.table.records) == {2}, "ids are never used again"
 
 
-def test_object_below_min_area_is_excluded(frames: list[Frame]) -> None:
+def test_object_volumes_below_min_area_are_excluded(frames: list[Frame]) -> None:
     fuser = new_fuser(min_observations=1, min_area=40.0)
     fuse(fuser, frames[0], masks_of(frames[0]))
     assert not fuser.scene.instances()
@@ -256,7 +256,7 @@ def test_object_below_min_area_is_excluded(frames: list[Frame]) -> None:
 # The map
 
 
-def test_incremental_mesh_equals_mesh_of_loaded_map(frames: list[Frame], tmp_path: Path) -> None:
+def test_object_volumes_incremental_mesh_equals_loaded_mesh(frames: list[Frame], tmp_path: Path) -> None:
     fuser = new_fuser(min_observations=1)
     for frame in frames[::3]:
         fuse(fuser, frame, masks_of(frame)[: 1 + frame.index % 2])
@@ -271,8 +271,8 @@ def test_incremental_mesh_equals_mesh_of_loaded_map(frames: list[Frame], tmp_pat
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
 
 
-def test_overlapping_objects_both_have_surfaces(frames: list[Frame]) -> None:
-    """One detection a frame, now of the whole and now of a small part: what an IoU rule makes of a partial mask."""
+def test_object_volumes_keep_surfaces_of_overlapping_objects(frames: list[Frame]) -> None:
+    """Each frame has one detection, of the whole or of a small part, which an IoU rule does not match."""
     fuser = new_fuser(min_observations=1)
     whole = masks_of(frames[0])[0]
     for k, mask in enumerate([whole, part_of(whole, 0.15)]):
@@ -284,7 +284,7 @@ def test_overlapping_objects_both_have_surfaces(frames: list[Frame]) -> None:
     assert len(second) > 20
 
 
-def test_overlap_renders_most_probable_then_first_object(frames: list[Frame]) -> None:
+def test_object_volumes_overlap_renders_most_probable_object(frames: list[Frame]) -> None:
     frame, scene = frames[0], new_fuser().scene
     T = frame.T_world_camera
     assert T is not None
@@ -296,7 +296,7 @@ def test_overlap_renders_most_probable_then_first_object(frames: list[Frame]) ->
         assert (seen[mask[::2, ::2]] == expected).mean() > 0.9, expected
 
 
-def test_map_does_not_depend_on_thread_count(frames: list[Frame], tmp_path: Path) -> None:
+def test_object_volumes_do_not_depend_on_thread_count(frames: list[Frame], tmp_path: Path) -> None:
     def saved() -> bytes:
         fuser = new_fuser()
         for frame in frames[::2]:
@@ -308,13 +308,13 @@ def test_map_does_not_depend_on_thread_count(frames: list[Frame], tmp_path: Path
     assert by_one == by_two
 
 
-def test_full_map_raises(frames: list[Frame]) -> None:
+def test_object_volumes_full_map_raises(frames: list[Frame]) -> None:
     background = fuse(new_fuser(), frames[0], []).scene.background.voxels.block_count
     with pytest.raises(MapFullError, match=f"at most {background} blocks in the background and 2 objects"):
         fuse(new_fuser(max_blocks=background), frames[0], masks_of(frames[0]))
 
 
-def test_pixel_outside_image_or_other_classes_raise(frames: list[Frame]) -> None:
+def test_object_volumes_pixel_outside_or_other_classes_raise(frames: list[Frame]) -> None:
     frame = frames[0]
     clusters = clusters_of(frame, masks_of(frame))
     fuser = fuse(new_fuser(), frame, [])
@@ -326,7 +326,7 @@ def test_pixel_outside_image_or_other_classes_raise(frames: list[Frame]) -> None
         fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, classes=("a", "b", "c")))
 
 
-def test_invalid_parameter_raises() -> None:
+def test_object_volumes_invalid_parameter_raises() -> None:
     for wrong in ({"min_overlap": 1.5}, {"min_existence": -0.1}, {"create_points": 0}, {"label_band": 9.0}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             assemble(ObjectVolumes, **wrong)

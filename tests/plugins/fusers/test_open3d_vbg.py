@@ -1,4 +1,4 @@
-"""Open3D's blocks as a fuser: what a voxel counts, where surfaces lie, and what is kept, on scenes known exactly."""
+"""Tests of Open3D's voxel blocks as a fuser: votes, surfaces and storage, on exact scenes."""
 
 import dataclasses
 from pathlib import Path
@@ -41,7 +41,7 @@ def frames() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def mapped(frames: list[Frame]) -> Open3DMap:
-    """The room with its three spheres, from six frames."""
+    """Map the room with its three spheres from six frames."""
     fuser = new_fuser()
     for frame in frames:
         fuse_masks(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
@@ -49,7 +49,7 @@ def mapped(frames: list[Frame]) -> Open3DMap:
 
 
 def one_view(**changes: float) -> tuple[Open3DMap, Frame]:
-    """A wall seen once."""
+    """Map a wall from one frame."""
     frame = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)]).frame(np.eye(4))
     scene = Open3DMap(dataclasses.replace(SETTINGS, **changes), CONFIRMATION)
     scene.integrate(frame, np.eye(4))
@@ -60,7 +60,7 @@ def one_view(**changes: float) -> tuple[Open3DMap, Frame]:
 
 
 def majority(votes: list[int]) -> tuple[int, int]:
-    """Candidate and counter after Boyer and Moore, one vote at a time."""
+    """Return candidate and counter after Boyer and Moore, one vote at a time."""
     candidate = count = 0
     for vote in votes:
         if vote == candidate:
@@ -73,7 +73,7 @@ def majority(votes: list[int]) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("votes", [[1], [1, 2], [1, 2, 2], [1, 2, 3, 3], [2, 2, 1, 1, 1], [3, 3, 3, 1, 2]])
-def test_voxel_votes_match_boyer_moore(votes: list[int]) -> None:
+def test_open3d_vbg_voxel_votes_match_boyer_moore(votes: list[int]) -> None:
     scene, frame = one_view()
     for vote in votes:
         scene.vote(frame, np.eye(4), np.full(frame.depth.shape, vote, np.int32), band=2.0)
@@ -85,7 +85,7 @@ def test_voxel_votes_match_boyer_moore(votes: list[int]) -> None:
 
 
 def voxel_centers(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
-    """Flat numbers and places (m) of all voxels, the slow and obvious way."""
+    """Return the indices and positions (m) of all voxels with a slow reference."""
     r, size = scene.grid.settings.block_resolution, scene.grid.settings.voxel_size
     hashmap = scene.grid.blocks.hashmap()
     z, y, x = np.mgrid[:r, :r, :r].reshape(3, -1)
@@ -97,7 +97,7 @@ def voxel_centers(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(numbers), np.concatenate(places)
 
 
-def test_only_voxels_in_band_under_mask_vote(frames: list[Frame]) -> None:
+def test_open3d_vbg_only_voxels_in_band_under_mask_vote(frames: list[Frame]) -> None:
     frame = frames[3]
     T = frame.T_world_camera
     scene = Open3DMap(SETTINGS, CONFIRMATION)
@@ -115,11 +115,11 @@ def test_only_voxels_in_band_under_mask_vote(frames: list[Frame]) -> None:
     found = scene.grid.flat("instance")[numbers] == 7
     assert expected.sum() > 500
     assert (found != expected).mean() < 1e-4, "rounding at the border alone"
-    assert (scene.grid.flat("instance") == 7).sum() == found.sum(), "a voxel in no block has voted"
+    assert (scene.grid.flat("instance") == 7).sum() == found.sum(), "voxels without a block have no votes"
 
 
 @pytest.mark.parametrize(("scores", "winner"), [([0.9, 0.6], 1), ([0.6, 0.9], 2)])
-def test_shared_pixels_go_to_higher_score(frames: list[Frame], scores: list[float], winner: int) -> None:
+def test_open3d_vbg_shared_pixels_go_to_higher_score(frames: list[Frame], scores: list[float], winner: int) -> None:
     first, second, _ = masks_of(frames[0])
     v = np.arange(CAMERA.height)[:, None]
     shared = first & (v > np.quantile(np.nonzero(first)[0], 0.7))
@@ -134,8 +134,8 @@ def test_shared_pixels_go_to_higher_score(frames: list[Frame], scores: list[floa
 
 
 @pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.1, 0.5, 0.0), (-0.2, -0.4, 0.3)])
-def test_rendered_surface_is_accurate(rotvec: tuple[float, float, float]) -> None:
-    """Open3D's own rays end 12 mm too far, and its depth look-up is off by half a pixel; neither is left."""
+def test_open3d_vbg_rendered_surface_is_accurate(rotvec: tuple[float, float, float]) -> None:
+    """Open3D's own rays end 12 mm too far, and its depth lookup is off by half a pixel; both are corrected."""
     scene, T = Open3DMap(SETTINGS, CONFIRMATION), pose(rotvec=rotvec)
     walls = Scene(planes=[(np.array([-0.3, 0.1, -1.0]) / np.sqrt(1.1), -1.777)], spheres=room().spheres)
     for _ in range(3):
@@ -156,7 +156,7 @@ def test_rendered_surface_is_accurate(rotvec: tuple[float, float, float]) -> Non
     assert np.array_equal(near.depth, view.depth)
 
 
-def test_mesh_is_accurate_and_repeatable(mapped: Open3DMap, frames: list[Frame]) -> None:
+def test_open3d_vbg_mesh_is_accurate_and_repeatable(mapped: Open3DMap, frames: list[Frame]) -> None:
     mesh = mapped.mesh()
     distance = room().distance(mesh.vertices.astype(np.float64))
     assert np.median(distance) < 0.1 * 0.02
@@ -172,7 +172,7 @@ def test_mesh_is_accurate_and_repeatable(mapped: Open3DMap, frames: list[Frame])
         assert np.array_equal(getattr(mesh, name), getattr(twin, name)), name
 
 
-def test_min_weight_applies_after_first_frames() -> None:
+def test_open3d_vbg_min_weight_applies_after_first_frames() -> None:
     scene, frame = one_view()
     view, mesh = scene.render(CAMERA, np.eye(4)), scene.mesh()
     assert (view.depth > 0).mean() > 0.9
@@ -186,8 +186,8 @@ def test_min_weight_applies_after_first_frames() -> None:
     assert scene.mesh().vertices[:, 0].max() < 0.1
 
 
-def test_low_resolution_image_leaves_no_holes() -> None:
-    """Open3D touches blocks at every 4th pixel only: here 12 cm apart, for blocks of 8 cm."""
+def test_open3d_vbg_low_resolution_image_leaves_no_holes() -> None:
+    """Open3D touches blocks only at every 4th pixel: here 12 cm apart, for blocks of 8 cm."""
     coarse = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
     scene = Open3DMap(dataclasses.replace(SETTINGS, voxel_size=0.01), CONFIRMATION)
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.2)])
@@ -196,10 +196,8 @@ def test_low_resolution_image_leaves_no_holes() -> None:
     assert (scene.render(coarse, np.eye(4)).depth > 0)[2:-2, 2:-2].all()
 
 
-def test_close_view_of_large_map_is_complete_without_output(
-    mapped: Open3DMap, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Open3D sizes its map of ranges by the first view, prints a warning in a later one and leaves holes there."""
+def test_open3d_vbg_close_view_is_complete_without_output(mapped: Open3DMap, capfd: pytest.CaptureFixture[str]) -> None:
+    """Open3D sizes its range map by the first view; in a later one it prints a warning and leaves holes."""
     scene = Open3DMap(mapped.grid.settings, CONFIRMATION)
     for T in walk(3):
         scene.integrate(room().frame(T), T)
@@ -215,7 +213,7 @@ def test_close_view_of_large_map_is_complete_without_output(
 # Instances
 
 
-def test_instance_ids_match_bayesian_tsdf(frames: list[Frame]) -> None:
+def test_open3d_vbg_instance_ids_match_bayesian_tsdf(frames: list[Frame]) -> None:
     ours, theirs = new_fuser(), assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
     for k, frame in enumerate(frames):
         order = np.roll(np.arange(3), k)
@@ -235,7 +233,7 @@ def test_instance_ids_match_bayesian_tsdf(frames: list[Frame]) -> None:
     assert (a == b).mean() > 0.97
 
 
-def test_each_sphere_is_one_instance_on_its_surface(mapped: Open3DMap) -> None:
+def test_open3d_vbg_each_sphere_is_one_instance_on_its_surface(mapped: Open3DMap) -> None:
     mesh, instances = mapped.mesh(), mapped.instances()
     assert sorted(instances) == [1, 2, 3]
     for (center, radius), instance in zip(room().spheres, instances.values(), strict=True):
@@ -247,7 +245,7 @@ def test_each_sphere_is_one_instance_on_its_surface(mapped: Open3DMap) -> None:
         assert (mesh.class_ids[instance.vertices] == 0).all()
 
 
-def test_merge_relabels_all_voxels(frames: list[Frame]) -> None:
+def test_open3d_vbg_merge_relabels_all_voxels(frames: list[Frame]) -> None:
     fuser = new_fuser(merge_overlap=0.5, merge_frames=1)
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
@@ -260,19 +258,19 @@ def test_merge_relabels_all_voxels(frames: list[Frame]) -> None:
     assert set(np.unique(fuser.scene.grid.flat("instance"))) == {0, 1}
 
 
-def test_instance_below_min_area_is_excluded(frames: list[Frame]) -> None:
+def test_open3d_vbg_instance_below_min_area_is_excluded(frames: list[Frame]) -> None:
     fuser = new_fuser(min_area=40.0)
     for frame in frames[:3]:
         fuse_masks(fuser, frame, masks_of(frame)[:1], [0.9])
     assert not fuser.scene.instances()
     assert (fuser.scene.mesh().class_ids == -1).all()
-    assert fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids.any(), "it is tentative, not gone"
+    assert fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids.any(), "it is tentative, not removed"
 
 
 # Storage
 
 
-def test_grid_growth_keeps_content(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open3d_vbg_grid_growth_keeps_content(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
     maps = []
     for first in (16, 5000):
         monkeypatch.setattr("framework.baselines.open3d_grid.FIRST_BLOCKS", first)
@@ -286,7 +284,7 @@ def test_grid_growth_keeps_content(frames: list[Frame], monkeypatch: pytest.Monk
         assert np.array_equal(getattr(small.mesh(), name), getattr(large.mesh(), name))
 
 
-def test_full_map_raises_and_keeps_content(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open3d_vbg_full_map_raises_and_keeps_content(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("framework.baselines.open3d_grid.FIRST_BLOCKS", 16)
     first = new_fuser()
     fuse_masks(first, frames[0], [], [])
@@ -299,15 +297,15 @@ def test_full_map_raises_and_keeps_content(frames: list[Frame], monkeypatch: pyt
     assert fuser.scene.statistics.voxels == budget * 512
     assert fuser.scene.grid.blocks.hashmap().capacity() <= budget
     assert np.array_equal(fuser.scene.mesh().vertices, before.vertices)
-    fuse_masks(fuser, frames[0], [], [])  # what is there can still be seen again
+    fuse_masks(fuser, frames[0], [], [])  # existing blocks can still be fused
 
 
-def test_statistics_count_blocks_in_use(mapped: Open3DMap) -> None:
+def test_open3d_vbg_statistics_count_blocks_in_use(mapped: Open3DMap) -> None:
     assert mapped.statistics.bytes == mapped.statistics.voxels * 4 * (1 + 1 + 3 + 1 + 1)
     assert mapped.statistics.voxels == mapped.grid.block_count * 512
 
 
-def test_map_file_round_trip_is_exact(mapped: Open3DMap, tmp_path: Path) -> None:
+def test_open3d_vbg_map_file_round_trip_is_exact(mapped: Open3DMap, tmp_path: Path) -> None:
     mapped.save(tmp_path / "map.npz")
     loaded = Open3DMap.load(tmp_path / "map.npz")
     assert (loaded.grid.settings, loaded.classes, loaded.grid.frames) == (mapped.grid.settings, CLASSES, 6)
@@ -325,7 +323,7 @@ def test_map_file_round_trip_is_exact(mapped: Open3DMap, tmp_path: Path) -> None
     assert coords == sorted(coords, key=lambda xyz: xyz[::-1]), "Open3D's order differs between runs"
 
 
-def test_damaged_or_foreign_map_file_raises(mapped: Open3DMap, tmp_path: Path) -> None:
+def test_open3d_vbg_damaged_or_foreign_file_raises(mapped: Open3DMap, tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     mapped.save(path)
     whole = path.read_bytes()
@@ -342,10 +340,10 @@ def test_damaged_or_foreign_map_file_raises(mapped: Open3DMap, tmp_path: Path) -
         Open3DMap.load(tmp_path / "none.npz")
 
 
-# Odd input
+# Unusual input
 
 
-def test_empty_scene_gives_empty_map_with_round_trip(tmp_path: Path) -> None:
+def test_open3d_vbg_empty_map_round_trip_is_exact(tmp_path: Path) -> None:
     fuser = new_fuser()
     fuse_masks(fuser, Scene().frame(np.eye(4)), [np.ones(CAMERA.shape, np.bool_)], [0.9])
     assert (fuser.scene.statistics.voxels, len(fuser.scene.table.records)) == (0, 0)
@@ -353,8 +351,8 @@ def test_empty_scene_gives_empty_map_with_round_trip(tmp_path: Path) -> None:
     assert Open3DMap.load(tmp_path / "map.npz").statistics.voxels == 0
 
 
-def test_single_depth_reading_is_mapped(frames: list[Frame]) -> None:
-    """It lies between the pixels that Open3D looks at, which then raises an error."""
+def test_open3d_vbg_single_depth_reading_is_mapped(frames: list[Frame]) -> None:
+    """It is between the pixels that Open3D uses, which then raises an error."""
     depth = np.zeros_like(frames[0].depth)
     depth[61, 83] = 1.5
     fuser = new_fuser()
@@ -362,7 +360,7 @@ def test_single_depth_reading_is_mapped(frames: list[Frame]) -> None:
     assert fuser.scene.statistics.voxels > 0
 
 
-def test_invalid_parameter_raises() -> None:
+def test_open3d_vbg_invalid_parameter_raises() -> None:
     for wrong in ({"block_resolution": 1}, {"class_floor": 1.0}, {"min_weight": float("nan")}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             assemble(Open3DVoxelBlockGrid, **wrong)

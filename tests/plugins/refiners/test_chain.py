@@ -1,4 +1,4 @@
-"""Refiners in a row, as Hydra composes them."""
+"""Tests of chained refiners, as composed by Hydra."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support import registered
 
 
 class Halving(LargestComponent):
-    """Takes every other point: what it leaves depends on what it is given."""
+    """Keeps every other point, so that its result depends on its input."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return PointClusters(
@@ -41,14 +41,14 @@ def line() -> tuple[Frame, PointClusters]:
     return frame, PointClusters(points, pixels, np.zeros(8, np.int32), ones, ones[0], ("chair",))
 
 
-def test_links_refine_in_sequence() -> None:
+def test_chain_links_refine_in_sequence() -> None:
     frame, clusters = line()
     left = Chain({"first": Halving(), "second": Halving()}).refine(clusters, frame)
     assert left.points_world.tolist() == clusters.points_world[::4].tolist()
 
 
-def test_link_with_pixels_outside_image_raises() -> None:
-    class MadeUp(LargestComponent):
+def test_chain_link_with_pixels_outside_image_raises() -> None:
+    class InvalidPixels(LargestComponent):
         def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
             return replace(clusters, pixels=clusters.pixels - 9)
 
@@ -56,7 +56,7 @@ def test_link_with_pixels_outside_image_raises() -> None:
     with pytest.raises(
         DataError, match=r"clusters: expected pixels in the image of 8x8, got u in \[-9, -9\], v in \[.*, .*\]"
     ):
-        Chain({"first": MadeUp(), "second": LargestComponent()}).refine(clusters, frame)
+        Chain({"first": InvalidPixels(), "second": LargestComponent()}).refine(clusters, frame)
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_link_with_pixels_outside_image_raises() -> None:
         ),
     ],
 )
-def test_overrides_set_remove_replace_and_add_links(overrides: list[str], links: dict[str, type]) -> None:
+def test_chain_overrides_set_remove_replace_and_add_links(overrides: list[str], links: dict[str, type]) -> None:
     chain = registered.built("refiner", "chain", *overrides)
     found = {name: type(link) for name, link in chain.links.items()}
     assert found == links
@@ -94,11 +94,11 @@ def test_overrides_set_remove_replace_and_add_links(overrides: list[str], links:
         (["refiner.links=3"], "expected plugins by name, got 3|Could not|merge"),
     ],
 )
-def test_error_names_link(overrides: list[str], message: str) -> None:
+def test_chain_error_names_link(overrides: list[str], message: str) -> None:
     with pytest.raises(Exception, match=message):
         registered.built("refiner", "chain", *overrides)
 
 
-def test_empty_chain_raises_with_advice() -> None:
+def test_chain_without_links_raises_with_advice() -> None:
     with pytest.raises(ConfigError, match="refiner=identity"):
         Chain({})

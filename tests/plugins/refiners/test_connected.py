@@ -1,4 +1,4 @@
-"""Pieces of a cluster: what a step in depth parts from the rest leaves, what lies behind an occluder stays."""
+"""Tests of connected components of a cluster: parts behind a depth step are removed, parts behind an occluder kept."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def frame_of(depth: Float32, camera: Camera = CAMERA) -> Frame:
 
 
 def kept(refiner: Connected | LargestComponent, mask: Bool, depth: Float32) -> Bool:
-    """(H, W) the pixels of the mask that stay."""
+    """Return the kept pixels (H, W) of the mask."""
     frame = frame_of(depth)
     after = refiner.refine(clusters_of([mask], frame), frame)
     image = np.zeros(mask.shape, np.bool_)
@@ -36,8 +36,8 @@ def kept(refiner: Connected | LargestComponent, mask: Bool, depth: Float32) -> B
     return image
 
 
-def test_occluder_does_not_split_object() -> None:
-    """A couch at 3 m, a pole at 2 m before it that the mask leaves out: LargestComponent loses the smaller half."""
+def test_connected_occluder_does_not_split_object() -> None:
+    """A couch at 3 m is behind a pole at 2 m that the mask excludes: LargestComponent loses the smaller half."""
     pole = (U >= 20) & (U < 24)
     depth = np.where(pole, 2.0, 3.0)
     assert (kept(Connected(), ~pole, depth) == ~pole).all()
@@ -45,25 +45,25 @@ def test_occluder_does_not_split_object() -> None:
 
 
 @pytest.mark.parametrize("neighbor_depth", [4.5, 1.5])
-def test_depth_step_ends_object(neighbor_depth: float) -> None:
+def test_connected_object_ends_at_depth_step(neighbor_depth: float) -> None:
     """The mask includes a wall behind the object or a table in front of it."""
     depth = np.where(U < 6, neighbor_depth, 3.0)
     assert (kept(Connected(), np.ones(depth.shape, np.bool_), depth) == (U >= 6)).all()
 
 
-def test_missing_depth_does_not_split_object() -> None:
+def test_connected_missing_depth_does_not_split_object() -> None:
     depth = np.where((U >= 20) & (U < 26), 0.0, 3.0)
     assert (kept(Connected(), depth > 0, depth) == (depth > 0)).all()
 
 
-def test_background_between_slats_is_removed() -> None:
+def test_connected_removes_background_between_slats() -> None:
     slat = U % 8 < 4
     depth = np.where(slat, 1.5, 2.5)
     assert (kept(Connected(), np.ones(depth.shape, np.bool_), depth) == slat).all()
 
 
-def test_slanted_surface_continues_behind_occluder() -> None:
-    """At 0.8 m of depth a meter aside; at 4 m aside it would be a step."""
+def test_connected_keeps_slanted_surface_behind_occluder() -> None:
+    """The slope is 0.8 m of depth per meter; across 4 m it would be a step."""
     x = (U - CAMERA.cx) / CAMERA.fx
     slanted = 2.0 / (1 - 0.8 * x)  # z = 2 + 0.8 x z
     pole = (U >= 20) & (U < 30)
@@ -73,7 +73,7 @@ def test_slanted_surface_continues_behind_occluder() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_connected_refiner_matches_reference(seed: int) -> None:
-    """On clusters so small that every point is a sample."""
+    """The clusters are so small that every point is a sample."""
     rng = np.random.default_rng(seed)
     camera = Camera(16, 12, 20.0, 20.0, 7.5, 5.5)
     coarse = rng.choice([1.0, 1.05, 1.3, 2.0], (3, 4))

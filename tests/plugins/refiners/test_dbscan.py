@@ -1,4 +1,4 @@
-"""What density clustering keeps of clusters."""
+"""Tests of density-based clustering."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAME = Frame(0, 0.0, np.zeros((60, 90, 3), np.uint8), np.full((60, 90), 2.0, np
 
 
 def clusters_of(*sets: np.ndarray) -> PointClusters:
-    """The point sets as clusters, their points seen at the pixels of a 90x60 image one after the other."""
+    """Return the point sets as clusters, with their points at consecutive pixels of a 90x60 image."""
     points = np.concatenate([np.zeros((0, 3)), *sets]).astype(np.float32)
     ones = np.ones(len(sets), np.float32)
     at = np.concatenate([np.arange(0), *(np.arange(len(s)) for s in sets)])
@@ -29,7 +29,7 @@ def clusters_of(*sets: np.ndarray) -> PointClusters:
 
 
 def blobs(seed: int, count: int = 1500) -> np.ndarray:
-    """Four dense balls of different density that nearly touch, and noise around them, far from the origin."""
+    """Return four dense balls of different density that nearly touch, with noise, far from the origin."""
     rng = np.random.default_rng(seed)
     centers = rng.uniform(-0.4, 0.4, (4, 3))
     sigmas = rng.uniform(0.02, 0.08, 4)
@@ -41,7 +41,7 @@ def blobs(seed: int, count: int = 1500) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_dbscan_keeps_largest_component_with_border(seed):
-    """scikit-learn's largest cluster by core points, with all that is within eps of one of them."""
+    """The reference is scikit-learn's largest cluster by core points, with all points within eps of one."""
     eps, min_points, points = 0.04, 12, blobs(seed)
     reference = DBSCAN(eps=eps, min_samples=min_points).fit(points)
     core = reference.core_sample_indices_
@@ -54,8 +54,8 @@ def test_dbscan_keeps_largest_component_with_border(seed):
     assert 0 < right.sum() < len(points)
 
 
-def test_eps_grows_with_depth():
-    """Points 5 cm apart on a line at 2 m."""
+def test_dbscan_eps_grows_with_depth():
+    """The points are 5 cm apart on a line at 2 m."""
     line = np.stack([np.arange(20) * 0.05, np.zeros(20), np.full(20, 2.0)], axis=1)
     line[12:, 0] += 0.06
     for slope, kept in ((0.01, 12), (0.05, 20)):
@@ -63,8 +63,8 @@ def test_eps_grows_with_depth():
         assert len(refined.pixels) == kept, slope
 
 
-def test_skipped_points_follow_sampled_points():
-    """Two plates of different size; with a stride the pixels between follow those near them."""
+def test_dbscan_skipped_points_follow_sampled_points():
+    """There are two plates of different size; with a stride, pixels between samples follow near samples."""
     v, u = np.mgrid[:60, :90]
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.3)], axis=-1).reshape(-1, 3)
     clusters = clusters_of(plates)
@@ -74,17 +74,17 @@ def test_skipped_points_follow_sampled_points():
         assert len(refined.pixels) == 60 * 50
 
 
-def test_sampled_points_are_weighted_for_skipped_points():
-    """Of a plate of 5400 points at most 600 are searched: every third row and column, each point for nine."""
+def test_dbscan_weights_sampled_points_for_skipped_points():
+    """Of a plate of 5400 points at most 600 are searched: every third row and column, with weight nine."""
     v, u = np.mgrid[:60, :90]
     plate = np.stack([u * 0.01, v * 0.01, 0 * u + 2.0], axis=-1).reshape(-1, 3)
-    plate[-90:, 1] += 0.5  # the last row comes off: none of the points searched is in it
+    plate[-90:, 1] += 0.5  # the last row is removed: it contains no sample
     for eps, min_points, kept in ((0.035, 9 * 3, 59 * 90), (0.035, 9 * 5 + 1, 60 * 90)):
         refiner = Dbscan(eps=eps, eps_per_depth=0.0, min_points=min_points, stride=1, max_points=600)
         assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, "each has at most 5 within eps"
 
 
-def test_first_of_two_equal_components_stays():
+def test_dbscan_first_of_two_equal_components_stays():
     rng = np.random.default_rng(0)
     ball = rng.normal(0, 0.01, (50, 3))
     for offset in (1.0, -1.0):
@@ -94,12 +94,12 @@ def test_first_of_two_equal_components_stays():
         np.testing.assert_array_equal(refined.pixels[:, 0], np.arange(50))
 
 
-def test_sparse_cluster_is_unchanged():
+def test_dbscan_sparse_cluster_is_unchanged():
     spread = np.arange(60).reshape(20, 3) * 1.0
     assert len(Dbscan().refine(clusters_of(spread), FRAME).pixels) == 20
 
 
-def test_degenerate_clusters_are_valid():
+def test_dbscan_degenerate_clusters_are_valid():
     same = np.zeros((500, 3))
     one = np.array([[1.0, 2.0, 3.0]])
     none = np.zeros((0, 3))
@@ -111,7 +111,7 @@ def test_degenerate_clusters_are_valid():
     assert len(Dbscan(eps=0.001, eps_per_depth=0, min_points=1, stride=1).refine(clusters_of(far), FRAME).pixels) == 1
 
 
-def test_unassigned_points_stay():
+def test_dbscan_unassigned_points_stay():
     clusters = clusters_of(blobs(0))
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, 0).astype(np.int32)
     refined = Dbscan(stride=1).refine(replace(clusters, cluster=cluster), FRAME)
@@ -119,7 +119,7 @@ def test_unassigned_points_stay():
     assert 0 < (refined.cluster == 0).sum() < (cluster == 0).sum()
 
 
-def test_result_does_not_depend_on_thread_count():
+def test_dbscan_does_not_depend_on_thread_count():
     clusters = clusters_of(*(blobs(seed) for seed in range(5)))
     np.testing.assert_array_equal(*by_one_thread_and_two(lambda: Dbscan().refine(clusters, FRAME).points_world))
 
@@ -133,6 +133,6 @@ def test_result_does_not_depend_on_thread_count():
         ({"stride": 0}, "Dbscan.stride"),
     ],
 )
-def test_invalid_parameter_raises(parameters, message):
+def test_dbscan_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         Dbscan(**parameters)

@@ -1,4 +1,4 @@
-"""Masks that claim convex segments: a box on a table under masks that fall short, bleed and overlap."""
+"""Tests of masks that claim convex segments: a box on a table under small, bleeding and overlapping masks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POSE = Pose(exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1])))
 
 
 def table() -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W) m and ids: 1 a box whose front is 1.2 m away, 0 the table below and the wall 2 m away."""
+    """Return depth (H, W) m and ids: 1 a box whose front is 1.2 m away, 0 the table below and the wall 2 m away."""
     v, u = np.mgrid[:240, :320]
     x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
     depth = np.minimum(2.0, 0.7 / np.maximum(y, 1e-9))
@@ -57,8 +57,8 @@ def shifted(mask: np.ndarray, dv: int, du: int) -> np.ndarray:
     return moved
 
 
-def test_shifted_mask_is_corrected_to_box():
-    """Eight pixels too far right: the table on the right goes, the box's left rim comes, with the points of lift."""
+def test_geometric_corrects_shifted_mask_to_box():
+    """The mask is eight pixels too far right: the table is removed, and the box's left rim is added."""
     depth, ids = table()
     frame = frame_of(depth)
     mask = shifted(ids == 1, 0, 8)
@@ -76,7 +76,7 @@ def test_shifted_mask_is_corrected_to_box():
     np.testing.assert_array_equal(after.class_probabilities, before.class_probabilities)
 
 
-def test_refiner_without_segment_growth_only_shrinks():
+def test_geometric_without_growth_only_shrinks():
     depth, ids = table()
     frame = frame_of(depth)
     mask = shifted(ids == 1, 0, 8)
@@ -85,7 +85,7 @@ def test_refiner_without_segment_growth_only_shrinks():
     np.testing.assert_array_equal(shrunk, grown & mask)
 
 
-def test_segment_goes_to_mask_of_largest_coverage():
+def test_geometric_segment_goes_to_mask_of_largest_coverage():
     depth, ids = table()
     frame = frame_of(depth)
     u = np.arange(320)[None]
@@ -99,7 +99,7 @@ def test_segment_goes_to_mask_of_largest_coverage():
 
 
 @pytest.mark.parametrize(("min_overlap", "claimed"), [(0.4, True), (0.6, False)])
-def test_segment_below_min_overlap_is_not_claimed(min_overlap, claimed):
+def test_geometric_does_not_claim_segment_below_min_overlap(min_overlap, claimed):
     depth, ids = table()
     frame = frame_of(depth)
     half = (ids == 1) & (np.arange(320)[None] < 160)
@@ -108,7 +108,7 @@ def test_segment_below_min_overlap_is_not_claimed(min_overlap, claimed):
     assert len(refined) == 1
 
 
-def test_unassigned_points_stay():
+def test_geometric_unassigned_points_stay():
     depth, ids = table()
     frame = frame_of(depth)
     before = lifted((ids == 1)[None], frame)
@@ -119,8 +119,8 @@ def test_unassigned_points_stay():
     np.testing.assert_array_equal(after.pixels[after.cluster == -1], before.pixels[::7])
 
 
-def test_collinear_points_are_not_extended():
-    """A mask of one column of a narrow segment has points on a line: they stay, no other comes."""
+def test_geometric_collinear_points_are_not_extended():
+    """A mask of one column in a narrow segment has collinear points, which are unchanged."""
     depth = np.zeros(CAMERA.shape, np.float32)
     depth[40:80, 60:62] = 1.0
     frame = frame_of(depth)
@@ -134,7 +134,7 @@ def test_collinear_points_are_not_extended():
     assert len(refiner.refine(lifted(mask, frame), frame).pixels) == 80, "two columns fix the pose"
 
 
-def test_degenerate_input_is_valid():
+def test_geometric_degenerate_input_is_valid():
     refiner = Geometric()
     depth, _ = table()
     nothing = lifted(np.zeros((0, *CAMERA.shape), bool), frame_of(depth))
@@ -147,7 +147,7 @@ def test_degenerate_input_is_valid():
     assert len(refiner.refine(lifted(one, frame_of(depth)), frame_of(depth)).points_world) <= 1
 
 
-def test_result_does_not_depend_on_thread_count():
+def test_geometric_does_not_depend_on_thread_count():
     depth, ids = table()
     noise = np.random.default_rng(0).normal(0, 0.003, depth.shape)
     frame = frame_of(depth + noise)
@@ -166,6 +166,6 @@ def test_result_does_not_depend_on_thread_count():
         ({"min_overlap": 1.0}, "Geometric.min_overlap"),
     ],
 )
-def test_invalid_parameter_raises(parameters, message):
+def test_geometric_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         Geometric(**parameters)

@@ -1,4 +1,4 @@
-"""The tree over a frame's masks, compared with a slow float64 reference."""
+"""Tests of the mixture tree over all masks of a frame, compared with a slow float64 reference."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CLASSES = ("chair", "bed")
 
 
 def clusters_of(points: Float32, masks: Int32, scores: tuple[float, ...], pixels: Int32 | None = None) -> PointClusters:
-    """Return clusters whose points have pixels of their own."""
+    """Return clusters without common pixels."""
     n = np.arange(len(points))
     return PointClusters(
         points_world=points,
@@ -32,7 +32,7 @@ def clusters_of(points: Float32, masks: Int32, scores: tuple[float, ...], pixels
 
 
 def three_objects(seed: int, bleed: float = 0.15) -> tuple[Float32, Int32, Int32]:
-    """Return points (S, 3) of three bent objects, their masks, some of which are of the wrong object, and the truth."""
+    """Return points (S, 3) of three curved objects, their masks with some wrong points, and the true objects."""
     rng = np.random.default_rng(seed)
     centers = np.array([[0.0, 0.0, 2.0], [0.5, 0.1, 2.2], [0.1, 0.6, 1.7]])
     truth = np.sort(rng.integers(0, 3, 900))
@@ -119,7 +119,7 @@ def slow_masks(refiner: GmmFrame, points: Float32, masks: Int32, count: int) -> 
 @pytest.mark.parametrize("children", [2, 4, 8])
 @pytest.mark.parametrize("levels", [1, 2])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_point_assignment_matches_reference(levels: int, children: int, seed: int) -> None:
+def test_gmm_frame_point_assignment_matches_reference(levels: int, children: int, seed: int) -> None:
     refiner = GmmFrame(levels=levels, children=children, min_points=1)
     points, masks, truth = three_objects(seed)
     refined = refiner.refine(clusters_of(points, masks, (0.9, 0.8, 0.7)), FRAME)
@@ -133,7 +133,7 @@ def test_point_assignment_matches_reference(levels: int, children: int, seed: in
 
 
 @pytest.mark.parametrize("treatment", ForeignPoints)
-def test_foreign_points_move_drop_or_stay(treatment: ForeignPoints) -> None:
+def test_gmm_frame_foreign_points_move_drop_or_stay(treatment: ForeignPoints) -> None:
     points, masks, _ = three_objects(2)
     clusters = clusters_of(points, masks, (0.9, 0.8, 0.7))
     expected = slow_masks(GmmFrame(), points, masks, 3)
@@ -147,7 +147,7 @@ def test_foreign_points_move_drop_or_stay(treatment: ForeignPoints) -> None:
     np.testing.assert_allclose(sizes, by_treatment[treatment], atol=4)
 
 
-def test_pixel_in_several_masks_goes_to_best_score() -> None:
+def test_gmm_frame_pixel_in_several_masks_goes_to_best_score() -> None:
     points, masks, _ = three_objects(3, bleed=0.0)
     n = np.arange(len(points))
     pixels = np.stack([n % 80, n // 80], axis=1).astype(np.int32)
@@ -165,7 +165,7 @@ def test_pixel_in_several_masks_goes_to_best_score() -> None:
     assert set(np.unique(GmmFrame(foreign_points=ForeignPoints.STAY).refine(equal, FRAME).cluster)) == {0, 1, 2}
 
 
-def test_small_cluster_is_dropped() -> None:
+def test_gmm_frame_small_cluster_is_dropped() -> None:
     points, masks, _ = three_objects(4, bleed=0.0)
     kept = (masks != 1) | (np.cumsum(masks == 1) <= 20)
     clusters = clusters_of(points[kept], masks[kept], (0.9, 0.8, 0.7))
@@ -175,7 +175,7 @@ def test_small_cluster_is_dropped() -> None:
         assert len(refined) == 3, "cluster k is detection k"
 
 
-def test_k_means_initialization_differs_but_finds_objects() -> None:
+def test_gmm_frame_k_means_start_differs_but_finds_objects() -> None:
     points, masks, truth = three_objects(5)
     clusters = clusters_of(points, masks, (0.9, 0.8, 0.7))
     by_masks, by_k_means = (
@@ -189,7 +189,7 @@ def test_k_means_initialization_differs_but_finds_objects() -> None:
     assert (found == truth).mean() > 0.93
 
 
-def test_several_gaussians_per_mask_form_one_object() -> None:
+def test_gmm_frame_several_gaussians_per_mask_form_object() -> None:
     points, masks, truth = three_objects(6)
     refined = GmmFrame(levels=1, gaussians_per_mask=3).refine(clusters_of(points, masks, (0.9, 0.8, 0.7)), FRAME)
     found = np.empty(len(points), np.int32)
@@ -197,14 +197,14 @@ def test_several_gaussians_per_mask_form_one_object() -> None:
     assert (found == truth).mean() > 0.9
 
 
-def test_fit_on_subset_assigns_all_points() -> None:
+def test_gmm_frame_fit_on_subset_assigns_all_points() -> None:
     points, masks, truth = three_objects(7)
     refined = GmmFrame(max_points=200).refine(clusters_of(points, masks, (0.9, 0.8, 0.7)), FRAME)
     assert len(refined.cluster) == len(points)
     assert abs(np.bincount(refined.cluster) - np.bincount(truth)).max() < 40
 
 
-def test_empty_mask_and_empty_frame_are_kept() -> None:
+def test_gmm_frame_empty_mask_and_empty_frame_are_kept() -> None:
     points, masks, _ = three_objects(8)
     refined = GmmFrame().refine(clusters_of(points, masks * 2, (0.9, 0.8, 0.7, 0.6, 0.5)), FRAME)
     assert set(np.unique(refined.cluster)) == {0, 2, 4}
@@ -212,13 +212,13 @@ def test_empty_mask_and_empty_frame_are_kept() -> None:
     assert len(GmmFrame().refine(nothing, FRAME).cluster) == 0
 
 
-def test_result_does_not_depend_on_thread_count() -> None:
+def test_gmm_frame_does_not_depend_on_thread_count() -> None:
     points, masks, _ = three_objects(9)
     clusters = clusters_of(points, masks, (0.9, 0.8, 0.7))
     by_one, by_two = by_one_thread_and_two(lambda: GmmFrame().refine(clusters, FRAME).cluster.tobytes())
     assert by_one == by_two
 
 
-def test_invalid_children_count_raises() -> None:
+def test_gmm_frame_invalid_children_count_raises() -> None:
     with pytest.raises(ConfigError, match="children: expected 2, 4 or 8, got 3"):
         GmmFrame(children=3)

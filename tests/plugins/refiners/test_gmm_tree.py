@@ -1,4 +1,4 @@
-"""The tree of mixtures on a toy scene: a box on a floor before a wall, under a mask that bleeds."""
+"""Tests of the mixture tree: a box on a floor in front of a wall, under a bleeding mask."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 
 
 def room() -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W) m with noise and ids: the box of 0.5 m with its front (1) 2 m away, and its top (2), 16 px high.
+    """Return depth (H, W) m with noise and ids: the front (1) of a 0.5 m box at 2 m, and its top (2), 16 px high.
 
-    It stands on a floor before a wall at 3 m.
+    The box is on a floor in front of a wall at 3 m.
     """
     v, u = np.mgrid[:240, :320]
     ray_x, ray_y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
@@ -44,7 +44,7 @@ def lifted(masks: np.ndarray, frame: Frame) -> PointClusters:
 
 
 def bleeding(mask: np.ndarray, px: int) -> np.ndarray:
-    """The mask grown by `px` to all sides."""
+    """Return the mask grown by `px` to all sides."""
     v, u = np.nonzero(mask)
     grown = np.zeros_like(mask)
     for dv in range(-px, px + 1):
@@ -67,14 +67,14 @@ def test_gmm_tree_removes_mask_bleed(px, levels):
     frame = frame_of(depth)
     mask = bleeding(ids > 0, px)
     after = kept(GmmTree(levels=levels).refine(lifted(mask[None], frame), frame))
-    assert after[ids == 1].mean() > 0.98, "the top is no deeper in the mask than it bleeds: nobody can tell"
+    assert after[ids == 1].mean() > 0.98, "the top is within the bleeding margin, so that it is ambiguous"
     assert 1 - after[mask & (ids == 0)].mean() > 0.92
     before = kept(Identity().refine(lifted(mask[None], frame), frame))
-    assert before[mask].all(), "there was something to take away"
+    assert before[mask].all(), "the input must have background points"
 
 
-def test_mask_log_odds_decide_in_one_plane():
-    """Object and wall in one plane: geometry says nothing, and the mask alone decides, to where its log-odds are 0."""
+def test_gmm_tree_mask_log_odds_decide_in_one_plane():
+    """Object and wall are in one plane: geometry is uninformative, and the border is where the log-odds are 0."""
     depth = np.full(CAMERA.shape, 2.0, np.float32)
     frame = frame_of(depth)
     mask = np.zeros((1, *CAMERA.shape), bool)
@@ -82,10 +82,10 @@ def test_mask_log_odds_decide_in_one_plane():
     clusters = lifted(mask, frame)
     after = kept(GmmTree().refine(clusters, frame))
     assert after[85:155, 125:195].mean() > 0.98
-    assert len(GmmTree(mask_log_odds=0.0).refine(clusters, frame).pixels) == 0, "without evidence nobody's: a draw"
+    assert len(GmmTree(mask_log_odds=0.0).refine(clusters, frame).pixels) == 0, "without evidence it is a tie"
 
 
-def test_masks_are_refined_independently():
+def test_gmm_tree_refines_masks_independently():
     depth, ids = room()
     frame = frame_of(depth)
     wall = np.zeros_like(ids, bool)
@@ -97,7 +97,7 @@ def test_masks_are_refined_independently():
     assert (both.cluster != 1).all()
 
 
-def test_cluster_with_too_few_points_is_unchanged():
+def test_gmm_tree_cluster_with_too_few_points_is_unchanged():
     depth, ids = room()
     frame = frame_of(depth)
     tiny = np.zeros((1, *CAMERA.shape), bool)
@@ -111,7 +111,7 @@ def test_cluster_with_too_few_points_is_unchanged():
     assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), "a tree without a node"
 
 
-def test_unassigned_points_stay():
+def test_gmm_tree_unassigned_points_stay():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids > 0, 8)[None], frame)
@@ -121,7 +121,7 @@ def test_unassigned_points_stay():
     assert (GmmTree().refine(PointClusters(*arrays), frame).cluster == -1).sum() == (cluster == -1).sum()
 
 
-def test_result_does_not_depend_on_thread_count():
+def test_gmm_tree_does_not_depend_on_thread_count():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(np.stack([bleeding(ids > 0, 8), ids > 0]), frame)
@@ -137,6 +137,6 @@ def test_result_does_not_depend_on_thread_count():
         ({"min_support": 1.0}, "GmmTree.min_support"),
     ],
 )
-def test_invalid_parameter_raises(parameters, message):
+def test_gmm_tree_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         GmmTree(**parameters)

@@ -1,4 +1,4 @@
-"""Floors and walls leave the clusters, the flat parts of objects stay: exact scenes of boxes in a room."""
+"""Tests of plane removal: floors and walls are removed from clusters, flat parts of objects are kept."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 def scene(*boxes: Corners, pitch: float = PITCH, noise: float = 0.0) -> tuple[Frame, np.ndarray]:
-    """The room with the boxes in it, and the (H, W) ids: 0 room, k the k-th box. Noise in standard deviations / z^2."""
+    """Return the room with boxes, and (H, W) ids: 0 room, k the k-th box. Noise is in standard deviations / z^2."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
     c, s = np.cos(pitch), np.sin(pitch)
@@ -42,7 +42,7 @@ def scene(*boxes: Corners, pitch: float = PITCH, noise: float = 0.0) -> tuple[Fr
 
 
 def heights(frame: Frame, pitch: float = PITCH) -> np.ndarray:
-    """(H, W) m above the floor."""
+    """Return (H, W) m above the floor."""
     v = np.arange(CAMERA.height)[:, None]
     return 1.2 - (np.cos(pitch) * (v - CAMERA.cy) / CAMERA.fy + np.sin(pitch)) * frame.depth
 
@@ -59,14 +59,14 @@ def bleeding(mask: np.ndarray, px: int = 8) -> np.ndarray:
 
 
 def masks_of(clusters: PointClusters) -> np.ndarray:
-    """(N, H, W) the pixels that are left of each cluster."""
+    """Return (N, H, W) the remaining pixels of each cluster."""
     masks = np.zeros((len(clusters), *CAMERA.shape), bool)
     masks[clusters.cluster, clusters.pixels[:, 1], clusters.pixels[:, 0]] = True
     return masks
 
 
 @pytest.mark.parametrize("pitch", [0.0, PITCH, 0.6])
-def test_box_on_floor_keeps_sides_above_plane_distance(pitch):
+def test_plane_removal_keeps_box_above_plane_distance(pitch):
     frame, ids = scene(BOX, pitch=pitch)
     [left] = masks_of(PlaneRemoval(plane_distance=0.02).refine(lifted(frame, bleeding(ids == 1)), frame))
     np.testing.assert_array_equal(left, (ids == 1) & (heights(frame, pitch) > 0.02))
@@ -80,8 +80,8 @@ def test_structure_mask_marks_floor_and_walls():
     assert refined.structure[ids == 0].mean() > 0.99
 
 
-def test_sensor_noise_widens_plane_distance():
-    """A Kinect at 3 m: 99 % of the floor and the wall leave, and the box stays from 6 cm above the floor."""
+def test_plane_removal_sensor_noise_widens_plane_distance():
+    """With Kinect noise at 3 m, 99 % of floor and wall are removed, and the box is kept above 6 cm."""
     frame, ids = scene(BOX, noise=0.002)
     bled = bleeding(ids == 1)
     [left] = masks_of(PlaneRemoval().refine(lifted(frame, bled), frame))
@@ -89,8 +89,8 @@ def test_sensor_noise_widens_plane_distance():
     assert left[(ids == 1) & (heights(frame) > 0.06)].all()
 
 
-def test_table_top_stays():
-    """A table that fills the lower half of the image; what it hides of the floor and the room is behind its top."""
+def test_plane_removal_keeps_table_top():
+    """The table fills the lower half of the image; the floor and the room are hidden behind its top."""
     table = (-1.2, 0.45, 0.9), (1.2, 0.5, 2.2)
     frame, ids = scene(table, BOX)
     top = PlaneRemoval(min_area=0.1)
@@ -99,8 +99,8 @@ def test_table_top_stays():
         np.testing.assert_array_equal(left, bleeding(mask, 4) & (ids > 0))
 
 
-def test_plane_stays_in_cluster_with_largest_fraction():
-    """A table top that hides all: nothing is behind it, so that only the share that a cluster holds can tell."""
+def test_plane_removal_keeps_plane_in_cluster_of_most_points():
+    """The table top hides everything, so that only its fraction of the cluster is informative."""
     frame, ids = scene(((-9.0, 0.5, -9.0), (9.0, 0.6, 9.0)), ((-0.1, 0.3, 0.4), (0.1, 0.5, 0.6)), pitch=0.9)
     assert (ids > 0).all()
     refined = PlaneRemoval(min_area=0.3).refine(lifted(frame, ids == 1, bleeding(ids == 2)), frame)
@@ -109,7 +109,7 @@ def test_plane_stays_in_cluster_with_largest_fraction():
     assert cup.sum() > 0.8 * (ids == 2).sum()
     assert not cup[ids == 1].any()
     assert refined.structure is not None
-    assert not refined.structure[ids == 1].any(), "what an object keeps is no structure, whoever else lost it"
+    assert not refined.structure[ids == 1].any(), "points kept by an object are not structure"
     half = (ids == 1) & (np.cumsum(ids == 1).reshape(ids.shape) <= 0.49 * (ids == 1).sum())
     [left] = masks_of(PlaneRemoval(min_area=0.3).refine(lifted(frame, half), frame))
     assert not left.any()
@@ -118,8 +118,8 @@ def test_plane_stays_in_cluster_with_largest_fraction():
 
 
 @pytest.mark.parametrize(("share", "unchanged"), [(0.4, False), (0.6, True)])
-def test_cluster_fraction_counts_all_parts_of_plane(share, unchanged):
-    """A wall seen between posts, in a mask that ends in the middle of it and is longer than what a thread counts."""
+def test_plane_removal_cluster_fraction_counts_all_parts(share, unchanged):
+    """The wall is visible between posts, in a mask that ends inside it and spans several thread blocks."""
     post = np.arange(320) // 32 % 2 == 1
     depth = np.where(post, 1.5, 2.0) * np.ones(CAMERA.shape)
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth.astype(np.float32), CAMERA)
@@ -129,8 +129,8 @@ def test_cluster_fraction_counts_all_parts_of_plane(share, unchanged):
     np.testing.assert_array_equal(left, mask & (post | unchanged))
 
 
-def test_screen_near_wall_keeps_front_and_loses_wall():
-    """8 cm before the wall, 1.2 m x 0.7 m, in Kinect noise; even with planes this small: the wall is behind it."""
+def test_plane_removal_keeps_screen_and_removes_wall_behind():
+    """The screen of 1.2 m x 0.7 m is 8 cm in front of the wall, with Kinect noise and a small minimum area."""
     screen = (-0.6, -0.4, 3.85), (0.6, 0.3, 3.92)
     for noise, kept, dropped in ((0.0, 1.0, 1.0), (0.001, 0.99, 0.99)):
         frame, ids = scene(screen, pitch=0.0, noise=noise)
@@ -141,8 +141,8 @@ def test_screen_near_wall_keeps_front_and_loses_wall():
             assert 1 - left[bled & (ids == 0)].mean() >= dropped
 
 
-def test_wall_with_small_opening_is_structure():
-    """With a twentieth of the wall open it is structure, with a third of it it could be the side of a cupboard."""
+def test_plane_removal_wall_with_small_opening_is_structure():
+    """With an opening of a twentieth it is structure; with a third it could be the side of a cupboard."""
     for width, dropped in ((12, True), (100, False)):
         frame, _ = scene(BOX)
         depth = frame.depth.copy()
@@ -154,8 +154,8 @@ def test_wall_with_small_opening_is_structure():
         assert is_wall.any() == dropped, width
 
 
-def test_max_tilt_limits_removal_to_floor():
-    """With a tilt of 60 degrees the wall counts no longer, the floor does."""
+def test_plane_removal_max_tilt_limits_removal_to_floor():
+    """With a tilt of 60 degrees the wall is no longer structure, the floor is."""
     frame, ids = scene(BOX)
     mask = np.ones(CAMERA.shape, bool)
     refiner = PlaneRemoval(plane_distance=0.02, max_tilt=60.0, max_cluster_fraction=1.0 - 1e-9)
@@ -171,7 +171,7 @@ def test_max_tilt_limits_removal_to_floor():
     assert ids.any()
 
 
-def test_frame_without_planes_is_unchanged():
+def test_plane_removal_without_planes_changes_nothing():
     rng = np.random.default_rng(0)
     depth = rng.uniform(1, 3, CAMERA.shape).astype(np.float32)
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth, CAMERA)
@@ -179,15 +179,15 @@ def test_frame_without_planes_is_unchanged():
     np.testing.assert_array_equal(PlaneRemoval().refine(clusters, frame).pixels, clusters.pixels)
 
 
-def test_small_plane_is_not_structure():
-    """Of 0.5 m^2, or of a twentieth of the frame, when more is asked."""
+def test_plane_removal_small_plane_is_not_structure():
+    """The plane has 0.5 m^2, or a twentieth of the frame, which is below the minimum."""
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1))
     for strict in (PlaneRemoval(min_area=100.0), PlaneRemoval(min_frame_fraction=0.9)):
         assert len(strict.refine(clusters, frame).pixels) == len(clusters.pixels)
 
 
-def test_unassigned_points_stay():
+def test_plane_removal_unassigned_points_stay():
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1), np.zeros_like(ids, bool))
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, clusters.cluster).astype(np.int32)
@@ -206,6 +206,6 @@ def test_unassigned_points_stay():
         ({"max_tilt": 200.0}, "PlaneRemoval.max_tilt"),
     ],
 )
-def test_invalid_parameter_raises(parameters, message):
+def test_plane_removal_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         PlaneRemoval(**parameters)

@@ -1,4 +1,4 @@
-"""What rank-order clustering keeps of clusters."""
+"""Tests of rank-order clustering."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAME = Frame(0, 0.0, np.zeros((60, 90, 3), np.uint8), np.full((60, 90), 2.0, np
 
 
 def clusters_of(*sets: np.ndarray) -> PointClusters:
-    """The point sets as clusters, their points seen at the pixels of a 90x60 image one after the other."""
+    """Return the point sets as clusters, with their points at consecutive pixels of a 90x60 image."""
     points = np.concatenate([np.zeros((0, 3)), *sets]).astype(np.float32)
     ones = np.ones(len(sets), np.float32)
     at = np.concatenate([np.arange(0), *(np.arange(len(s)) for s in sets)])
@@ -36,7 +36,7 @@ def blobs(seed: int, count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
-def test_separated_blobs_split_at_any_scale(scale):
+def test_rank_order_separated_blobs_split_at_any_scale(scale):
     rng = np.random.default_rng(0)
     small, large = rng.normal(0, 0.05, (200, 3)), rng.normal(0, 0.05, (300, 3)) + np.array([0.0, 0.6, 0.0])
     points = (np.concatenate([small, large]) * scale).astype(np.float32)
@@ -48,8 +48,8 @@ def test_separated_blobs_split_at_any_scale(scale):
     assert len(at) > 0.9 * 300
 
 
-def test_skipped_points_follow_nearest_sampled_point():
-    """Two plates; blocks of pixels leave 200 of 5400 points, and the others follow by distance in space."""
+def test_rank_order_skipped_points_follow_nearest_sample():
+    """There are two plates; pixel blocks leave 200 of 5400 points, and the others follow by distance."""
     v, u = np.mgrid[:60, :90]
     rng = np.random.default_rng(0)
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.5)], axis=-1).reshape(-1, 3)
@@ -66,7 +66,7 @@ def test_skipped_points_follow_nearest_sampled_point():
     np.testing.assert_array_equal(refined.pixels[:, 1] * 90 + refined.pixels[:, 0], np.flatnonzero(right))
 
 
-def test_first_of_two_equal_groups_stays():
+def test_rank_order_first_of_two_equal_groups_stays():
     rng = np.random.default_rng(0)
     ball = rng.normal(0, 0.01, (60, 3))
     for offset in (1.0, -1.0):
@@ -75,7 +75,7 @@ def test_first_of_two_equal_groups_stays():
         np.testing.assert_array_equal(refined.pixels[:, 1] * 90 + refined.pixels[:, 0], np.arange(60))
 
 
-def test_degenerate_clusters_are_valid():
+def test_rank_order_degenerate_clusters_are_valid():
     same, one, none = np.zeros((500, 3)), np.array([[1.0, 2.0, 3.0]]), np.zeros((0, 3))
     two = np.array([[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
     refined = RankOrder().refine(clusters_of(same, none, one, two, none), FRAME)
@@ -86,7 +86,7 @@ def test_degenerate_clusters_are_valid():
     assert len(RankOrder().refine(clusters_of(), FRAME)) == 0
 
 
-def test_unassigned_points_stay():
+def test_rank_order_unassigned_points_stay():
     clusters = clusters_of(blobs(0, 900))
     cluster = np.where(np.arange(900) % 3 == 0, -1, 0).astype(np.int32)
     refined = RankOrder(threshold=0.3).refine(replace(clusters, cluster=cluster), FRAME)
@@ -94,7 +94,7 @@ def test_unassigned_points_stay():
     assert 0 < (refined.cluster == 0).sum() < 600
 
 
-def test_result_does_not_depend_on_thread_count():
+def test_rank_order_does_not_depend_on_thread_count():
     clusters = clusters_of(*(blobs(seed, 1500) for seed in range(5)))
     np.testing.assert_array_equal(*by_one_thread_and_two(lambda: RankOrder().refine(clusters, FRAME).points_world))
 
@@ -108,20 +108,20 @@ def test_result_does_not_depend_on_thread_count():
         ({"max_points": 9}, "RankOrder.max_points"),
     ],
 )
-def test_invalid_parameter_raises(parameters, message):
+def test_rank_order_invalid_parameter_raises(parameters, message):
     with pytest.raises(ConfigError, match=message):
         RankOrder(**parameters)
 
 
 def neighbor_order(points: np.ndarray) -> list[list[int]]:
-    """All points in the order of their distance from each one; itself first, of equally near the first."""
+    """Return all points in the order of their distance from each one; itself first, ties by index."""
     distances = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
     np.fill_diagonal(distances, -1)
     return [sorted(range(len(points)), key=lambda b, row=row: (row[b], b)) for row in distances]
 
 
 def slow_groups(points: np.ndarray, k: int, threshold: float) -> np.ndarray:
-    """The definition, word by word."""
+    """Return the groups by the definition."""
     order = neighbor_order(points)
     n = len(points)
 
@@ -144,11 +144,11 @@ def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
 
 @pytest.mark.parametrize("threshold", [0.0, 0.5, 0.7, 1.0, 1.5])
 @pytest.mark.parametrize(("points", "k"), [(blobs(0, 70), 6), (blobs(1, 50), 9), (blobs(2, 60), 3), (blobs(3, 8), 9)])
-def test_groups_match_reference(points, k, threshold):
+def test_rank_order_groups_match_reference(points, k, threshold):
     assert same_partition(rank_order_groups(points, k, threshold), slow_groups(points, k, threshold))
 
 
-def test_reference_splits_test_data():
-    """Neither one group nor as many as points: the comparison above says something."""
+def test_rank_order_reference_splits_test_data():
+    """There are several groups and fewer groups than points, so that the comparison is meaningful."""
     for points, k in ((blobs(0, 70), 6), (blobs(1, 50), 9), (blobs(2, 60), 3)):
         assert 1 < len(np.unique(slow_groups(points, k, 0.5))) < len(points) // 2

@@ -1,4 +1,4 @@
-"""The shrinking refiners on a toy scene: a box on a floor before a wall, under a mask that bleeds."""
+"""Tests of the shrinking refiners: a box on a floor in front of a wall, under a bleeding mask."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ T_WORLD_CAMERA = exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1]))
 
 
 def room(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W) m with 1 % noise, and the true ids: 0 wall at 3 m and floor 0.8 m below, 1 a box of 0.5 m on it.
+    """Return depth (H, W) m with 1 % noise, and ids: 0 wall at 3 m and floor 0.8 m below, 1 a 0.5 m box on it.
 
-    The front of the box is 2 m away; a pole (id 2) stands before its left edge at 1.2 m.
+    The front of the box is 2 m away; a pole (id 2) is in front of its left edge at 1.2 m.
     """
     v, u = np.mgrid[:240, :320]
     ray_x, ray_y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
@@ -67,31 +67,31 @@ def bleeding(mask: np.ndarray, px: int) -> np.ndarray:
 
 
 def recall_and_rejection(refined: PointClusters, before: PointClusters, ids: np.ndarray) -> tuple[float, float]:
-    """The share of the box's points that is kept and of all others that is dropped, in cluster 0."""
+    """Return the kept fraction of the box's points, and the dropped fraction of the others, in cluster 0."""
     right, was_right = (ids[c.pixels[c.cluster == 0, 1], c.pixels[c.cluster == 0, 0]] == 1 for c in (refined, before))
     return right.sum() / was_right.sum(), 1 - (~right).sum() / (~was_right).sum()
 
 
 @pytest.mark.parametrize("px", [4, 6, 8])
 def test_gmm_em_removes_mask_bleed(px):
-    """Pole, floor and wall around the box are dropped, both faces of the box stay: better than the alternatives."""
+    """Pole, floor and wall are dropped, and both faces of the box are kept."""
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, px)[None], frame)
     recall, rejection = recall_and_rejection(GmmEm().refine(before, frame), before, ids)
     assert recall > 0.97
-    assert rejection > (0.95 if px < 6 else 0.88)  # the mask is believed up to 4.8 px of bleeding: `expected_bleed`
+    assert rejection > (0.95 if px < 6 else 0.88)  # the mask is trusted up to 4.8 px of bleeding: `expected_bleed`
     doubting = GmmEm(object_components=2, mask_log_odds=2.0, expected_bleed=0.5).refine(before, frame)
     doubting_recall, doubting_rejection = recall_and_rejection(doubting, before, ids)
     assert doubting_recall > 0.97
-    assert doubting_rejection > 0.95, "a mask that is believed less lets the mixture take more away"
+    assert doubting_rejection > 0.95, "a less trusted mask allows the mixture to remove more"
     for other in (KMeans(), LargestComponent(), GmmEm(mask_log_odds=0.0)):
         other_recall, other_rejection = recall_and_rejection(other.refine(before, frame), before, ids)
         assert recall + rejection > other_recall + other_rejection, other
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_refiner_only_shrinks_and_keeps_point_data(make):
+def test_shrinking_refiner_only_shrinks_and_keeps_point_data(make):
     depth, ids = room()
     depth[100:110, 150:160] = 0
     frame = frame_of(depth)
@@ -112,7 +112,7 @@ def test_refiner_only_shrinks_and_keeps_point_data(make):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_clusters_are_refined_independently_in_any_order(make):
+def test_shrinking_refiner_does_not_depend_on_cluster_order(make):
     depth, ids = room()
     frame = frame_of(depth)
     masks = np.stack([bleeding(ids == 1, 8), bleeding(ids == 2, 3)])
@@ -125,7 +125,7 @@ def test_clusters_are_refined_independently_in_any_order(make):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_result_does_not_depend_on_thread_count(make):
+def test_shrinking_refiner_does_not_depend_on_thread_count(make):
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(np.stack([bleeding(ids == 1, 8), bleeding(ids == 2, 3)]), frame)
@@ -133,7 +133,7 @@ def test_result_does_not_depend_on_thread_count(make):
 
 
 @pytest.mark.parametrize("make", REFINERS)
-def test_degenerate_input_is_valid(make):
+def test_shrinking_refiner_degenerate_input_is_valid(make):
     refiner = make()
     depth, ids = room()
     nothing = lifted(np.zeros((0, 240, 320), bool), frame_of(depth))
@@ -145,11 +145,11 @@ def test_degenerate_input_is_valid(make):
     assert len(refiner.refine(whole, frame_of(depth)).points_world) > 0
     flat = frame_of(np.full_like(depth, 2.0))
     on_wall = refiner.refine(lifted((ids == 1)[None], flat), flat)
-    assert len(on_wall) == 1, "object and background in one plane: no crash, whatever is kept"
+    assert len(on_wall) == 1, "object and background in one plane must not raise"
 
 
 @pytest.mark.parametrize("make", [GmmEm, KMeans])
-def test_cluster_with_too_few_points_is_unchanged(make):
+def test_shrinking_refiner_keeps_cluster_with_too_few_points(make):
     depth, ids = room()
     tiny = np.zeros((1, 240, 320), bool)
     tiny[0, 100:105, 150:155] = True
@@ -160,7 +160,7 @@ def test_cluster_with_too_few_points_is_unchanged(make):
     assert len(make().refine(box, lonely).pixels) == (ids == 1).sum(), "a ring without readings"
 
 
-def test_unassigned_points_stay():
+def test_shrinking_refiner_unassigned_points_stay():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, 8)[None], frame)
@@ -174,7 +174,7 @@ def test_unassigned_points_stay():
 
 
 def test_largest_component_keeps_larger_of_two_pieces():
-    """Two pieces beside each other, 1 m and 1.2 m away; the gap allowed at 1 m is 0.05 m."""
+    """Two components are at 1 m and 1.2 m; the allowed gap at 1 m is 0.05 m."""
     camera = Camera(40, 20, 50.0, 50.0, 19.5, 9.5)
     depth = np.full((20, 40), 1.0, np.float32)
     depth[:, 25:] = 1.2
@@ -216,7 +216,7 @@ def test_largest_component_agrees_with_scipy():
 @pytest.mark.parametrize("reach", [1, 2, 3])
 @pytest.mark.parametrize("density", [0.05, 0.3, 0.9])
 def test_largest_component_matches_reference(reach, density):
-    """Over noisy depth, beside a graph with an edge for every pair of points that are near in image and depth."""
+    """The reference is a graph over noisy depth with an edge between points that are near in image and depth."""
     from scipy.sparse.csgraph import connected_components
 
     camera = Camera(37, 23, 50.0, 50.0, 18.0, 11.0)
@@ -245,7 +245,7 @@ def test_largest_component_matches_reference(reach, density):
         (LargestComponent, {"connection_radius": 0}, "LargestComponent.connection_radius"),
     ],
 )
-def test_invalid_parameter_raises(make, parameters, message):
+def test_shrinking_refiner_invalid_parameter_raises(make, parameters, message):
     with pytest.raises(ConfigError, match=message):
         make(**parameters)
 
@@ -297,7 +297,7 @@ def test_gmm_em_single_gaussian_matches_reference():
         KMeans(ring=Ring(ring_fraction=0.0)),
     ],
 )
-def test_all_points_stay_without_background_model(refiner):
+def test_gmm_em_without_background_model_keeps_all_points(refiner):
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids == 1, 8)[None], frame)

@@ -1,4 +1,4 @@
-"""The trackers of given poses in a run: frames without one are skipped, counted and told in one line, by both alike."""
+"""Tests of trackers with given poses: frames without a pose are skipped, counted and logged in one line."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ TRACKERS = pytest.mark.parametrize(
 
 
 @TRACKERS
-def test_frames_without_pose_are_skipped_with_one_warning(
+def test_given_poses_skip_frames_without_pose_with_one_warning(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     fuser = GridFuser()
@@ -68,10 +68,10 @@ def test_frames_without_pose_are_skipped_with_one_warning(
 
 
 @TRACKERS
-def test_unposed_frames_do_not_hide_unreadable_frames(
+def test_given_poses_missing_do_not_hide_unreadable_frames(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Unreadable frames are told one by one up to a limit, which frames without poses do not count in."""
+    """Unreadable frames are logged one by one up to a limit, in which frames without poses do not count."""
     late = 30
     room = CornerRoom(frames=late + 2, unposed=tuple(range(late)), unreadable=late)
     given = tracker(tmp_path)
@@ -86,8 +86,8 @@ def test_unposed_frames_do_not_hide_unreadable_frames(
     assert len(caplog.records) == 2
 
 
-def test_trajectory_error_uses_only_frames_with_true_pose(tmp_path: Path) -> None:
-    """Every pose given is wrong where the true one is not known: neither ATE nor RPE may notice."""
+def test_given_poses_error_uses_only_frames_with_true_pose(tmp_path: Path) -> None:
+    """Every given pose without a true pose is wrong; neither ATE nor RPE may change."""
     poses = [np.linalg.inv(pose_at(9 * k)) if k in GAP else pose_at(k) for k in range(FRAMES)]
     write_tum(tmp_path / "poses.txt", [k / 30 for k in range(FRAMES)], poses)
     tracker = TrajectoryFile(tmp_path / "poses.txt")
@@ -99,7 +99,7 @@ def test_trajectory_error_uses_only_frames_with_true_pose(tmp_path: Path) -> Non
 
 
 @TRACKERS
-def test_run_without_poses_raises_one_line(
+def test_given_poses_missing_in_all_frames_raise_one_line_error(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     room = CornerRoom(frames=1, unposed=GAP)
@@ -112,7 +112,7 @@ def test_run_without_poses_raises_one_line(
     assert not caplog.records
 
 
-def test_sequence_without_poses_raises_before_reading() -> None:
+def test_given_poses_missing_in_sequence_raise_before_reading() -> None:
     class Unposed(CornerRoom):
         def has_poses(self) -> bool:
             return False

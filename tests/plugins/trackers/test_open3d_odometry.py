@@ -1,4 +1,4 @@
-"""Open3D's odometry as a tracker: a known motion, and frames that tell nothing."""
+"""Tests of Open3D's odometry as a tracker: known motion, and uninformative frames."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.scenes.papered_room import CAMERA, papered_frame
 LOOKING_INTO_A_CORNER = exp_se3(np.array([0, 0, 0, 0.5, 0.6, 0]))
 BEST = [
     ({}, 0.01),
-    # as Open3D computes it, color drifts by a third of the motion even in exact images
+    # in Open3D, color drifts by a third of the motion even in exact images
     ({"method": Method.HYBRID, "reference": Reference.PREVIOUS_FRAME}, 0.05),
     ({"method": Method.INTENSITY, "reference": Reference.PREVIOUS_FRAME}, 0.05),
 ]
@@ -50,16 +50,16 @@ def assert_near(pose: Pose, frame: Frame, meters: float) -> None:
 
 
 @pytest.mark.parametrize(("parameters", "meters"), BEST)
-def test_known_motion_is_recovered(frames: list[Frame], parameters: dict, meters: float) -> None:
+def test_open3d_odometry_recovers_known_motion(frames: list[Frame], parameters: dict, meters: float) -> None:
     poses = run(Open3dOdometry(**parameters), frames)
     assert not any(pose.lost for pose in poses)
     for pose, frame in zip(poses, frames, strict=True):
         assert_near(pose, frame, meters)
-    assert np.linalg.norm(poses[-1].T_world_camera[:3, 3] - poses[0].T_world_camera[:3, 3]) > 0.05, "it did move"
+    assert np.linalg.norm(poses[-1].T_world_camera[:3, 3] - poses[0].T_world_camera[:3, 3]) > 0.05, "the camera moved"
 
 
 @pytest.mark.parametrize(("parameters", "meters"), BEST)
-def test_uninformative_frames_are_lost_and_tracking_resumes(
+def test_open3d_odometry_resumes_after_uninformative_frames(
     frames: list[Frame], parameters: dict, meters: float
 ) -> None:
     rng = np.random.default_rng(0)
@@ -79,7 +79,7 @@ def test_uninformative_frames_are_lost_and_tracking_resumes(
     assert_near(poses[-1], frames[7], meters)
 
 
-def test_empty_map_is_lost_with_reason(frames: list[Frame]) -> None:
+def test_open3d_odometry_empty_map_is_lost_with_reason(frames: list[Frame]) -> None:
     tracker, scene = Open3dOdometry(), BayesianTsdf().scene
     assert not tracker.track(frames[0], scene).lost
     pose = tracker.track(frames[1], scene)
@@ -87,7 +87,7 @@ def test_empty_map_is_lost_with_reason(frames: list[Frame]) -> None:
     assert "\n" not in pose.reason
 
 
-def test_initially_covered_video_starts_at_first_depth(frames: list[Frame]) -> None:
+def test_open3d_odometry_covered_video_starts_at_first_depth(frames: list[Frame]) -> None:
     covered = replace(frames[0], depth=np.zeros(CAMERA.shape, np.float32))
     poses = run(Open3dOdometry(), [covered, *frames[1:4]])
     assert [pose.lost for pose in poses] == [True, False, False, False]
@@ -95,13 +95,13 @@ def test_initially_covered_video_starts_at_first_depth(frames: list[Frame]) -> N
 
 
 @pytest.mark.parametrize("bound", [{"max_translation": 1e-3}, {"max_rotation": 1e-3}])
-def test_implausible_step_is_lost(frames: list[Frame], bound: dict[str, float]) -> None:
+def test_open3d_odometry_implausible_step_is_lost(frames: list[Frame], bound: dict[str, float]) -> None:
     pose = run(Open3dOdometry(**bound), [frames[0], frames[2]])[1]
     assert pose.lost
     assert "implausible step of" in pose.reason
 
 
-def test_odometry_method_is_set_by_name() -> None:
+def test_open3d_odometry_method_is_set_by_name() -> None:
     assert registered.built("tracker", "open3d_odometry", "tracker.method=INTENSITY").method is Method.INTENSITY
     hybrid = registered.built("tracker", "open3d_odometry_hybrid")
     assert (hybrid.method, hybrid.reference) == (Method.HYBRID, Reference.PREVIOUS_FRAME)

@@ -1,4 +1,4 @@
-"""Sparse tracking in a papered room whose every pose is known, and on real video."""
+"""Tests of sparse tracking in a textured room with known poses, and on real video."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BLACK = np.zeros((*CAMERA.shape, 3), np.uint8)
 
 
 def pose_at(k: int) -> np.ndarray:
-    """About 2 cm and 2 degrees a frame."""
+    """Return the pose of a frame; the motion is about 2 cm and 2 degrees per frame."""
     return exp_se3(np.array([0.02, -0.005, 0.01, 0.003, 0.035, 0.002]) * k)
 
 
@@ -44,7 +44,7 @@ def assert_near(pose: Pose, frame: Frame) -> None:
     assert rotation_angle(error[:3, :3]) < 0.005
 
 
-def test_known_motion_is_recovered_repeatably(frames: list[Frame]) -> None:
+def test_pycolmap_pnp_recovers_known_motion_repeatably(frames: list[Frame]) -> None:
     poses = track(frames)
     assert not any(pose.lost for pose in poses)
     for pose, frame in zip(poses, frames, strict=True):
@@ -53,7 +53,7 @@ def test_known_motion_is_recovered_repeatably(frames: list[Frame]) -> None:
         np.testing.assert_array_equal(pose.T_world_camera, again.T_world_camera)
 
 
-def test_uninformative_frames_are_lost_and_camera_relocalizes(frames: list[Frame]) -> None:
+def test_pycolmap_pnp_relocalizes_after_uninformative_frames(frames: list[Frame]) -> None:
     rng = np.random.default_rng(0)
     garbage = replace(
         frames[4],
@@ -68,31 +68,31 @@ def test_uninformative_frames_are_lost_and_camera_relocalizes(frames: list[Frame
     assert [pose.lost for pose in poses] == [False] * 17 + [True] * 4 + [False]
     assert "fewer than 20 of the frame's" in poses[17].reason
     np.testing.assert_array_equal(poses[20].T_world_camera, poses[16].T_world_camera)
-    assert_near(poses[-1], frames[1])  # of which the keyframes near the last pose have seen nothing
+    assert_near(poses[-1], frames[1])  # which the keyframes near the last pose do not show
 
 
-def test_depth_inconsistent_with_color_is_lost(frames: list[Frame]) -> None:
+def test_pycolmap_pnp_depth_inconsistent_with_color_is_lost(frames: list[Frame]) -> None:
     assert track([*frames[:2], replace(frames[2], depth=1.3 * frames[2].depth)])[-1].lost
     without = track([*frames[:2], replace(frames[2], depth=np.zeros(CAMERA.shape, np.float32))])[-1]
     assert not without.lost, "pixels alone determine the pose"
     assert_near(without, frames[2])
 
 
-def test_initially_black_video_starts_at_first_features(frames: list[Frame]) -> None:
+def test_pycolmap_pnp_black_video_starts_at_first_features(frames: list[Frame]) -> None:
     poses = track([replace(frames[0], color=BLACK), *frames[1:3]])
     assert [pose.lost for pose in poses] == [True, False, False]
     assert poses[0].reason == "the frame has fewer than 30 features with depth"
     assert_near(poses[-1], frames[2])
 
 
-def test_invalid_parameter_raises() -> None:
+def test_pycolmap_pnp_invalid_parameter_raises() -> None:
     for bound in ({"min_inliers": 3}, {"max_ratio": 0.0}, {"candidates": 0}, {"max_error": -1.0}):
         with pytest.raises(ConfigError, match=next(iter(bound))):
             PycolmapPnp(**bound)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/data")
-def test_real_video_is_tracked() -> None:
+def test_pycolmap_pnp_tracks_real_video() -> None:
     kitchen = list(RgbdFolder(SHARED / "redkitchen", stop=60, stride=3))
     poses = track(kitchen)
     assert not any(pose.lost for pose in poses)

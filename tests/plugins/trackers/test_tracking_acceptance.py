@@ -1,4 +1,4 @@
-"""What the tracker promises: accuracy on scenes known exactly, and a map that no bad frame damages.
+"""Acceptance tests of the tracker: accuracy on exact scenes, and maps that bad frames do not damage.
 
 Longer runs (300 real frames, 200 synthetic ones) are rows of `pytest tests/benchmarks -k slam`.
 """
@@ -29,11 +29,11 @@ from tests.support.scenes.analytic_scene import CAMERA, NOTHING, Scene, pose
 pytestmark = pytest.mark.acceptance
 
 VOXEL = 0.02  # m, of the small images here
-WRONG = 0.04  # m, two voxels: a pose farther off than this, and not reported as lost, is a lie
+WRONG = 0.04  # m, two voxels: a pose with a larger error must be lost
 
 
 def run(tracker: VoxelHashingIcp, frames: Iterable[Frame], voxel_size: float = VOXEL) -> tuple[list[Pose], SceneMap]:
-    """As the pipeline does it: what is lost is not fused."""
+    """Track and fuse as the pipeline does; lost frames are not fused."""
     fuser = assemble(BayesianTsdf, voxel_size=voxel_size)
     poses = []
     for frame in frames:
@@ -44,19 +44,19 @@ def run(tracker: VoxelHashingIcp, frames: Iterable[Frame], voxel_size: float = V
 
 
 def drift(tracked: Pose, frame: Frame) -> float:
-    """m, between the estimate and the truth."""
+    """Return the distance (m) between the estimate and the truth."""
     assert frame.T_world_camera is not None
     return float(np.linalg.norm((inverse(frame.T_world_camera) @ tracked.T_world_camera)[:3, 3]))
 
 
 def drifts(poses: Sequence[Pose], frames: Sequence[Frame]) -> np.ndarray:
-    """(n,) m; NaN where the pose is lost."""
+    """Return the distances (n,) m; NaN if the pose is lost."""
     return np.array([np.nan if p.lost else drift(p, f) for p, f in zip(poses, frames, strict=True)])
 
 
 @pytest.fixture(scope="module")
 def wall() -> list[Frame]:
-    """Sideways along a flat, textured wall, 0.6 m at 1.5 m, with a Kinect's noise: only the texture tells."""
+    """Move sideways along a flat, textured wall, 0.6 m at 1.5 m, with Kinect noise; only the texture is informative."""
     scene = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     rng = np.random.default_rng(0)
     exact = [scene.frame(pose(0.01 * k, 0.02 * np.sin(0.1 * k)), k) for k in range(60)]
@@ -64,20 +64,20 @@ def wall() -> list[Frame]:
     return [dataclasses.replace(f, depth=f.depth + n) for f, n in zip(exact, noise, strict=True)]
 
 
-def test_color_tracks_flat_wall(wall: list[Frame]) -> None:
+def test_tracking_with_color_follows_flat_wall(wall: list[Frame]) -> None:
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), wall)
     assert not any(p.lost for p in poses)
     assert drift(poses[-1], wall[-1]) < 0.01
 
 
 @pytest.mark.parametrize("min_information", [VoxelHashingIcp.min_information, 0.0], ids=["default", "unchecked"])
-def test_geometry_alone_drifts_or_is_lost_on_flat_wall(min_information: float, wall: list[Frame]) -> None:
+def test_tracking_without_color_drifts_or_is_lost_on_flat_wall(min_information: float, wall: list[Frame]) -> None:
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=0.0, min_information=min_information), wall)
     assert any(p.lost for p in poses) or drift(poses[-1], wall[-1]) > 0.1
 
 
-def test_drift_without_noise_is_below_one_voxel() -> None:
-    """40 frames of the walk whose 200 frames are a benchmark; 1 cm voxels."""
+def test_tracking_drift_without_noise_is_below_one_voxel() -> None:
+    """The motion is 40 frames of the walk that a benchmark uses; voxels have 1 cm."""
     room = Synthetic(frames=240, stop=40, noise=0.0)
     frames = rendered_frames(room)
     poses, _ = run(VoxelHashingIcp(), frames, voxel_size=0.01)
@@ -85,8 +85,8 @@ def test_drift_without_noise_is_below_one_voxel() -> None:
     assert drift(poses[-1], frames[39]) < 0.002
 
 
-def test_color_does_not_reduce_accuracy(shared_data: Path) -> None:
-    """A real kitchen: with color the trajectory is not worse than without."""
+def test_tracking_with_color_is_not_less_accurate(shared_data: Path) -> None:
+    """In a real kitchen, color does not increase the trajectory error."""
     frames = list(RgbdFolder(shared_data / "redkitchen", stop=80, stride=2))
     truth = [f.T_world_camera for f in frames]
     both, alone = (evaluate(truth, run(VoxelHashingIcp(color_weight=w), frames)[0]) for w in (0.1, 0.0))
@@ -96,7 +96,7 @@ def test_color_does_not_reduce_accuracy(shared_data: Path) -> None:
 
 
 class Surface:
-    """The exact surface of a synthetic room, and how far a map is from it."""
+    """The exact surface of a synthetic room, with the distance of a map from it."""
 
     def __init__(self, room: Synthetic) -> None:
         self._scene = o3d.t.geometry.RaycastingScene()
@@ -106,14 +106,14 @@ class Surface:
         )
 
     def error(self, scene: SceneMap) -> tuple[float, float]:
-        """Median distance of the mesh's vertices, m, and the share that is more than two voxels off."""
+        """Return the median distance of the mesh's vertices, m, and the fraction more than two voxels off."""
         distance = self._scene.compute_distance(o3d.core.Tensor(scene.mesh().vertices)).numpy()
         return float(np.median(distance)), float((distance > 2 * VOXEL).mean())
 
 
 @pytest.fixture(scope="module")
 def room() -> Synthetic:
-    """Furnished, seen by a Kinect, quarter resolution."""
+    """Return a furnished room with Kinect noise at quarter resolution."""
     return Synthetic(frames=240, stop=80, width=320, height=240)
 
 
@@ -134,17 +134,17 @@ def elsewhere() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def clean_error(frames: list[Frame], surface: Surface) -> tuple[float, float]:
-    """Of the map that no bad frame has come near."""
+    """Return the error of the map without bad frames."""
     return surface.error(run(VoxelHashingIcp(), [*frames[:60], *frames[60:5:-1]])[1])
 
 
 def black(frame: Frame) -> Frame:
-    """A hand before the lens."""
+    """Cover the lens."""
     return dataclasses.replace(frame, depth=np.zeros_like(frame.depth), color=np.zeros_like(frame.color))
 
 
 def plain(frame: Frame) -> Frame:
-    """A blank wall at 1 m fills the view."""
+    """Fill the view with a blank wall at 1 m."""
     return dataclasses.replace(frame, depth=np.full_like(frame.depth, 1.0), color=np.full_like(frame.color, 200))
 
 
@@ -160,7 +160,7 @@ def garbage(frame: Frame) -> Frame:
 def assert_unharmed(
     poses: list[Pose], shown: list[Frame], error: tuple[float, float], clean: tuple[float, float]
 ) -> None:
-    """No pose is wrong without saying so, the last ones are right, and the map is as good as without the bad frames."""
+    """Check that wrong poses are lost, the last poses are correct, and the map is as accurate as without bad frames."""
     off = drifts(poses, shown)
     assert np.nanmax(off) < WRONG, f"frame {np.nanargmax(off)} of the video is {np.nanmax(off):.3f} m off and not lost"
     assert not np.isnan(off[-10:]).any(), f"lost on known ground: {poses[-1].reason}"
@@ -169,7 +169,7 @@ def assert_unharmed(
 
 
 def there_and_back(frames: list[Frame], begin: int, bad: list[Frame], end: int) -> list[Frame]:
-    """The camera walks on behind the bad frames, [begin, end), for ten more frames, and then back to the beginning."""
+    """Return a walk that continues for ten frames after the bad frames [begin, end) and returns to the start."""
     return [*frames[:begin], *bad, *frames[end : end + 10], *frames[end + 10 : 5 : -1]]
 
 
@@ -182,7 +182,7 @@ def there_and_back(frames: list[Frame], begin: int, bad: list[Frame], end: int) 
         (garbage, 5),
     ],
 )
-def test_bad_frames_are_lost_and_leave_map_accurate(
+def test_tracking_loses_bad_frames_and_keeps_map_accurate(
     spoilt, count: int, frames: list[Frame], surface, clean_error
 ) -> None:
     shown = there_and_back(frames, 25, [spoilt(f) for f in frames[25 : 25 + count]], 25 + count)
@@ -191,9 +191,7 @@ def test_bad_frames_are_lost_and_leave_map_accurate(
     assert_unharmed(poses, shown, surface.error(scene), clean_error)
 
 
-def test_cut_to_other_room_is_lost_and_leaves_map_accurate(
-    frames: list[Frame], elsewhere, surface, clean_error
-) -> None:
+def test_tracking_loses_cut_to_other_room_and_keeps_map(frames: list[Frame], elsewhere, surface, clean_error) -> None:
     bad = [dataclasses.replace(f, depth=e.depth, color=e.color) for f, e in zip(frames[25:28], elsewhere, strict=True)]
     shown = there_and_back(frames, 25, bad, 28)
     poses, scene = run(VoxelHashingIcp(), shown)
@@ -202,15 +200,15 @@ def test_cut_to_other_room_is_lost_and_leaves_map_accurate(
 
 
 @pytest.mark.parametrize("missing", [3, 5, 20, 40])
-def test_jump_is_tracked_or_lost(missing: int, frames: list[Frame], surface, clean_error) -> None:
-    """Frames are missing from the middle of the video: 4, 9, 30 and 58 cm; 2, 5, 17 and 33 degrees."""
+def test_tracking_follows_or_loses_jump(missing: int, frames: list[Frame], surface, clean_error) -> None:
+    """Frames are missing in the middle of the video: 4, 9, 30 and 58 cm; 2, 5, 17 and 33 degrees."""
     shown = there_and_back(frames, 25, [], 25 + missing)
     poses, scene = run(VoxelHashingIcp(), shown)
     assert_unharmed(poses, shown, surface.error(scene), clean_error)
 
 
-def test_jump_in_real_video_is_tracked_or_lost(shared_data: Path) -> None:
-    """As above, against the poses that the data come with, which are good to a centimeter or two."""
+def test_tracking_follows_or_loses_jump_in_real_video(shared_data: Path) -> None:
+    """The reference poses of the recording are accurate to one or two centimeters."""
     frames = list(RgbdFolder(shared_data / "redkitchen", stop=70))
     shown = [*frames[:25], *frames[45:55], *frames[55:5:-2]]
     poses, _ = run(VoxelHashingIcp(), shown)
@@ -219,8 +217,8 @@ def test_jump_in_real_video_is_tracked_or_lost(shared_data: Path) -> None:
     assert not np.isnan(off[-5:]).any()
 
 
-def test_sparse_video_is_tracked() -> None:
-    """Steps of 6 and 40 cm, of 3 and 22 degrees, in turns: neither the last step nor the last pose tells the next."""
+def test_tracking_follows_sparse_video() -> None:
+    """Steps alternate between 6 and 40 cm, and 3 and 22 degrees, so that no motion model predicts the next one."""
     video = Synthetic(frames=240, stop=200, width=320, height=240)
     sparse = rendered_frames(video, [k for k in range(200) if k % 32 in (0, 4)])
     poses, _ = run(VoxelHashingIcp(), sparse)
@@ -234,8 +232,8 @@ BALL = (np.array([-1.2, 0.8, 2.2]), 0.25)
 
 
 @pytest.mark.parametrize("spheres", [[BALL], []], ids=["ball", "bare"])
-def test_textureless_wall_is_lost(spheres: list[tuple[np.ndarray, float]]) -> None:
-    """From a corner, bare or with a ball in it, along an untextured wall until nothing else is in view, and back."""
+def test_tracking_loses_textureless_wall(spheres: list[tuple[np.ndarray, float]]) -> None:
+    """The camera moves from a corner, empty or with a ball, until only an untextured wall is visible, and back."""
     corner = Scene(
         planes=[
             (np.array([0.0, 0.0, -1.0]), -2.5),
@@ -257,7 +255,7 @@ def test_textureless_wall_is_lost(spheres: list[tuple[np.ndarray, float]]) -> No
     assert np.median(corner.distance(scene.mesh().vertices.astype(float))) < 0.1 * VOXEL
 
 
-def test_poses_and_map_do_not_depend_on_thread_count(frames: list[Frame], tmp_path: Path) -> None:
+def test_tracking_does_not_depend_on_thread_count(frames: list[Frame], tmp_path: Path) -> None:
     saved, tracked = [], []
     before = numba.get_num_threads()
     for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):

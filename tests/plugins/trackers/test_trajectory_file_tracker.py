@@ -1,4 +1,4 @@
-"""Poses come from the file by time, in the world that the contract or the file defines."""
+"""Tests of poses from a file by timestamp, in the world frame of the contract or of the file."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from tests.support import registered
 from tests.support.scenes.corner_room import CornerRoom, GridMap, pose_at
 
 SCENE = GridMap()
-T_FILE_WORLD = exp_se3(np.array([3.0, -2.0, 1.0, 0.4, -0.7, 0.2]))  # another system's world
+T_FILE_WORLD = exp_se3(np.array([3.0, -2.0, 1.0, 0.4, -0.7, 0.2]))  # world of another system
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Frames 0 to 5 of the corner room, as another system saw them: 4 ms late, and without frame 3."""
+    """Write frames 0 to 5 of the corner room with timestamps 4 ms late, and without frame 3."""
     path = tmp_path / "other_slam.txt"
     frames = [0, 1, 2, 4, 5]
     write_tum(path, [k / 30 + 0.004 for k in frames], [T_FILE_WORLD @ pose_at(k) for k in frames])
     return path
 
 
-def test_file_poses_are_aligned_to_first_frame(path: Path) -> None:
+def test_trajectory_file_poses_are_aligned_to_first_frame(path: Path) -> None:
     tracker = TrajectoryFile(path)
     for k, frame in enumerate(CornerRoom()):
         if k != 3:
             np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, pose_at(k), atol=1e-9)
 
 
-def test_frame_without_pose_raises_with_reason(path: Path) -> None:
+def test_trajectory_file_frame_without_pose_raises_with_reason(path: Path) -> None:
     tracker = TrajectoryFile(path)
     with pytest.raises(NoPoseError) as caught:
         tracker.track(CornerRoom()[3], SCENE)
@@ -46,20 +46,20 @@ def test_frame_without_pose_raises_with_reason(path: Path) -> None:
     assert str(caught.value) == why
 
 
-def test_first_pose_without_ground_truth_is_identity(path: Path) -> None:
+def test_trajectory_file_first_pose_without_truth_is_identity(path: Path) -> None:
     tracker = TrajectoryFile(path)
     first, second = (tracker.track(frame, SCENE) for frame in CornerRoom(frames=2, truth=False))
     np.testing.assert_allclose(first.T_world_camera, np.eye(4), atol=1e-12)
     np.testing.assert_allclose(second.T_world_camera, np.linalg.inv(pose_at(0)) @ pose_at(1), atol=1e-9)
 
 
-def test_world_frame_file_keeps_file_coordinates(path: Path) -> None:
+def test_trajectory_file_in_world_frame_keeps_coordinates(path: Path) -> None:
     tracker = TrajectoryFile(path, world_frame=World.FILE)
     for k, frame in enumerate(CornerRoom(frames=3)):
         np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, T_FILE_WORLD @ pose_at(k), atol=1e-9)
 
 
-def test_late_trajectory_starts_world_at_first_pose(tmp_path: Path) -> None:
+def test_trajectory_file_late_start_sets_world_at_first_pose(tmp_path: Path) -> None:
     path = tmp_path / "late.txt"
     write_tum(path, [2 / 30, 3 / 30], [T_FILE_WORLD @ pose_at(k) for k in (2, 3)])
     tracker = TrajectoryFile(path)
@@ -71,7 +71,7 @@ def test_late_trajectory_starts_world_at_first_pose(tmp_path: Path) -> None:
             np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, pose_at(k), atol=1e-9)
 
 
-def test_time_offset_aligns_clocks(tmp_path: Path) -> None:
+def test_trajectory_file_time_offset_aligns_clocks(tmp_path: Path) -> None:
     path = tmp_path / "clock.txt"
     write_tum(path, [1.7e9, 1.7e9 + 1 / 30], [pose_at(0), pose_at(1)])
     frames = [replace(frame, timestamp=frame.timestamp + 12) for frame in CornerRoom(frames=2)]
@@ -93,14 +93,14 @@ def test_time_offset_aligns_clocks(tmp_path: Path) -> None:
         ("# nothing\n", "expected poses in TUM format, got none"),
     ],
 )
-def test_invalid_trajectory_raises_one_line(tmp_path: Path, text: str, message: str) -> None:
+def test_trajectory_file_invalid_raises_one_line_error(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "bad.txt").write_text(text)
     with pytest.raises(DataError, match=rf"bad\.txt.* {message}") as refused:
         registered.built("tracker", "trajectory_file", f"tracker.path={tmp_path / 'bad.txt'}")
     assert "\n" not in str(refused.value)
 
 
-def test_missing_file_or_invalid_parameter_raises(tmp_path: Path, path: Path) -> None:
+def test_trajectory_file_missing_or_invalid_parameter_raises(tmp_path: Path, path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere\.txt: expected a trajectory in TUM format, got no such file"):
         TrajectoryFile(tmp_path / "nowhere.txt")
     with pytest.raises(ConfigError, match=r"TrajectoryFile\.max_time_difference"):

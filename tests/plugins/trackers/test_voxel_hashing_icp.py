@@ -1,4 +1,4 @@
-"""The tracker on a scene whose motion is known exactly."""
+"""Tests of tracker=voxel_hashing_icp on a scene with known motion."""
 
 import dataclasses
 import pickle
@@ -38,14 +38,14 @@ def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], Scen
 
 
 def drift(pose: Pose, frame: Frame) -> tuple[float, float]:
-    """(m, rad) between the estimate and the truth."""
+    """Return (m, rad) between the estimate and the truth."""
     assert frame.T_world_camera is not None
     error = inverse(frame.T_world_camera) @ pose.T_world_camera
     return float(np.linalg.norm(error[:3, 3])), rotation_angle(error[:3, :3])
 
 
 @pytest.mark.parametrize("color_weight", [0.0, 0.1])
-def test_known_motion_is_recovered(color_weight: float) -> None:
+def test_voxel_hashing_icp_recovers_known_motion(color_weight: float) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(40))]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=color_weight), frames)
     assert not any(pose.lost for pose in poses)
@@ -54,7 +54,7 @@ def test_known_motion_is_recovered(color_weight: float) -> None:
     assert drift(poses[-1], frames[-1])[1] < 0.003
 
 
-def test_raw_keyframe_stops_drift_of_standing_camera(shared: Path) -> None:
+def test_voxel_hashing_icp_keyframe_stops_drift_at_standstill(shared: Path) -> None:
     """Structure below the voxel size biases the alignment to the map alone."""
     frame = dataclasses.replace(RgbdFolder(shared / "data" / "redkitchen")[0], T_world_camera=np.eye(4))
     with_keyframe, alone = (
@@ -64,18 +64,18 @@ def test_raw_keyframe_stops_drift_of_standing_camera(shared: Path) -> None:
     assert drift(alone, frame)[0] > 2 * drift(with_keyframe, frame)[0]
 
 
-def test_color_determines_motion_along_wall() -> None:
-    """Facing one textured wall, geometry alone cannot see sideways motion; with color it is seen."""
+def test_voxel_hashing_icp_color_determines_motion_along_wall() -> None:
+    """Geometry does not determine sideways motion in front of one wall; its texture does."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     frames = [wall.frame(T, k) for k, T in enumerate(walk(20))]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], frames[-1])[0] < 0.01
     alone, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=0.0), frames)
-    assert any(pose.lost for pose in alone), "and alone it says that the motion is not determined"
+    assert any(pose.lost for pose in alone), "alone it reports that the motion is undetermined"
 
 
-def test_covered_frames_are_lost_and_tracking_resumes() -> None:
+def test_voxel_hashing_icp_resumes_after_covered_frames() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(30))]
     covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[10:14]]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames[:10] + covered + frames[14:])
@@ -84,7 +84,7 @@ def test_covered_frames_are_lost_and_tracking_resumes() -> None:
     assert drift(poses[-1], frames[-1])[0] < 0.006
 
 
-def test_jump_is_relocalized_or_lost_and_not_fused() -> None:
+def test_voxel_hashing_icp_relocalizes_or_loses_jump() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(20))]
     away = walk(1)[0].copy()
     away[:3, 3] += (0.0, 0.0, -1.2)
@@ -98,8 +98,8 @@ def test_jump_is_relocalized_or_lost_and_not_fused() -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1])
-def test_result_does_not_depend_on_feature_timing(seconds: float) -> None:
-    """Of frames that are taken aside, one is in doubt or lost and asks for keyframes right after one was offered."""
+def test_voxel_hashing_icp_does_not_depend_on_feature_timing(seconds: float) -> None:
+    """A doubtful or lost frame needs keyframes right after one was offered to the worker thread."""
     path = [exp_se3(np.array([0.03 * k - 0.3, 0, 0, 0, 0.01 * k, 0])) for k in range(24)]
     for k in (8, 16, 17):
         path[k] = path[k] @ exp_se3(np.array([0, 0, -0.4, 0, 0.3, 0]))
@@ -133,7 +133,7 @@ def test_result_does_not_depend_on_feature_timing(seconds: float) -> None:
         np.testing.assert_array_equal(later.keyframes()[name], array, err_msg=name)
 
 
-def test_tracker_pickles_with_keyframes() -> None:
+def test_voxel_hashing_icp_pickles_with_keyframes() -> None:
     frames = [papered_frame(exp_se3(np.array([0.03 * k, 0, 0, 0, 0, 0])), k) for k in range(8)]
     tracker = VoxelHashingIcp()
     _, scene = run(tracker, frames[:-1])
@@ -145,7 +145,7 @@ def test_tracker_pickles_with_keyframes() -> None:
     np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
 
 
-def test_random_depth_is_lost() -> None:
+def test_voxel_hashing_icp_random_depth_is_lost() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(5))]
     rng = np.random.default_rng(0)
     garbage = dataclasses.replace(frames[-1], depth=rng.uniform(0.5, 4, frames[-1].depth.shape).astype(np.float32))
@@ -153,7 +153,7 @@ def test_random_depth_is_lost() -> None:
     assert poses[-1].lost
 
 
-def test_initially_covered_video_starts_at_first_depth() -> None:
+def test_voxel_hashing_icp_covered_video_starts_at_depth() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
     covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[:3]]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), covered + frames[3:])
@@ -162,7 +162,7 @@ def test_initially_covered_video_starts_at_first_depth() -> None:
 
 
 @pytest.mark.parametrize("size", [(161, 119), (163, 121)])
-def test_images_of_odd_sizes_are_tracked(size: tuple[int, int]) -> None:
+def test_voxel_hashing_icp_tracks_images_of_odd_sizes(size: tuple[int, int]) -> None:
     camera = Camera(*size, 131.0, 131.0, 80.0, 60.5)
     frames = [room().frame(T, k, camera) for k, T in enumerate(walk(10))]
     for finest in (1.0, 0.5):
@@ -172,12 +172,12 @@ def test_images_of_odd_sizes_are_tracked(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("finest", [0.3, 0.75, 2.0])
-def test_finest_scale_not_power_of_half_raises(finest: float) -> None:
+def test_voxel_hashing_icp_finest_scale_not_half_power_raises(finest: float) -> None:
     with pytest.raises(ConfigError, match="finest_scale: expected"):
         VoxelHashingIcp(finest_scale=finest)
 
 
-def test_map_is_rendered_from_predicted_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxel_hashing_icp_renders_map_from_predicted_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(6))]
     tracker = VoxelHashingIcp(finest_scale=1.0)
     poses, scene = run(tracker, frames[:5])
@@ -190,7 +190,7 @@ def test_map_is_rendered_from_predicted_pose(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("bound", [{"max_translation": 0.002}, {"max_rotation": 0.001}])
-def test_implausible_step_is_lost(bound: dict[str, float]) -> None:
+def test_voxel_hashing_icp_implausible_step_is_lost(bound: dict[str, float]) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(2)[:1] + walk(60)[4:5])]
     assert not any(pose.lost for pose in run(VoxelHashingIcp(finest_scale=1.0), frames)[0])
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0, **bound), frames)
@@ -206,7 +206,7 @@ def spoilt_beginnings() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", spoilt_beginnings())
-def test_unusable_first_frame_is_lost_and_tracking_starts(name: str) -> None:
+def test_voxel_hashing_icp_starts_after_unusable_first_frame(name: str) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
     frames[0] = dataclasses.replace(frames[0], depth=spoilt_beginnings()[name])
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
@@ -216,7 +216,7 @@ def test_unusable_first_frame_is_lost_and_tracking_starts(name: str) -> None:
     assert drift(poses[-1], frames[-1])[0] < 0.004
 
 
-def test_unmappable_depth_is_lost_despite_true_poses() -> None:
+def test_voxel_hashing_icp_loses_unmappable_depth() -> None:
     far = [dataclasses.replace(f, depth=100 * f.depth) for f in (room().frame(T, k) for k, T in enumerate(walk(4)))]
     poses, scene = run(VoxelHashingIcp(finest_scale=1.0), far)
     assert scene.statistics.voxels == 0
@@ -224,8 +224,8 @@ def test_unmappable_depth_is_lost_despite_true_poses() -> None:
     assert poses[-1].reason == "depth within 0.2 to 4 m in 0.0% of the pixels only"
 
 
-def test_removed_object_does_not_lose_tracking() -> None:
-    """No texture, so no keyframe can confirm the pose; the ball covers several per cent of the view."""
+def test_voxel_hashing_icp_continues_after_object_is_removed() -> None:
+    """Without texture, no keyframe can confirm the pose; the ball covers several percent of the view."""
     planes = room().planes
     with_ball, without = (Scene(planes, spheres, contrast=0.0) for spheres in ([(np.array([0, 0.1, 1.3]), 0.2)], []))
     frames = [(with_ball if k < 10 else without).frame(T, k) for k, T in enumerate(walk(30)[:16])]
@@ -234,7 +234,7 @@ def test_removed_object_does_not_lose_tracking() -> None:
     assert drift(poses[-1], frames[-1])[0] < 0.006
 
 
-def test_jump_resets_motion_prediction() -> None:
+def test_voxel_hashing_icp_jump_resets_motion_prediction() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(20))]
     away = walk(1)[0].copy()
     away[:3, 3] += (0.0, 0.0, -1.2)
@@ -244,7 +244,7 @@ def test_jump_resets_motion_prediction() -> None:
     assert np.array_equal(tracker._T_last_next, np.eye(4))
 
 
-def test_image_too_small_for_pyramid_raises() -> None:
+def test_voxel_hashing_icp_too_small_image_raises() -> None:
     camera = Camera(30, 23, 25.0, 25.0, 14.5, 11.0)
     frame = Frame(0, 0.0, np.zeros((23, 30, 3), np.uint8), np.ones((23, 30), np.float32), camera)
     with pytest.raises(DataError, match=r"tracker\.finest_scale: expected .*, got 0\.5 for images of 30x23 px"):
@@ -260,8 +260,8 @@ ONE_STEP = {
 }
 
 
-def test_pose_is_accepted_after_correct_final_step() -> None:
-    """Before it, 6 cm away, too little agreed with the map; the single step goes most of that way."""
+def test_voxel_hashing_icp_accepts_pose_after_good_final_step() -> None:
+    """Before the step, 6 cm away, too few points agree with the map; the step removes most of the distance."""
     start = walk(1)[0]
     frames = [room().frame(T, k) for k, T in enumerate((start, start @ exp_se3(np.array([0.06, 0, 0, 0, 0, 0]))))]
     poses, _ = run(VoxelHashingIcp(**ONE_STEP), frames)
@@ -269,7 +269,7 @@ def test_pose_is_accepted_after_correct_final_step() -> None:
     assert drift(poses[1], frames[1])[0] < 0.03
 
 
-def test_pose_is_lost_after_wrong_final_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxel_hashing_icp_loses_pose_after_bad_final_step(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     assert not any(pose.lost for pose in run(VoxelHashingIcp(**ONE_STEP), frames)[0])
     monkeypatch.setattr(voxel_hashing_icp, "_solved", lambda *_: np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
@@ -279,7 +279,7 @@ def test_pose_is_lost_after_wrong_final_step(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def aligned(T_world_camera: np.ndarray, agreement: float = 0.85, behind: float = 0.05) -> Alignment:
-    """An alignment that an imperfect camera has, or a wrong pose."""
+    """Return the alignment of an imperfect camera, or a wrong pose."""
     return Alignment(T_world_camera, 0.7, agreement, behind, agreement / (1 - behind), "", "85% agree")
 
 
@@ -287,10 +287,10 @@ def moved(step: float) -> np.ndarray:
     return exp_se3(np.array([step, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
-def test_steady_motion_lowers_required_agreement(
+def test_voxel_hashing_icp_steady_motion_needs_less_agreement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A camera that moves 1 cm a frame, of whose points never more than 85 % agree with the map."""
+    """The camera moves 1 cm per frame, and at most 85 % of its points agree with the map."""
     frames = [room().frame(walk(1)[0], k) for k in range(2 * STEADY + 6)]
     ends = iter(moved(0.01 * k) for k in range(1, len(frames)))
     tracker = VoxelHashingIcp(finest_scale=1.0, relocalize=False)
@@ -303,14 +303,14 @@ def test_steady_motion_lowers_required_agreement(
     lost = [tracker.track(frame, fuser.scene).lost for frame in frames[1 : STEADY + 4]]
     assert not any(lost), "the prediction has been right before"
     monkeypatch.setattr(tracker, "_align", lambda *_: aligned(tracker._T_world_last @ moved(0.2)))
-    assert tracker.track(frames[-2], fuser.scene).lost, "20 cm beside the prediction"
+    assert tracker.track(frames[-2], fuser.scene).lost, "20 cm from the prediction"
     for worse in (aligned(tracker._T_world_last, agreement=0.7), aligned(tracker._T_world_last, 0.8, behind=0.15)):
         tracker._lost_frames, tracker._steady_frames = 0, STEADY
         monkeypatch.setattr(tracker, "_align", lambda *_, worse=worse: worse)
         assert tracker.track(frames[-1], fuser.scene).lost
 
 
-def test_features_are_used_until_motion_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxel_hashing_icp_uses_features_until_motion_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(40)[: STEADY + 4])]
     tracker, asked = VoxelHashingIcp(finest_scale=1.0), []
     search = tracker._pose_from_features
@@ -320,8 +320,8 @@ def test_features_are_used_until_motion_is_steady(monkeypatch: pytest.MonkeyPatc
     assert asked == list(range(1, STEADY))
 
 
-def test_pose_contradicted_by_features_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All points agree with the map, but features tell a place 30 cm away, from where alignment leads nowhere."""
+def test_voxel_hashing_icp_features_reject_contradicting_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All points agree with the map, but features give a position 30 cm away, from where alignment diverges."""
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     tracker = VoxelHashingIcp(finest_scale=1.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
@@ -333,8 +333,8 @@ def test_pose_contradicted_by_features_is_rejected(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_tracking_resumes_without_relocalization(moving: bool) -> None:
-    """Half of the view is hidden for some frames, during which the camera stands, or turns."""
+def test_voxel_hashing_icp_resumes_without_relocalization(moving: bool) -> None:
+    """Half of the view is hidden for some frames, while the camera stands still or rotates."""
     there = walk(30)[:14]
     frames = [room().frame(T, k) for k, T in enumerate(there)]
     hidden = [room().frame(there[7 + (k if moving else 0)], 7 + k) for k in range(4)]
@@ -349,12 +349,12 @@ def test_tracking_resumes_without_relocalization(moving: bool) -> None:
 
 
 def coarse(frame: Frame) -> Frame:
-    """As if depth had been stored in 8 bits."""
+    """Quantize depth as if it were stored in 8 bits."""
     steps = (np.floor(frame.depth / 0.0392) + 0.5) * 0.0392
     return dataclasses.replace(frame, depth=np.where(frame.depth > 0, steps, 0).astype(np.float32))
 
 
-def test_coarse_depth_is_tracked_without_normals(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxel_hashing_icp_tracks_coarse_depth_without_normals(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [coarse(room().frame(T, k)) for k, T in enumerate(walk(40)[::2])]
     matched: list[float] = []
     align = VoxelHashingIcp._align

@@ -1,4 +1,4 @@
-"""The tracker of preset=paper: the parameters of VoxelHashing, without our checks and relocalization."""
+"""Tests of the tracker of preset=paper: VoxelHashing's parameters, without our checks and relocalization."""
 
 import dataclasses
 from typing import Any
@@ -57,7 +57,7 @@ def test_paper_tracker_recovers_known_motion() -> None:
 
 
 def test_paper_tracker_uses_published_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of each level: iterations, weights of color and depth, and gates."""
+    """Each level has its iterations, weights of color and depth, and gates."""
     calls: list[tuple[int, Any, float, Any]] = []
     linearize = voxel_hashing_icp.linearize
 
@@ -80,7 +80,7 @@ def test_paper_tracker_uses_published_parameters(monkeypatch: pytest.MonkeyPatch
         assert brightness == 0, "exposure is not compensated"
 
 
-def test_lost_frames_keep_last_pose_until_tracking_resumes() -> None:
+def test_paper_tracker_lost_frames_keep_last_pose() -> None:
     frames = walked(30)
     away = [room().frame(exp_se3(np.array([0, 0, -1.4, 0, 0, 0])) @ walk(1)[0], k) for k in range(10, 13)]
     shown = [*frames[:10], *away, covered(frames[10]), *frames[10:]]
@@ -106,14 +106,14 @@ def test_paper_tracker_uses_no_features(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def hidden_frames() -> list[Frame]:
-    """A walk, with random depth in half of the last view."""
+    """Return a walk with random depth in half of the last view."""
     frames = walked(8)
     frames[-1].depth[:, :80] = np.random.default_rng(0).uniform(0.5, 4, (120, 80))
     return frames
 
 
-def test_agreement_is_not_checked() -> None:
-    """Half of the points lie anywhere: that is a doubt, which only the checks of agreement have."""
+def test_paper_tracker_agreement_is_not_checked() -> None:
+    """Half of the points are random, which only the agreement checks of the default tracker reject."""
     poses = run(paper_tracker(), hidden_frames())
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], hidden_frames()[-1]) < 0.01
@@ -124,7 +124,7 @@ def test_agreement_is_not_checked() -> None:
 
 
 @pytest.mark.parametrize("steady", [0, 10**9])
-def test_steady_motion_has_no_effect(monkeypatch: pytest.MonkeyPatch, steady: int) -> None:
+def test_paper_tracker_steady_motion_has_no_effect(monkeypatch: pytest.MonkeyPatch, steady: int) -> None:
     frames = hidden_frames()
     expected = run(paper_tracker(), frames)
     monkeypatch.setattr(voxel_hashing_icp, "STEADY", steady)
@@ -133,7 +133,7 @@ def test_steady_motion_has_no_effect(monkeypatch: pytest.MonkeyPatch, steady: in
         np.testing.assert_array_equal(pose.T_world_camera, other.T_world_camera)
 
 
-def test_single_alignment_ends_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paper_tracker_single_alignment_ends_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     aligned: list[bool] = []
     align = VoxelHashingIcp._align
     monkeypatch.setattr(VoxelHashingIcp, "_align", lambda *a: aligned.append(True) or align(*a))  # type: ignore[func-returns-value]
@@ -143,7 +143,7 @@ def test_single_alignment_ends_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(aligned) == len(poses) - 1
 
 
-def test_frame_with_few_matching_points_is_lost() -> None:
+def test_paper_tracker_frame_with_few_matching_points_is_lost() -> None:
     frames = walked(5)
     noise = np.random.default_rng(0).uniform(0.5, 4, frames[-1].depth.shape).astype(np.float32)
     poses = run(paper_tracker(), [*frames[:4], dataclasses.replace(frames[-1], depth=noise)])
@@ -153,14 +153,14 @@ def test_frame_with_few_matching_points_is_lost() -> None:
     assert all(pose.lost for pose in poses[1:])
 
 
-def test_frame_after_implausible_step_is_lost() -> None:
+def test_paper_tracker_frame_after_implausible_step_is_lost() -> None:
     frames = walked(8)
     assert not run(paper_tracker(), [frames[0], frames[4]])[1].lost
     poses = run(paper_tracker("tracker.max_translation=0.002"), [frames[0], frames[4]])
     assert "implausible step of" in poses[1].reason
 
 
-def test_frame_of_single_wall_is_lost() -> None:
+def test_paper_tracker_frame_of_single_wall_is_lost() -> None:
     """The finest level uses no color, so that nothing determines a motion along the wall."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     poses = run(paper_tracker(), [wall.frame(T, k) for k, T in enumerate(walk(3))])
@@ -168,7 +168,7 @@ def test_frame_of_single_wall_is_lost() -> None:
     assert "does not determine the motion" in poses[1].reason
 
 
-def test_linear_weights_alone_change_poses_little() -> None:
+def test_paper_tracker_linear_weights_alone_change_poses_little() -> None:
     frames = walked(12)
     tukey, linear = (
         run(VoxelHashingIcp(finest_scale=1.0, residual_weights=weights), frames) for weights in ResidualWeights
@@ -186,6 +186,6 @@ def test_linear_weights_alone_change_poses_little() -> None:
         (["tracker.depth_weight=0"], "color_levels: expected 3 if depth_weight is 0, got 2"),
     ],
 )
-def test_invalid_parameter_raises(overrides: list[str], message: str) -> None:
+def test_paper_tracker_invalid_parameter_raises(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         paper_tracker(*overrides)

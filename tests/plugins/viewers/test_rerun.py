@@ -1,4 +1,4 @@
-"""A run in rerun's files: what is in them, what is left of a killed run, and what stands in the way."""
+"""Tests of rerun recordings: their content, killed runs, and errors."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def pipeline(viewer: RerunViewer, **stages: Any) -> Pipeline:
 
 
 def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
-    """What was logged to an entity as time went by: the values by column, the times by time line, in ns."""
+    """Return the logged values of an entity by column, and the times by timeline, in ns."""
     for chunk in RrdReader(file).stream():
         if chunk.entity_path == f"/{entity}" and not chunk.is_static:
             batch = chunk.to_record_batch()
@@ -74,7 +74,7 @@ def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
 
 
 def fixed(file: Path) -> Path:
-    """The messages that are whole, which rerun's viewer shows: `RrdReader` refuses a file that ends within one."""
+    """Return the complete messages, which rerun's viewer shows: `RrdReader` rejects a truncated file."""
     whole = file.with_name("whole.rrd")
     rrd("merge", file, "-o", str(whole))
     return whole
@@ -82,7 +82,7 @@ def fixed(file: Path) -> Path:
 
 def rrd(command: str, file: Path, *options: str) -> None:
     line = [sys.executable, "-m", "rerun", "rrd", command, str(file), *options]
-    home = os.environ | {"HOME": str(file.parent)}  # where rerun notes that it has run
+    home = os.environ | {"HOME": str(file.parent)}  # rerun records here that it has run
     done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, env=home)
     assert done.returncode == 0, done.stderr
 
@@ -93,7 +93,7 @@ def entities(file: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of six frames, of which 2 cannot be read and 4 is lost."""
+    """Return a run of six frames, of which 2 cannot be read and 4 is lost."""
     directory = tmp_path_factory.mktemp("run")
     viewer = RerunViewer(frame_interval=1, stride=1, mesh_interval=0.1, min_confidence=0.1)
     pipeline(viewer).run_to_any_end(CornerRoom(unreadable=2), directory)
@@ -105,25 +105,25 @@ def stages_timed(milliseconds: Sequence[float]) -> list[str]:
     return [stage for stage, time in zip(STAGE_COLORS, milliseconds, strict=True) if np.isfinite(time)]
 
 
-def test_recording_is_valid_and_has_blueprint(recorded: Path) -> None:
+def test_rerun_recording_is_valid_and_has_blueprint(recorded: Path) -> None:
     rrd("verify", recorded)
     assert len(RrdReader(recorded).blueprints()) >= 1
 
 
-def test_stage_times_cover_only_completed_stages(recorded: Path) -> None:
+def test_rerun_stage_times_cover_only_completed_stages(recorded: Path) -> None:
     times = {row["frame"]: row["Scalars:scalars"] for row in rows(recorded, "milliseconds")}
     assert sorted(times) == [0, 1, 3, 4, 5]
     assert all(stages_timed(times[k]) == [*STAGE_NAMES] for k in (0, 1, 3, 5))
     assert stages_timed(times[4]) == ["reading", "detection", "tracking"], "its pose is lost"
 
 
-def test_lost_and_skipped_frames_are_logged(recorded: Path) -> None:
+def test_rerun_lost_and_skipped_frames_are_logged(recorded: Path) -> None:
     expected = {row["TextLog:text"][0]: row["frame"] for row in rows(recorded, "log")}
     assert expected["lost: too dark"] == 4
     assert "skipped: frame 2: depth/000002.png is truncated" in expected
 
 
-def test_camera_path_is_split_at_lost_frames(recorded: Path) -> None:
+def test_rerun_camera_path_is_split_at_lost_frames(recorded: Path) -> None:
     pieces = {}
     for entity in entities(recorded):
         if entity.startswith("/world/path/"):
@@ -132,7 +132,7 @@ def test_camera_path_is_split_at_lost_frames(recorded: Path) -> None:
     np.testing.assert_allclose(pieces["/world/path/0"], [pose_at(k)[:3, 3] for k in (0, 1, 3)], atol=1e-6)
 
 
-def test_recorded_mesh_equals_map_mesh(recorded: Path, tmp_path: Path) -> None:
+def test_rerun_mesh_equals_map_mesh(recorded: Path, tmp_path: Path) -> None:
     last = {}
     for entity in entities(recorded):
         if entity.startswith("/world/mesh/"):
@@ -145,7 +145,7 @@ def test_recorded_mesh_equals_map_mesh(recorded: Path, tmp_path: Path) -> None:
     assert {tuple(row) for row in points.astype(np.float32).tolist()} == {tuple(row) for row in used.tolist()}
 
 
-def test_objects_and_masks_share_colors_and_names(recorded: Path) -> None:
+def test_rerun_objects_and_masks_share_colors_and_names(recorded: Path) -> None:
     boxes = list(rows(recorded, "world/objects/boxes"))[-1]
     names = list(rows(recorded, "world/objects/names"))[-1]
     assert sorted(label.split()[0] for label in names["Points3D:labels"]) == ["chair", "couch"]
@@ -162,7 +162,7 @@ def test_objects_and_masks_share_colors_and_names(recorded: Path) -> None:
     assert len(set(image[image > 0].tolist())) == 2
 
 
-def test_recorded_camera_has_pose_and_intrinsics(recorded: Path) -> None:
+def test_rerun_camera_has_pose_and_intrinsics(recorded: Path) -> None:
     camera = list(rows(recorded, "world/camera"))[-1]
     assert camera["frame"] == 5
     np.testing.assert_allclose(camera["Transform3D:translation"][0], pose_at(5)[:3, 3], atol=1e-6)
@@ -171,8 +171,8 @@ def test_recorded_camera_has_pose_and_intrinsics(recorded: Path) -> None:
     np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # rerun's pixels begin at whole numbers
 
 
-def test_viewer_does_not_change_result(tmp_path: Path) -> None:
-    """To the byte, with a viewer that looks at the map after every frame."""
+def test_rerun_viewer_does_not_change_result(tmp_path: Path) -> None:
+    """The outputs are byte-identical with a viewer that reads the map after every frame."""
     maps = {}
     for name in ("none", "rerun"):
         viewer = build_viewer(name, "viewer.mesh_interval=0.1") if name == "rerun" else build_viewer(name)
@@ -190,8 +190,8 @@ def build_viewer(name: str, *overrides: str) -> Any:
     return registered.built("viewer", name, *overrides)
 
 
-def test_killed_run_keeps_recording_up_to_last_second(tmp_path: Path) -> None:
-    """By the computer's clock, which rerun notes with everything, and by when the last frame was fused."""
+def test_rerun_recording_of_killed_run_has_last_second(tmp_path: Path) -> None:
+    """The clock is that of the recording; the reference is the time of the last fused frame."""
     endless = ("dataset.frames=100000", "dataset.slow_s=0.03", "fuser.capacity=100000", "fuser.note=note")
     line = [
         sys.executable,
@@ -219,16 +219,16 @@ def test_killed_run_keeps_recording_up_to_last_second(tmp_path: Path) -> None:
     finally:
         os.kill(run.pid, signal.SIGKILL)
         run.communicate()
-    fused_at = (tmp_path / "note").stat().st_mtime  # later than that nothing can have been drawn, and the rest must be
+    fused_at = (tmp_path / "note").stat().st_mtime  # nothing can be drawn later, and everything before must be
     file = tmp_path / "run" / "recording.rrd"
-    os.truncate(file, file.stat().st_size - 1)  # as if it had been killed while it wrote, which happens now and then
+    os.truncate(file, file.stat().st_size - 1)  # as if killed during a write, which happens occasionally
     frames = list(rows(fixed(file), "world/camera/color"))
     assert len(frames) > 3
     last = max(row["log_time"] for row in frames) / 1e9
     assert abs(fused_at - last) < 1.5, f"{fused_at - last:.2f} s are missing"
 
 
-def test_mapper_writes_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rerun_mapper_writes_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     mapper = Mapper(*STAGES, viewer="rerun")
     room = CornerRoom()
@@ -243,7 +243,7 @@ def test_mapper_writes_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert [row["TextLog:text"] for row in rows(tmp_path / "recording.rrd", "log")]
 
 
-def test_missing_rerun_package_names_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rerun_missing_package_error_names_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     find_spec = importlib.util.find_spec
     there = {"rerun": None}
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: there.get(name, find_spec(name, *rest)))
@@ -261,7 +261,7 @@ def test_missing_rerun_package_names_extra(monkeypatch: pytest.MonkeyPatch) -> N
         ("port=80", "port: expected a value in"),
     ],
 )
-def test_invalid_parameter_raises(parameter: str, message: str) -> None:
+def test_rerun_invalid_parameter_raises(parameter: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         build_viewer("rerun", f"viewer.{parameter}")
 
@@ -270,7 +270,7 @@ def begun(viewer: RerunViewer, directory: Path) -> None:
     viewer.begin(assemble(BayesianTsdf).scene, "nothing", directory)
 
 
-def test_unwritable_recording_raises(tmp_path: Path) -> None:
+def test_rerun_unwritable_recording_raises(tmp_path: Path) -> None:
     (tmp_path / "recording.rrd").mkdir()
     with pytest.raises(
         ConfigError, match=r"viewer\.file: expected a writable file, got .*recording\.rrd: .*Is a directory"
@@ -281,7 +281,7 @@ def test_unwritable_recording_raises(tmp_path: Path) -> None:
         begun(RerunViewer(file="file/below.rrd"), tmp_path)
 
 
-def test_window_mode_without_display_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rerun_window_mode_without_display_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
@@ -289,7 +289,7 @@ def test_window_mode_without_display_raises(tmp_path: Path, monkeypatch: pytest.
         begun(RerunViewer(mode=Mode.WINDOW), tmp_path)
 
 
-def test_occupied_port_raises(tmp_path: Path) -> None:
+def test_rerun_occupied_port_raises(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -299,14 +299,14 @@ def test_occupied_port_raises(tmp_path: Path) -> None:
 
 
 def listening() -> set[str]:
-    """ADDRESS:PORT, in /proc's hexadecimal, where this process waits for calls."""
+    """Return ADDRESS:PORT, in /proc's hexadecimal, on which this process listens."""
     own = {str(file.readlink()) for file in list(Path("/proc/self/fd").iterdir()) if file.is_symlink()}
     lines = [line.split() for table in ("tcp", "tcp6") for line in Path("/proc/net", table).read_text().splitlines()]
     return {line[1] for line in lines if line[3] == "0A" and f"socket:[{line[9]}]" in own}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="who listens is in /proc")
-def test_browser_mode_listens_only_on_localhost(tmp_path: Path) -> None:
+def test_rerun_browser_mode_listens_only_on_localhost(tmp_path: Path) -> None:
     viewer = RerunViewer(mode=Mode.BROWSER, port=free_port(), web_port=free_port())
     begun(viewer, tmp_path)
     served = {address.partition(":")[2]: address.partition(":")[0] for address in listening()}
@@ -315,8 +315,8 @@ def test_browser_mode_listens_only_on_localhost(tmp_path: Path) -> None:
     assert not {host for host in served.values() if not host.endswith("7F")}, "nothing else is open"
 
 
-def test_window_mode_binds_only_localhost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a program in rerun's place that notes how it was called, and listens for a while."""
+def test_rerun_window_mode_binds_only_localhost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that records its arguments and listens replaces rerun."""
     program, port = tmp_path / "rerun", free_port()
     program.write_text(
         f"""#!{sys.executable}
@@ -329,7 +329,7 @@ if "--port" in sys.argv:
     )
     program.chmod(0o755)
     monkeypatch.setattr(rerun_program, "program", lambda: str(program))
-    for _ in range(2):  # the second time one is there
+    for _ in range(2):  # the second call finds it running
         rerun_program.open_window(port, "1GB")
     disabled, opened, *others = (tmp_path / "calls").read_text().splitlines()
     assert disabled == "analytics disable"
@@ -340,7 +340,7 @@ if "--port" in sys.argv:
         rerun_program.open_window(free_port(), "1GB")
 
 
-def test_browser_page_connects_only_to_own_server(tmp_path: Path) -> None:
+def test_rerun_browser_page_connects_only_to_own_server(tmp_path: Path) -> None:
     viewer = RerunViewer(mode=Mode.BROWSER, port=free_port(), web_port=free_port(), file="also.rrd")
     begun(viewer, tmp_path)
     with urlopen(f"http://127.0.0.1:{viewer.web_port}/?url=data", timeout=30) as page:

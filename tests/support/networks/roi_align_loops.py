@@ -1,4 +1,4 @@
-"""RoIAlign as Detectron and torchvision write it: sample by sample. Slow and obvious."""
+"""RoIAlign sample by sample, as in Detectron and torchvision; a slow reference."""
 
 import math
 
@@ -19,7 +19,7 @@ def bilinear(plane, y, x):
 
 
 def roi_align_loops(plane, boxes, bins, scale, ratio, half_pixel):
-    """(N, C, bins, bins) of a plane (C, H, W)."""
+    """Return (N, C, bins, bins) of a plane (C, H, W)."""
     pooled = np.zeros((len(boxes), plane.shape[0], bins, bins))
     offset = 0.5 if half_pixel else 0.0
     for n, box in enumerate(boxes):

@@ -1,4 +1,4 @@
-"""Random CLIPs and SigLIPs with a tokenizer of a few words, small enough to be written and run in no time."""
+"""Tiny random CLIP and SigLIP models with a small tokenizer, which are quick to write and run."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TEXT = {
 
 
 def write_image_text(folder: Path, kind: str = "siglip") -> Path:
-    """A model of this `model_type`, as save_pretrained writes it, with its tokenizer and preprocessing."""
+    """Write a model of this `model_type` with its tokenizer and preprocessing, like save_pretrained."""
     import transformers
 
     torch.manual_seed(5)
@@ -42,7 +42,7 @@ def write_image_text(folder: Path, kind: str = "siglip") -> Path:
     more = {"projection_dim": 16} if kind == "clip" else {}
     model = model_class(config_class(text_config=TEXT, vision_config=VISION, **more))
     with torch.no_grad():
-        for weights in model.parameters():  # as they are made, all pictures would look alike to them
+        for weights in model.parameters():  # with their initial weights, all images would have equal embeddings
             weights.add_(torch.randn_like(weights) * 0.3)
     model.save_pretrained(folder)
     write_tokenizer(folder)
@@ -54,7 +54,7 @@ def write_image_text(folder: Path, kind: str = "siglip") -> Path:
 
 
 def write_tokenizer(folder: Path) -> None:
-    """One of WORDS."""
+    """Write a tokenizer of WORDS."""
     import transformers
     from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors
 

@@ -1,4 +1,4 @@
-"""A Mask R-CNN of random weights that runs in milliseconds: what it finds is nonsense, how it is found is not."""
+"""A tiny random Mask R-CNN that runs in milliseconds; its results are meaningless, its computation is complete."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TINY = Architecture(
 
 
 def tiny_network(architecture: Architecture = TINY, seed: int = 0) -> MaskRCNN:
-    """Ready to run; also the normalization's statistics are random, so that nothing in it is a neutral element."""
+    """Return the network with random normalization statistics, so that no operation is neutral."""
     generator = torch.Generator().manual_seed(seed)
     network = MaskRCNN(architecture).eval()
     for name, tensor in network.state_dict().items():
@@ -37,7 +37,7 @@ def tiny_network(architecture: Architecture = TINY, seed: int = 0) -> MaskRCNN:
 
 
 def tiny_network_file(folder: Path) -> Path:
-    """The network in a file in `folder`."""
+    """Write the network to a file in `folder`."""
     path = folder / "tiny_mask_rcnn.safetensors"
     save_network(tiny_network(), path, {"data": "none: the weights are random"})
     return path

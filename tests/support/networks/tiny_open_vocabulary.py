@@ -1,4 +1,4 @@
-"""Random OWLv2s and SAMs, small enough to be written and run in no time."""
+"""Tiny random OWLv2 and SAM models, which are quick to write and run."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def write_owlv2(folder: Path) -> Path:
 
 
 def write_sam(folder: Path, kind: str) -> Path:
-    """A SAM or a SAM 2."""
+    """Write a SAM or a SAM 2."""
     import transformers
 
     torch.manual_seed(2)

@@ -1,4 +1,4 @@
-"""Random networks of each family of transformers, small enough to be written and run in no time."""
+"""Tiny random networks of each transformers family, which are quick to write and run."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ PREPROCESSING: dict[str, dict[str, Any]] = {
 
 
 def write_network(folder: Path, kind: str, labels: Mapping[int, str] | None = None) -> Path:
-    """One of a family, spread so that classes and masks differ from query to query; its classes are LABELS or these."""
+    """Write a network of a family, whose classes and masks differ by query; the classes are LABELS by default."""
     import transformers
 
     name, parameters = MODELS[kind]

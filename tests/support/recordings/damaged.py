@@ -1,4 +1,4 @@
-"""Real recordings as users bring them: with one convention that is not the format's."""
+"""Real recordings with one convention that differs from the format."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_damaged(
     poses_late: int = 0,
     frames: int = 10_000,
 ) -> Path:
-    """An RGB-D folder of `sound`'s images, linked, with damaged poses, depth scale or order of poses or depth."""
+    """Write an RGB-D folder of `sound`'s linked images with damaged poses, depth scale or order."""
     recorded = sound.contents.frames[:frames]
     usable = range(max(depth_late, poses_late, 0), len(recorded) + min(depth_late, poses_late, 0))
     for name in ("color", "depth"):

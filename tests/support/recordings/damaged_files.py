@@ -1,4 +1,4 @@
-"""What happens to files, for tests that a reader takes it or says in one line what is wrong."""
+"""Random damage of files, for tests that a reader accepts a file or raises a one-line error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from framework.errors import DataError
 
 EXAMPLES = int(os.environ.get("INSTANCEMAP_FUZZ", "60"))
-SLOWEST = 2.0  # s, for files of at most some 100 KB on a busy machine
+SLOWEST = 2.0  # s, for files of up to 100 KB on a busy machine
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?")
 ODD_NUMBERS = (b"0", b"-1", b"3", b"65536", b"2147483648", b"4294967295", b"1" * 20, b"1" * 5000, b"1e400", b"-0.5")
 NO_NUMBERS = (b"nan", b"-inf", b"1_0", b"0x1p3", b"x", b"", b"\xff", b"\x00", b"1 1", b"\n")
@@ -26,7 +26,7 @@ ODD = (*LARGE, 0.5, 1e-300, 1e300, -1e-9, float("nan"), float("inf"), None, True
 
 @st.composite
 def changed_json(draw: st.DrawFn, node: Any) -> Any:
-    """JSON with one of its values, somewhere, replaced, taken away or doubled."""
+    """Return JSON with one random value replaced, removed or duplicated."""
     if isinstance(node, dict) and node and draw(st.integers(0, 9)):
         key = draw(st.sampled_from(sorted(node)))
         if draw(st.integers(0, 9)) == 0:
@@ -42,7 +42,7 @@ def changed_json(draw: st.DrawFn, node: Any) -> Any:
 
 @st.composite
 def damaged(draw: st.DrawFn, content: bytes, tokens: tuple[bytes, ...]) -> bytes:
-    """`content` with one to four things done to it that disks, transfers, editors and attackers do."""
+    """Return `content` with one to four changes as by disks, transfers, editors and attackers."""
     for _ in range(draw(st.integers(1, 4))):
         first = draw(st.integers(0, max(len(content) - 1, 0)))
         last = first + draw(st.integers(0, 30))
@@ -69,7 +69,7 @@ def damaged(draw: st.DrawFn, content: bytes, tokens: tuple[bytes, ...]) -> bytes
 
 
 def check(read: Callable[[Path], object], path: Path, content: bytes) -> str:
-    """Reads the file; "" or the error's line. Fails for everything else that can happen."""
+    """Read the file; return "" or the error's line. Fails for any other outcome."""
     path.write_bytes(content)
     began = time.perf_counter()
     try:

@@ -1,4 +1,4 @@
-"""Writes OpenNI recordings (.oni) as its recorders do: nodes, their images, tables for seeking, an end."""
+"""A writer of OpenNI recordings (.oni): nodes, images, seek tables and an end record."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ def jpeg(image):
 
 
 def with_table(image):
-    """OpenNI's 16zT, without its short forms: the values, the place of the first among them, 0xff and place of each."""
+    """Return OpenNI's 16zT encoding without short forms: the values, the index of the first, 0xff and each index."""
     values, places = np.unique(image, return_inverse=True)
     table = struct.pack("<H", len(values)) + values.astype("<u2").tobytes()
     first, *others = places.ravel()
@@ -50,8 +50,8 @@ class Node:
 @dataclass
 class OniFile:
     nodes: list[Node]
-    wide: bool = True  # 64-bit places, as from version 1.0.1.0 on; else 1.0.0.5 and no tables for seeking
-    end_node: int = 0  # in the record of the end; OpenNI 1 writes OPENNI_1_END_NODE
+    wide: bool = True  # 64-bit positions since version 1.0.1.0; otherwise 1.0.0.5 without seek tables
+    end_node: int = 0  # in the end record; OpenNI 1 writes OPENNI_1_END_NODE
 
     def write(self, path: Path) -> Path:
         content = self._content([0] * len(self.nodes))
@@ -116,5 +116,5 @@ def _string(text: str) -> bytes:
 
 
 def crash(sender, path, streams):
-    """Stands for OpenNI 2 on a damaged recording."""
+    """Simulate a crash of OpenNI 2 on a damaged recording."""
     os.kill(os.getpid(), signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Recordings as the apps of phones export them, written from frames that are known, for tests of the importers."""
+"""Exports of phone apps, written from known frames, for tests of the importers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # its camera has y up and z backwa
 
 @dataclass(frozen=True)
 class PhoneFrame:
-    """What a phone sees at one moment."""
+    """One frame of a phone."""
 
     timestamp: float  # s
     camera: Camera  # of color
@@ -38,7 +38,7 @@ class PhoneFrame:
 
 
 def seen_by_phone(frames: Sequence[Frame], shape: tuple[int, int] = LIDAR) -> Iterator[PhoneFrame]:
-    """Frames with depth thinned to a phone's, and low confidence beside steps in it."""
+    """Return frames with depth reduced to a phone's, and low confidence next to depth steps."""
     for frame in frames:
         assert frame.T_world_camera is not None
         v, u = (
@@ -83,7 +83,7 @@ def write_video(path: Path, colors: Sequence[UInt8]) -> None:
 
 
 def write_stray_scanner(folder: Path, frames: Sequence[PhoneFrame], own_intrinsics: bool = True) -> None:
-    """As docs/format.md of StrayRobots/scanner says, and its OdometryEncoder writes."""
+    """Write an export as in docs/format.md of StrayRobots/scanner and its OdometryEncoder."""
     folder.mkdir(parents=True)
     K = frames[0].camera.K
     (folder / "camera_matrix.csv").write_text("\n".join(numbered(row) for row in K))
@@ -108,7 +108,7 @@ T_COLOR_DEPTH[:3, 3] = 0.015014, 0.000251, 0.000425
 
 
 def room_frames(count: int = 4) -> list[PhoneFrame]:
-    """A walk in a small room, seen by a camera that focuses anew from frame to frame; depth is exact."""
+    """Return a walk in a small room with exact depth; the focal length changes from frame to frame."""
     frames = []
     for k in range(count):
         camera = replace(ROOM, fx=ROOM.fx - 2 * k, fy=ROOM.fy - 2 * k)
@@ -125,7 +125,7 @@ def room_frames(count: int = 4) -> list[PhoneFrame]:
 def check_imported(
     folder: Path, frames: Sequence[PhoneFrame], scale: float = 1.0, least: int = 1, tells_up: bool = True
 ) -> None:
-    """The folder, read as it is mapped, shows the room where it is: size, intrinsics, poses, up, color and depth."""
+    """Check that the imported folder matches the room: size, intrinsics, poses, up, color and depth."""
     sequence = RgbdFolder(folder)
     assert sequence.camera == frames[0].camera.scaled(scale)
     assert len(sequence) == len(frames)
@@ -149,7 +149,7 @@ def check_imported(
 
 
 def record3d_metadata(frames: Sequence[PhoneFrame], own_intrinsics: bool = True) -> dict[str, object]:
-    """As in metadata.json of a real export; newer versions have the intrinsics of each frame."""
+    """Return metadata.json as in a real export; newer versions have intrinsics of each frame."""
     (dh, dw), camera = frames[0].depth_mm.shape, frames[0].camera
     poses = [[*Rotation.from_matrix(T[:3, :3]).as_quat(), *T[:3, 3]] for T in (frame.T_world_arkit for frame in frames)]
     metadata = {
@@ -194,7 +194,7 @@ def write_r3d(path: Path, frames: Sequence[PhoneFrame], confident: bool = True) 
 
 
 def write_scanner_app(folder: Path, frames: Sequence[PhoneFrame]) -> None:
-    """As "All Data" of a low resolution scan: every frame has depth and a pose, color is kept of some."""
+    """Write "All Data" of a low resolution scan: every frame has depth and a pose, some have color."""
     for k, frame in enumerate(frames):
         write_png(folder / f"depth_{k:05d}.png", frame.depth_mm)
         write_png(folder / f"conf_{k:05d}.png", frame.confidence)
@@ -215,7 +215,7 @@ def write_scanner_app(folder: Path, frames: Sequence[PhoneFrame]) -> None:
 
 
 def write_polycam(folder: Path, frames: Sequence[PhoneFrame], prefix: str = "") -> None:
-    """As the raw data of polyform's README; with the prefix corrected_, what the app has optimized."""
+    """Write raw data as in polyform's README; the prefix corrected_ marks optimized data."""
     keyframes = folder / "keyframes"
     (keyframes / f"{prefix}cameras").mkdir(parents=True)
     for frame in frames:

@@ -1,4 +1,4 @@
-"""What the tests of several readers write and run."""
+"""Functions that the tests of several readers share."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from tests.support.scenes.corner_room import GridFuser, KeepAll
 
 
 def write_color(path: Path, rgb: tuple[int, int, int], shape: tuple[int, int] = (480, 640)) -> None:
-    """An image of one color."""
+    """Write an image of one color."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.full((*shape, 3), rgb[::-1], np.uint8))
 
 
 def write_depth(path: Path, value: int | np.ndarray, shape: tuple[int, int] = (480, 640)) -> None:
-    """A uint16 image, of one value or of the given ones."""
+    """Write a uint16 image of one value or of the given ones."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.broadcast_to(value, shape).astype(np.uint16))
 
 
 def mapped(sequence: RGBDSequence) -> tuple[RunResult, np.ndarray]:
-    """A run over all frames with true poses, and the mapped points (P, 3) in the world."""
+    """Run all frames with true poses; return the result and the mapped points (P, 3) in the world."""
     fuser = GridFuser()
     result = Pipeline(NoDetections(), GroundTruth(), KeepAll(), fuser, prefetch=0).run(sequence)
     return result, fuser.scene.mesh().vertices
 
 
 def opened(option: str, *overrides: str) -> RGBDSequence:
-    """The recording as `python -m framework dataset=OPTION ...` opens it."""
+    """Open the recording like `python -m framework dataset=OPTION ...`."""
     sequence: RGBDSequence = registered.built("dataset", option, *overrides)
     return sequence
 
 
 def fault_of(sequence: RGBDSequence, bad: int) -> str:
-    """What is wrong with frame `bad`, of which the others know nothing."""
+    """Return the error of frame `bad`; the other frames must be readable."""
     for k in range(len(sequence)):
         if k != bad:
             sequence[k]

@@ -1,4 +1,4 @@
-"""A network file in the other layouts that exporters write, by changing its graph."""
+"""A network file converted to the layouts of other exporters by graph changes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-MOST = 300  # detections, where suppression is inside
+MOST = 300  # detections of networks with internal suppression
 
 
 class Surgery:
-    """Puts nodes behind the two outputs of a YOLO segmentation network, boxes as center and size in px."""
+    """Appends nodes to both outputs of a YOLO segmentation network; boxes are center and size in px."""
 
     def __init__(self, source: Path) -> None:
         self.model = onnx.load(source)
@@ -25,18 +25,18 @@ class Surgery:
         self._names = 0
 
     def add(self, kind: str, *inputs: str | np.ndarray[Any, Any], outputs: int = 1, **attributes: Any) -> Any:
-        """A node; arrays among its inputs become constants. Returns the name of its output, or their names."""
+        """Add a node; array inputs become constants. Returns the names of its outputs."""
         names = [self._constant(one) if isinstance(one, np.ndarray) else one for one in inputs]
         made = [self._name() for _ in range(outputs)]
         self.graph.node.append(helper.make_node(kind, names, made, **attributes))
         return made[0] if outputs == 1 else made
 
     def columns_of(self, start: int, stop: int) -> str:
-        """Some rows of the table (1, columns, K)."""
+        """Return some rows of the table (1, columns, K)."""
         return self.add("Slice", self.table, np.array([start]), np.array([stop]), np.array([1]))
 
     def save(self, path: Path) -> Path:
-        """With the present table and prototypes as outputs, of any shape."""
+        """Save with the current table and prototypes as outputs, of any shape."""
         del self.graph.output[:]
         for name, axes in ((self.table, 3), (self.prototypes, 4)):
             shape = [f"{name}_{k}" for k in range(axes)]
@@ -81,7 +81,7 @@ def any_size(net: Surgery) -> None:
 
 
 def best_rows(net: Surgery) -> None:
-    """The cells with the best scores as detections, without suppression: as of networks that need none."""
+    """Select the cells with the best scores as detections, for networks without suppression."""
     corners(net)
     scores = net.columns_of(4, net.columns - 32)
     best = net.add("ReduceMax", scores, axes=[1], keepdims=0)  # (1, K)
@@ -90,7 +90,7 @@ def best_rows(net: Surgery) -> None:
 
 
 def suppressed(net: Surgery) -> None:
-    """Suppression within the best class, its threshold that of the detector; then rows of zeros up to MOST."""
+    """Suppress within the best class with the detector's threshold; pad with rows of zeros up to MOST."""
     corners(net)
     scores = net.columns_of(4, net.columns - 32)
     best = net.add("ReduceMax", scores, axes=[1], keepdims=1)
@@ -104,7 +104,7 @@ def suppressed(net: Surgery) -> None:
 
 
 def _finish(net: Surgery, scores: str, index: str) -> None:
-    """The table (1, n, 38) of the rows `index` (n,)."""
+    """Set the table (1, n, 38) to the rows `index` (n,)."""
     best = net.add("ReduceMax", scores, axes=[1], keepdims=1)
     label = net.add("Cast", net.add("ArgMax", scores, axis=1, keepdims=1), to=TensorProto.FLOAT)
     coefficients = net.columns_of(net.columns - 32, net.columns)
@@ -114,7 +114,7 @@ def _finish(net: Surgery, scores: str, index: str) -> None:
 
 
 def unit_rows(net: Surgery) -> None:
-    """Of detections."""
+    """Convert the boxes of the detections to units of the image."""
     scale = np.ones((1, 1, 38), np.float32)
     scale[..., :4] = 1 / net.side
     net.table = net.add("Mul", net.table, scale)
@@ -133,7 +133,7 @@ LAYOUTS: dict[str, tuple[Callable[[Surgery], None], ...]] = {
 
 
 def rewritten(source: Path, name: str, path: Path) -> Path:
-    """The network `source` in the layout `name`, in the file `path`."""
+    """Write the network `source` in the layout `name` to `path`."""
     net = Surgery(source)
     for step in LAYOUTS[name]:
         step(net)

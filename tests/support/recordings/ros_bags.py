@@ -1,4 +1,4 @@
-"""ROS bags of a small room, for tests of the importer: written by rosbags, which has to be there."""
+"""ROS bags of a small room for tests of the importer, written by rosbags."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DEPTH_LATE = 0.004  # s, of each depth image after its color image
 
 @dataclass
 class BagWriter:
-    """Collects messages and writes them as one of the kinds of bags."""
+    """Collects messages and writes them as one kind of bag."""
 
     ros1: bool = False
     messages: list[tuple[float, str, str, Any]] = field(default_factory=list)  # s, topic, type, message
@@ -135,7 +135,7 @@ class BagWriter:
         self.add(START, topic, "geometry_msgs/msg/Transform", **self.transform(T))
 
     def add_static(self, *transforms: tuple[str, str, Float64]) -> None:
-        """Parent, child and T_parent_child of each."""
+        """Add parent, child and T_parent_child of each transform."""
         stamped = [
             self.made(
                 "geometry_msgs/msg/TransformStamped",
@@ -163,7 +163,7 @@ class BagWriter:
         )
 
     def write(self, path: Path) -> Path:
-        """A ROS 1 bag; of ROS 2 a folder of .mcap where the name says so, else of .db3."""
+        """Write a ROS 1 bag, or a ROS 2 folder with .mcap or .db3 by its name."""
         if self.ros1:
             writer: Any = Writer1(path)
             serialize: Callable[..., Any] = self.types.serialize_ros1
@@ -185,7 +185,7 @@ def time_of(k: int) -> float:
 
 
 def seen(k: int, camera: Camera = ROOM) -> tuple[np.ndarray, np.ndarray]:
-    """Color and exact depth (m) of frame k."""
+    """Return color and exact depth (m) of frame k."""
     depth, _, color, _ = look(camera, pose_at(k))
     return color, depth
 
@@ -195,7 +195,7 @@ def png(image: np.ndarray) -> bytes:
 
 
 def compressed_depth(depth: np.ndarray) -> tuple[bytes, str]:
-    """As compressed_depth_image_transport packs floats: inverse depth, quantized."""
+    """Encode floats like compressed_depth_image_transport: inverse depth, quantized."""
     a, b = 100.0 * 101.0, 1.0 - 100.0 * 101.0 / 10.0  # its formula, for a quantization of 100 and a range of 10 m
     stored = np.where(depth > 0, np.rint(a / np.where(depth > 0, depth, 1) + b), 0).astype(np.uint16)
     return struct.pack("<iff", 0, a, b) + png(stored), "32FC1; compressedDepth png"
@@ -206,7 +206,7 @@ def millimeters(depth: np.ndarray) -> np.ndarray:
 
 
 def add_camera_of_ros(bag: BagWriter, depth: str = "aligned_depth_to_color") -> None:
-    """Topics as of realsense2_camera with align_depth, color and depth of the room."""
+    """Add topics of realsense2_camera with align_depth, with color and depth of the room."""
     for k in range(COUNT):
         color, metric = seen(k)
         bag.add_image(time_of(k), "/camera/color/image_raw", color, "rgb8", padding=16)
@@ -216,7 +216,7 @@ def add_camera_of_ros(bag: BagWriter, depth: str = "aligned_depth_to_color") -> 
 
 
 def add_realsense(bag: BagWriter, depth_camera: Camera, unit: float = 0.0001) -> None:
-    """Topics as of RealSense's own recorder: depth as the depth camera sees it."""
+    """Add topics of RealSense's own recorder, with depth of the depth camera."""
     color_topic, depth_topic = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
     bag.add_camera(START, f"{color_topic}/info/camera_info", ROOM)
     bag.add_camera(START, f"{depth_topic}/info/camera_info", depth_camera, "Brown Conrady")

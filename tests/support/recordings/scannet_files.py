@@ -1,4 +1,4 @@
-"""ScanNet's files as published: `.sens` written field by field, and the folders that its SensReader exports."""
+"""ScanNet's files as published: `.sens` files written field by field, and folders of its SensReader."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ZLIB, OCCIPITAL = 1, 2
 
 @dataclass
 class Shot:
-    """What one frame of a file is made of; bytes in place of an image are written as they are."""
+    """The content of one frame; bytes in place of an image are written unchanged."""
 
     color: np.ndarray | bytes
     depth: np.ndarray | bytes
@@ -30,7 +30,7 @@ class Shot:
 
 
 def shots(count: int = 3) -> list[Shot]:
-    """Smooth colors, a slanted depth, and a camera that moves by 5 cm a frame along x."""
+    """Return smooth colors, slanted depth, and a camera that moves by 5 cm per frame along x."""
     u, v = np.meshgrid(np.arange(COLOR_CAMERA.width), np.arange(COLOR_CAMERA.height))
     x, y = np.meshgrid(np.arange(DEPTH_CAMERA.width), np.arange(DEPTH_CAMERA.height))
     made = []
@@ -53,7 +53,7 @@ def sens(
     version: int = 4,
     count: int | None = None,
 ) -> bytes:
-    """The content of a `.sens` file."""
+    """Return the content of a `.sens` file."""
     name = b"StructureSensor"
     parts = [struct.pack("<IQ", version, len(name)), name]
     extrinsics = np.eye(4) if color_extrinsics is None else color_extrinsics
@@ -77,7 +77,7 @@ def write_sens(path: Path, frames: list[Shot], **options: object) -> None:
 
 
 def write_exported(folder: Path, frames: list[Shot], suffix: str = ".png") -> None:
-    """What `SensReader/python/reader.py` writes; color as PNG unless told, so that it stays exact."""
+    """Write the output of `SensReader/python/reader.py`; color is PNG by default, so that it is exact."""
     for name in ("color", "depth", "pose", "intrinsic"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     for k, shot in enumerate(frames):

@@ -1,4 +1,4 @@
-"""A scene with exact answers: planes and spheres, seen by a pinhole camera, computed in closed form."""
+"""A scene of planes and spheres with closed-form views of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from framework.data import Camera, Frame, FrameTruth, PointClusters
 CAMERA = Camera(160, 120, 131.0, 131.0, 79.5, 59.5)
 
 
-NOTHING = PointClusters(  # a frame in which nothing was detected
+NOTHING = PointClusters(  # a frame without detections
     np.zeros((0, 3), np.float32),
     np.zeros((0, 2), np.int32),
     np.zeros(0, np.int32),
@@ -24,14 +24,14 @@ NOTHING = PointClusters(  # a frame in which nothing was detected
 
 @dataclass
 class Scene:
-    """Planes n . x = d (n towards the camera's side) and spheres; each surface is one instance, numbered from 1."""
+    """Planes n . x = d (n towards the camera) and spheres; each surface is one instance, numbered from 1."""
 
     planes: list[tuple[np.ndarray, float]] = field(default_factory=list)
     spheres: list[tuple[np.ndarray, float]] = field(default_factory=list)
     contrast: float = 0.5  # of the texture, in [0, 1]
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(depth m (H, W) float32, color (H, W, 3) uint8, surface number (H, W) int32, 0 = nothing)."""
+        """Return depth m (H, W) float32, color (H, W, 3) uint8 and surface number (H, W) int32, 0 = nothing."""
         v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         directions = rays @ T_world_camera[:3, :3].T
@@ -57,7 +57,7 @@ class Scene:
         return np.where(np.isfinite(depth), depth, 0).astype(np.float32), color, surface
 
     def _texture(self, points: np.ndarray) -> np.ndarray:
-        """A solid texture of a few wave lengths, so that every view of a point has the same color."""
+        """Return a solid texture of a few wavelengths, so that all views of a point have the same color."""
         x, y, z = (points[..., i] for i in range(3))
         waves = [
             np.sin(7 * x + 3 * y) + np.sin(11 * z - 5 * x + 1) + np.sin(17 * y + 4 * z),
@@ -69,21 +69,21 @@ class Scene:
     def frame(
         self, T_world_camera: np.ndarray, index: int = 0, camera: Camera = CAMERA, class_name: str = "chair"
     ) -> Frame:
-        """The scene as a frame; spheres are the instances, planes are background."""
+        """Return the scene as a frame; spheres are instances, planes are background."""
         depth, color, surface = self.render(camera, T_world_camera)
         instance_ids = np.where(surface > len(self.planes), surface - len(self.planes), 0).astype(np.int32)
         names = dict.fromkeys(range(1, len(self.spheres) + 1), class_name)
         return Frame(index, index / 30, color, depth, camera, T_world_camera, FrameTruth(instance_ids, names))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """The distance (P,) m of points (P, 3) to the nearest surface."""
+        """Return the distance (P,) m of points (P, 3) to the nearest surface."""
         distances = [np.abs(points @ n - d) for n, d in self.planes]
         distances += [np.abs(np.linalg.norm(points - center, axis=1) - radius) for center, radius in self.spheres]
         return np.min(distances, axis=0)
 
 
 def room() -> Scene:
-    """A room's corner with three spheres: every motion is determined."""
+    """Return a room corner with three spheres, in which every motion is determined."""
     return Scene(
         planes=[
             (np.array([0.0, 0.0, -1.0]), -2.5),
@@ -100,7 +100,7 @@ def room() -> Scene:
 
 
 def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, rotvec: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
-    """T_world_camera from a position (m) and a rotation vector (rad)."""
+    """Return T_world_camera from a position (m) and a rotation vector (rad)."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix()
     T[:3, 3] = (x, y, z)
@@ -108,7 +108,7 @@ def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, rotvec: tuple[float, fl
 
 
 def walk(frames: int) -> list[np.ndarray]:
-    """A smooth hand-held motion: about 10 mm and 0.5 degrees a frame."""
+    """Return a smooth hand-held motion: about 10 mm and 0.5 degrees per frame."""
     t = np.linspace(0, 1, frames) * frames / 60
     return [
         pose(

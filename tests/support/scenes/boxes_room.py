@@ -1,4 +1,4 @@
-"""A room with two boxes that pictures are taken of: its surface is known exactly."""
+"""A room with two boxes and an exact surface, for rendered images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def box(
 
 
 def furnished(R: np.ndarray = Z_UP) -> InstanceMesh:
-    """A 4 x 3 x 2.5 m room seen from inside, with a red box (1) and a blue one (2); R turns the world."""
+    """Return a 4 x 3 x 2.5 m room seen from inside, with a red box (1) and a blue one (2); R rotates the world."""
     parts = [box((0, 0, 1.25), (4, 3, 2.5), True), box((-1, 0, 0.4), (0.8,) * 3), box((1, 0.3, 0.4), (0.8,) * 3)]
     offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
     ids = np.repeat([0, 1, 2], [len(vertices) for vertices, _ in parts]).astype(np.int32)
@@ -39,7 +39,7 @@ def furnished(R: np.ndarray = Z_UP) -> InstanceMesh:
 
 
 def walk(R: np.ndarray = Z_UP, n: int = 20) -> np.ndarray:
-    """Cameras at eye height that look about the room and a little down."""
+    """Return cameras at eye height that look around the room and slightly down."""
     poses = np.tile(np.eye(4), (n, 1, 1))
     for pose, angle in zip(poses, np.linspace(0, 2 * np.pi, n, endpoint=False), strict=True):
         pose[:3, :3] = R @ looking(np.array([np.cos(angle), np.sin(angle), -0.4]), np.array([0.0, 0, 1]))
@@ -49,7 +49,7 @@ def walk(R: np.ndarray = Z_UP, n: int = 20) -> np.ndarray:
 
 @dataclass
 class BoxesRoom(RGBDSequence):
-    """The room as a data set without frames: its labeled surface only."""
+    """The room as a dataset without frames, with only its labeled surface."""
 
     scene: str = "boxes"  # "gone": cannot be read
 

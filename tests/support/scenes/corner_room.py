@@ -1,4 +1,4 @@
-"""The contracts' room as videos, with the faults that tests need, and the simplest plugins that can map it."""
+"""The contracts' room as videos with configurable errors, and minimal plugins that can map it."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ class CornerRoom(RGBDSequence):
 
     frames: int = 6
     unreadable: int = -1  # this frame raises FrameError; -1 = none
-    truth: bool = True  # whether poses and instances are known
+    truth: bool = True  # True if poses and instances are known
     unposed: tuple[int, ...] = ()  # frames whose true pose is not known
-    slow_s: float = 0.0  # how long reading a frame takes
+    slow_s: float = 0.0  # s to read a frame
     scene: str = ""  # any name: all are the same room
     start: int = 0
     stop: int = -1  # -1 = to the end
@@ -81,12 +81,12 @@ class CornerRoom(RGBDSequence):
 
 @dataclass
 class LiveRoom(LiveVideo):
-    """The room as a camera in it sends it, with true poses."""
+    """The room as live video, with true poses."""
 
-    frames_sent: int = 6  # then it ends
-    period_s: float = -1.0  # from frame to frame; -1 = each comes when the one before was read, so that none is dropped
+    frames_sent: int = 6  # number of frames
+    period_s: float = -1.0  # s between frames; -1 = each comes after the previous one was read, so that none is dropped
     unreadable: int = -1  # reading this frame raises FrameError; -1 = none
-    fails_after: int = -1  # it breaks down after so many frames; -1 = never
+    fails_after: int = -1  # number of frames before a failure; -1 = never
 
     def __post_init__(self) -> None:
         self.name = "live_room"
@@ -119,7 +119,7 @@ class LiveRoom(LiveVideo):
 
 @dataclass
 class SphereDetector(Detector):
-    """Finds both spheres where they really are, in several frames at once."""
+    """Detects both spheres exactly, in several frames at once."""
 
     concurrent = True
     broken_at: int = -1  # raises FrameError at this frame
@@ -135,7 +135,7 @@ class SphereDetector(Detector):
 
 @dataclass
 class GivenPose(PoseTracker):
-    """Passes the true pose on, but for the frames in [lost_from, lost_to)."""
+    """Returns the true pose, except for the frames in [lost_from, lost_to)."""
 
     pose_source = "ground_truth"
     lost_from: int = 0
@@ -150,7 +150,7 @@ class GivenPose(PoseTracker):
 
 @dataclass
 class KeepAll(ClusterRefiner):
-    """Changes nothing."""
+    """Keeps all points."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return clusters
@@ -158,7 +158,7 @@ class KeepAll(ClusterRefiner):
 
 @dataclass
 class GridMap(SceneMap):
-    """Each frame that was fused, as a grid of triangles of its own."""
+    """Each fused frame as a separate grid of triangles."""
 
     vertices: list[np.ndarray] = field(default_factory=list)
     colors: list[np.ndarray] = field(default_factory=list)
@@ -173,7 +173,7 @@ class GridMap(SceneMap):
         return MapStatistics(voxels, bytes=28 * voxels)
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
-        depth, normals, color, ids = look(camera, T_world_camera)  # as a perfect map would
+        depth, normals, color, ids = look(camera, T_world_camera)  # like a perfect map
         return View(camera, T_world_camera, depth, normals.astype(np.float32), color, ids, ids - 1)
 
     def mesh(self) -> InstanceMesh:
@@ -219,12 +219,12 @@ class GridMap(SceneMap):
 
 @dataclass
 class GridFuser(MapFuser):
-    """Puts each frame beside the others; cluster k is instance k + 1."""
+    """Appends each frame; cluster k is instance k + 1."""
 
     capacity: int = 100  # frames
-    slow_s: float = 0.0  # how long fusing takes
-    slow_save_s: float = 0.0  # how long saving the map takes
-    note: str = ""  # a file that is there once a frame is in the map; "" = none
+    slow_s: float = 0.0  # s to fuse a frame
+    slow_save_s: float = 0.0  # s to save the map
+    note: str = ""  # a file that is created once a frame is in the map; "" = none
 
     def __post_init__(self) -> None:
         self.scene: GridMap = GridMap(slow_save_s=self.slow_save_s)
@@ -253,7 +253,7 @@ class GridFuser(MapFuser):
 
 
 def fault(kind: str) -> BaseException:
-    """What a stage may raise, by name."""
+    """Return an exception that a stage may raise, by name."""
     faults: dict[str, BaseException] = {
         "OSError": OSError(5, "Input/output error", "weights.bin"),
         "ValueError": ValueError("operands could not be broadcast together"),
@@ -265,7 +265,7 @@ def fault(kind: str) -> BaseException:
 
 @dataclass
 class FaultyDetector(SphereDetector):
-    """Fails at one frame: in a way that `fault` knows, or with masks of a wrong size."""
+    """Fails at one frame with an exception of `fault`, or with masks of a wrong size."""
 
     at: int = 3
     kind: str = "OSError"

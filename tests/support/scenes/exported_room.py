@@ -17,7 +17,7 @@ from framework.rendering.viewpoint import looking
 from framework.runs.instances_file import write_instances
 from framework.runs.mesh_file import write_mesh
 
-SIDE = 0.05  # m, of the squares that faces are made of, two triangles each
+SIDE = 0.05  # m, size of the squares of a face, two triangles each
 UP = np.array([0.0, 0.0, 1.0])
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # R_world_room of a world whose y is up
 Block = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1 m
@@ -32,7 +32,7 @@ PICTURE: list[Block] = [(2.8, 2.95, 1.2, 3.3, 3.0, 1.6)]
 
 
 def faces(block: Block, inward: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices and triangles of a box, its sides cut into squares, facing out or in."""
+    """Return vertices and triangles of a box with subdivided sides, facing out or in."""
     low, high = np.array(block[:3]), np.array(block[3:])
     vertices, triangles, count = [], [], 0
     for axis in range(3):
@@ -52,7 +52,7 @@ def faces(block: Block, inward: bool = False) -> tuple[np.ndarray, np.ndarray]:
 
 
 def look_about(places: Sequence[tuple[float, float, float]], n: int = 12) -> Float64:
-    """(F, 4, 4) T_room_camera of cameras at these places, that look all about, and down as well."""
+    """Return (F, 4, 4) T_room_camera of cameras at these positions that look in all directions and down."""
     poses = []
     for place in places:
         for angle in np.linspace(0, 2 * np.pi, n, endpoint=False):
@@ -66,7 +66,7 @@ def look_about(places: Sequence[tuple[float, float, float]], n: int = 12) -> Flo
 
 @dataclass
 class ExportedRoom:
-    """What stands in a room, and where its cameras were."""
+    """Objects of a room, and its camera positions."""
 
     things: dict[str, list[Block]] = field(
         default_factory=lambda: {"dining table": TABLE, "cube": CUBE, "picture": PICTURE}
@@ -84,7 +84,7 @@ class ExportedRoom:
         return T
 
     def mesh(self) -> InstanceMesh:
-        """In the world; objects are numbered from 1 in their order."""
+        """Return the mesh in the world; objects are numbered from 1 in their order."""
         solid = [(k, block, False) for k, blocks in enumerate(self.things.values(), start=1) for block in blocks]
         solid += [(0, block, False) for block in self.blocks] + [(0, block, True) for block in self.walls]
         vertices, triangles, ids, count = [], [], [], 0
@@ -107,7 +107,7 @@ class ExportedRoom:
         )
 
     def write(self, run: Path, figures: bool = True) -> Path:
-        """Leaves the record of a run; without `figures` it does not tell up and floor."""
+        """Write a run directory; without `figures` it lacks up and floor."""
         run.mkdir(parents=True, exist_ok=True)
         mesh, up = self.mesh(), self.R_world_room @ UP
         write_mesh(run / "mesh.ply", mesh)

@@ -1,6 +1,6 @@
-"""Modules like the libraries of depth cameras, with a camera in the corner room: what we ask of them, and no more.
+"""Fake libraries of depth cameras with a camera in the corner room. They contain only what the readers use.
 
-Names, arguments and what is returned are those of pyrealsense2 2.59 and of pyorbbecsdk2 2.1.
+Names, arguments and return values are those of pyrealsense2 2.59 and of pyorbbecsdk2 2.1.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ DEPTH_AFTER_COLOR_US = 4000  # time from the color to the depth image, microseco
 
 @dataclass
 class FakeCamera:
-    """The camera that is plugged in, and what happens to it."""
+    """The connected camera and its configured errors."""
 
     plugged_in: bool = True
     coeffs: tuple[float, ...] = (0.0,) * 5  # of its lens: k1, k2, p1, p2, k3
     model: str = "inverse"  # of the lens; brown = ours
-    frames: int = 4  # then it sends nothing more
-    unplugged_at: int = -1  # the frame at which the library raises; -1 = never
+    frames: int = 4  # number of frames before it stops sending
+    unplugged_at: int = -1  # frame at which the library raises; -1 = never
     without_depth: int = -1  # this frame has no depth; -1 = none
     running: bool = False
-    started: list[dict[str, Any]] = field(default_factory=list)  # what each start asked for
+    started: list[dict[str, Any]] = field(default_factory=list)  # request of each start
     registered: int = 0  # pairs of images
 
     def start(self, asked: dict[str, Any]) -> None:
@@ -55,7 +55,7 @@ class FakeCamera:
 
 @dataclass
 class _Images:
-    """What both libraries call a set of frames."""
+    """The frame set of both libraries."""
 
     camera: FakeCamera
     k: int
@@ -79,9 +79,9 @@ class _Images:
 
 
 def _image(pixels: np.ndarray, shift: int = 0, time_us: int = 0) -> SimpleNamespace:
-    """An image, moved by so many pixels where it is of another camera than the color."""
+    """Return an image, shifted by pixels if it is of another camera than the color."""
     pixels = np.roll(pixels, shift, axis=1)
-    pixels.setflags(write=False)  # it is the library's
+    pixels.setflags(write=False)  # owned by the library
     height, width = pixels.shape[:2]
     return SimpleNamespace(
         get_data=lambda: pixels,
@@ -95,7 +95,7 @@ def _image(pixels: np.ndarray, shift: int = 0, time_us: int = 0) -> SimpleNamesp
 
 
 def realsense_module(camera: FakeCamera) -> ModuleType:
-    """What `import pyrealsense2` finds."""
+    """Return the fake of `pyrealsense2`."""
 
     class Config:
         def __init__(self) -> None:
@@ -150,7 +150,7 @@ def realsense_module(camera: FakeCamera) -> ModuleType:
 
 
 def orbbec_module(camera: FakeCamera) -> ModuleType:
-    """What `import pyorbbecsdk` finds."""
+    """Return the fake of `pyorbbecsdk`."""
 
     class OBError(Exception):
         pass

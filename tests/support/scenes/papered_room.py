@@ -1,4 +1,4 @@
-"""A box-shaped room with another random wallpaper on every wall: textured as image features need it, exactly known."""
+"""A box-shaped room with exact geometry and a random wallpaper on every wall, for image features."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RESOLUTION = 160  # px a meter
 
 @cache
 def wallpaper(paper: int, wall: int) -> np.ndarray:
-    """A random pattern of several sizes, (H, W, 3) uint8."""
+    """Return a random pattern of several sizes, (H, W, 3) uint8."""
     rng = np.random.default_rng([paper, wall])
     side = int(2 * HALF.max() * RESOLUTION) + 2
     pattern = np.zeros((side, side, 3), np.float32)
@@ -27,7 +27,7 @@ def wallpaper(paper: int, wall: int) -> np.ndarray:
 
 
 def papered_frame(T_world_camera: np.ndarray, index: int = 0, paper: int = 0, camera: Camera = CAMERA) -> Frame:
-    """What a camera inside the room sees."""
+    """Return the frame of a camera inside the room."""
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     directions = rays @ T_world_camera[:3, :3].T
@@ -49,7 +49,7 @@ def papered_frame(T_world_camera: np.ndarray, index: int = 0, paper: int = 0, ca
 
 
 def _sampled(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Bilinear samples (P, 3); in rows, because OpenCV's remap takes at most 32767 of them."""
+    """Return bilinear samples (P, 3); in rows, because OpenCV's remap takes at most 32767 of them."""
     pad = -len(x) % 256
     grid_x, grid_y = (np.pad(c, (0, pad)).reshape(-1, 256) for c in (x, y))
     return cv2.remap(image, grid_x, grid_y, cv2.INTER_LINEAR).reshape(-1, 3)[: len(x)]

@@ -1,4 +1,4 @@
-"""`compile` says what it did, and is ended by Ctrl-C at once."""
+"""Tests of the command `compile` and its interruption by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_compile_second_call_compiles_no_kernels(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
 def test_compile_ctrl_c_ends_in_one_line(tmp_path: Path) -> None:
     process = compiling(tmp_path)
-    time.sleep(3)  # it is at work, or about to be
+    time.sleep(3)  # it is working, or about to start
     process.send_signal(signal.SIGINT)
     asked = time.monotonic()
     _, message = process.communicate(timeout=10)

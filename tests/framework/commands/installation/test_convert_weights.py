@@ -1,4 +1,4 @@
-"""`python -m framework convert-weights`: from detectron2's pickle to a file that detector=mask_rcnn takes."""
+"""Tests of the command `convert-weights`, which writes networks for detector=mask_rcnn."""
 
 import hashlib
 import pickle

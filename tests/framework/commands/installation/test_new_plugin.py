@@ -1,4 +1,4 @@
-"""A repository that `new-plugin` writes: built, installed outside of the checkout, tested there and swept."""
+"""Tests of the command `new-plugin`: its repositories are built, installed and tested outside of the checkout."""
 
 from __future__ import annotations
 
@@ -30,19 +30,21 @@ EXAMPLE = CHECKOUT / "examples" / "instancemap-depth-median"
 SITE = Path(sysconfig.get_paths()["purelib"])
 
 
-def test_example_plugin_matches_new_plugin_output() -> None:
+def test_new_plugin_output_matches_example_plugin() -> None:
     written = files_of("refiner", "depth_median")
     files = {path.relative_to(EXAMPLE) for path in EXAMPLE.rglob("*") if path.is_file()}
     left = {path for path in files if not {"__pycache__", ".ruff_cache", ".pytest_cache"}.intersection(path.parts)}
     assert left == set(map(Path, written))
     for path, text in written.items():
-        assert (EXAMPLE / path).read_text() == text, f"{path}: remove {EXAMPLE.name}, write it anew with new-plugin"
+        assert (EXAMPLE / path).read_text() == text, (
+            f"{path}: remove {EXAMPLE.name}, and create it again with new-plugin"
+        )
 
 
 @pytest.mark.parametrize("name", ["x", "a" * LONGEST_NAME])
 @pytest.mark.parametrize("stage", GROUPS)
 def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> None:
-    """Undefined names and invalid Python in a template fail, too."""
+    """Undefined names and invalid Python in a template also fail."""
     made = write_repository(stage, name, tmp_path)
     for line in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
         done = subprocess.run(
@@ -101,9 +103,9 @@ def test_new_plugin_failure_keeps_existing_files(tmp_path: Path, monkeypatch: py
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a plugin's repository for each group, and `env`, where all of them are installed from wheels.
+    """Return a folder with a plugin repository per group, and `env`, in which all are installed from wheels.
 
-    The libraries are those of this environment; InstanceMap itself is in its own, and nothing of the checkout.
+    The libraries are those of this environment; InstanceMap is installed separately, without the checkout.
     """
     folder = tmp_path_factory.mktemp("stranger")
     (folder / "wheels").mkdir()
@@ -126,18 +128,18 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def copy_kernels(site: Path) -> None:
-    """What numba has compiled of the checkout's files, for the same files here: it looks at their times and sizes."""
+    """Copy numba's cache of the checkout for the installed files; numba checks their times and sizes."""
     for path in (CHECKOUT / "framework").rglob("*.py"):
         shutil.copystat(path, site / path.relative_to(CHECKOUT))
     for path in (CHECKOUT / "framework").rglob("*.nb[ic]"):
         copied = site / path.relative_to(CHECKOUT)
-        if copied.parents[1].is_dir():  # else a cache of a removed package
+        if copied.parents[1].is_dir():  # otherwise the cache of a removed package is used
             copied.parent.mkdir(exist_ok=True)
             shutil.copy2(path, copied)
 
 
 def run(place: Path, *line: str) -> str:
-    """What a program of the new environment prints."""
+    """Return the output of a program of the new environment."""
     alone = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "HYDRA_FULL_ERROR")}
     program = str(place / "env" / "bin" / line[0])
     done = subprocess.run([program, *line[1:]], cwd=place, env=alone, capture_output=True, text=True, timeout=300)
@@ -146,7 +148,7 @@ def run(place: Path, *line: str) -> str:
 
 
 @pytest.mark.acceptance
-def test_installed_plugins_pass_their_own_tests(place: Path) -> None:
+def test_new_plugin_installed_plugins_pass_their_tests(place: Path) -> None:
     where = run(place, "python", "-c", "import framework, instancemap_my_refiner; print(framework.__file__)")
     assert where.startswith(str(place))
     (place / "pytest.ini").touch()
@@ -158,7 +160,7 @@ def test_installed_plugins_pass_their_own_tests(place: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_sweep_of_plugin_and_builtin_tabulates_both(place: Path) -> None:
+def test_new_plugin_sweep_with_builtin_tabulates_both(place: Path) -> None:
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
@@ -193,7 +195,7 @@ def test_installed_package_runs_doctor_and_new_plugin(place: Path) -> None:
 
 @pytest.mark.acceptance
 def test_installed_package_maps_the_desk(place: Path) -> None:
-    """The command without a dataset, and the Python example of the README, each on a few frames."""
+    """Run the command without a dataset and the Python example of the README, each on a few frames."""
     assert run(place, "instancemap", "--version") == f"instancemap {framework.__version__}\n"
     run(place, "instancemap", "dataset.stop=3", "hydra.run.dir=desk")
     assert json.loads((place / "desk" / "metrics.json").read_text())["frames"] == 3

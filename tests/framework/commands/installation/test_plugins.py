@@ -1,4 +1,4 @@
-"""The listing, and a real third-party package whose plugin is there after `pip install` like any other."""
+"""Tests of the plugin listing, with a third-party package installed by pip."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ PACKAGE = {
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """An environment in which the package is installed."""
+    """Return an environment with the package installed."""
     import textwrap
 
     source, site = tmp_path_factory.mktemp("acme"), tmp_path_factory.mktemp("site")
@@ -206,7 +206,7 @@ def test_plugins_faulty_options_are_listed_with_reason(tmp_path: Path, monkeypat
     assert len(found["maskrcnn2go"].parameters) > 3
 
 
-def test_registered_options_can_be_described() -> None:
+def test_describe_option_accepts_every_registered_option() -> None:
     options = registered(*GROUPS)
     assert {option.stage for option in options} == set(GROUPS)
     for option in options:
@@ -216,7 +216,7 @@ def test_registered_options_can_be_described() -> None:
 
 
 def test_plugins_listing_does_not_import_open3d(tmp_path: Path) -> None:
-    """It takes half a second and 170 MB, and a run with the default stages needs none of it."""
+    """The import takes 0.5 s and 170 MB, and the default stages do not need it."""
     code = (
         "import sys; from framework.commands.installation.plugins import *; "
         "registered(*GROUPS); print('open3d' in sys.modules)"

@@ -1,4 +1,4 @@
-"""`python -m framework check`: what it prints and draws, and that what it names to be set mends the recording."""
+"""Tests of the command `check`: its output, and that its suggested setting corrects the recording."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def test_check_suggested_setting_corrects_recording(inverted: Path, tmp_path: Pa
     picture = cv2.imread(str(tmp_path / "outputs" / "check.png"))
     assert picture is not None
     assert [path.name for path in tmp_path.rglob("*.png")] == ["check.png"]
-    fixed = checked(tmp_path, *asked, "dataset.pose_kind=T_CAMERA_WORLD", "out=mended.png")
+    fixed = checked(tmp_path, *asked, "dataset.pose_kind=T_CAMERA_WORLD", "out=fixed.png")
     assert (fixed.returncode, "WRONG" in fixed.stdout) == (0, False), fixed.stderr
-    assert (tmp_path / "mended.png").stat().st_size > 10_000
+    assert (tmp_path / "fixed.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`python -m framework convert-oni`: what it writes, and what it leaves behind when it cannot go on."""
+"""Tests of the command `convert-oni`: its output files, also after errors."""
 
 import sys
 
@@ -29,7 +29,7 @@ def command(monkeypatch, *arguments):
 
 
 def deliver(monkeypatch, count, fault=None):
-    """In place of OpenNI 2, which may not be installed."""
+    """Deliver `count` frames in place of OpenNI 2, which may not be installed."""
 
     def read_frames(contents, scratch):
         yield from FRAMES[:count]

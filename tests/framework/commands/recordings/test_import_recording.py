@@ -1,4 +1,4 @@
-"""`python -m framework import`: a phone's recording of a kitchen, from the export to the map."""
+"""Tests of the command `import`, from a phone's export of a kitchen to the map."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_import_prints_written_frames_and_next_commands(
 def test_import_turned_images_have_turned_poses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The room's y points down and ARKit's up: for a phone, these images stand on their heads."""
+    """In the room y points down, in ARKit up, so that these images are upside down for a phone."""
     frames = room_frames()
     write_stray_scanner(tmp_path / "export", frames)
     command(monkeypatch, tmp_path / "export", tmp_path / "out", "--turn", "180", "--confidence", "0")
@@ -77,7 +77,7 @@ def test_import_existing_output_raises_before_reading(
 def test_import_of_phone_recording_is_mappable(
     shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """256x192 depth, a video and ARKit's poses, made of a real kitchen: no fault, no frame lost."""
+    """The export of a real kitchen has 256x192 depth, a video and ARKit poses; no frame is lost."""
     kitchen = RgbdFolder(shared_data / "redkitchen", stride=3, stop=180)
     write_stray_scanner(tmp_path / "export", list(seen_by_phone(list(kitchen))))
     command(monkeypatch, tmp_path / "export", tmp_path / "out")

@@ -1,4 +1,4 @@
-"""The command's answers to what it cannot do, and its line when all is there."""
+"""Tests of the command `synthesize`."""
 
 from __future__ import annotations
 

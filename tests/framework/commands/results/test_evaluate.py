@@ -1,4 +1,4 @@
-"""`python -m framework evaluate`: stored runs evaluated anew."""
+"""Tests of the command `evaluate` on stored runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CODE = {"evaluation.git_commit": "abcdef0", "evaluation.git_dirty": False}
 
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of a real run, but for its picture."""
+    """Return the run directory of a real run without its picture."""
     directory = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
@@ -45,14 +45,14 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of it, and a known commit of the code that evaluates."""
+    """Return a copy of the run, and set a known commit of the evaluating code."""
     monkeypatch.setattr(reevaluation, "code_version", lambda: {"git_commit": "abcdef0", "git_dirty": False})
     return Path(shutil.copytree(mapped, tmp_path / "runs" / "first"))
 
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Runs the command here; returns its status and what it wrote to stdout and stderr."""
+    """Run the command in this process; return its status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["evaluate", *map(str, arguments)])
@@ -117,7 +117,7 @@ def test_evaluate_tiny_difference_prints_all_digits(stored: Path, command) -> No
 
 
 def test_evaluate_other_truth_requires_option(stored: Path, command) -> None:
-    """A relative dataset.root means another folder elsewhere, and its truth says nothing about this run."""
+    """A relative dataset.root is another folder elsewhere, whose ground truth does not belong to this run."""
     true = metrics_of(stored)
     write_metrics(stored, true | {"truth_sha256": "0" * 64})
     status, out, err = command(stored)
@@ -144,7 +144,7 @@ def test_evaluate_dry_run_writes_nothing(stored: Path, command) -> None:
 
 
 def _with_dataset(directory: Path, **parameters: object) -> None:
-    """The same record, had its dataset had these parameters."""
+    """Change the dataset parameters of a stored run."""
     config = CONFIG | {
         "dataset": {"_target_": "tests.support.scenes.corner_room.CornerRoom", "frames": 4, **parameters}
     }
@@ -272,7 +272,7 @@ def test_evaluate_process_reports_results_and_status(mapped: Path, tmp_path: Pat
 
 
 def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
-    """Between its look at the file and its own writing of it, nobody may begin the run again."""
+    """Without the lock, a run could restart while its file is rewritten."""
     write_metrics(stored, metrics_of(stored) | {"instances.ap50": 0.5})
     before = (stored / "metrics.json").read_bytes()
     with locked(stored):
@@ -285,11 +285,11 @@ def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
 
 @pytest.mark.parametrize("started", [["-m", "framework"], ["-P", "-m", "framework"]])
 def test_evaluate_does_not_execute_code_in_record(started: list[str], stored: Path) -> None:
-    """Somebody sends a folder, and one looks at it in place: modules in it are neither imported nor found."""
+    """Modules in a received run directory are neither imported nor found."""
     (stored / "brought.py").write_text(
         "print('runs')\nfrom tests.support.scenes.corner_room import CornerRoom as Brought\n"
     )
-    for name in ("numpy", "yaml", "matplotlib", "evo"):  # what the command itself imports
+    for name in ("numpy", "yaml", "matplotlib", "evo"):  # imported by the command itself
         (stored / f"{name}.py").write_text("print('runs')\n")
     _with_dataset(stored, _target_="brought.Brought")
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}

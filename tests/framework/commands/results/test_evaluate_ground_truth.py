@@ -1,4 +1,4 @@
-"""Runs that are compared with the map of another run, and with another ground truth later."""
+"""Tests of runs that are evaluated with the map of another run as ground truth."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FRAMES = 6
 
 
 def write_folder(root: Path) -> None:
-    """The corner of the room as an RGB-D folder, without poses and annotation."""
+    """Write the corner of the room as an RGB-D folder without poses and annotation."""
     for name in ("color", "depth"):
         (root / name).mkdir(parents=True)
     camera = {key: getattr(CAMERA, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
@@ -43,7 +43,7 @@ def write_folder(root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with `reference`, a run with true masks and poses, and `posed` and `unposed`, recordings of it."""
+    """Return a folder with `reference`, a run with true masks and poses, and its recordings `posed` and `unposed`."""
     place = tmp_path_factory.mktemp("truth")
     reported_run.write_run(place / "reference")
     for name in ("posed", "unposed"):
@@ -77,13 +77,13 @@ def evaluated(directory: Path, ground_truth: Path | None) -> int:
 
 
 def tracker(made: Path) -> dict[str, str]:
-    """Poses in the world of the first frame."""
+    """Return a tracker with poses in the world of the first frame."""
     path = made / "reference" / "trajectory.txt"
     return {"_target_": "plugins.trackers.trajectory_file.TrajectoryFile", "path": str(path)}
 
 
 @pytest.mark.parametrize("name", ["posed", "unposed"])
-def test_run_is_compared_with_another_run(made: Path, tmp_path: Path, name: str) -> None:
+def test_ground_truth_of_another_run_is_compared(made: Path, tmp_path: Path, name: str) -> None:
     named = {"ground_truth": str(made / "reference")}
     changes = {"tracker": tracker(made)} if name == "unposed" else {}
     metrics = mapped(tmp_path / "run", made / name, dataset=named, **changes)
@@ -92,8 +92,8 @@ def test_run_is_compared_with_another_run(made: Path, tmp_path: Path, name: str)
     assert metrics["annotation_release"] == "reference/mesh.ply"
 
 
-def test_unposed_map_is_moved_to_the_run(made: Path, tmp_path: Path) -> None:
-    """The reference begins elsewhere: 0.5 m aside."""
+def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None:
+    """The world of the reference is shifted by 0.5 m."""
     reference = tmp_path / "reference"
     reference.mkdir()
     for file in (made / "reference").iterdir():
@@ -106,13 +106,15 @@ def test_unposed_map_is_moved_to_the_run(made: Path, tmp_path: Path) -> None:
     write_tum(reference / "trajectory.txt", times, shift @ poses)
     named = {"ground_truth": str(reference)}
     assert mapped(tmp_path / "run", made / "unposed", dataset=named, tracker=tracker(made))["instances.ap50"] == 1.0
-    write_tum(reference / "trajectory.txt", times, poses)  # now the poses do not fit the mesh
+    write_tum(reference / "trajectory.txt", times, poses)  # the poses no longer fit the mesh
     assert evaluated(tmp_path / "run", reference) == 0
     assert metrics_of(tmp_path / "run")["instances.ap50"] == 0.0
 
 
-def test_finished_run_gets_another_ground_truth(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It is kept by later evaluations, reports and figures."""
+def test_evaluate_changes_ground_truth_of_finished_run(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Later evaluations, reports and figures keep it."""
     fake = {"_target_": "plugins.detectors.none.NoDetections"}
     directory = tmp_path / "run"
     assert "instances.ap50" not in mapped(directory, made / "posed", detector=fake)
@@ -133,7 +135,9 @@ def test_finished_run_gets_another_ground_truth(made: Path, tmp_path: Path, caps
     np.testing.assert_array_equal(drawn.instance_ids, truth.instance_ids)
 
 
-def test_unusable_ground_truth_is_one_line(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluate_unusable_ground_truth_is_one_line_error(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     directory = tmp_path / "run"
     mapped(directory, made / "posed", dataset={"ground_truth": str(made / "reference")})
     before = (directory / "metrics.json").read_bytes()
@@ -144,8 +148,8 @@ def test_unusable_ground_truth_is_one_line(made: Path, tmp_path: Path, capsys: p
     assert (directory / "metrics.json").read_bytes() == before
 
 
-def test_re_evaluation_is_identical(made: Path, tmp_path: Path) -> None:
-    """The alignment of a tracked map uses the poses that are stored."""
+def test_evaluate_again_gives_identical_metrics(made: Path, tmp_path: Path) -> None:
+    """The alignment of a tracked map uses the stored poses."""
     reference = made / "reference"
     before = mapped(tmp_path / "run", made / "unposed", dataset={"ground_truth": str(reference)}, tracker=tracker(made))
     assert evaluated(tmp_path / "run", None) == 0
@@ -153,7 +157,7 @@ def test_re_evaluation_is_identical(made: Path, tmp_path: Path) -> None:
     assert {key: value for key, value in after.items() if not key.startswith("evaluation.")} == before
 
 
-def test_inputs_contain_the_files_of_the_ground_truth(made: Path, tmp_path: Path) -> None:
+def test_inputs_contain_files_of_ground_truth(made: Path, tmp_path: Path) -> None:
     mesh, names = tmp_path / "mesh.ply", tmp_path / "instances.json"
     mesh.write_text("a mesh")
     names.write_text("{}")

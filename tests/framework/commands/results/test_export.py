@@ -1,4 +1,4 @@
-"""`instancemap export` as users meet it: words in, files and one-line errors out."""
+"""Tests of the command `export`: arguments, written files and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`python -m framework raycast`: the ray-cast view of a run."""
+"""Tests of the command `raycast`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path) -> Path:
-    """A run whose third frame is lost."""
+    """Return a run whose third frame is lost."""
     run = Path(shutil.copytree(mapped, tmp_path / "run"))
     timestamps, poses = read_tum(run / "trajectory.txt")
     write_tum(run / "trajectory.txt", np.delete(timestamps, 2), np.delete(poses, 2, axis=0))
@@ -43,7 +43,7 @@ def stored(mapped: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Run the command here; return its status and what it wrote to stdout and stderr."""
+    """Run the command in this process; return its status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["raycast", *map(str, arguments)])
@@ -60,7 +60,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 @pytest.fixture
 def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[View, str]]:
-    """The drawn views with their notes."""
+    """Return the drawn views with their notes."""
     drawn: list[tuple[View, str]] = []
     write = raycast_figure.write_raycast
 
@@ -129,7 +129,7 @@ def test_raycast_error_is_one_line(stored: Path, command: Command, arguments: li
     assert command(stored, *arguments) == (1, "", f"error: {message}\n")
 
 
-def test_raycast_without_map_is_one_line(stored: Path, command: Command, tmp_path: Path) -> None:
+def test_raycast_without_map_is_one_line_error(stored: Path, command: Command, tmp_path: Path) -> None:
     (stored / "map.npz").unlink()
     for run in (stored, tmp_path / "nowhere"):
         status, output, error = command(run)
@@ -137,7 +137,7 @@ def test_raycast_without_map_is_one_line(stored: Path, command: Command, tmp_pat
         assert error.startswith("error: raycast: expected a run directory, got")
 
 
-def test_raycast_without_mapped_frames_is_one_line(stored: Path, command: Command) -> None:
+def test_raycast_without_mapped_frames_is_one_line_error(stored: Path, command: Command) -> None:
     (stored / "trajectory.txt").write_text("")
     status, _, err = command(stored)
     assert status == 1

@@ -1,4 +1,4 @@
-"""`python -m framework report`: pages of runs."""
+"""Tests of the command `report`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def stored(mapped: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Runs the command here; returns its status and what it wrote to stdout and stderr."""
+    """Run the command in this process; return its status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
@@ -50,7 +50,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 
 def texts(page: str) -> str:
-    """What a reader sees of a page."""
+    """Return the visible texts of a page."""
     body = page[page.index("<body>") : page.index('<script type="application/json"')]
     return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", body))
 
@@ -94,8 +94,8 @@ def test_report_without_recording_shows_map_images(stored: Path, command, monkey
 
 
 def test_report_top_view_alone_omits_enlarged_path(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(composition, "_added", [])  # no recording, and so no true way
-    monkeypatch.setattr(run_page, "SMALL_PATH", 0.0)  # the way is large enough among the objects
+    monkeypatch.setattr(composition, "_added", [])  # no recording, so no true path
+    monkeypatch.setattr(run_page, "SMALL_PATH", 0.0)  # the path is large enough between the objects
     assert command(stored)[0] == 0
     page = (stored / "report.html").read_text()
     assert "Camera path, top view" in page
@@ -118,7 +118,7 @@ def test_report_invalid_unicode_names_are_escaped(stored: Path, command) -> None
 
 
 def test_report_object_without_class_is_listed(stored: Path, command) -> None:
-    """As in the map of a fuser that knows no classes."""
+    """A fuser without classes writes such maps."""
     entries = json.loads((stored / "instances.json").read_text())
     entries[0] |= {"class": None, "class_probabilities": {}}
     (stored / "instances.json").write_text(json.dumps(entries))

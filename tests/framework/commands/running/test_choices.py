@@ -1,4 +1,4 @@
-"""What is wrong with a sweep is said before its first run."""
+"""Tests of the checks before the first run of a sweep."""
 
 import pytest
 

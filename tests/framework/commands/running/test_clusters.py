@@ -1,4 +1,4 @@
-"""Sweeps on clusters that take jobs and nodes away: they go on, and end with the table of an undisturbed one."""
+"""Tests of sweeps on clusters that preempt jobs and remove nodes; the resumed table is identical."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def tables(directory: Path) -> dict[str, bytes]:
 
 
 def mapping(directory: Path) -> dict[int, str]:
-    """The runs that are at work, by the process that says in their directory's lock that it has it."""
+    """Return the active runs by the process that holds the lock of their directory."""
     holders = {}
     for name in begun(directory):
         words = (directory / PLACE / name / ".lock_holder").read_text().split()
@@ -33,7 +33,7 @@ def mapping(directory: Path) -> dict[int, str]:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The tables of the sweep where nothing happens to it, one run after the other."""
+    """Return the tables of the sweep without interruption, run by run."""
     directory = tmp_path_factory.mktemp("undisturbed")
     done = end(begin(directory, *THREE, "threads=1"))
     assert done.returncode == 0, done.stderr
@@ -41,14 +41,14 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
-    """By submitit's own queue, with the signal that SLURM sends before it takes a job's node, and with `kill -9`."""
+    """Use submitit's queue, the signal that SLURM sends before it preempts a job, and `kill -9`."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     arguments = ("launcher=submitit_local", *THREE)
     first = begin(tmp_path, *arguments)
     wait_until(lambda: len(mapping(tmp_path)) == 3, first)
     preempted, killed, _ = map(psutil.Process, mapping(tmp_path))
     preempted.send_signal(signal.SIGUSR2)
-    for process in (*killed.parents()[:1], killed):  # the queue's process for this job, which would end it in peace
+    for process in (*killed.parents()[:1], killed):  # the queue's process for this job, which would end it normally
         process.kill()
     done = end(first)
     assert done.returncode == 1
@@ -66,7 +66,7 @@ def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturb
 
 @pytest.fixture
 def ray_cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
-    """A head that runs no jobs, and two nodes of one core each."""
+    """Start a head without jobs and two nodes with one core each."""
     pytest.importorskip("hydra_plugins.hydra_ray_launcher")
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
@@ -87,7 +87,7 @@ def test_ray_sweep_replaces_dead_node(tmp_path: Path, undisturbed: dict[str, byt
     assert done.returncode == 0, done.stderr
     assert len(recorded(tmp_path)) == 3
     assert tables(tmp_path) == undisturbed
-    assert not all(psutil.pid_exists(pid) for pid in at_work), "a run had to be begun again"
+    assert not all(psutil.pid_exists(pid) for pid in at_work), "one run was restarted"
 
 
 def test_ray_sweep_restarted_after_failure_resumes(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:

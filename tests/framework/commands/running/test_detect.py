@@ -1,4 +1,4 @@
-"""`python -m framework detect` as a user meets it."""
+"""Tests of the command `detect`."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_detect_failing_detector_leaves_no_file(tmp_path: Path) -> None:
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("found.json", "before")]
 
 
-def test_result_file_without_detections_is_valid(tmp_path: Path) -> None:
+def test_detect_without_detections_writes_valid_file(tmp_path: Path) -> None:
     class Nothing(SphereDetector):
         def detect(self, frame):  # type: ignore[no-untyped-def]
             found = super().detect(frame)
@@ -103,14 +103,14 @@ def test_result_file_without_detections_is_valid(tmp_path: Path) -> None:
 
 @dataclass
 class PartlyTrueRoom(CornerRoom):
-    """A room whose frame 2 has no pose from which its true instances can be rendered."""
+    """A room whose frame 2 has no pose, so that its true instances cannot be rendered."""
 
     def __getitem__(self, k: int) -> Frame:
         frame = super().__getitem__(k)
         return replace(frame, truth=unseen(self.camera, "frame 2 has no pose")) if frame.index == 2 else frame
 
 
-def test_frame_without_rendered_truth_is_detected(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_detect_accepts_frame_without_rendered_truth(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_detections(tmp_path / "found.json", NoDetections(), PartlyTrueRoom())
     assert "frame skipped in the evaluation: frame 2 has no pose" in caplog.text
     with pytest.raises(DataError, match="expected usable frames, got none of 1"):

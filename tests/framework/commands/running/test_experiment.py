@@ -1,4 +1,4 @@
-"""Experiments as a user meets them, and the rows of those that come with the project."""
+"""Tests of experiments and of the rows of the included experiments."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ def figures(line: dict[str, str], column: str) -> list[float | None]:
 
 
 def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
-    """The values are those of the experiment's own comment: all 8 frames or 4 of them, `seed` of which are lost."""
+    """The values are in the comment of the experiment: all 8 frames or 4 of them; `seed` frames are lost."""
     first = start(tmp_path)
     out = tmp_path / "outputs" / "fake_ablation"
-    assert first.returncode == 1, "the broken row's runs failed"
+    assert first.returncode == 1, "the runs of the broken row failed"
     assert first.stderr.count("ERROR") == 2
     assert "Traceback" not in first.stderr
     metrics = {path.parent.name: path for path in out.glob("*/metrics.json")}
@@ -77,7 +77,7 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
     assert json.loads(metrics["row=half,seed=3"].read_text())["choice.refiner"] == "identity"
 
     written = {name: path.stat().st_mtime_ns for name, path in metrics.items()}
-    metrics["row=half,seed=3"].unlink()  # as a kill leaves it: what is written last is not there
+    metrics["row=half,seed=3"].unlink()  # as after a kill: the last files are missing
     again = start(tmp_path, "row=all,half", "table.columns=[frames]")
     assert again.returncode == 0, again.stderr
     assert again.stderr.count("skipped: the completed run in") == 3
@@ -89,7 +89,7 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
 
 
 def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
-    """Names with zeros in front stay names; what the table looks like is in no directory's name."""
+    """Names with leading zeros stay names. Directory names do not contain table settings."""
     done = start(tmp_path, "experiment=fake_scenes", "table.average_over=[seed]")
     assert done.returncode == 0, done.stderr
     lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
@@ -100,11 +100,11 @@ def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
     assert (out / "dataset.scene=078,row=prior,seed=1,tracker=fake" / "metrics.json").exists()
 
 
-# What a job is made of
+# Composition of a job
 
 
 def composed(overrides: list[str], *directories: Path) -> tuple[DictConfig, Any]:
-    """A job's config and Hydra's own, as in a sweep's job."""
+    """Return a job's config and Hydra's own config, as in a job of a sweep."""
     with initialize_config_dir(str(directories[0] if directories else CONF), version_base="1.3"):
         config = compose("config", overrides=overrides, return_hydra_config=True)
         HydraConfig.instance().set_config(config)
@@ -123,8 +123,8 @@ def test_experiment_row_name_may_be_number() -> None:
     ("preset", "all_rows"),
     [(None, False), ("paper", False), *(pytest.param(p, True, marks=pytest.mark.acceptance) for p in [None, *PRESETS])],
 )
-def test_preset_composes_with_experiment_rows(experiment: str, preset: str | None, all_rows: bool) -> None:
-    """Compose rows as the command does, and build their stages. The last rows without `all_rows`."""
+def test_experiment_rows_compose_with_every_preset(experiment: str, preset: str | None, all_rows: bool) -> None:
+    """Rows are composed as by the command, and their stages are built. The last rows are without `all_rows`."""
     hashes: dict[str, str] = {}
     asked = [f"experiment={experiment}", "seed=1", *ONLY_THE_USER_KNOWS] + ([f"preset={preset}"] if preset else [])
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -155,7 +155,7 @@ def build_detector(node: DictConfig) -> None:
         assert str(node.weights) in str(error)
 
 
-def test_row_applies_its_overrides() -> None:
+def test_experiment_row_applies_its_overrides() -> None:
     config, choices = composed(["experiment=ablation_refiner", "row=chain_with_kmeans", "seed=4"])
     assert config.refiner.links.gmm_em._target_ == "plugins.refiners.kmeans.KMeans"
     assert (choices["refiner"], config.seed, config.dataset.stride, config.fuser.voxel_size) == ("chain", 4, 2, 0.02)
@@ -188,13 +188,13 @@ def chosen(**choices: str) -> dict[str, str]:
     return {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
 
 
-def test_default_preset_changes_nothing() -> None:
+def test_preset_default_changes_nothing() -> None:
     assert composed(["preset=default"])[0] == composed(["~preset"])[0]
 
 
 @pytest.mark.parametrize("experiment", ["table1_runtime", "table2_class_ap", "table3_map", "figure3_stage_times"])
-def test_scenenn_sequences_select_real_data_settings(experiment: str) -> None:
-    """A network that knows real pictures, no rendered truth, the paper's sequences, and a folder of its own."""
+def test_sequences_of_scenenn_select_real_data_settings(experiment: str) -> None:
+    """They select a network for real images, no rendered truth, the paper's sequences and a separate folder."""
     overrides = [f"experiment={experiment}", "sequences=scenenn", "dataset.root=DIR"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose("config", overrides=overrides, return_hydra_config=True)
@@ -220,12 +220,12 @@ def test_experiment_on_rooms_uses_simulated_detector(experiment: str) -> None:
 
 
 @pytest.mark.parametrize(("sequences", "stop"), [("benchmark", 40), ("scenenn", 1000)])
-def test_progress_row_stop_depends_on_sequence_length(sequences: str, stop: int) -> None:
+def test_experiment_progress_stop_depends_on_sequence_length(sequences: str, stop: int) -> None:
     config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=third"])
     assert config.dataset.stop == stop
 
 
-def test_ranks_folder_depends_on_sequences_and_detector() -> None:
+def test_experiment_ranks_folder_has_sequences_and_detector() -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose(
             "config",
@@ -238,13 +238,13 @@ def test_ranks_folder_depends_on_sequences_and_detector() -> None:
     assert asked.hydra.sweeper.params.seed == "0,1,2,3"
 
 
-def test_command_line_overrides_experiment() -> None:
+def test_experiment_is_overridden_by_command_line() -> None:
     config, _ = composed(["experiment=ablation_fuser", "row=label_count", "fuser.voxel_size=0.04", "tracker=icp_only"])
     assert config.fuser.voxel_size == 0.04
     assert config.tracker._target_ == "plugins.trackers.voxel_hashing_icp.VoxelHashingIcp"
 
 
-def test_figure_kind_unknown_raises_before_runs() -> None:
+def test_experiment_unknown_figure_kind_raises_before_runs() -> None:
     with pytest.raises(ConfigError, match=r"figure\.kind: expected one"):
         composed(["experiment=figure4_progress", "row=whole", "figure.kind=pie"])
 

@@ -1,4 +1,4 @@
-"""A run that is killed at any moment leaves a record that is whole, partial or absent, and the next run goes well.
+"""A run killed at a random time leaves a complete, partial or no record, and the next run succeeds.
 
 INSTANCEMAP_KILLS=30 python -m pytest tests/framework/commands/running/test_random_kills.py
 """
@@ -27,11 +27,11 @@ pytestmark = pytest.mark.acceptance
 
 KILLS = int(os.environ.get("INSTANCEMAP_KILLS", "6"))
 SHORT = ("dataset.frames=20", "fuser.slow_s=0.02", "fuser.slow_save_s=0.3", "fuser.note=note")
-LONGEST_WAIT_S = 1.2  # from any of the moments below; mapping takes half a second here, and the record another
+LONGEST_WAIT_S = 1.2  # from any of the times below; mapping takes 0.5 s here, and saving another 0.5 s
 
 
 def whole_files(place: Path) -> set[str]:
-    """The names of what there is of a record; each file is read as a whole. Raises DataError for one that is torn."""
+    """Return the names of the files of a record. Raises DataError for a truncated file."""
     read = {
         "trajectory.txt": read_tum,
         "timings.csv": read_timings,
@@ -47,7 +47,7 @@ def whole_files(place: Path) -> set[str]:
     return there
 
 
-def test_torn_file_is_detected(tmp_path: Path) -> None:
+def test_run_record_truncated_file_is_detected(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text('{"frames": 2')
     with pytest.raises(DataError):
         whole_files(tmp_path)

@@ -1,4 +1,4 @@
-"""A map from before is gone on with: to the byte as if it had never been put away, or not at all."""
+"""Tests of resumed maps, which are byte-identical to an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ TRACKED = ("detector=none", "fuser.voxel_size=0.02")
 DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
 
 
-def put_away(mapper: Mapper, place: Path) -> Path:
-    """What a run leaves of its map."""
+def stored_files(mapper: Mapper, place: Path) -> Path:
+    """Return the stored files of a run's map."""
     place.mkdir()
     mapper.scene.save(place / "map.npz")
     if keyframes := mapper.pipeline.tracker.keyframes():
@@ -45,7 +45,7 @@ def mapped(frames: Iterable[Frame], *overrides: str) -> tuple[Mapper, list[Pose]
 def test_resumed_map_is_identical_to_single_run(tmp_path: Path, room: CornerRoom, fuser: str) -> None:
     stages = (*GIVEN, f"fuser={fuser}")
     first, _ = mapped([room[k] for k in range(3)], *stages)
-    before = put_away(first, tmp_path / "first")
+    before = stored_files(first, tmp_path / "first")
     continued, _ = mapped([room[k] for k in range(3, len(room))], *stages, f"resume_from={before}")
     whole, _ = mapped(room, *stages)
     continued.scene.save(tmp_path / "continued.npz")
@@ -54,9 +54,9 @@ def test_resumed_map_is_identical_to_single_run(tmp_path: Path, room: CornerRoom
 
 
 def test_resumed_map_continues_frame_numbers(tmp_path: Path, room: CornerRoom) -> None:
-    """Both number their frames from 0: an object that both show was seen in the frames of both."""
+    """Both recordings number their frames from 0. An object in both counts the frames of both."""
     first, _ = mapped(room, *GIVEN)
-    again, _ = mapped(room, *GIVEN, f"resume_from={put_away(first, tmp_path / 'first')}")
+    again, _ = mapped(room, *GIVEN, f"resume_from={stored_files(first, tmp_path / 'first')}")
     for key, instance in first.instances().items():
         assert again.instances()[key].observations == 2 * instance.observations
         assert again.instances()[key].first_frame == instance.first_frame
@@ -68,11 +68,11 @@ def ate_mm(recording: Recording, poses: list[Pose]) -> float:
 
 
 def check_halves(tmp_path: Path, recording: Recording) -> None:
-    """The second half, continued, is tracked as if there had been no break."""
+    """Check that the tracking of the resumed second half is identical to that of a single run."""
     half = len(recording) // 2
     whole, poses = mapped(recording, *TRACKED)
     first, in_first = mapped([recording[k] for k in range(half)], *TRACKED)
-    put_away(first, tmp_path / "first")
+    stored_files(first, tmp_path / "first")
     continued, in_second = mapped(
         [recording[k] for k in range(half, len(recording))], *TRACKED, f"resume_from={tmp_path / 'first'}"
     )
@@ -94,7 +94,7 @@ def test_resumed_kitchen_tracking_matches_single_run(tmp_path: Path, shared_data
 def test_resume_in_other_place_leaves_map_unchanged(tmp_path: Path, shared_data: Path, tracker: str) -> None:
     stages = (*TRACKED, f"tracker={tracker}")
     desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *stages)
-    before = put_away(desk, tmp_path / "desk")
+    before = stored_files(desk, tmp_path / "desk")
     elsewhere, poses = mapped(RgbdFolder(shared_data / "redkitchen", stride=30), *stages, f"resume_from={before}")
     assert all(pose.lost for pose in poses)
     assert len(poses) == 10
@@ -104,7 +104,7 @@ def test_resume_in_other_place_leaves_map_unchanged(tmp_path: Path, shared_data:
 
 def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
     desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *TRACKED)
-    before = put_away(desk, tmp_path / "desk")
+    before = stored_files(desk, tmp_path / "desk")
     black = replace(DESK[5], color=np.zeros_like(DESK[5].color))
     empty = replace(DESK[5], depth=np.zeros_like(DESK[5].depth))
     _, poses = mapped([black, empty, DESK[11], DESK[12]], *TRACKED, f"resume_from={before}")
@@ -129,7 +129,7 @@ def test_resume_with_incompatible_config_raises(
     tmp_path: Path, room: CornerRoom, overrides: tuple[str, ...], message: str
 ) -> None:
     first, _ = mapped([room[0]], *GIVEN)
-    before = put_away(first, tmp_path / "first")
+    before = stored_files(first, tmp_path / "first")
     with pytest.raises(ConfigError, match=message):
         Mapper(*GIVEN, *overrides, f"resume_from={before}")
 
@@ -141,7 +141,7 @@ def test_resume_from_missing_map_raises(tmp_path: Path) -> None:
         Mapper(*GIVEN, "resume_from=7")
 
 
-def test_keyframes_round_trip_and_damage_raises(tmp_path: Path) -> None:
+def test_keyframes_file_round_trip_is_exact_and_damage_raises(tmp_path: Path) -> None:
     desk, _ = mapped([DESK[k] for k in range(0, 30, 5)], *TRACKED)
     keyframes = desk.pipeline.tracker.keyframes()
     path = tmp_path / "keyframes.npz"
@@ -173,18 +173,18 @@ def test_keyframes_round_trip_and_damage_raises(tmp_path: Path) -> None:
         read_keyframes(path)
 
 
-def test_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerRoom) -> None:
+def test_resumed_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerRoom) -> None:
     first, _ = mapped(room, *GIVEN)
-    again, _ = mapped(room, *GIVEN, f"resume_from={put_away(first, tmp_path / 'first')}")
+    again, _ = mapped(room, *GIVEN, f"resume_from={stored_files(first, tmp_path / 'first')}")
     again.scene.save(tmp_path / "again.npz")
     assert list(load_map(tmp_path / "again.npz").instances()) == list(again.instances())
 
 
 def test_localize_in_places_new_map_in_stored_world(tmp_path: Path) -> None:
-    """Without true poses: those of the second recording are of the first one's world all the same."""
+    """Without true poses, the second recording gets poses in the world of the first one."""
     unposed = [replace(DESK[k], T_world_camera=None) for k in range(40)]
     first, poses = mapped(unposed[:25], *TRACKED)
-    own, in_its_world = mapped(unposed[20:], *TRACKED, f"localize_in={put_away(first, tmp_path / 'first')}")
+    own, in_its_world = mapped(unposed[20:], *TRACKED, f"localize_in={stored_files(first, tmp_path / 'first')}")
     assert not any(pose.lost for pose in in_its_world)
     for k in range(5):
         apart = inverse(poses[20 + k].T_world_camera) @ in_its_world[k].T_world_camera

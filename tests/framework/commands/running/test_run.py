@@ -1,4 +1,4 @@
-"""How a run ends: completed, partial or with nothing to keep, and what its place is."""
+"""Tests of the end of a run (complete, partial or without result) and of its directory."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def begin(directory: Path, *arguments: str, before: Callable[[], object] | None 
 
 
 def end(process: ForkedCommand) -> tuple[int | None, str]:
-    """Return exit status and stderr."""
+    """Return the exit status and stderr."""
     try:
         _, stderr = process.communicate(timeout=PATIENCE_S)
     except subprocess.TimeoutExpired:
@@ -56,7 +56,7 @@ def figures(directory: Path, name: str = "metrics.partial.json") -> dict[str, ob
 
 
 def limit_file_size() -> None:
-    """Limit files to 64 KiB. The kernel then answers as on a full disk."""
+    """Limit files to 64 KiB. The kernel then responds as on a full disk."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))
 
 
@@ -66,8 +66,8 @@ def ignore_ctrl_c() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("background", [False, True])
-def test_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, background: bool) -> None:
-    """Also where a script has started the run in the background, which ignores Ctrl-C then."""
+def test_run_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, background: bool) -> None:
+    """This includes runs that a script starts in the background, which ignore Ctrl-C."""
     place = tmp_path / "run"
     process = begin(tmp_path, *ENDLESS, f"hydra.run.dir={place}", before=ignore_ctrl_c if background else None)
     wait_for(tmp_path / "note", process)
@@ -91,7 +91,7 @@ def test_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, ba
         ("masks", "masks"),
     ],
 )
-def test_stage_error_leaves_partial_record(tmp_path: Path, kind: str, message: str) -> None:
+def test_run_stage_error_leaves_partial_record(tmp_path: Path, kind: str, message: str) -> None:
     place = tmp_path / "run"
     status, stderr = end(begin(tmp_path, "detector=faulty", f"detector.kind={kind}", f"hydra.run.dir={place}"))
     assert status == 3
@@ -115,22 +115,22 @@ def test_run_folder_deleted_during_run_is_recreated(tmp_path: Path) -> None:
     assert (place / "config.yaml").read_bytes() == config
 
 
-def test_error_before_first_frame_leaves_no_record(tmp_path: Path) -> None:
+def test_run_error_before_first_frame_leaves_no_record(tmp_path: Path) -> None:
     place = tmp_path / "run"
     status, _ = end(begin(tmp_path, "detector=faulty", "detector.at=0", f"hydra.run.dir={place}"))
     assert status == 1
     assert {path.name for path in place.iterdir()}.isdisjoint({*MAPPED, "metrics.partial.json", "metrics.json"})
 
 
-def test_stage_system_exit_leaves_partial_record(tmp_path: Path) -> None:
-    """As submitit does when its job is preempted."""
+def test_run_stage_system_exit_leaves_partial_record(tmp_path: Path) -> None:
+    """A preempted job of submitit exits like this."""
     place = tmp_path / "run"
     status, _ = end(begin(tmp_path, "detector=faulty", "detector.kind=SystemExit", f"hydra.run.dir={place}"))
     assert status == 7
     assert figures(place)["frames"] == 3
 
 
-def test_full_disk_leaves_small_files(tmp_path: Path) -> None:
+def test_run_on_full_disk_writes_small_files(tmp_path: Path) -> None:
     place = tmp_path / "run"
     place.mkdir()
     (place / "mesh.ply").write_text("of an earlier run")
@@ -148,7 +148,7 @@ def test_full_disk_leaves_small_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_during_saving_completes_record(tmp_path: Path, number: signal.Signals) -> None:
+def test_run_signal_during_saving_completes_record(tmp_path: Path, number: signal.Signals) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, "fuser.slow_save_s=1", f"hydra.run.dir={place}")
     wait_for(place / "metrics.partial.json", process)
@@ -160,7 +160,7 @@ def test_signal_during_saving_completes_record(tmp_path: Path, number: signal.Si
     assert not (place / "metrics.partial.json").exists()
 
 
-def test_second_signal_during_saving_leaves_complete_files(tmp_path: Path) -> None:
+def test_run_second_signal_in_saving_leaves_complete_files(tmp_path: Path) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, "fuser.slow_save_s=30", f"hydra.run.dir={place}")
     wait_for(place / "mesh.ply", process)
@@ -181,7 +181,7 @@ LIVE = ("dataset=live", "dataset.frames_sent=100000", "fuser.capacity=100000", "
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_completes_live_run(tmp_path: Path, number: signal.Signals) -> None:
+def test_live_run_signal_completes_record(tmp_path: Path, number: signal.Signals) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, *LIVE, f"hydra.run.dir={place}")
     wait_for(tmp_path / "note", process)
@@ -198,7 +198,7 @@ def test_signal_completes_live_run(tmp_path: Path, number: signal.Signals) -> No
     assert left["frames"] == len((place / "trajectory.txt").read_text().splitlines()) > 0
 
 
-def test_second_signal_leaves_live_run_partial(tmp_path: Path) -> None:
+def test_live_run_second_signal_leaves_partial_record(tmp_path: Path) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, *LIVE, "fuser.slow_s=2", f"hydra.run.dir={place}")
     wait_for(tmp_path / "note", process)
@@ -211,7 +211,7 @@ def test_second_signal_leaves_live_run_partial(tmp_path: Path) -> None:
     assert figures(place)["partial"] == "ended by SIGTERM"
 
 
-def test_live_source_failure_leaves_partial_record(tmp_path: Path) -> None:
+def test_live_run_source_failure_leaves_partial_record(tmp_path: Path) -> None:
     place = tmp_path / "run"
     status, stderr = end(begin(tmp_path, "dataset=live", "dataset.fails_after=3", f"hydra.run.dir={place}"))
     assert status == 3
@@ -275,7 +275,7 @@ def test_run_default_folder_is_named_after_dataset(tmp_path: Path) -> None:
 
 
 @pytest.mark.acceptance
-def test_simultaneous_runs_and_sweeps_have_own_folders(tmp_path: Path) -> None:
+def test_run_and_sweep_folders_differ_if_simultaneous(tmp_path: Path) -> None:
     runs = [begin(tmp_path, "hydra.run.dir=${new_directory:runs/now}") for _ in range(2)]
     assert [end(process)[0] for process in runs] == [0, 0]
     assert {path.parent.name for path in tmp_path.glob("runs/*/metrics.json")} == {"now", "now_2"}

@@ -1,4 +1,4 @@
-"""`python -m framework show-refinement` as a user meets it."""
+"""Tests of the command `show-refinement`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_show_refinement_errors_are_one_line(tmp_path: Path, overrides: list[str
 
 
 class FoundOnlyIn(SphereDetector):
-    """Finds both spheres in one frame, nothing elsewhere."""
+    """Detects both spheres in one frame and nothing in the others."""
 
     def __init__(self, index: int) -> None:
         super().__init__()
@@ -105,7 +105,7 @@ def test_show_refinement_tries_few_frames_of_long_video() -> None:
     assert Counted.calls == TRIED
 
 
-def test_called_returns_refiner_overrides() -> None:
+def test_show_refinement_called_has_refiner_overrides() -> None:
     overrides = ["refiner=chain", "refiner.links.gmm_em=null", "refiner@refiner.links.x=kmeans", "frame=3", "seed=1"]
     assert called("chain", overrides) == "refiner=chain refiner.links.gmm_em=null refiner@refiner.links.x=kmeans"
     added = "+refiner@refiner.links.last=largest_component"

@@ -1,4 +1,4 @@
-"""Sweeps as a user meets them: run by every launcher, killed in the middle, and started twice."""
+"""Tests of sweeps with every launcher, killed and started twice."""
 
 from __future__ import annotations
 
@@ -31,17 +31,20 @@ FAILED = "error: a run failed: dataset tests.support.scenes.corner_room.CornerRo
 PLACE = Path("outputs") / "fake_ablation"
 BY_JOBLIB = ("launcher=joblib", "hydra.launcher.n_jobs=2")
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
-SLOW = "dataset.slow_s=0.1"  # so that a worker that is killed is in the middle of a run, not of handing in its result
-SIX = ("row=half,broken", "seed=1,2,3", SLOW)  # the broken ones fail
+SLOW = "dataset.slow_s=0.1"  # so that a killed worker is in the middle of a run instead of returning its result
+SIX = ("row=half,broken", "seed=1,2,3", SLOW)  # runs of the broken row fail
 RUNS = {f"{SLOW},row=half,seed={seed}" for seed in (1, 2, 3)}
 PATIENCE_S = 180
 
 
 def begin(directory: Path, *arguments: str, sweep: str = "experiment=fake_ablation") -> subprocess.Popen[str]:
-    """The fake experiment or another sweep, with its own process group: what a terminal makes of a command."""
+    """Start the fake experiment or another sweep in its own process group, like a terminal."""
     fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), sweep]
     clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
-    environment = clean | {"PYTHONPATH": str(CHECKOUT), "RAY_AUTH_MODE": "disabled"}  # else Ray writes into the home
+    environment = clean | {
+        "PYTHONPATH": str(CHECKOUT),
+        "RAY_AUTH_MODE": "disabled",
+    }  # otherwise Ray writes into the home directory
     return subprocess.Popen(
         [sys.executable, "-m", "framework", *fakes, *arguments],
         cwd=directory,
@@ -71,31 +74,31 @@ def wait_until(condition: Callable[[], object], process: subprocess.Popen[str]) 
 
 
 def recorded(directory: Path) -> dict[str, int]:
-    """When the runs were completed, by their directory's name."""
+    """Return the completion time of each completed run by directory name."""
     return {path.parent.name: path.stat().st_mtime_ns for path in (directory / PLACE).glob("*/metrics.json")}
 
 
 def begun(directory: Path) -> dict[str, int]:
-    """When the runs began that have not been completed, by their directory's name."""
+    """Return the start time of each active run by directory name."""
     began = {path.parent.name: path.stat().st_mtime_ns for path in (directory / PLACE).glob("*/config.yaml")}
     return {name: began[name] for name in set(began) - set(recorded(directory))}
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
-    """A sweep by joblib that nobody disturbs, with a row whose runs fail; and where it is."""
+    """Return an uninterrupted joblib sweep with a row whose runs fail, and its folder."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     directory = tmp_path_factory.mktemp("whole")
     return directory, end(begin(directory, *BY_JOBLIB, *SIX))
 
 
-def test_joblib_sweep_continues_after_failed_runs(
+def test_sweep_by_joblib_continues_after_failed_runs(
     whole: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
     directory, done = whole
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert done.stderr.count("ERROR") == 3, "each failed run tells it once"
+    assert done.stderr.count("ERROR") == 3, "each failed run is logged once"
     assert "ERROR   #4 dataset" in done.stderr
     assert done.stderr.splitlines()[-1].startswith(
         "error: a run failed: dataset tests.support.scenes.corner_room.CornerRoom: frames"
@@ -104,7 +107,7 @@ def test_joblib_sweep_continues_after_failed_runs(
     text = (directory / PLACE / "table.md").read_text()
     assert text in done.stdout
     assert f"Incomplete: {SLOW},row=broken,seed=1: failed: dataset" in text
-    assert "threads=1" in text, "how fast the runs were depends on it"
+    assert "threads=1" in text, "it affects the speed of the runs"
 
 
 def test_sweep_with_other_launcher_keeps_completed_runs(
@@ -119,10 +122,10 @@ def test_sweep_with_other_launcher_keeps_completed_runs(
 
 
 @pytest.mark.acceptance
-def test_killed_sweep_resumes_to_same_table(
+def test_sweep_after_kill_resumes_to_same_table(
     whole: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
-    """First one of its workers is killed, then all of it at once."""
+    """First one worker is killed, then the whole sweep."""
     first = begin(tmp_path, *BY_JOBLIB, *SIX)
     wait_until(lambda: recorded(tmp_path) and begun(tmp_path), first)
     workers = [child for child in psutil.Process(first.pid).children() if "LokyProcess" in " ".join(child.cmdline())]
@@ -152,8 +155,8 @@ def test_killed_sweep_resumes_to_same_table(
         assert (tmp_path / PLACE / name).read_bytes() == (whole[0] / PLACE / name).read_bytes()
 
 
-def test_plain_sweep_has_one_folder_and_reports_failures(tmp_path: Path) -> None:
-    """Its place is named after the time, which workers must not read anew."""
+def test_sweep_without_experiment_reports_failures(tmp_path: Path) -> None:
+    """The folder is named after the start time, which workers must not determine again."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     done = end(begin(tmp_path, *FAKES, "dataset.frames=few,many", "launcher=joblib", sweep="-m"))
     assert done.returncode == 1
@@ -166,15 +169,15 @@ def test_plain_sweep_has_one_folder_and_reports_failures(tmp_path: Path) -> None
 
 
 def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, int]]:
-    """A sweep without an experiment, in one place; and when its runs were completed, by what their names end with."""
+    """Run a sweep without an experiment in one folder; return the completion times by the end of the run's name."""
     done = end(begin(directory, *FAKES, "dataset.frames=3", "hydra.sweep.dir=s", *arguments, sweep="-m"))
     assert done.returncode == 0, done.stderr
     runs = (directory / "s").glob("*/metrics.json")
     return done, {path.parent.name.partition("refiner=fake,")[2]: path.stat().st_mtime_ns for path in runs}
 
 
-def test_plain_sweep_is_resumed(tmp_path: Path) -> None:
-    """With whatever else that changes no result: it is not in the name of a run's directory."""
+def test_sweep_without_experiment_is_resumed(tmp_path: Path) -> None:
+    """Settings without effect on the results are not part of a directory name."""
     _, first = swept(tmp_path, "seed=1,2")
     assert set(first) == {"seed=1,tracker=fake", "seed=2,tracker=fake"}
     harmless = (
@@ -192,7 +195,7 @@ def test_plain_sweep_is_resumed(tmp_path: Path) -> None:
 
 @pytest.mark.acceptance
 def test_sweep_over_neutral_settings_has_separate_folders(tmp_path: Path) -> None:
-    """As those of a sweep that times them; workers name them alike."""
+    """A sweep that times these settings needs them; workers use the same names."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     _, first = swept(tmp_path, "threads=1,2", "prefetch=0")
     assert set(first) == {"threads=1,tracker=fake", "threads=2,tracker=fake"}
@@ -232,7 +235,7 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
 def test_sweep_signal_leaves_partial_record_of_active_runs(
     tmp_path: Path, signal_sent: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
 ) -> None:
-    """A terminal sends Ctrl-C to the workers, too; `kill` does not."""
+    """A terminal sends Ctrl-C to the workers as well; `kill` does not."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     by_joblib = (*BY_JOBLIB, f"hydra.launcher.n_jobs={n_jobs}")
     process = begin(tmp_path, *by_joblib, "row=all", f"seed={seeds}", *ENDLESS, "fuser.note=${seed}.note")
@@ -276,14 +279,14 @@ def test_sweep_second_signal_ends_workers_immediately(tmp_path: Path) -> None:
 
 @pytest.mark.acceptance
 def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
-    """`kill -9` of the sweep alone leaves its workers to their runs."""
+    """After `kill -9` of the main process, its workers finish their runs."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     arguments = (*BY_JOBLIB, "row=half", "dataset.slow_s=1")
     first = begin(tmp_path, *arguments)
     wait_until(lambda: len(begun(tmp_path)) == 2, first)
     workers = psutil.Process(first.pid).children(recursive=True)
     for worker in workers:
-        worker.suspend()  # until others wait for it, however slow the machine is
+        worker.suspend()  # until others wait for it, on a machine of any speed
     first.kill()
     again = begin(tmp_path, *arguments)
     logs = (tmp_path / PLACE).glob
@@ -292,7 +295,7 @@ def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
         worker.resume()
     done = end(again)
     for worker in workers:
-        worker.kill()  # idle by now, for some minutes
+        worker.kill()  # idle workers, for some minutes
     first.communicate()
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("in use by process") == 2
@@ -338,13 +341,13 @@ def test_cluster_launchers_run_locally(tmp_path: Path, package: str, arguments: 
 # Without a process
 
 
-def test_missing_launcher_error_names_extra() -> None:
+def test_launcher_missing_error_names_extra() -> None:
     error = MissingConfigException("?", missing_cfg_file="hydra/launcher/submitit_slurm", options=["basic"])
     assert one_line(error).endswith("pip install instancemap[slurm]")
 
 
 @pytest.mark.parametrize(("threads", "jobs"), [(1, 12), (5, 2), (12, 1), (13, 1), (0, 1)])
-def test_jobs_at_once_depend_on_threads_and_cores(monkeypatch: pytest.MonkeyPatch, threads: int, jobs: int) -> None:
+def test_jobs_at_once_depends_on_threads_and_cores(monkeypatch: pytest.MonkeyPatch, threads: int, jobs: int) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
     assert jobs_at_once(threads) == jobs
 
@@ -353,7 +356,7 @@ def test_jobs_at_once_depend_on_threads_and_cores(monkeypatch: pytest.MonkeyPatc
     ("launcher", "node"), [("joblib", "n_jobs"), ("slurm", "cpus_per_task"), ("ray", "ray.remote.num_cpus")]
 )
 def test_launcher_config_uses_job_threads(launcher: str, node: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of twelve cores; threads=0 are all of them: a job that counted for no core would never be one too many."""
+    """There are twelve cores, and threads=0 uses all. A job without cores would never reach the limit."""
     pytest.importorskip(f"hydra_plugins.hydra_{launcher.replace('slurm', 'submitit')}_launcher")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
     for threads in (3, 0):
@@ -364,5 +367,5 @@ def test_launcher_config_uses_job_threads(launcher: str, node: str, monkeypatch:
         assert own.hydra.job.env_set.TQDM_DISABLE == "1"
 
 
-def test_threads_do_not_change_config_hash() -> None:
+def test_config_hash_ignores_threads() -> None:
     assert config_hash({"seed": 1, "threads": 0}) == config_hash({"seed": 1, "threads": 8})

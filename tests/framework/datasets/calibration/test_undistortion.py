@@ -1,4 +1,4 @@
-"""Undistortion against OpenCV's map, and against a pinhole camera's view of a scene that is known exactly."""
+"""Tests of undistortion, compared with OpenCV and with the view of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LENS = Distortion(k1=0.2624, k2=-0.9531, p1=-0.0054, p2=0.0026, k3=1.1633)  # fr
 
 
 @pytest.mark.parametrize("intrinsics", [Intrinsics.FREIBURG1, Intrinsics.FREIBURG2])
-def test_distorted_pixels_match_opencv(intrinsics: Intrinsics) -> None:
+def test_distorted_matches_opencv(intrinsics: Intrinsics) -> None:
     camera, lens = PUBLISHED[intrinsics].camera, PUBLISHED[intrinsics].distortion
     assert lens is not None
     size = (camera.width, camera.height)
@@ -30,7 +30,7 @@ def test_distorted_pixels_match_opencv(intrinsics: Intrinsics) -> None:
 
 
 def recorded(camera: Camera, lens: Distortion, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(depth, color) that a camera with this lens records: the ray of each pixel by inversion of the lens."""
+    """Return (depth, color) as recorded with this lens; the ray of each pixel inverts the lens model."""
     wide = Camera(3 * camera.width, 3 * camera.height, 2 * camera.fx, 2 * camera.fy, 239.5, 179.5)
     depth, color, _ = room().render(wide, T_world_camera)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)
@@ -42,12 +42,12 @@ def recorded(camera: Camera, lens: Distortion, T_world_camera: np.ndarray) -> tu
     return cv2.remap(depth, u, v, cv2.INTER_NEAREST), cv2.remap(color, u, v, cv2.INTER_LINEAR)
 
 
-def test_undistorted_view_matches_pinhole_view() -> None:
+def test_undistortion_view_matches_pinhole_view() -> None:
     T = exp_se3(np.array([0.1, 0.0, 0.0, 0.1, -0.2, 0.1]))
     depth, color = recorded(CAMERA, LENS, T)
     true_depth, true_color, surface = room().render(CAMERA, T)
     inside = np.ones(CAMERA.shape, bool)
-    inside[:6], inside[-6:], inside[:, :6], inside[:, -6:] = False, False, False, False  # the lens shows less there
+    inside[:6], inside[-6:], inside[:, :6], inside[:, -6:] = False, False, False, False  # the lens covers less there
     edges = cv2.dilate(cv2.Laplacian(surface.astype(np.float32), cv2.CV_32F), np.ones((7, 7))) != 0
     kept = inside & ~edges & (true_depth > 0)
     undistortion = Undistortion(CAMERA, LENS)
@@ -58,14 +58,14 @@ def test_undistorted_view_matches_pinhole_view() -> None:
     assert np.percentile(off, 90) < np.percentile(was, 90) / 4  # the nearest pixel is half a pixel off
 
 
-def test_exact_undistortion_does_not_mix_labels() -> None:
+def test_undistortion_exact_mode_does_not_mix_labels() -> None:
     labels = np.random.default_rng(0).choice(np.array([0, 7, 300], np.uint16), CAMERA.shape)
     undistorted = Undistortion(CAMERA, LENS).exact(labels)
     assert undistorted.dtype == np.uint16
     assert set(np.unique(undistorted)) == {0, 7, 300}
 
 
-def test_undistorted_pixel_outside_image_is_zero() -> None:
+def test_undistortion_outside_image_is_zero() -> None:
     pincushion = Undistortion(CAMERA, Distortion(k1=0.5))
     ones = pincushion.exact(np.ones(CAMERA.shape, np.float32))
     assert ones[0, 0] == 0
@@ -73,12 +73,12 @@ def test_undistorted_pixel_outside_image_is_zero() -> None:
     assert (pincushion.smooth(np.full((*CAMERA.shape, 3), 9, np.uint8))[0, 0] == 0).all()
 
 
-def test_zero_distortion_keeps_image_unchanged() -> None:
+def test_undistortion_without_distortion_keeps_image_unchanged() -> None:
     color = np.random.default_rng(0).integers(0, 256, (*CAMERA.shape, 3), np.uint8)
     assert np.array_equal(Undistortion(CAMERA, Distortion()).smooth(color), color)
 
 
-def test_implausible_distortion_coefficients_raise() -> None:
+def test_undistortion_implausible_coefficients_raise() -> None:
     with pytest.raises(DataError, match=r"at most 80 px in the 160x120 image, got \d+ px"):
         Undistortion(CAMERA, Distortion(k1=10.0))
     with pytest.raises(DataError, match="expected finite coefficients"):

@@ -1,4 +1,4 @@
-"""Depth cameras, by fakes of their libraries: what is asked of these, and what their faults become."""
+"""Tests of depth cameras with fake vendor libraries."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from tests.support.scenes.fake_cameras import (
 
 @dataclass(frozen=True)
 class Brand:
-    """A reader, and a fake of its library."""
+    """A reader and a fake of its library."""
 
     name: str
     reader: type[RealSense] | type[Orbbec]
     library: str
     module: Callable[[FakeCamera], ModuleType]
-    depth_size: tuple[int, int]  # that is asked for; 0 = any
-    nothing_there: str  # what is said
+    depth_size: tuple[int, int]  # requested rate; 0 = any
+    nothing_there: str  # expected error
 
     def video(self, **parameters: object) -> LiveVideo:
         size = {"width": CAMERA.width, "height": CAMERA.height}
@@ -82,10 +82,10 @@ def test_camera_frames_are_registered_to_color(brand: Brand, device: FakeCamera)
     assert not device.running
 
 
-def test_device_stream_request_matches_parameters(brand: Brand, device: FakeCamera) -> None:
+def test_camera_stream_request_matches_parameters(brand: Brand, device: FakeCamera) -> None:
     video = brand.video(serial=SERIAL, fps=60)
     assert video.name == f"{brand.name}_{SERIAL}"
-    assert not device.started, "nothing before frames are asked for"
+    assert not device.started, "nothing is logged before the first frame is requested"
     assert len(list(sent(video, 1))) == len(list(sent(video, 1))) == 1
     for asked in device.started:
         assert asked["color"] == (96, 72, "rgb", 60)
@@ -93,14 +93,14 @@ def test_device_stream_request_matches_parameters(brand: Brand, device: FakeCame
     assert len(device.started) == 2
 
 
-def test_depth_beyond_max_depth_is_invalid(brand: Brand, device: FakeCamera) -> None:
+def test_camera_depth_beyond_max_depth_is_invalid(brand: Brand, device: FakeCamera) -> None:
     [frame] = sent(brand.video(max_depth=2.5), 1)
     assert 2.4 < frame.depth.max() <= 2.5
     [whole] = sent(brand.video(max_depth=0.0), 1)
     assert whole.depth.max() > 2.9
 
 
-def test_lens_is_undistorted_only_for_supported_model(
+def test_camera_lens_is_undistorted_only_for_supported_model(
     brand: Brand, device: FakeCamera, caplog: pytest.LogCaptureFixture
 ) -> None:
     device.coeffs = (0.1, -0.05, 0.01, 0.02, 0.001)
@@ -116,7 +116,7 @@ def test_lens_is_undistorted_only_for_supported_model(
     assert caplog.messages == [expected]
 
 
-def test_missing_package_raises_one_line(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_camera_missing_package_raises_one_line_error(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, brand.library, None)
     with pytest.raises(
         ConfigError,
@@ -125,7 +125,7 @@ def test_missing_package_raises_one_line(brand: Brand, monkeypatch: pytest.Monke
         next(brand.video().frames())
 
 
-def test_missing_device_raises_one_line(brand: Brand, device: FakeCamera) -> None:
+def test_camera_missing_device_raises_one_line_error(brand: Brand, device: FakeCamera) -> None:
     device.plugged_in = False
     with pytest.raises(DataError, match=f"device with 96x72 at 30 Hz cannot be started: {brand.nothing_there}$"):
         next(brand.video().frames())
@@ -135,7 +135,7 @@ def test_missing_device_raises_one_line(brand: Brand, device: FakeCamera) -> Non
     ("parameters", "message"),
     [({"serial": "999"}, ": device 999 with 96x72"), ({"width": 640}, ": device with 640x72")],
 )
-def test_unsupported_device_request_raises_one_line(
+def test_camera_unsupported_request_raises_one_line_error(
     brand: Brand, device: FakeCamera, parameters: dict[str, object], message: str
 ) -> None:
     with pytest.raises(DataError, match=f"{message} at 30 Hz cannot be started: ") as caught:
@@ -144,7 +144,7 @@ def test_unsupported_device_request_raises_one_line(
     assert not device.running
 
 
-def test_disconnected_device_raises_and_stops(
+def test_camera_disconnected_device_raises_and_stops(
     brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device.unplugged_at = 2
@@ -170,13 +170,13 @@ def test_camera_pauses_below_timeout_are_tolerated(monkeypatch: pytest.MonkeyPat
     assert message == ["first", None, "second", None, "third", None]
 
 
-def test_idle_device_yields_none(brand: Brand, device: FakeCamera) -> None:
+def test_camera_idle_device_yields_none(brand: Brand, device: FakeCamera) -> None:
     device.frames = 0
     with closing(brand.video().frames()) as readers:
         assert [next(readers), next(readers)] == [None, None]
 
 
-def test_frame_without_depth_raises_and_next_is_read(brand: Brand, device: FakeCamera) -> None:
+def test_camera_missing_depth_raises_for_its_frame_only(brand: Brand, device: FakeCamera) -> None:
     device.without_depth = 1
     with closing(brand.video().frames()) as readers:
         first, second, third = (reader for reader in (next(readers) for _ in range(3)) if reader)
@@ -186,7 +186,7 @@ def test_frame_without_depth_raises_and_next_is_read(brand: Brand, device: FakeC
 
 
 def test_orbbec_waits_for_first_depth_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its units are known from there."""
+    """The depth unit is known from this frame on."""
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", orbbec_module(FakeCamera(without_depth=0)))
     [frame] = sent(BRANDS[1].video(), 1)
     np.testing.assert_allclose(frame.depth, CornerRoom()[1].depth, atol=UNIT)

@@ -1,4 +1,4 @@
-"""A folder that fills while it is watched: whole frames only, in order, and nothing that came is without a word."""
+"""Tests of a watched folder: complete frames in order, and reports of all skipped files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ROOM = CornerRoom(frames=30)
 
 
 def encoded(k: int) -> dict[str, bytes]:
-    """The bytes of both files of frame k."""
+    """Return the bytes of both files of frame k."""
     frame = ROOM[k % len(ROOM)]
     color = cv2.imencode(".jpg", frame.color[..., ::-1])[1]
     return {
@@ -54,14 +54,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 class Watched:
-    """What a watch has said since one last asked."""
+    """A watched folder with the messages since the last call."""
 
     def __init__(self, folder: Path, **parameters: float) -> None:
         self.over = False
         self._frames = FolderWatch(folder, poll_interval=0.001, **parameters).frames()
 
     def readers(self) -> Iterator[FrameReader]:
-        """Those of one look, to the None after it."""
+        """Return the readers of one scan, up to the first None."""
         while (reader := next(self._frames, self)) is not None:
             if isinstance(reader, Watched):
                 self.over = True
@@ -69,7 +69,7 @@ class Watched:
             yield reader
 
     def look(self) -> list[int | str]:
-        """The frames that can be read by their numbers, of the others what is said."""
+        """Return the numbers of the readable frames and the messages about the others."""
         return [outcome(reader) for reader in self.readers()]
 
 
@@ -81,7 +81,7 @@ def outcome(reader: FrameReader) -> int | str:
         return str(error)
 
 
-def test_watched_frames_match_recorded_folder(folder: Path) -> None:
+def test_folder_watch_frames_match_recorded_folder(folder: Path) -> None:
     watched, before = Watched(folder), time.time()
     assert watched.look() == []
     found: list[Frame] = []
@@ -98,7 +98,7 @@ def test_watched_frames_match_recorded_folder(folder: Path) -> None:
 
 @pytest.mark.parametrize("share", [0, 0.3, 0.999])
 @pytest.mark.parametrize("late", ["color", "depth"])
-def test_frame_is_emitted_once_both_files_are_complete(folder: Path, late: str, share: float) -> None:
+def test_folder_watch_emits_frame_once_both_files_are_complete(folder: Path, late: str, share: float) -> None:
     watched, files = Watched(folder), encoded(4)
     [slow] = [name for name in files if name.startswith(late)]
     [fast] = files.keys() - {slow}
@@ -112,7 +112,7 @@ def test_frame_is_emitted_once_both_files_are_complete(folder: Path, late: str, 
     assert watched.look() == []
 
 
-def test_overtaken_incomplete_frame_is_reported_once(folder: Path) -> None:
+def test_folder_watch_reports_overtaken_incomplete_frame_once(folder: Path) -> None:
     watched, files = Watched(folder), encoded(1)
     color, depth = files
     write(folder, 0)
@@ -133,7 +133,7 @@ def test_overtaken_incomplete_frame_is_reported_once(folder: Path) -> None:
     ]
 
 
-def test_decreasing_frame_number_is_reported(folder: Path) -> None:
+def test_folder_watch_reports_decreasing_frame_number(folder: Path) -> None:
     watched = Watched(folder)
     write(folder, 7)
     assert watched.look() == [7]
@@ -143,13 +143,13 @@ def test_decreasing_frame_number_is_reported(folder: Path) -> None:
     assert watched.look() == [9]
 
 
-def test_existing_frames_are_read_in_order(folder: Path) -> None:
+def test_folder_watch_reads_existing_frames_in_order(folder: Path) -> None:
     write(folder, *range(12))
     watched = Watched(folder)
     assert watched.look() == list(range(12))
 
 
-def test_removed_files_do_not_stop_watching(folder: Path) -> None:
+def test_folder_watch_continues_after_files_are_removed(folder: Path) -> None:
     watched = Watched(folder)
     write(folder, 0, 1)
     first, second = watched.readers()
@@ -162,7 +162,7 @@ def test_removed_files_do_not_stop_watching(folder: Path) -> None:
     assert watched.look() == [2]
 
 
-def test_unrelated_files_are_ignored_and_ambiguous_names_raise(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_folder_watch_ambiguous_but_not_unrelated_names_raise(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     watched = Watched(folder)
     for name in (".000000.jpg", "000000.jpg.part", "preview.jpg", f"{2**53}.jpg"):
         (folder / "color" / name).write_bytes(b"?")
@@ -178,14 +178,14 @@ def test_unrelated_files_are_ignored_and_ambiguous_names_raise(folder: Path, cap
         watched.look()
 
 
-def test_image_size_mismatch_is_reported(folder: Path) -> None:
+def test_folder_watch_reports_image_size_mismatch(folder: Path) -> None:
     (folder / "camera.json").write_text(json.dumps(CALIBRATION | {"depth_scale": 1000, "width": 97}))
     write(folder, 0)
     assert str(*Watched(folder).look()).endswith(f"expected 97x72 px as in {folder}/camera.json, got 96x72 px")
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_end_file_stops_watching_after_remaining_frames(folder: Path, half: bool) -> None:
+def test_folder_watch_end_file_stops_after_remaining_frames(folder: Path, half: bool) -> None:
     watched = Watched(folder)
     assert watched.look() == []
     write(folder, 5)
@@ -197,7 +197,7 @@ def test_end_file_stops_watching_after_remaining_frames(folder: Path, half: bool
     assert watched.over
 
 
-def test_idle_timeout_stops_watching(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_watch_stops_after_idle_timeout(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = SimpleNamespace(now=100.0, time=time.time, sleep=lambda _: None, monotonic=lambda: clock.now)
     monkeypatch.setattr(folder_watch, "time", clock)
     watched = Watched(folder, idle_timeout=5.0)
@@ -227,7 +227,7 @@ def test_folder_watch_waits_for_camera_file(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "output"), [(None, "No such file"), ("{", "expected valid JSON"), ("{}", "expected a key 'width'")]
 )
-def test_missing_or_invalid_camera_file_raises_after_timeout(folder: Path, text: str | None, output: str) -> None:
+def test_folder_watch_unusable_camera_file_raises_after_timeout(folder: Path, text: str | None, output: str) -> None:
     (folder / "camera.json").unlink()
     if text is not None:
         (folder / "camera.json").write_text(text)
@@ -242,21 +242,21 @@ def test_missing_or_invalid_camera_file_raises_after_timeout(folder: Path, text:
     [{"idle_timeout": -1}, {"camera_timeout": float("nan")}, {"poll_interval": 0.2}, {"max_depth": -1}],
     ids=str,
 )
-def test_watch_parameter_out_of_range_raises(folder: Path, parameter: dict[str, float]) -> None:
+def test_folder_watch_parameter_out_of_range_raises(folder: Path, parameter: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(parameter))):
         FolderWatch(folder, **parameter)
 
 
 @dataclass
 class Known(PoseTracker):
-    """By the frame's number."""
+    """Returns detections by frame number."""
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         return Pose(pose_at(frame.index))
 
 
-def test_folder_is_mapped_while_being_written(folder: Path) -> None:
-    """By a writer that is slow, writes its files in place, and ends."""
+def test_folder_watch_maps_folder_while_it_is_written(folder: Path) -> None:
+    """The writer is slow, writes its files in place, and ends."""
 
     def writer() -> None:
         for k in range(len(ROOM)):

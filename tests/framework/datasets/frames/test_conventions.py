@@ -1,4 +1,4 @@
-"""Recordings whose poses, units or image pairs are not as their format says, read as they are meant."""
+"""Tests of configurable conventions: poses, units and image pairs that differ from the format."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def test_pose_reading_recovers_original_pose(seed: int) -> None:
     np.testing.assert_allclose(PoseReading(pose_unit=0.001).pose(in_mm), T_world_camera, atol=1e-12)
     x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
     misread = T_world_camera.copy()
-    misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()  # the file's w x y z, taken for x y z w
+    misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()  # w x y z of the file, read as x y z w
     scalar_first = PoseReading(quaternion_order=QuaternionOrder.WXYZ)
     np.testing.assert_allclose(scalar_first.pose(misread), T_world_camera, atol=1e-12)
 
 
 def test_camera_axes_match_system_conventions() -> None:
-    """What is ahead, to the right and below in the image, in the axes of each."""
+    """The directions forward, right and down in the image, in the axes of each system."""
     right, below, ahead = np.eye(3)
     for axes, expected in {
         CameraAxes.OPENCV: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -64,7 +64,7 @@ def test_camera_axes_match_system_conventions() -> None:
         ({"depth_delay": 1001}, "delay"),
     ],
 )
-def test_invalid_reading_parameter_raises(wrong: dict[str, float], message: str) -> None:
+def test_pose_reading_invalid_parameter_raises(wrong: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         DepthReading(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="pose_unit"):
@@ -74,7 +74,7 @@ def test_invalid_reading_parameter_raises(wrong: dict[str, float], message: str)
 
 
 def images(k: int) -> StoredImages:
-    """Images that contain their number."""
+    """Return images that contain their number."""
     color, depth = np.full((2, 2, 3), k, np.uint8), np.full((2, 2), k, np.uint16)
     return StoredImages(f"color {k}", f"depth {k}", lambda: color, lambda: depth)
 
@@ -109,7 +109,7 @@ def test_pose_delay_pairs_images_with_matching_pose(delay: int) -> None:
             assert frame.up is stored[k].up
 
 
-def test_recording_is_read_with_configured_conventions() -> None:
+def test_conventions_are_applied_when_recording_is_read() -> None:
     desk = {"root": Path("data/desk"), "scene": "rgbd_dataset_freiburg1_rpy"}
     plain = TumRgbd(**desk)  # type: ignore[arg-type]
     meant = TumRgbd(

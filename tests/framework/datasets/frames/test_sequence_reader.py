@@ -1,3 +1,5 @@
+"""Tests of frame selection: start, stop, stride and frame_fraction."""
+
 import pytest
 
 from framework.datasets.frames.sequence_reader import check_selection, choose_frames
@@ -14,12 +16,12 @@ def test_frame_selection_matches_slice():
     ("start", "stop", "stride", "name"),
     [(-1, -1, 1, "start"), (0, -2, 1, "stop"), (5, 5, 1, "stop"), (0, -1, 0, "stride")],
 )
-def test_invalid_selection_error_names_parameter(start, stop, stride, name):
+def test_frame_selection_invalid_value_error_names_parameter(start, stop, stride, name):
     with pytest.raises(ConfigError, match=f"dataset.{name}"):
         check_selection(start, stop, stride)
 
 
-def test_start_past_end_error_gives_frame_count():
+def test_frame_selection_past_end_error_gives_frame_count():
     with pytest.raises(ConfigError, match=r"dataset\.start: expected a frame from 0 to 2, got 3"):
         choose_frames(3, 3, -1, 1)
 
@@ -35,7 +37,7 @@ def test_frame_fraction_is_seeded_ordered_subset():
 
 
 def test_frame_fraction_sampling_is_uniform():
-    """Each of 20 frames is in half of the subsets of half of them: 500 +- 5 standard deviations of 1000."""
+    """Each of 20 frames is in half of the subsets: 500 +- 5 standard deviations of 1000."""
     taken = [index for seed in range(1000) for index in choose_frames(20, 0, -1, 1, frame_fraction=0.5, seed=seed)]
     counts = [taken.count(index) for index in range(20)]
     assert min(counts) > 420
@@ -48,11 +50,11 @@ def test_frame_fraction_one_keeps_all_and_minimum_keeps_one():
 
 
 @pytest.mark.parametrize("share", [0.0, -0.1, 1.001, float("nan")])
-def test_invalid_frame_fraction_error_names_parameter(share):
+def test_frame_fraction_invalid_value_error_names_parameter(share):
     with pytest.raises(ConfigError, match=r"dataset.frame_fraction: expected a value in \(0, 1\]"):
         check_selection(0, -1, 1, share)
 
 
-def test_negative_seed_raises():
+def test_frame_fraction_negative_seed_raises():
     with pytest.raises(ConfigError, match="seed: expected at least 0, got -1"):
         choose_frames(7, 0, -1, 1, frame_fraction=0.5, seed=-1)

@@ -1,4 +1,4 @@
-"""The ground truth that the user names, on a labeled wall in front of a camera."""
+"""Tests of a ground truth chosen by the user, on a labeled wall in front of a camera."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def label_at(x: np.ndarray) -> np.ndarray:
 
 
 def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray) -> None:
-    """A wall of 4 x 4 m, moved by T; by default with labels."""
+    """Write a wall of 4 x 4 m, moved by T; by default with labels."""
     side = np.arange(-2.0, 2.0 + CELL / 2, CELL)
     x, y = np.meshgrid(side, side)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -57,7 +57,7 @@ def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray
 
 
 def seen_labels(k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The label of each pixel's point on the wall, and the pixels that are clear of borders between labels."""
+    """Return the label of each pixel's point on the wall, and the pixels away from label borders."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(CAMERA.shape)], axis=-1)
     T = pose(k)
@@ -68,7 +68,7 @@ def seen_labels(k: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A recording with poses and no annotation."""
+    """Return a recording with poses and no annotation."""
     root = tmp_path / "room"
     for name in ("color", "depth"):
         (root / name).mkdir(parents=True)
@@ -92,7 +92,7 @@ def mesh(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tracked_run(tmp_path: Path) -> Path:
-    """A run of the recording in a world of its own; instance UNKNOWN is tentative, without an entry."""
+    """Return a run of the recording in its own world; instance UNKNOWN is tentative, without an entry."""
     run = tmp_path / "run"
     run.mkdir()
     write_wall(run / "mesh.ply", T_RUN_WORLD)
@@ -102,7 +102,7 @@ def tracked_run(tmp_path: Path) -> Path:
     return run
 
 
-def test_masks_are_rendered_from_the_mesh(folder: Path, mesh: Path) -> None:
+def test_named_truth_renders_masks_from_mesh(folder: Path, mesh: Path) -> None:
     video = RgbdFolder(folder, ground_truth=mesh)
     for k in range(FRAMES):
         truth = video[k].truth
@@ -114,7 +114,7 @@ def test_masks_are_rendered_from_the_mesh(folder: Path, mesh: Path) -> None:
     assert [detections.classes[c] for c in detections.class_probabilities.argmax(axis=1)] == ["chair"]
 
 
-def test_scene_truth_is_the_mesh_in_the_world_of_the_poses(folder: Path, mesh: Path) -> None:
+def test_named_truth_scene_is_mesh_in_world_of_poses(folder: Path, mesh: Path) -> None:
     video = RgbdFolder(folder, ground_truth=mesh, stop=1)
     truth = video.scene_truth()
     assert truth is not None
@@ -124,7 +124,7 @@ def test_scene_truth_is_the_mesh_in_the_world_of_the_poses(folder: Path, mesh: P
     assert in_map_world(truth, np.array([0.0, 1 / 30]), np.array([pose(0), pose(3)])) is truth
 
 
-def test_named_mesh_replaces_the_recordings_annotation(folder: Path, mesh: Path) -> None:
+def test_named_truth_replaces_annotation_of_recording(folder: Path, mesh: Path) -> None:
     (folder / "instance").mkdir()
     for k in range(FRAMES):
         cv2.imwrite(str(folder / f"instance/{k:06d}.png"), np.full(CAMERA.shape, 3, np.uint16))
@@ -137,18 +137,18 @@ def test_named_mesh_replaces_the_recordings_annotation(folder: Path, mesh: Path)
     assert RgbdFolder(folder, ground_truth=mesh).scene_truth() is not None
 
 
-def test_instances_json_is_found_in_parent_folder(folder: Path, mesh: Path) -> None:
+def test_named_truth_finds_instances_json_in_parent_folder(folder: Path, mesh: Path) -> None:
     (mesh.parent / "instances.json").rename(mesh.parents[1] / "instances.json")
     assert read_named_truth(mesh).mesh.class_names == {CHAIR: "chair", UNKNOWN: None}
 
 
-def test_directory_with_annotated_mesh_selects_mesh(mesh: Path) -> None:
+def test_named_truth_selects_annotated_mesh_of_directory(mesh: Path) -> None:
     mesh.rename(mesh.parent / "mesh.ply")
     named = read_named_truth(mesh.parent)
     assert (named.name, named.trajectory) == ("annotation/mesh.ply", None)
 
 
-def test_frame_without_a_pose_has_no_rendered_truth(folder: Path, tracked_run: Path) -> None:
+def test_named_truth_of_frame_without_pose_is_not_rendered(folder: Path, tracked_run: Path) -> None:
     times, poses = read_tum(tracked_run / "trajectory.txt")
     write_tum(tracked_run / "trajectory.txt", times[:2], poses[:2])
     frame = RgbdFolder(folder, ground_truth=tracked_run)[2]
@@ -157,13 +157,13 @@ def test_frame_without_a_pose_has_no_rendered_truth(folder: Path, tracked_run: P
     assert frame_hash(frame, ("color", "truth")), "a stored detection is found without rendering"
 
 
-def test_mesh_without_given_poses_raises(folder: Path, mesh: Path) -> None:
+def test_named_truth_mesh_without_given_poses_raises(folder: Path, mesh: Path) -> None:
     (folder / "poses.txt").unlink()
     with pytest.raises(ConfigError, match=r"dataset\.ground_truth: expected given poses.*to a run directory"):
         RgbdFolder(folder, ground_truth=mesh)
 
 
-def test_run_without_common_time_raises(folder: Path, tracked_run: Path) -> None:
+def test_named_truth_run_without_common_time_raises(folder: Path, tracked_run: Path) -> None:
     _, poses = read_tum(tracked_run / "trajectory.txt")
     write_tum(tracked_run / "trajectory.txt", [10.0 + k for k in range(FRAMES)], poses)
     with pytest.raises(ConfigError, match=r"dataset\.ground_truth: expected a run of this recording"):
@@ -171,7 +171,7 @@ def test_run_without_common_time_raises(folder: Path, tracked_run: Path) -> None
 
 
 @pytest.mark.parametrize("given_poses", [True, False])
-def test_tracked_run_is_aligned_to_the_map(folder: Path, tracked_run: Path, given_poses: bool) -> None:
+def test_named_truth_tracked_run_is_aligned_to_map(folder: Path, tracked_run: Path, given_poses: bool) -> None:
     if not given_poses:
         (folder / "poses.txt").unlink()
     video = RgbdFolder(folder, ground_truth=tracked_run)
@@ -189,8 +189,8 @@ def test_tracked_run_is_aligned_to_the_map(folder: Path, tracked_run: Path, give
     np.testing.assert_array_equal(aligned.instance_ids, truth.instance_ids)
 
 
-def test_run_with_given_poses_is_not_aligned_to_a_tracked_map(folder: Path, tracked_run: Path) -> None:
-    """The map begins with the given pose and drifts; its drift counts."""
+def test_named_truth_run_with_given_poses_is_not_aligned(folder: Path, tracked_run: Path) -> None:
+    """The map begins at the given pose and drifts; its drift is part of the error."""
     (tracked_run / "metrics.json").write_text('{"pose_source": "ground_truth"}')
     times, poses = read_tum(tracked_run / "trajectory.txt")
     truth = RgbdFolder(folder, ground_truth=tracked_run).scene_truth()
@@ -232,28 +232,30 @@ def test_run_with_given_poses_is_not_aligned_to_a_tracked_map(folder: Path, trac
         ),
     ],
 )
-def test_unusable_truth_raises_one_line(spoil, kind: type[Exception], message: str, folder: Path, mesh: Path) -> None:
+def test_named_truth_unusable_file_raises_one_line_error(
+    spoil, kind: type[Exception], message: str, folder: Path, mesh: Path
+) -> None:
     spoil(mesh)
     with pytest.raises(kind, match=message) as caught:
         RgbdFolder(folder, ground_truth=mesh)
     assert "\n" not in str(caught.value)
 
 
-def test_points_without_faces_are_rejected(folder: Path, mesh: Path) -> None:
+def test_named_truth_rejects_points_without_faces(folder: Path, mesh: Path) -> None:
     ply = read_ply(mesh)
     write_ply(mesh, ply.vertices, ply.triangles[:0], ply.properties)
     with pytest.raises(DataError, match="expected faces to render masks from"):
         RgbdFolder(folder, ground_truth=mesh)
 
 
-def test_directory_without_a_mesh_is_rejected(folder: Path, tmp_path: Path) -> None:
+def test_named_truth_rejects_directory_without_mesh(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"dataset\.ground_truth: expected mesh\.ply in the directory"):
         RgbdFolder(folder, ground_truth=tmp_path)
 
 
 @pytest.mark.parametrize("name", ["redkitchen", "freiburg1_rpy"])
-def test_rendered_masks_agree_with_annotated_images(shared_data: Path, name: str) -> None:
-    """Wrong axes, an inverted pose or other ids agree in less than half of the annotated pixels."""
+def test_named_truth_masks_agree_with_annotated_images(shared_data: Path, name: str) -> None:
+    """With wrong axes, an inverted pose or other ids, less than half of the annotated pixels agree."""
     kitchen, desk = shared_data / "redkitchen", shared_data / "tum_fr1_rpy_a"
     images: list[Path] = sorted(((kitchen if name == "redkitchen" else desk / "annotation") / "instance").iterdir())
     video: Recording = RgbdFolder(kitchen, ground_truth=kitchen / "annotation" / "mesh.ply")
@@ -278,7 +280,7 @@ def test_rendered_masks_agree_with_annotated_images(shared_data: Path, name: str
         ("tum_rgbd", "tum_fr1_rpy_a", "rgbd_dataset_freiburg1_rpy"),
     ],
 )
-def test_named_mesh_is_the_truth_of_every_dataset(
+def test_named_truth_applies_to_every_dataset(
     shared_data: Path, mesh: Path, option: str, root: str, scene: str
 ) -> None:
     """The mesh is a wall in front of the first camera with a pose."""

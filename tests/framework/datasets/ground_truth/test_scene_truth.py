@@ -1,4 +1,4 @@
-"""Votes on tiny scenes with exact answers, and against a slow obvious reference."""
+"""Tests of the voxel votes on small scenes with exact results, compared with a slow reference."""
 
 from collections import Counter, defaultdict
 
@@ -58,7 +58,7 @@ def test_scene_truth_matches_per_pixel_reference():
         np.testing.assert_allclose(point, mean, atol=1e-6)
 
 
-def test_wall_gives_one_point_per_voxel():
+def test_scene_truth_wall_gives_one_point_per_voxel():
     camera = Camera(200, 150, 100.0, 100.0, 99.5, 74.5)
     truth = fuse_scene_truth(
         [view(np.full(camera.shape, 2.0), np.full(camera.shape, 5), camera=camera)], {5: "tv"}, 0.05
@@ -69,7 +69,7 @@ def test_wall_gives_one_point_per_voxel():
     assert (truth.instance_ids == 5).all()
 
 
-def test_vote_majority_wins_and_tie_takes_smaller_id():
+def test_scene_truth_majority_wins_and_tie_takes_smaller_id():
     depth = np.zeros(CAMERA.shape)
     depth[2, 2] = 1.0
     frames = [view(depth, np.full(CAMERA.shape, i)) for i in (3, 2, 3, 2, 9)]
@@ -77,7 +77,7 @@ def test_vote_majority_wins_and_tie_takes_smaller_id():
     assert fuse_scene_truth([*frames, frames[0]], {}, 1.0).instance_ids.tolist() == [3]
 
 
-def test_hash_table_growth_keeps_voxels_unique():
+def test_scene_truth_hash_table_growth_keeps_voxels_unique():
     camera = Camera(160, 120, 10.0, 10.0, 79.5, 59.5)
     truth = fuse_scene_truth(random_views(6, 1, camera), {}, 0.001)
     assert len(truth.points_world) > 80_000
@@ -87,11 +87,11 @@ def test_hash_table_growth_keeps_voxels_unique():
     assert len(np.unique(keys, axis=0)) > 0.99 * len(keys)  # a mean may be rounded across a voxel's border
 
 
-def test_empty_depth_gives_no_points():
+def test_scene_truth_empty_depth_gives_no_points():
     assert len(fuse_scene_truth([view(np.zeros(CAMERA.shape), np.ones(CAMERA.shape))], {}, 0.02).points_world) == 0
     assert len(fuse_scene_truth([], {}, 0.02).points_world) == 0
 
 
-def test_point_outside_grid_raises():
+def test_scene_truth_point_outside_grid_raises():
     with pytest.raises(DataError, match=r"expected points within \d+ m of the origin"):
         fuse_scene_truth([view(np.full(CAMERA.shape, 3e6), np.ones(CAMERA.shape))], {}, 0.02)

@@ -1,4 +1,4 @@
-"""Scans of ScanNet written as published, as `.sens` files and as exported folders, through the whole pipeline."""
+"""Tests of ScanNet scans as `.sens` files and as exported folders."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def write(request: pytest.FixtureRequest) -> Writer:
 
 
 def write_labels(scene: Path) -> None:
-    """A wall 2 m in front of the first camera: left of x = 0 a chair, right of x = 0.3 what nobody labeled."""
+    """Write a wall 2 m in front of the first camera: a chair left of x = 0, unlabeled right of x = 0.3."""
     x, y = np.meshgrid(np.linspace(-1.5, 1.5, 31), np.linspace(-1.5, 1.5, 31))
     vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(30)[:, None] * 31 + np.arange(30)).ravel()
@@ -63,7 +63,7 @@ def write_labels(scene: Path) -> None:
     (scene.parent / "scannetv2-labels.combined.tsv").write_text("raw_category\tnyu40class\nfolding chair\tchair\n")
 
 
-def test_frame_matches_files(tmp_path: Path, write: Writer) -> None:
+def test_scannet_frame_matches_files(tmp_path: Path, write: Writer) -> None:
     written = shots()
     write(tmp_path / SCENE, written)
     sequence = ScanNet(tmp_path, SCENE)
@@ -81,7 +81,7 @@ def test_frame_matches_files(tmp_path: Path, write: Writer) -> None:
     assert sequence.annotation == ""
 
 
-def test_sens_and_exported_frames_are_equal(tmp_path: Path) -> None:
+def test_scannet_sens_and_exported_frames_are_equal(tmp_path: Path) -> None:
     as_sens(tmp_path / "a" / SCENE, shots())
     write_exported(tmp_path / "b" / SCENE, shots())
     for one, other in zip(ScanNet(tmp_path / "a" / SCENE), ScanNet(tmp_path / "b", SCENE), strict=True):
@@ -90,7 +90,7 @@ def test_sens_and_exported_frames_are_equal(tmp_path: Path) -> None:
         np.testing.assert_allclose(one.T_world_camera, other.T_world_camera, atol=1e-6)
 
 
-def test_sens_file_takes_precedence_over_exported_images(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scannet_sens_file_takes_precedence_over_images(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     as_sens(tmp_path / SCENE, shots(3))
     write_exported(tmp_path / SCENE, shots(2))
     with caplog.at_level(logging.INFO):
@@ -98,7 +98,7 @@ def test_sens_file_takes_precedence_over_exported_images(tmp_path: Path, caplog:
     assert f"{SCENE}.sens: preferred to the images exported" in caplog.text
 
 
-def test_timestamps_are_depth_times_if_increasing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scannet_timestamps_are_depth_times_if_increasing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     frames = shots()
     as_sens(tmp_path / SCENE, frames)
     assert [frame.timestamp for frame in ScanNet(tmp_path, SCENE)] == [7e-6, 0.03334, 0.066673]
@@ -109,7 +109,7 @@ def test_timestamps_are_depth_times_if_increasing(tmp_path: Path, caplog: pytest
     assert caplog.text.count("expected increasing timestamps") == 1
 
 
-def test_points_are_mapped_at_their_positions(tmp_path: Path, write: Writer) -> None:
+def test_scannet_points_are_mapped_at_their_positions(tmp_path: Path, write: Writer) -> None:
     frames = shots(2)
     write(tmp_path / SCENE, frames)
     result, points = mapped(ScanNet(tmp_path, SCENE))
@@ -121,14 +121,14 @@ def test_points_are_mapped_at_their_positions(tmp_path: Path, write: Writer) -> 
     assert distance.max() < 0.1  # the grid's cells
 
 
-def test_invalid_pose_raises_for_its_frame(tmp_path: Path, write: Writer) -> None:
+def test_scannet_invalid_pose_raises_for_its_frame(tmp_path: Path, write: Writer) -> None:
     frames = shots()
     frames[1].T_world_camera = NO_POSE
     write(tmp_path / SCENE, frames)
     assert "pose: expected finite values" in fault_of(ScanNet(tmp_path, SCENE), 1)
 
 
-def test_frames_missing_from_truncated_sens_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scannet_frames_missing_in_truncated_sens_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     content = sens(shots(4))
     path = tmp_path / SCENE / f"{SCENE}.sens"
     path.parent.mkdir()
@@ -143,13 +143,13 @@ def test_frames_missing_from_truncated_sens_are_counted(tmp_path: Path, caplog: 
 
 
 @pytest.mark.parametrize("name", ["color/1.png", "depth/1.png", "pose/1.txt"])
-def test_missing_file_raises_for_its_frame(tmp_path: Path, name: str) -> None:
+def test_scannet_missing_file_raises_for_its_frame(tmp_path: Path, name: str) -> None:
     write_exported(tmp_path / SCENE, shots())
     (tmp_path / SCENE / name).unlink()
     assert name.rpartition(".")[0] in fault_of(ScanNet(tmp_path, SCENE), 1)
 
 
-def test_exported_frame_gaps_and_padded_names_are_accepted(tmp_path: Path) -> None:
+def test_scannet_exported_gaps_and_padded_names_are_accepted(tmp_path: Path) -> None:
     written = shots(4)
     write_exported(tmp_path / SCENE, written)
     for k in range(4):
@@ -161,21 +161,21 @@ def test_exported_frame_gaps_and_padded_names_are_accepted(tmp_path: Path) -> No
     np.testing.assert_allclose(frames[1].T_world_camera, written[3].T_world_camera, atol=1e-6)
 
 
-def test_missing_poses_give_no_pose(tmp_path: Path) -> None:
+def test_scannet_missing_poses_give_no_pose(tmp_path: Path) -> None:
     write_exported(tmp_path / SCENE, shots(1))
     (tmp_path / SCENE / "pose/0.txt").unlink()
     (tmp_path / SCENE / "pose").rmdir()
     assert ScanNet(tmp_path, SCENE)[0].T_world_camera is None
 
 
-def test_color_size_mismatch_raises_for_its_frame(tmp_path: Path, write: Writer) -> None:
+def test_scannet_color_size_mismatch_raises_for_its_frame(tmp_path: Path, write: Writer) -> None:
     frames = shots()
     frames[1].color = frames[1].color[:-1]
     write(tmp_path / SCENE, frames)
     assert "expected 65x49 px as in the color camera, got 65x48 px" in fault_of(ScanNet(tmp_path, SCENE), 1)
 
 
-def test_downsized_color_scales_published_intrinsics(tmp_path: Path) -> None:
+def test_scannet_downsized_color_scales_published_intrinsics(tmp_path: Path) -> None:
     write_exported(tmp_path / SCENE, shots(1))
     published = np.array([[1170.188, 0, 647.75, 0], [0, 1170.188, 483.75, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     np.savetxt(tmp_path / SCENE / "intrinsic/intrinsic_color.txt", published, fmt="%f")
@@ -188,7 +188,7 @@ def test_downsized_color_scales_published_intrinsics(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("which", ["color", "depth"])
-def test_intrinsics_of_other_image_size_raise(tmp_path: Path, which: str) -> None:
+def test_scannet_intrinsics_of_other_image_size_raise(tmp_path: Path, which: str) -> None:
     write_exported(tmp_path / SCENE, shots(1))
     path = tmp_path / SCENE / f"intrinsic/intrinsic_{which}.txt"
     matrix = np.loadtxt(path)
@@ -198,7 +198,7 @@ def test_intrinsics_of_other_image_size_raise(tmp_path: Path, which: str) -> Non
         ScanNet(tmp_path, SCENE)
 
 
-def test_camera_offset_is_logged_with_shift_in_pixels(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scannet_camera_offset_is_logged_in_pixels(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     extrinsics = np.eye(4)
     extrinsics[0, 3] = 0.1
     path = tmp_path / SCENE / f"{SCENE}.sens"
@@ -216,7 +216,7 @@ def test_camera_offset_is_logged_with_shift_in_pixels(tmp_path: Path, caplog: py
     assert "expected rigid extrinsics" in caplog.text
 
 
-def test_folder_without_scan_error_names_missing_files(tmp_path: Path) -> None:
+def test_scannet_folder_without_scan_error_names_files(tmp_path: Path) -> None:
     (tmp_path / SCENE).mkdir()
     with pytest.raises(DataError, match=rf"expected {SCENE}\.sens or color/, got neither"):
         ScanNet(tmp_path, SCENE)
@@ -226,7 +226,7 @@ def test_folder_without_scan_error_names_missing_files(tmp_path: Path) -> None:
         ScanNet(tmp_path, SCENE)
 
 
-def test_truth_matches_labeled_mesh(tmp_path: Path, write: Writer) -> None:
+def test_scannet_truth_matches_labeled_mesh(tmp_path: Path, write: Writer) -> None:
     write(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     sequence = opened(
@@ -246,8 +246,8 @@ def test_truth_matches_labeled_mesh(tmp_path: Path, write: Writer) -> None:
     np.testing.assert_array_equal(seen.instance_ids[12, sure], expected[sure])
 
 
-def test_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Of the same map it gives other figures, so tables must not mix the two."""
+def test_scannet_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The same map has other metrics without the table, so tables must not mix both."""
     as_sens(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     (tmp_path / "scannetv2-labels.combined.tsv").unlink()
@@ -256,10 +256,10 @@ def test_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pyt
     assert f"{tmp_path / 'scannetv2-labels.combined.tsv'}: expected a label table" in caplog.text
     truth = sequence.scene_truth()
     assert truth is not None
-    assert set(truth.class_names.values()) == {None}, "nobody else knows what a folding chair is"
+    assert set(truth.class_names.values()) == {None}, "other tables have no folding chair"
 
 
-def test_first_release_names_are_resolved_by_its_table(tmp_path: Path) -> None:
+def test_scannet_first_release_names_are_resolved_by_its_table(tmp_path: Path) -> None:
     as_sens(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     table = tmp_path / "scannetv2-labels.combined.tsv"
@@ -279,7 +279,7 @@ def test_first_release_names_are_resolved_by_its_table(tmp_path: Path) -> None:
     assert truth.class_names == of_both.class_names
 
 
-def test_incomplete_truth_files_give_no_truth_and_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scannet_incomplete_truth_files_give_no_truth_and_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     as_sens(tmp_path / SCENE, shots(1))
     write_labels(tmp_path / SCENE)
     (tmp_path / SCENE / f"{SCENE}.aggregation.json").unlink()
@@ -295,7 +295,7 @@ def test_incomplete_truth_files_give_no_truth_and_log(tmp_path: Path, caplog: py
 
 
 def read_all(path: Path) -> None:
-    """Every frame of the scan in which the file is; raises the fault of the last that has one."""
+    """Read every frame of the scan; raise the error of the last invalid frame."""
     sequence = ScanNet(path.parent)
     fault = None
     for k in range(len(sequence)):
@@ -324,7 +324,7 @@ FUZZED = {
 
 
 @pytest.mark.parametrize("name", FUZZED)
-def test_fuzzed_scan_file_is_read_or_raises_one_line(tmp_path: Path, name: str) -> None:
+def test_scannet_fuzzed_file_is_read_or_raises_one_line_error(tmp_path: Path, name: str) -> None:
     scene = tmp_path / SCENE
     scene.mkdir()
     write_labels(scene)
@@ -332,7 +332,7 @@ def test_fuzzed_scan_file_is_read_or_raises_one_line(tmp_path: Path, name: str) 
     path = scene / name if (scene / name).exists() else tmp_path / name
     content = path.read_bytes()
     for other in (MESH,) if name.endswith(".sens") else ():
-        (scene / other).unlink()  # it costs time, and is read in the other tests
+        (scene / other).unlink()  # it is slow, and other tests read it
     read, tokens = FUZZED[name]
 
     @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
@@ -344,7 +344,7 @@ def test_fuzzed_scan_file_is_read_or_raises_one_line(tmp_path: Path, name: str) 
     refuse()
 
 
-def test_inverted_header_or_frame_byte_is_read_or_raises(tmp_path: Path) -> None:
+def test_scannet_file_with_inverted_byte_is_read_or_raises(tmp_path: Path) -> None:
     path = tmp_path / SCENE / f"{SCENE}.sens"
     path.parent.mkdir()
     content = sens(shots(1))

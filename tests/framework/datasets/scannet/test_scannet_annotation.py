@@ -1,4 +1,4 @@
-"""ScanNet's labeled mesh: exact instances from segments and objects, and what each kind of name becomes."""
+"""Tests of ScanNet's labeled mesh: instances from segments and objects, and classes from names."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def read(folder: Path, groups: list[dict[str, Any]], segments: list[int] | None 
     return read_labeled_mesh(folder / "s.ply", folder / "s.segs.json", folder / "s.aggregation.json", nyu40)
 
 
-def test_segments_map_to_object_instances(tmp_path: Path) -> None:
+def test_scannet_annotation_maps_segments_to_instances(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "office chair", 70, 9), group(4, "couch", 5), group(1, "wall", 3)])
-    # the wall is known to be no instance; what nobody labeled is one more, of no known class
+    # the wall is no instance; the unlabeled part is one more instance without a class
     np.testing.assert_array_equal(mesh.instance_ids, [0, 0, 1, 1, 5, 5, 1, 1, 6, 6])
     assert mesh.class_names == {1: "chair", 5: "couch", 6: None}
     assert mesh.instance_ids.dtype == np.int32
@@ -54,13 +54,13 @@ def test_segments_map_to_object_instances(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.triangles, [[0, 1, 2]])
 
 
-def test_fully_labeled_mesh_adds_no_unknown_instance(tmp_path: Path) -> None:
+def test_scannet_annotation_full_mesh_adds_no_unknown_instance(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "bed", 3, 70, 5, 9, 11), group(1, "floor", 12)])
     np.testing.assert_array_equal(mesh.instance_ids, [1] * 9 + [0])
     assert mesh.class_names == {1: "bed"}
 
 
-def test_mesh_without_objects_is_one_unknown_instance(tmp_path: Path) -> None:
+def test_scannet_annotation_without_objects_is_unknown_instance(tmp_path: Path) -> None:
     mesh = read(tmp_path, [])
     np.testing.assert_array_equal(mesh.instance_ids, [1] * 10)
     assert mesh.class_names == {1: None}
@@ -85,18 +85,20 @@ def test_mesh_without_objects_is_one_unknown_instance(tmp_path: Path) -> None:
         ("", 1, None),
     ],
 )
-def test_label_name_maps_to_instance_and_class(tmp_path: Path, label: str, instance: int, name: str | None) -> None:
+def test_scannet_annotation_label_maps_to_instance_and_class(
+    tmp_path: Path, label: str, instance: int, name: str | None
+) -> None:
     mesh = read(tmp_path, [group(0, label, *SEGMENTS)])
     assert set(mesh.instance_ids.tolist()) == {instance}
     assert mesh.class_names == ({instance: name} if instance else {})
 
 
 @pytest.mark.parametrize(("label", "name"), [("recliner chair", "chair"), ("gizmo", None), ("laptop", "laptop")])
-def test_label_table_resolves_rare_names(tmp_path: Path, label: str, name: str | None) -> None:
+def test_scannet_label_table_resolves_rare_names(tmp_path: Path, label: str, name: str | None) -> None:
     assert read(tmp_path, [group(0, label, *SEGMENTS)], table=TABLE).class_names == {1: name}
 
 
-def test_first_release_label_table_is_read(tmp_path: Path) -> None:
+def test_scannet_label_table_of_first_release_is_read(tmp_path: Path) -> None:
     table = "category\tcount\tnyu40class\nrecliner chair\t3\tchair\nnerf gun\t8\totherprop\nstorage\t8\t\n"
     mesh = read(tmp_path, [group(0, "reclinerchair", 3), group(1, "nerf gun", 70)], table=table)
     assert mesh.class_names == {1: "chair", 2: None, 3: None}
@@ -107,7 +109,7 @@ def test_first_release_label_table_is_read(tmp_path: Path) -> None:
     }
 
 
-def test_names_missing_from_label_table_are_listed(tmp_path: Path) -> None:
+def test_scannet_label_table_missing_names_are_listed(tmp_path: Path) -> None:
     objects = [
         group(k, label, 3) for k, label in enumerate(("zimzum", "laptop", "Gizmo", "unknown", "whatnot", "zimzum"))
     ]
@@ -117,20 +119,20 @@ def test_names_missing_from_label_table_are_listed(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_equivalent_name_spellings_have_one_meaning() -> None:
-    """Spaces and signs may therefore be left out."""
+def test_scannet_label_table_name_spellings_are_equivalent() -> None:
+    """Spaces and punctuation may be omitted."""
     meanings: dict[str, set[str | None]] = {}
     for name, meaning in MEANINGS.items():
         meanings.setdefault("".join(filter(str.isalnum, name)), set()).add(meaning)
     assert all(len(meant) == 1 for meant in meanings.values())
 
 
-def test_shared_segment_belongs_to_later_object(tmp_path: Path) -> None:
+def test_scannet_annotation_shared_segment_is_of_later_object(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "bed", 3, 70), group(1, "pillow", 70), group(2, "chair", 3)])
     np.testing.assert_array_equal(mesh.instance_ids[:4], [3, 3, 0, 0])
 
 
-def test_duplicate_object_merges_unless_labels_conflict(tmp_path: Path) -> None:
+def test_scannet_annotation_duplicate_object_is_merged(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "bed", 3), group(0, "bed", 3, 70)])
     np.testing.assert_array_equal(mesh.instance_ids[:4], 1)
     with pytest.raises(DataError, match=r"s\.aggregation\.json: object 0: expected one label, got 'bed' and 'sofa'"):
@@ -151,7 +153,7 @@ def test_duplicate_object_merges_unless_labels_conflict(tmp_path: Path) -> None:
         ({}, "expected a list 'segGroups', got dict"),
     ],
 )
-def test_invalid_object_raises(tmp_path: Path, groups: Any, message: str) -> None:
+def test_scannet_annotation_invalid_object_raises(tmp_path: Path, groups: Any, message: str) -> None:
     with pytest.raises(DataError, match=r"s\.aggregation\.json: .*" + message) as caught:
         read(tmp_path, groups)
     assert "\n" not in str(caught.value)
@@ -166,7 +168,7 @@ def test_invalid_object_raises(tmp_path: Path, groups: Any, message: str) -> Non
         ("3", "expected a list 'segIndices', got str"),
     ],
 )
-def test_invalid_segments_raise(tmp_path: Path, segments: Any, message: str) -> None:
+def test_scannet_annotation_invalid_segments_raise(tmp_path: Path, segments: Any, message: str) -> None:
     with pytest.raises(DataError, match=r"s\.segs\.json.*" + message):
         read(tmp_path, [], segments)
 
@@ -181,7 +183,7 @@ def test_invalid_segments_raise(tmp_path: Path, segments: Any, message: str) -> 
         (b"[]", "expected a JSON object"),
     ],
 )
-def test_invalid_json_raises_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+def test_scannet_annotation_invalid_json_raises_one_line_error(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "s.aggregation.json"
     path.write_bytes(content)
     with pytest.raises(DataError, match=message) as caught:
@@ -189,7 +191,7 @@ def test_invalid_json_raises_one_line(tmp_path: Path, content: bytes, message: s
     assert "\n" not in str(caught.value)
 
 
-def test_oversized_file_raises_before_reading(tmp_path: Path) -> None:
+def test_scannet_annotation_oversized_raises_before_reading(tmp_path: Path) -> None:
     path = tmp_path / "s.aggregation.json"
     with path.open("wb") as file:
         file.truncate(LARGEST_FILE + 1)
@@ -197,7 +199,7 @@ def test_oversized_file_raises_before_reading(tmp_path: Path) -> None:
         read_aggregation(path)
 
 
-def test_invalid_label_table_line_error_gives_line_number(tmp_path: Path) -> None:
+def test_scannet_label_table_invalid_line_error_gives_number(tmp_path: Path) -> None:
     path = tmp_path / "scannetv2-labels.combined.tsv"
     path.write_text("id\traw_category\tnyu40class\r\n1\tArm chair\tchair\r\n2\tdesk\tdesk\r\n")
     assert read_label_table(path) == {"arm chair": "chair", "desk": "desk"}

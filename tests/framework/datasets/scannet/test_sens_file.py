@@ -1,4 +1,4 @@
-"""`.sens` files written field by field, sound, cut and with every field wrong."""
+"""Tests of `.sens` files, written field by field: valid, truncated and with every field wrong."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ def test_sens_file_round_trip_is_exact(path: Path, compressions: tuple[int, int]
         assert frame.depth().dtype == np.uint16
 
 
-def test_jpeg_color_is_read_as_rgb(path: Path) -> None:
+def test_sens_file_jpeg_color_is_read_as_rgb(path: Path) -> None:
     [frame] = opened(path, sens(shots(1), compressions=(JPEG, ZLIB))).frames
     assert np.abs(frame.color().astype(int) - shots(1)[0].color).mean() < 3
 
 
-def test_frames_are_readable_from_multiple_threads(path: Path) -> None:
+def test_sens_file_is_readable_from_multiple_threads(path: Path) -> None:
     frames = opened(path, sens(shots(6))).frames * 4
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda frame: frame.depth(), frames))
@@ -69,7 +69,7 @@ def test_frames_are_readable_from_multiple_threads(path: Path) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 3, 11, 20, 100, SIZES - 1, SIZES + 10, HEADER - 1])
-def test_truncated_header_raises(path: Path, length: int) -> None:
+def test_sens_file_truncated_header_raises(path: Path, length: int) -> None:
     with pytest.raises(
         DataError, match=rf"\.sens, byte \d+: expected a full header, got the end of the file at byte {length}"
     ):
@@ -113,7 +113,7 @@ def test_truncated_header_raises(path: Path, length: int) -> None:
         (SIZES + 28, struct.pack("<Q", 0), "expected frames, got none: 0 according to its header"),
     ],
 )
-def test_invalid_header_field_error_gives_byte_offset(path: Path, byte: int, replaced: bytes, message: str) -> None:
+def test_sens_file_invalid_header_error_gives_byte_offset(path: Path, byte: int, replaced: bytes, message: str) -> None:
     content = sens(shots())
     with pytest.raises(DataError, match=message) as caught:
         opened(path, content[:byte] + replaced + content[byte + len(replaced) :])
@@ -121,7 +121,7 @@ def test_invalid_header_field_error_gives_byte_offset(path: Path, byte: int, rep
     assert "\n" not in str(caught.value)
 
 
-def test_excessive_frame_count_in_large_file_raises(path: Path) -> None:
+def test_sens_file_excessive_frame_count_raises(path: Path) -> None:
     path.write_bytes(sens(shots(1), count=MOST_FRAMES + 1))
     with path.open("r+b") as file:
         file.truncate((MOST_FRAMES + 100) * FRAME.size)
@@ -129,7 +129,7 @@ def test_excessive_frame_count_in_large_file_raises(path: Path) -> None:
         open_sens(path)
 
 
-def test_truncated_file_keeps_complete_frames(path: Path) -> None:
+def test_sens_file_truncated_keeps_complete_frames(path: Path) -> None:
     content = sens(shots())
     last = starts(path, content)[2]
     for length in (last, last + 50, last + FRAME.size + 10):
@@ -138,7 +138,7 @@ def test_truncated_file_keeps_complete_frames(path: Path) -> None:
         assert file.cut == f"byte {last}: the file ends at byte {length}, within frame 2 of 3"
 
 
-def test_excessive_image_size_ends_frame_list(path: Path) -> None:
+def test_sens_file_excessive_image_size_ends_frame_list(path: Path) -> None:
     content = sens(shots())
     second = starts(path, content)[1]
     for at, claimed in ((80, 2**63), (88, 10**6), (80, 2**64 - 1)):
@@ -148,7 +148,7 @@ def test_excessive_image_size_ends_frame_list(path: Path) -> None:
         assert file.cut.startswith(f"byte {second}: frame 1: expected at most")
 
 
-def test_file_without_complete_frame_raises(path: Path) -> None:
+def test_sens_file_without_complete_frame_raises(path: Path) -> None:
     with pytest.raises(DataError, match=r"expected frames, got none: byte \d+: the file ends"):
         opened(path, sens(shots())[: HEADER + 3 * FRAME.size])
 
@@ -163,7 +163,7 @@ def test_file_without_complete_frame_raises(path: Path) -> None:
         (b"", "truncated"),
     ],
 )
-def test_invalid_depth_raises_for_its_frame(path: Path, depth: bytes, message: str) -> None:
+def test_sens_file_invalid_depth_raises_for_its_frame(path: Path, depth: bytes, message: str) -> None:
     good = shots(3)
     file = opened(path, sens([good[0], Shot(good[1].color, depth), good[2]]))
     np.testing.assert_array_equal(file.frames[2].depth(), good[2].depth)
@@ -173,13 +173,13 @@ def test_invalid_depth_raises_for_its_frame(path: Path, depth: bytes, message: s
 
 
 @pytest.mark.parametrize("color", [b"", b"\xff\xd8\xff", b"no image at all"])
-def test_invalid_color_raises_for_its_frame(path: Path, color: bytes) -> None:
+def test_sens_file_invalid_color_raises_for_its_frame(path: Path, color: bytes) -> None:
     [frame] = opened(path, sens([Shot(color, shots(1)[0].depth)])).frames
     with pytest.raises(FrameError, match="color of frame 0 at byte"):
         frame.color()
 
 
-def test_raw_image_length_mismatch_raises(path: Path) -> None:
+def test_sens_file_raw_image_length_mismatch_raises(path: Path) -> None:
     [frame] = opened(path, sens([Shot(bytes(100), bytes(100))], compressions=(RAW, RAW))).frames
     with pytest.raises(FrameError, match="expected 9555 bytes, got 100"):
         frame.color()
@@ -187,7 +187,7 @@ def test_raw_image_length_mismatch_raises(path: Path) -> None:
         frame.depth()
 
 
-def test_deleted_file_raises_on_frame_read(path: Path) -> None:
+def test_sens_file_deleted_raises_on_frame_read(path: Path) -> None:
     [frame] = opened(path, sens(shots(1))).frames
     path.unlink()
     with pytest.raises(FrameError, match="cannot be read: No such file"):
@@ -197,5 +197,5 @@ def test_deleted_file_raises_on_frame_read(path: Path) -> None:
 
 
 def starts(path: Path, content: bytes) -> list[int]:
-    """Where each frame begins."""
+    """Return the position of each frame."""
     return [frame.byte - FRAME.size for frame in opened(path, content).frames]

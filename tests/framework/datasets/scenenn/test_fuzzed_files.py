@@ -1,6 +1,6 @@
-"""Damaged files of every format: each is read, or raises one line that says which file and where; nothing else.
+"""Fuzz tests of every file format: a damaged file is read, or raises a one-line error with file and position.
 
-`INSTANCEMAP_FUZZ=5000 pytest tests/framework/datasets/scenenn/test_fuzzed_files.py` tries so many of each format.
+`INSTANCEMAP_FUZZ=5000 pytest tests/framework/datasets/scenenn/test_fuzzed_files.py` tries 5000 cases per format.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PLACE = re.compile(r"(line|byte) \d+")
 
 PLY_HEADER = b"""ply
 format %s 1.0
-comment two triangles, a square, and an element that nobody knows
+comment two triangles, a square, and an unknown element
 element vertex 5
 property float x
 property double y
@@ -127,13 +127,13 @@ FORMATS: dict[str, tuple[Callable[[Path], object], bytes, tuple[bytes, ...]]] = 
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_undamaged_file_is_read(name: str, tmp_path: Path) -> None:
+def test_reader_undamaged_file_is_read(name: str, tmp_path: Path) -> None:
     read, content, _ = FORMATS[name]
     assert check(read, tmp_path / name, content) == ""
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_damaged_file_is_read_or_raises_one_line(name: str, tmp_path: Path) -> None:
+def test_reader_damaged_file_is_read_or_raises_one_line_error(name: str, tmp_path: Path) -> None:
     read, content, tokens = FORMATS[name]
 
     @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
@@ -145,7 +145,7 @@ def test_damaged_file_is_read_or_raises_one_line(name: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["ascii.ply", "little.ply", "big.ply", "011.xml", "trajectory.log"])
-def test_truncated_file_error_gives_position(name: str, tmp_path: Path) -> None:
+def test_reader_truncated_file_error_gives_position(name: str, tmp_path: Path) -> None:
     read, content, _ = FORMATS[name]
     for length in range(len(content.rstrip()) - 1):
         line = check(read, tmp_path / name, content[:length])
@@ -162,7 +162,7 @@ def test_png_with_flipped_bit_raises(name: str, tmp_path: Path) -> None:
 
 @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
-def test_damaged_png_with_valid_crc_is_read_or_raises(tmp_path_factory, data: st.DataObject) -> None:
+def test_png_damaged_with_valid_crc_is_read_or_raises(tmp_path_factory, data: st.DataObject) -> None:
     content = FORMATS["color.png"][1]
     chunks, position = [], 8
     while position < len(content):
@@ -179,7 +179,7 @@ def test_damaged_png_with_valid_crc_is_read_or_raises(tmp_path_factory, data: st
     check(read_color, tmp_path_factory.mktemp("png") / "color.png", built)
 
 
-def test_oversized_image_header_raises_before_decoding(tmp_path: Path) -> None:
+def test_image_reader_oversized_header_raises_before_decoding(tmp_path: Path) -> None:
     content = FORMATS["color.png"][1]
     header = b"IHDR" + struct.pack(">II", 100000, 100000) + content[24:29]
     huge = content[:12] + header + struct.pack(">I", zlib.crc32(header)) + content[33:]

@@ -1,4 +1,4 @@
-"""Intrinsics: keys and values in every spelling that such files have."""
+"""Tests of intrinsics files in every known spelling of keys and values."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def test_intrinsics_syntax_variants_are_read(tmp_path, text):
         ("cy 240\n", "", "asus.ini: expected values of fx, fy, cx, cy, got no cy"),
     ],
 )
-def test_invalid_intrinsics_error_gives_file_and_line(tmp_path, old, new, message):
+def test_intrinsics_invalid_file_error_gives_file_and_line(tmp_path, old, new, message):
     (tmp_path / "asus.ini").write_text("# asus\nfx 544\nfy 544\ncx 320\ncy 240\n".replace(old, new))
     with pytest.raises(DataError, match=message):
         read_intrinsics(tmp_path / "asus.ini")
 
 
-def test_missing_or_oversized_intrinsics_file_raises(tmp_path):
+def test_intrinsics_missing_or_oversized_file_raises(tmp_path):
     with pytest.raises(DataError, match=r"asus.ini: cannot be read: No such file"):
         read_intrinsics(tmp_path / "asus.ini")
     (tmp_path / "large.ini").write_bytes(b"fx 1\n" * 2**18)

@@ -1,4 +1,4 @@
-"""The frames of .oni recordings: pairing on its own, and real play-back where OpenNI 2 is installed."""
+"""Tests of .oni frames: pairing of color and depth, and real playback if OpenNI 2 is installed."""
 
 import ctypes
 import signal
@@ -62,14 +62,14 @@ def test_openni_decodes_compressed_streams(tmp_path):
 
 
 @played
-def test_depth_in_100_um_units_is_rounded_to_millimeters(tmp_path):
+def test_oni_depth_in_100_um_is_rounded_to_millimeters(tmp_path):
     frames = frames_of(OniFile(recording(pixel_format=oni.DEPTH_100_UM)).write(tmp_path / "a.oni"))
     expected = np.floor(np.array(depths()) / 10 + 0.5)
     np.testing.assert_array_equal([frame.depth_mm for frame in frames], expected)
 
 
 @played
-def test_truncated_recording_plays_complete_frames(tmp_path):
+def test_oni_truncated_recording_plays_complete_frames(tmp_path):
     path = OniFile(recording()).write(tmp_path / "a.oni")
     second = OniFile(recording())
     second.write(tmp_path / "b.oni")
@@ -80,7 +80,7 @@ def test_truncated_recording_plays_complete_frames(tmp_path):
 
 
 @played
-def test_unsupported_pixel_format_raises(tmp_path):
+def test_oni_unsupported_pixel_format_raises(tmp_path):
     nodes = recording()
     nodes[1].pixel_format = YUV422
     with pytest.raises(DataError, match=r"a\.oni: color: expected OpenNI pixel format 200 .*, got 201"):
@@ -88,7 +88,7 @@ def test_unsupported_pixel_format_raises(tmp_path):
 
 
 @played
-def test_stalled_player_raises_after_timeout(tmp_path, monkeypatch):
+def test_oni_stalled_player_raises_after_timeout(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "PATIENCE", 200)
     path = OniFile(recording()).write(tmp_path / "a.oni")
     streams = {stream: Images(node=1, count=9, last=9) for stream in Stream}
@@ -96,7 +96,7 @@ def test_stalled_player_raises_after_timeout(tmp_path, monkeypatch):
         list(oni.play(path, streams))
 
 
-def test_player_crash_raises_one_line(tmp_path, monkeypatch):
+def test_oni_player_crash_raises_one_line_error(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "_deliver", crash)
     path = OniFile(recording()).write(tmp_path / "a.oni")
     with pytest.raises(DataError) as caught:
@@ -104,14 +104,14 @@ def test_player_crash_raises_one_line(tmp_path, monkeypatch):
     assert str(caught.value) == f"{path}: damaged recording: OpenNI 2 crashed with status {-signal.SIGKILL}"
 
 
-def test_missing_openni_error_names_package(tmp_path, monkeypatch):
+def test_oni_missing_openni_error_names_package(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "LIBRARIES", ("libNotThere.so",))
     with pytest.raises(ConfigError, match="OpenNI 2 is not installed; run apt-get install libopenni2-0"):
         next(oni.play(tmp_path / "a.oni", {}))
 
 
 @played
-def test_path_over_255_bytes_raises(tmp_path):
+def test_oni_path_over_255_bytes_raises(tmp_path):
     with pytest.raises(DataError, match="expected a path of at most 255 bytes"):
         next(oni.play(tmp_path / ("a" * 250 + ".oni"), {}))
 
@@ -125,7 +125,7 @@ def times_of(frames):
 
 
 def play_back(color_times, depth_times):
-    """SceneNN's PlaybackSync: reads one of each, then of the earlier one until both are close."""
+    """Pair frames like SceneNN's PlaybackSync: read one of each, then the earlier stream until both are close."""
     paired, color_reader, depth_reader = [], iter(color_times), iter(depth_times)
     try:
         while True:
@@ -156,11 +156,11 @@ def test_frame_pairing_accepts_maximum_time_difference():
     assert times_of(pair([image(Stream.DEPTH, 0), image(Stream.COLOR, LARGEST_TIME_DIFFERENCE + 1)])) == []
 
 
-def test_unpaired_stream_buffer_is_bounded():
+def test_oni_unpaired_stream_buffer_is_bounded():
     alone = [image(Stream.DEPTH, time) for time in range(WAITING + 1)]
     assert times_of(pair([*alone, image(Stream.COLOR, 0)])) == [(0, 1)]
 
 
-def test_color_and_depth_size_mismatch_raises():
+def test_oni_color_and_depth_size_mismatch_raises():
     with pytest.raises(DataError, match="expected color and depth of the same size, got 6x4 px and 3x2 px"):
         list(pair([image(Stream.DEPTH, 0), image(Stream.COLOR, 0, (4, 6, 3))]))

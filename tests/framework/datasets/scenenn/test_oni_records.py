@@ -1,4 +1,4 @@
-"""What the records of an .oni say, also where it ends too early."""
+"""Tests of the records of .oni files, including truncated files."""
 
 import os
 import struct
@@ -21,7 +21,7 @@ def recording(wide=True):
 
 
 @pytest.mark.parametrize("wide", [True, False])
-def test_images_of_both_streams_are_counted(tmp_path, wide):
+def test_oni_records_count_images_of_both_streams(tmp_path, wide):
     path = recording(wide).write(tmp_path / "a.oni")
     contents = read_contents(path)
     counted = {stream: (images.node, images.count, images.last) for stream, images in contents.streams.items()}
@@ -32,7 +32,7 @@ def test_images_of_both_streams_are_counted(tmp_path, wide):
         assert played == path
 
 
-def test_data_after_end_record_is_ignored(tmp_path):
+def test_oni_records_ignore_data_after_end(tmp_path):
     path = recording().write(tmp_path / "a.oni")
     size = path.stat().st_size
     with path.open("ab") as file:
@@ -42,13 +42,13 @@ def test_data_after_end_record_is_ignored(tmp_path):
     assert contents.end == size
 
 
-def test_openni_1_end_record_is_valid(tmp_path):
+def test_oni_records_openni_1_end_is_valid(tmp_path):
     path = replace(recording(), end_node=OPENNI_1_END_NODE).write(tmp_path / "a.oni")
     contents = read_contents(path)
     assert (contents.cut_off, contents.end, contents.largest_node) == (False, path.stat().st_size, 2)
 
 
-def test_openni_1_end_node_in_other_record_truncates(tmp_path):
+def test_oni_records_end_node_in_other_record_truncates(tmp_path):
     content = bytearray(recording().write(tmp_path / "a.oni").read_bytes())
     second = recording()
     second.write(tmp_path / "b.oni")
@@ -61,7 +61,7 @@ def test_openni_1_end_node_in_other_record_truncates(tmp_path):
 
 @pytest.mark.parametrize("end_node", [0, OPENNI_1_END_NODE])
 @pytest.mark.parametrize("wide", [True, False])
-def test_truncated_recording_is_repaired_to_complete_records(tmp_path, wide, end_node):
+def test_oni_records_truncated_file_is_repaired(tmp_path, wide, end_node):
     content = replace(recording(wide), end_node=end_node).write(tmp_path / "a.oni").read_bytes()
     path, scratch = tmp_path / "cut.oni", tmp_path / "scratch"
     scratch.mkdir()
@@ -86,7 +86,7 @@ def test_truncated_recording_is_repaired_to_complete_records(tmp_path, wide, end
     assert path.read_bytes() == content[:size]  # the recording itself is not touched
 
 
-def test_missing_largest_node_is_repaired(tmp_path):
+def test_oni_records_missing_largest_node_is_repaired(tmp_path):
     content = bytearray(recording().write(tmp_path / "a.oni").read_bytes()[:-28])
     content[20:24] = bytes(4)
     (tmp_path / "a.oni").write_bytes(content)
@@ -115,7 +115,7 @@ def test_missing_largest_node_is_repaired(tmp_path):
         (None, "cannot be read: No such file"),
     ],
 )
-def test_invalid_recording_raises_one_line(tmp_path, content, fault):
+def test_oni_records_invalid_file_raises_one_line_error(tmp_path, content, fault):
     path = tmp_path / "a.oni"
     if content is not None:
         path.write_bytes(content)
@@ -125,14 +125,14 @@ def test_invalid_recording_raises_one_line(tmp_path, content, fault):
     assert fault in str(caught.value)
 
 
-def test_named_pipe_raises_without_blocking(tmp_path):
+def test_oni_records_named_pipe_raises_without_blocking(tmp_path):
     os.mkfifo(tmp_path / "a.oni")
     with pytest.raises(DataError, match=r"a\.oni: expected a regular file, got a device, a pipe"):
         read_contents(tmp_path / "a.oni")
 
 
 @pytest.mark.parametrize(("kept", "missing"), [(0, "color"), (1, "depth")])
-def test_recording_without_color_or_depth_raises(tmp_path, kept, missing):
+def test_oni_records_without_color_or_depth_raise(tmp_path, kept, missing):
     path = OniFile([recording().nodes[kept]]).write(tmp_path / "a.oni")
     with pytest.raises(DataError, match=f"expected depth and color images, got no {missing}$"):
         read_contents(path)

@@ -1,4 +1,4 @@
-"""trajectory.log: the published text, lost and cut-off frames, and what is wrong with its line."""
+"""Tests of trajectory.log: the published format, lost and truncated frames, and errors with line numbers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def path(tmp_path):
     return tmp_path / "trajectory.log"
 
 
-def test_trajectory_round_trip_is_exact(path):
+def test_trajectory_log_round_trip_is_exact(path):
     rng = np.random.default_rng(0)
     poses = {frame: exp_se3(rng.normal(0, 2, 6)) for frame in (7, 0, 3, 2**31 - 2)}
     write_trajectory_log(path, poses)
@@ -49,7 +49,7 @@ def test_trajectory_round_trip_is_exact(path):
         np.testing.assert_array_equal(log.poses[frame], T)
 
 
-def test_published_trajectory_is_read_and_rewritten(path):
+def test_trajectory_log_published_file_is_read_and_rewritten(path):
     path.write_text(PUBLISHED)
     log = read_trajectory_log(path)
     T = printed(PUBLISHED.splitlines()[6:10])
@@ -60,19 +60,19 @@ def test_published_trajectory_is_read_and_rewritten(path):
     assert path.read_text() == PUBLISHED
 
 
-def test_published_rotation_digits_become_rigid(path):
+def test_trajectory_log_published_rotation_becomes_rigid(path):
     path.write_text(PUBLISHED)
     R = read_trajectory_log(path).poses[6][:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
     check_rigid("pose 6", read_trajectory_log(path).poses[6])
 
 
-def test_trajectory_whitespace_variants_are_read(path):
+def test_trajectory_log_whitespace_variants_are_read(path):
     path.write_bytes(("\n" + PUBLISHED.replace(" ", "\t ").replace("\n", " \r\n") + "\r\n").encode())
     assert list(read_trajectory_log(path).poses) == [0, 6]
 
 
-def test_lost_frame_is_unusable(path):
+def test_trajectory_log_lost_frame_is_unusable(path):
     path.write_text(LOST + PUBLISHED)
     log = read_trajectory_log(path)
     assert list(log.poses) == [0, 6]
@@ -93,7 +93,7 @@ def test_lost_frame_is_unusable(path):
         ("0.000000 1.000000\n", "0.000000 2.000000\n", "last row"),
     ],
 )
-def test_invalid_pose_is_unusable(path, old, new, why):
+def test_trajectory_log_invalid_pose_is_unusable(path, old, new, why):
     first, second = PUBLISHED[: PUBLISHED.index("6 6 7")], PUBLISHED[PUBLISHED.index("6 6 7") :]
     path.write_text(first + second.replace(old, new))
     log = read_trajectory_log(path)
@@ -102,7 +102,7 @@ def test_invalid_pose_is_unusable(path, old, new, why):
     assert why in log.unusable[6]
 
 
-def test_truncated_trajectory_loses_only_last_frame(path):
+def test_trajectory_log_truncated_file_loses_only_last_frame(path):
     second = PUBLISHED.index("6 6 7")
     for length in range(second, len(PUBLISHED)):
         path.write_text(PUBLISHED[:length])
@@ -114,7 +114,7 @@ def test_truncated_trajectory_loses_only_last_frame(path):
         assert log.unusable == ({6: "expected a full pose, got the end of the file"} if known and not whole else {})
 
 
-def test_duplicate_frame_is_usable_only_if_poses_agree(path):
+def test_trajectory_log_duplicate_frame_requires_equal_poses(path):
     path.write_text(PUBLISHED + PUBLISHED.replace("1.0 0.0", "1 0"))
     log = read_trajectory_log(path)
     assert (list(log.poses), log.unusable) == ([0, 6], {})
@@ -128,7 +128,7 @@ def test_duplicate_frame_is_usable_only_if_poses_agree(path):
     assert list(read_trajectory_log(path).unusable) == [1259]
 
 
-def test_empty_trajectory_has_no_poses(path):
+def test_trajectory_log_empty_file_has_no_poses(path):
     path.write_text("\n")
     log = read_trajectory_log(path)
     assert (log.poses, log.unusable) == ({}, {})
@@ -150,7 +150,7 @@ def test_empty_trajectory_has_no_poses(path):
         (10, "0 0 0 1 0", "line 10: expected row 4"),
     ],
 )
-def test_malformed_trajectory_error_gives_file_and_line(path, line, new, message):
+def test_trajectory_log_malformed_error_gives_file_and_line(path, line, new, message):
     lines = PUBLISHED.splitlines()
     lines[line - 1] = new
     path.write_text("\n".join(lines) + "\n")
@@ -158,7 +158,7 @@ def test_malformed_trajectory_error_gives_file_and_line(path, line, new, message
         read_trajectory_log(path)
 
 
-def test_missing_trajectory_raises(path):
+def test_trajectory_log_missing_file_raises(path):
     with pytest.raises(DataError, match=r"trajectory.log: cannot be read: No such file"):
         read_trajectory_log(path)
 
@@ -167,7 +167,7 @@ def test_missing_trajectory_raises(path):
     ("poses", "message"),
     [({0: 2 * np.eye(4)}, "pose of frame 0: expected a rigid transform"), ({-1: np.eye(4)}, "got -1")],
 )
-def test_writing_invalid_pose_raises_and_leaves_no_file(path, poses, message):
+def test_trajectory_log_invalid_pose_raises_and_leaves_no_file(path, poses, message):
     with pytest.raises(DataError, match=message):
         write_trajectory_log(path, poses)
     assert list(path.parent.iterdir()) == []

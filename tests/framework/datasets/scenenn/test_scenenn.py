@@ -1,4 +1,4 @@
-"""SceneNN's folders written in the exact layout, sound and with what real copies lack."""
+"""Tests of SceneNN folders: the exact layout, and known omissions of real copies."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ WALL = 2.0  # m, where the mesh lies in front of the first camera
 
 
 def labels() -> list[Annotated]:
-    """In no order, as in the data set."""
+    """Return the labels in random order, as in the dataset."""
     named = ((CHAIR, "chair1", "chair"), (NAMELESS, "thing", ""), (CABINET, "cabinet", "cabinet"), (SOFA, "s", "Sofa"))
     return [Annotated(i, text, nyu, (10, 20, 30), None, None) for i, text, nyu in named]
 
 
 def striped_wall() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A wall of vertical stripes 0.25 m wide from x = -1 to 1, each of one label; vertices every 5 cm."""
+    """Return a wall from x = -1 to 1 of vertical stripes 0.25 m wide, one label each; vertices every 5 cm."""
     x, y = np.meshgrid(np.arange(-20, 21) * 0.05, np.arange(-20, 21) * 0.05)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
     corner = (np.arange(40)[:, None] * 41 + np.arange(40)).ravel()
@@ -69,7 +69,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_frame_matches_files(root: Path) -> None:
+def test_scenenn_frame_matches_files(root: Path) -> None:
     sequence = SceneNN(root, "016")
     assert (len(sequence), sequence.name, sequence.camera) == (FRAMES, "016", CAMERA)
     frame = sequence[2]
@@ -78,10 +78,10 @@ def test_frame_matches_files(root: Path) -> None:
     assert (frame.depth == np.float32(2.002)).all()
     assert frame.T_world_camera is not None
     np.testing.assert_allclose(frame.T_world_camera, pose(2), atol=1e-9)
-    assert frame.truth is None, "it costs time, and only some detectors need it"
+    assert frame.truth is None, "it is slow, and only some detectors need it"
 
 
-def test_labels_map_to_instances_of_nine_classes(root: Path) -> None:
+def test_scenenn_labels_map_to_instances_of_nine_classes(root: Path) -> None:
     truth = SceneNN(root, "016").scene_truth()
     assert truth is not None
     _, _, vertex_labels = striped_wall()
@@ -90,14 +90,14 @@ def test_labels_map_to_instances_of_nine_classes(root: Path) -> None:
     np.testing.assert_array_equal(truth.instance_ids, expected)
 
 
-def test_truth_classes_are_the_nine_classes(root: Path) -> None:
+def test_scenenn_truth_classes_are_the_nine_classes(root: Path) -> None:
     truth = SceneNN(root, "016").scene_truth()
     assert truth is not None
     assert len(truth.classes or ()) == 9
     assert "toilet" in (truth.classes or ())
 
 
-def test_labels_missing_from_annotation_are_counted(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scenenn_labels_missing_from_annotation_are_counted(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     SceneNN(root, "016")
     assert caplog.text.count("016.ply: expected all labels in 016.xml, got none for 1, such as 55") == 1
     write_annotation(root / "016" / "016.xml", [*labels(), Annotated(UNLISTED, "x", "chair")])
@@ -106,13 +106,13 @@ def test_labels_missing_from_annotation_are_counted(root: Path, caplog: pytest.L
     assert not caplog.records
 
 
-def test_annotation_without_labels_raises(root: Path) -> None:
+def test_scenenn_empty_annotation_raises(root: Path) -> None:
     (root / "016" / "016.xml").write_text("<annotation/>")
     with pytest.raises(DataError, match=r"016\.xml: expected <label> elements"):
         SceneNN(root, "016")
 
 
-def test_label_without_text_or_known_class_is_not_evaluated(root: Path) -> None:
+def test_scenenn_label_without_known_class_is_not_evaluated(root: Path) -> None:
     changed = [
         Annotated(CHAIR, "", "chair", (0, 0, 0), None, None),
         Annotated(SOFA, "sofa", "unknown", (0, 0, 0), None, None),
@@ -123,7 +123,7 @@ def test_label_without_text_or_known_class_is_not_evaluated(root: Path) -> None:
     assert set(truth.class_names.values()) == {None}
 
 
-def test_true_masks_match_mesh_rendered_from_true_pose(root: Path) -> None:
+def test_scenenn_true_masks_match_mesh_at_true_pose(root: Path) -> None:
     frame = SceneNN(root, "016", frame_ground_truth=True)[1]
     assert frame.truth is not None
     u = np.arange(CAMERA.width)
@@ -133,11 +133,11 @@ def test_true_masks_match_mesh_rendered_from_true_pose(root: Path) -> None:
     row = vertex_labels.reshape(41, 41)[0]
     expected = np.where(np.abs(x) <= 1, row[np.clip(nearest, 0, 40)], 0)
     expected[expected == CABINET] = 0
-    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01  # amid two vertices it is a matter of rounding
+    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01  # between two vertices the result depends on rounding
     np.testing.assert_array_equal(frame.truth.instance_ids[11, sure], expected[sure])
 
 
-def test_frame_without_usable_pose_raises_on_read(root: Path) -> None:
+def test_scenenn_frame_without_usable_pose_raises_on_read(root: Path) -> None:
     path = root / "016" / "trajectory.log"
     write_trajectory_log(path, {k: pose(k) for k in range(FRAMES - 1)})
     text = path.read_text().replace("0.1", "nan", 1)
@@ -151,13 +151,13 @@ def test_frame_without_usable_pose_raises_on_read(root: Path) -> None:
         sequence[3]
 
 
-def test_missing_trajectory_gives_no_pose(root: Path) -> None:
+def test_scenenn_missing_trajectory_gives_no_pose(root: Path) -> None:
     (root / "016" / "trajectory.log").unlink()
     assert SceneNN(root, "016")[1].T_world_camera is None
 
 
 @pytest.mark.parametrize("name", ["image/image00003.png", "depth/depth00003.png"])
-def test_missing_image_raises_for_its_frame(root: Path, name: str) -> None:
+def test_scenenn_missing_image_raises_for_its_frame(root: Path, name: str) -> None:
     (root / "016" / name).unlink()
     sequence = SceneNN(root, "016")
     assert len(sequence) == FRAMES
@@ -166,31 +166,31 @@ def test_missing_image_raises_for_its_frame(root: Path, name: str) -> None:
         sequence[2]
 
 
-def test_missing_timestamps_default_to_30_hz(root: Path) -> None:
+def test_scenenn_missing_timestamps_default_to_30_hz(root: Path) -> None:
     (root / "016" / "timestamp.txt").unlink()
     assert SceneNN(root, "016")[3].timestamp == pytest.approx(0.1)
 
 
-def test_nonincreasing_timestamps_default_to_30_hz(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scenenn_nonincreasing_timestamps_default_to_30_hz(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_timestamps(root / "016" / "timestamp.txt", dict.fromkeys(range(1, FRAMES + 1), 0))
     assert [frame.timestamp for frame in SceneNN(root, "016")] == [k / 30 for k in range(FRAMES)]
     assert caplog.text.count("expected increasing timestamps") == 1
 
 
-def test_incomplete_timestamps_are_ignored(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_scenenn_incomplete_timestamps_are_ignored(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_timestamps(root / "016" / "timestamp.txt", {k: 7 + k / 10 for k in (1, 2, 4)})
     assert [frame.timestamp for frame in SceneNN(root, "016")] == [k / 30 for k in range(FRAMES)]
     assert caplog.text.count("timestamp.txt: expected timestamps of all images, got none for 1 of 4, first 3") == 1
 
 
 @pytest.mark.parametrize("line", ["2 x 5", "2 5", "1 0 0", "2 0 nan"])
-def test_invalid_timestamp_line_error_gives_line_number(root: Path, line: str) -> None:
+def test_scenenn_invalid_timestamp_error_gives_line_number(root: Path, line: str) -> None:
     (root / "016" / "timestamp.txt").write_text(f"1 0 0\n{line}\n")
     with pytest.raises(DataError, match=r"timestamp\.txt, line 2"):
         SceneNN(root, "016")
 
 
-def test_missing_annotation_gives_no_truth(root: Path) -> None:
+def test_scenenn_missing_annotation_gives_no_truth(root: Path) -> None:
     (root / "016" / "016.xml").unlink()
     sequence = SceneNN(root, "016")
     assert sequence.scene_truth() is None
@@ -199,21 +199,21 @@ def test_missing_annotation_gives_no_truth(root: Path) -> None:
         SceneNN(root, "016", frame_ground_truth=True)
 
 
-def test_mesh_without_labels_raises(root: Path) -> None:
+def test_scenenn_mesh_without_labels_raises(root: Path) -> None:
     vertices, triangles, _ = striped_wall()
     write_ply(root / "016" / "016.ply", vertices, triangles, {"red": np.zeros(len(vertices), np.uint8)})
     with pytest.raises(DataError, match=r"016\.ply: expected a vertex property 'label'"):
         SceneNN(root, "016")
 
 
-def test_annotation_release_is_reported(root: Path) -> None:
+def test_scenenn_annotation_release_is_reported(root: Path) -> None:
     assert SceneNN(root, "016").annotation == "of a test"
     assert SceneNN(root, "016", release="2016").annotation == "2016"
     (root / "release.txt").unlink()
     assert SceneNN(root, "016").annotation == "not named"
 
 
-def test_sensor_selects_intrinsics_file(root: Path) -> None:
+def test_scenenn_sensor_selects_intrinsics_file(root: Path) -> None:
     with pytest.raises(DataError, match=r"kinect2\.ini"):
         SceneNN(root, "016", sensor=SceneNNSensor.KINECT2)
     write_intrinsics(root / "intrinsic" / "kinect2.ini", Camera(32, 24, 29.0, 28.0, 16.0, 12.0))

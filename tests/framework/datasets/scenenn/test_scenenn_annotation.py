@@ -1,4 +1,4 @@
-"""NNN.xml: the published attributes, what is missing or odd, and what is an attack."""
+"""Tests of NNN.xml: published attributes, missing or invalid values, and malicious files."""
 
 from __future__ import annotations
 
@@ -50,63 +50,63 @@ def assert_same(a, b):
         np.testing.assert_allclose(a.obb.rotation, b.obb.rotation, atol=1e-15)
 
 
-def test_annotation_writer_matches_reference_text(path):
+def test_scenenn_annotation_writer_matches_reference_text(path):
     write_annotation(path, OBJECTS)
     assert path.read_text() == GOLDEN
 
 
-def test_annotation_round_trip_preserves_labels(path):
+def test_scenenn_annotation_round_trip_preserves_labels(path):
     odd = Annotated(3, 'a <b> & "c\'s"\n\tKüche', "sofa", (1, 2, 3), None, dataclasses.replace(BOX, rotation=TURN))
     write_annotation(path, (*OBJECTS, odd))
     for read, written in zip(read_annotation(path), (*OBJECTS, odd), strict=True):
         assert_same(read, written)
 
 
-def test_oriented_box_is_rotated_by_quaternion(path):
-    """A quarter turn about z: the box's x axis is the world's y."""
+def test_scenenn_annotation_box_is_rotated_by_quaternion(path):
+    """After a quarter turn about z, the box's x axis is the world's y axis."""
     half = np.sqrt(0.5)
     box = read_label(path, f'id="1" obbox="1 2 3 4 5 6 0 0 {half} {half}"').obb
     np.testing.assert_allclose(box.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-15)
     assert (box.center.tolist(), box.extent.tolist()) == ([1, 2, 3], [4, 5, 6])
 
 
-def test_unknown_xml_content_is_ignored(path):
+def test_scenenn_annotation_unknown_xml_content_is_ignored(path):
     path.write_text('<scene v="2"><!-- x --><camera id="x"/>text<label id=" 7 " z="1"><part id="8"/></label></scene>')
     (label,) = read_annotation(path)
     assert_same(label, Annotated(7, "", "", NO_COLOR, None, None))
 
 
-def test_xml_namespace_is_ignored(path):
+def test_scenenn_annotation_xml_namespace_is_ignored(path):
     path.write_text('<annotation xmlns="http://a.b/c"><label id="7" text="chair"/></annotation>')
     assert [(label.id, label.text) for label in read_annotation(path)] == [(7, "chair")]
     path.write_text('<n:annotation xmlns:n="http://a.b/c"><n:label id="7" text="chair"/></n:annotation>')
     assert [(label.id, label.text) for label in read_annotation(path)] == [(7, "chair")]
 
 
-def test_identical_duplicate_labels_count_once(path):
+def test_scenenn_annotation_duplicate_labels_count_once(path):
     path.write_text('<a><label id="5" text="chair"/><label id="6"/><label id="5" text="chair"/></a>')
     assert [label.id for label in read_annotation(path)] == [5, 6]
 
 
 @pytest.mark.parametrize("text", ["<annotation/>", "<annotation><labels/></annotation>", "<a><b id='1'/></a>"])
-def test_annotation_without_labels_raises(path, text):
+def test_scenenn_annotation_without_labels_raises(path, text):
     path.write_text(text)
     with pytest.raises(DataError, match=r"011.xml: expected <label> elements"):
         read_annotation(path)
 
 
 @pytest.mark.parametrize("text", ["", "1 2", "1 2 3 4", "1 2 256", "1 2 -1", "1 2 x", "1 2 nan", "1 2 2.5"])
-def test_invalid_label_color_reads_as_no_color(path, text):
+def test_scenenn_annotation_invalid_color_is_none(path, text):
     assert read_label(path, f'id="1" color="{text}"').color == NO_COLOR
 
 
 @pytest.mark.parametrize("text", ["", "0 0 0 1 1", "0 0 0 1 1 1 1", "0 0 0 1 1 inf", "0 0 0 1 1 x", "0 0 2 1 1 1"])
-def test_invalid_axis_aligned_box_reads_as_none(path, text):
+def test_scenenn_annotation_invalid_aligned_box_is_none(path, text):
     assert read_label(path, f'id="1" aabbox="{text}"').aabb is None
 
 
 @pytest.mark.parametrize("text", ["0 0 0 1 1 1", "0 0 0 1 1 -1 0 0 0 1", "0 0 0 1 1 1 0 0 0 0", "0 0 0 1 1 1 0 0 0 9"])
-def test_invalid_oriented_box_reads_as_none(path, text):
+def test_scenenn_annotation_invalid_oriented_box_is_none(path, text):
     assert read_label(path, f'id="1" obbox="{text}"').obb is None
 
 
@@ -125,7 +125,7 @@ def test_invalid_oriented_box_reads_as_none(path, text):
         ('<label id="&a;"/>', "line 3: expected valid XML: undefined entity"),
     ],
 )
-def test_malformed_annotation_error_gives_file_and_line(path, label, message):
+def test_scenenn_annotation_malformed_error_gives_line(path, label, message):
     path.write_text(f'<annotation>\n<label id="5"/>\n{label}\n</annotation>')
     with pytest.raises(DataError, match=f"011.xml, {message}"):
         read_annotation(path)
@@ -144,7 +144,7 @@ BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10 if k else "ha"}">' for k in 
         f'<!DOCTYPE l [<!ATTLIST label text CDATA "{"x" * 100000}">]>',  # each label would hold it
     ],
 )
-def test_xml_entities_and_document_types_raise(path, prologue):
+def test_scenenn_annotation_entities_and_doctypes_raise(path, prologue):
     path.write_text(f'<?xml version="1.0"?>\n{prologue}\n<l><label id="1" text="&a11;"/></l>')
     began = time.perf_counter()
     with pytest.raises(DataError, match=r"011.xml, line 2: expected XML without a document type or entities") as caught:
@@ -154,25 +154,25 @@ def test_xml_entities_and_document_types_raise(path, prologue):
 
 
 @pytest.mark.parametrize("encoding", ["rot13", "hex", "shift_jis", "idna", "x" * 1000])
-def test_unknown_encoding_raises(path, encoding):
+def test_scenenn_annotation_unknown_encoding_raises(path, encoding):
     path.write_text(f'<?xml version="1.0" encoding="{encoding}"?><l/>')
     with pytest.raises(DataError, match=r"011.xml, line 1: expected UTF-8, got an unknown encoding$"):
         read_annotation(path)
 
 
-def test_latin_1_and_utf_16_encodings_are_read(path):
+def test_scenenn_annotation_latin_1_and_utf_16_are_read(path):
     path.write_text('<?xml version="1.0" encoding="latin-1"?><l><label id="1" text="Küche"/></l>', encoding="latin-1")
     assert read_annotation(path)[0].text == "Küche"
     path.write_bytes('<?xml version="1.0" encoding="utf-16"?><l><label id="1" text="Küche"/></l>'.encode("utf-16"))
     assert read_annotation(path)[0].text == "Küche"
 
 
-def test_deeply_nested_xml_is_read_without_recursion(path):
+def test_scenenn_annotation_nested_xml_needs_no_recursion(path):
     path.write_text("<a>" * 50000 + '<label id="1"/>' + "</a>" * 50000)
     assert [label.id for label in read_annotation(path)] == [1]
 
 
-def test_missing_or_oversized_annotation_raises(path, monkeypatch):
+def test_scenenn_annotation_missing_or_oversized_raises(path, monkeypatch):
     with pytest.raises(DataError, match=r"011.xml: cannot be read: No such file"):
         read_annotation(path)
     monkeypatch.setattr(scenenn_annotation, "LARGEST_FILE", 100)
@@ -195,7 +195,7 @@ def test_missing_or_oversized_annotation_raises(path, monkeypatch):
         ({"obb": dataclasses.replace(BOX, extent=np.array([1, 1, -1.0]))}, "label 5: expected finite boxes"),
     ],
 )
-def test_writing_invalid_label_raises_and_leaves_no_file(path, change, message):
+def test_scenenn_annotation_invalid_label_leaves_no_file(path, change, message):
     with pytest.raises(DataError, match=message):
         write_annotation(path, (OBJECTS[1], dataclasses.replace(Annotated(5, "chair", "chair"), **change)))
     with pytest.raises(DataError, match="at least one label"):

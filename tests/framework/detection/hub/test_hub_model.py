@@ -1,4 +1,4 @@
-"""Models by id, with a hub of the test's own."""
+"""Tests of models by hub id, with a local hub server."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ FILES = {
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    """Serves the model somebody/something as huggingface.co does, and notes what it was asked for."""
+    """Serve the model somebody/something like huggingface.co, and record the requests."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_HEAD(self):
@@ -80,7 +80,7 @@ def digest(content):
 
 
 def listing(files):
-    """What the hub says of a model: a large file has a SHA-256."""
+    """Return the hub's file list of a model; a large file has a SHA-256."""
     siblings = []
     for name, content in files.items():
         large = (
@@ -107,7 +107,7 @@ def test_hub_model_is_downloaded_once_and_logged(hub, caplog):
     assert folder.name == COMMIT
     wanted = ["config.json", "preprocessor_config.json", "model.safetensors"]
     assert hub.sent == wanted
-    hub.server_close()  # whether it answers does not matter any more
+    hub.server_close()  # the server is no longer used
     assert find_model("somebody/something", "main") == folder
     assert hub.sent == wanted
 
@@ -119,7 +119,7 @@ def test_hub_model_sharded_weights_download_missing_shard(hub):
     hub.files["model.safetensors.index.json"] = json.dumps({"weight_map": names}).encode()
     folder = find_model("somebody/something", "main")
     assert {file.name for file in folder.iterdir()} == {*hub.files} - {"README.md"}
-    (folder / "model-00002-of-00002.safetensors").resolve().unlink()  # as one that was interrupted
+    (folder / "model-00002-of-00002.safetensors").resolve().unlink()  # like an interrupted download
     hub.sent.clear()
     assert find_model("somebody/something", "main") == folder
     assert hub.sent == ["model-00002-of-00002.safetensors"]

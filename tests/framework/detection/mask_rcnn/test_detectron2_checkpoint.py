@@ -1,7 +1,6 @@
-"""detectron2's checkpoints: a pickle that runs nothing, and a network that computes what detectron2 would.
+"""Tests of detectron2 checkpoints: the pickle executes no code, and the network equals detectron2's.
 
-The reference is written from detectron2's own definitions, on its own names, in double precision and without any of
-the project's network code.
+The reference follows detectron2's definitions and names, in double precision and without the project's network code.
 """
 
 import math
@@ -26,7 +25,7 @@ MEAN_BGR = (103.530, 116.280, 123.675)
 
 
 def synthetic_state(network="resnet50", classes=80):
-    """A checkpoint with detectron2's names and random values, as float32 arrays."""
+    """Return a checkpoint with detectron2's names and random values, as float32 arrays."""
     rng = np.random.default_rng(11)
     state = {"pixel_mean": np.array(MEAN_BGR).reshape(3, 1, 1), "pixel_std": np.ones((3, 1, 1))}
 
@@ -114,7 +113,7 @@ class Detectron2:
         return [*levels, functional.max_pool2d(levels[-1], 1, 2)]
 
     def anchors(self, pyramid):
-        """(A, 4): centered at the cells' corners (OFFSET 0), sizes and ratios unrounded."""
+        """Return anchors (A, 4), centered at the cells' corners (OFFSET 0), sizes and ratios unrounded."""
         anchors = []
         for level, stride, side in zip(pyramid, (4, 8, 16, 32, 64), (32, 64, 128, 256, 512), strict=True):
             for y in range(level.shape[2]):
@@ -126,7 +125,7 @@ class Detectron2:
         return np.array(anchors)
 
     def proposals(self, pyramid):
-        """(scores (A,), boxes (A, 4)) of all anchors, before any is dropped."""
+        """Return (scores (A,), boxes (A, 4)) of all anchors, before any is dropped."""
         scores, deltas = [], []
         for level in pyramid:
             x = self.layer("proposal_generator.rpn_head.conv", level, padding=1).relu()
@@ -144,7 +143,7 @@ class Detectron2:
         return torch.from_numpy(np.concatenate(rows))
 
     def boxes(self, pyramid, boxes):
-        """(probabilities (N, K + 1), the background last; boxes (N, K, 4))."""
+        """Return (probabilities (N, K + 1), the background last; boxes (N, K, 4))."""
         x = self.pooled(pyramid, boxes, 7).flatten(1)
         x = self.layer("roi_heads.box_head.fc1", x, functional.linear).relu()
         x = self.layer("roi_heads.box_head.fc2", x, functional.linear).relu()
@@ -156,7 +155,7 @@ class Detectron2:
         )
 
     def masks(self, pyramid, boxes):
-        """(N, K, 28, 28) probabilities."""
+        """Return mask probabilities (N, K, 28, 28)."""
         x = self.pooled(pyramid, boxes, 14)
         for k in range(1, 5):
             x = self.layer(f"roi_heads.mask_head.mask_fcn{k}", x, padding=1).relu()
@@ -165,7 +164,7 @@ class Detectron2:
 
 
 def moved(boxes, deltas, weights):
-    """Box2BoxTransform.apply_deltas."""
+    """Apply deltas like Box2BoxTransform.apply_deltas."""
     widths, heights = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
     x, y = boxes[:, 0] + 0.5 * widths, boxes[:, 1] + 0.5 * heights
     dx, dy, dw, dh = (deltas[:, k] / weights[k] for k in range(4))
@@ -249,7 +248,7 @@ def test_detectron2_unsupported_networks_raise():
 
 
 class Runs:
-    """What it does when it is unpickled is its writer's choice."""
+    """Executes code when it is unpickled."""
 
     def __init__(self, path):
         self.path = path
@@ -284,7 +283,7 @@ def test_pickle_with_code_raises_without_execution(tmp_path):
         read_pickle(path)
     assert "\n" not in str(caught.value)
     assert not touched.exists()
-    pickle.loads(path.read_bytes())  # which the usual reader does run
+    pickle.loads(path.read_bytes())  # the standard reader executes it
     assert touched.exists()
 
 

@@ -1,4 +1,4 @@
-"""Fused normalization, anchors of a pyramid, and the selection of the best anchors."""
+"""Tests of fused normalization, pyramid anchors, and the selection of the best anchors."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_network_with_fused_batch_norms_matches_original():
 
 @pytest.mark.parametrize("count", [1, 40, 99, 100, 200])
 @pytest.mark.parametrize("decimals", [0, 6])  # 0: many equal scores
-def test_best_first_equals_stable_sort(count, decimals):
+def test_network_best_first_equals_stable_sort(count, decimals):
     scores = np.random.default_rng(3).normal(size=100).round(decimals).astype(np.float32)
     np.testing.assert_array_equal(best_first(scores, count), np.argsort(-scores, kind="stable")[:count])
 

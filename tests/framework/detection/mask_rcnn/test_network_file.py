@@ -1,4 +1,4 @@
-"""Networks as files: what is written comes back, and what was damaged does not."""
+"""Tests of network files: exact round trips, and errors for damaged files."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from tests.support.networks.tiny_mask_rcnn import TINY, tiny_network, tiny_netwo
 
 
 def rewritten(path, tensors=None, **metadata):
-    """The file with other tensors or metadata, written as by somebody else."""
+    """Return the file with other tensors or metadata, as from another writer."""
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as file:

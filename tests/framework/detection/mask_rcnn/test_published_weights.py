@@ -1,4 +1,4 @@
-"""Where networks come from, with a web server of the test's own."""
+"""Tests of downloaded weights, with a local web server."""
 
 import hashlib
 import threading
@@ -18,7 +18,7 @@ SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 @pytest.fixture
 def server():
-    """Serves CONTENT as /network-*.pth, cut short as /cut.pth, and counts what it was asked for."""
+    """Serve CONTENT as /network-*.pth, truncated as /cut.pth, and count the requests."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
@@ -46,7 +46,7 @@ def server():
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """An empty cache, and permission to download."""
+    """Set an empty cache, and allow downloads."""
     monkeypatch.setattr(published_weights.platformdirs, "user_cache_path", lambda *_, **__: tmp_path / "cache")
     monkeypatch.delenv("INSTANCEMAP_OFFLINE")
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
@@ -108,7 +108,7 @@ def test_published_network_download_error_names_url_and_path(server, cache, monk
     message = fault()
     assert "Not Found" in message
     assert f"download {server.address}/absent.pth and put it at {cache / 'absent.pth'}" in message
-    offer(monkeypatch, "http://127.0.0.1:9/network.pth")  # nobody listens
+    offer(monkeypatch, "http://127.0.0.1:9/network.pth")  # no server
     assert f"download http://127.0.0.1:9/network.pth and put it at {cache / 'network.pth'}" in fault()
     assert not list(cache.iterdir())
 
@@ -119,7 +119,7 @@ def test_published_network_offline_makes_no_requests(server, cache, monkeypatch)
     assert f"put it at {cache / 'network.pth'}" in fault()
     assert not server.asked
     cache.mkdir(parents=True)
-    (cache / "network.pth").write_bytes(CONTENT)  # as the message says
+    (cache / "network.pth").write_bytes(CONTENT)  # as in the message
     assert find_network(Path("offered")).read_bytes() == CONTENT
 
 

@@ -1,4 +1,4 @@
-"""RoIAlign against Detectron's and torchvision's loops, written out sample by sample, on both of its paths."""
+"""Tests of both RoIAlign implementations, compared with the sample loops of Detectron and torchvision."""
 
 import math
 
@@ -13,10 +13,10 @@ from tests.support.networks.roi_align_loops import roi_align_loops
 
 @pytest.fixture(params=["products", "sums"])
 def path(request, monkeypatch):
-    """Forces one of the two ways."""
+    """Force one of the two implementations."""
     monkeypatch.setattr(module, "PRODUCT_SPEED", {"products": math.inf, "sums": 0.0}[request.param])
     other = {"products": "_sums", "sums": "_products"}[request.param]
-    monkeypatch.setattr(module, other, lambda *_: pytest.fail("the other way was taken"))
+    monkeypatch.setattr(module, other, lambda *_: pytest.fail("the other implementation was used"))
     return request.param
 
 
@@ -61,7 +61,7 @@ def test_roi_align_chunks_keep_box_order(monkeypatch):
 
 @pytest.mark.parametrize("ratio", [0, 2])
 def test_roi_align_gradient_matches_cell_contributions(path, ratio):
-    """Pooling is linear: the gradient of its sum is, cell by cell, the sum of what a unit at that cell pools to."""
+    """Pooling is linear: the gradient of the sum at a cell is the pooled sum of a unit at that cell."""
     rng = np.random.default_rng(6)
     boxes = rng.uniform(0, 60, (4, 2))
     boxes = np.hstack([boxes, boxes + rng.uniform(4, 50, (4, 2))]).astype(np.float32)

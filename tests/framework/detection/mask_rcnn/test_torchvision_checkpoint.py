@@ -1,4 +1,4 @@
-"""torchvision's checkpoints: names, COCO's numbers, and, where torchvision works, its own outputs."""
+"""Tests of torchvision checkpoints: names, COCO's numbers and, if torchvision is installed, its outputs."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ NINETY = tuple(f"category {number}" for number in range(1, 91))
 
 
 def old_name(name):
-    """What torchvision called it when it published the checkpoint."""
+    """Return torchvision's name at the time of the published checkpoint."""
     name = name.replace("rpn.head.conv.0.0.", "rpn.head.conv.")
     for k in range(4):
         name = name.replace(f"fpn.inner_blocks.{k}.0.", f"fpn.inner_blocks.{k}.")
@@ -31,7 +31,7 @@ def old_name(name):
 
 
 def published(name="resnet50", width=2):
-    """(the network with all 91 labels, its state_dict as torchvision's frozen normalization would write it)."""
+    """Return the network with all 91 labels and its state_dict with torchvision's frozen normalization."""
     network = tiny_network(replace(TINY, classes=NINETY, backbone=ResNetShape(name, width, norm_eps=0.0)))
     state = {old_name(k): v.clone() for k, v in network.state_dict().items() if "num_batches_tracked" not in k}
     return network, state
@@ -98,7 +98,7 @@ def test_torchvision_invalid_checkpoints_raise():
 
 
 def test_torchvision_p6_anchor_stride_is_matched():
-    """At 800 px P5 has 25 rows and P6 13: 800 // 13 = 61, where 64 would be right."""
+    """At 800 px P5 has 25 rows and P6 13, so that the stride is 61 (rounded down) instead of 64."""
     _, state = published()
     network = from_torchvision(state, "here")
     pyramid = [
@@ -113,10 +113,10 @@ def test_torchvision_p6_anchor_stride_is_matched():
 
 
 def test_network_outputs_match_torchvision():
-    """The same random weights in torchvision's own model: every step gives the same numbers."""
+    """With the same random weights, every step gives the same numbers as torchvision's model."""
     try:
         import torchvision
-    except (ImportError, RuntimeError) as absent:  # its extension does not load beside a CPU build of torch
+    except (ImportError, RuntimeError) as absent:  # its extension does not load with a CPU build of torch
         pytest.skip(f"NOT COMPARED WITH TORCHVISION: no torchvision that works here ({str(absent).splitlines()[0]})")
     torch.manual_seed(5)
     theirs = torchvision.models.detection.maskrcnn_resnet50_fpn(

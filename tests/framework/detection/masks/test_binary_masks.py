@@ -1,4 +1,4 @@
-"""Pasted and prototype masks against interpolation of every pixel; boxes and overlaps against counting."""
+"""Tests of pasted and prototype masks, boxes and overlaps, compared with per-pixel references."""
 
 import numpy as np
 import pytest
@@ -42,11 +42,11 @@ def test_paste_masks_matches_per_pixel_interpolation(borders):
     grid = rng.uniform(0, 1, (24, 24)).astype(np.float32)
     (mask,) = paste_masks(grid[None], np.array([borders], np.float32), (40, 60), 0.5)
     expected = paste_by_pixel(grid, np.float64(np.float32(borders)), (40, 60), 0.5)
-    assert (mask != expected).sum() <= 2  # float32 against float64, at the threshold itself
+    assert (mask != expected).sum() <= 2  # float32 compared with float64, at the threshold
 
 
 def test_paste_masks_full_grid_fills_box_exactly():
-    """A cell of 1 beside the ring's 0 crosses 0.5 right at the box's border."""
+    """The interpolation between a cell of 1 and the border 0 crosses 0.5 exactly at the border of the box."""
     (mask,) = paste_masks(np.ones((1, 24, 24), np.float32), np.array([[9.5, 4.5, 33.5, 28.5]], np.float32), (40, 60))
     expected = np.zeros((40, 60), bool)
     expected[5:29, 10:34] = True
@@ -70,7 +70,7 @@ def test_tight_boxes_span_first_to_last_pixel():
 
 
 def test_mask_overlaps_count_shared_pixels():
-    """Of masks that fill the image, lie in a corner of it, meet in a row or column, or are empty."""
+    """The masks fill the image, lie in a corner, meet in a row or column, or are empty."""
     rng = np.random.default_rng(6)
     masks = rng.random((12, 40, 300)) > 0.5
     for mask in masks[2:]:
@@ -88,7 +88,7 @@ def test_suppress_duplicates_drops_duplicates_and_empty_masks():
     masks = np.zeros((5, 10, 10), bool)
     masks[0, :, :6] = True
     masks[1, :, :7] = True  # IoU 6/7 with 0
-    masks[2, :, 1:8] = True  # IoU 5/8 with 0 and 6/8 with 1, which is gone
+    masks[2, :, 1:8] = True  # IoU 5/8 with 0 and 6/8 with 1, which was removed
     masks[4, 8:, 8:] = True
     boxes = tight_boxes(masks)
     assert suppress_duplicates(masks, boxes, 0.7).tolist() == [0, 2, 4]
@@ -129,7 +129,7 @@ def test_masks_from_prototypes_match_definition(placement, threshold):
 
 
 def test_masks_from_prototypes_keep_edge_position():
-    """A prototype that is linear in x of the image crosses zero at u = 20.3: the mask begins with pixel 21."""
+    """A prototype linear in x crosses zero at u = 20.3: the mask begins with pixel 21."""
     letterbox = Letterbox.fit((48, 48), (96, 96), Placement.center)
     cell_centers = (np.arange(24) + 0.5) * 4 / 2 - 0.5  # in px of the image
     prototypes = np.tile((cell_centers - 20.3).astype("f4"), (1, 24, 1))

@@ -1,4 +1,4 @@
-"""Box arithmetic against the formulas for one box; suppression against the quadratic algorithm."""
+"""Tests of box arithmetic and non-maximum suppression, compared with formulas and a quadratic algorithm."""
 
 import math
 
@@ -25,7 +25,7 @@ def decode_one(box, delta, extent):
 
 
 @pytest.mark.parametrize("extent", [0.0, 1.0])
-def test_decode_matches_formula(extent):
+def test_box_decode_matches_formula(extent):
     rng = np.random.default_rng(1)
     corners = rng.uniform(0, 200, (50, 2))
     boxes = np.hstack([corners, corners + rng.uniform(1, 100, (50, 2))]).astype(np.float32)
@@ -34,7 +34,7 @@ def test_decode_matches_formula(extent):
     np.testing.assert_allclose(decode(boxes, deltas, extent), expected, rtol=1e-4, atol=1e-3)
 
 
-def test_decode_zero_deltas_are_identity_huge_deltas_finite():
+def test_box_decode_of_zero_deltas_is_identity_huge_are_finite():
     box = np.array([[10, 20, 29, 59]], np.float32)
     np.testing.assert_allclose(decode(box, np.zeros((1, 4), np.float32)), box)
     huge = decode(box, np.full((1, 4), 1000, np.float32))

@@ -1,4 +1,4 @@
-"""The letterbox: where an image's pixels and borders lie in a network's input, and back."""
+"""Tests of the letterbox transform between image and network input."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def test_letterbox_placement_sets_size_and_offsets(image, placement, resized, to
 
 @pytest.mark.parametrize("placement", Placement)
 def test_letterbox_image_borders_round_trip_exactly(placement):
-    """Also where the resized size had to be rounded: the image spans -0.5 to W - 0.5."""
+    """This includes rounded sizes: the image spans -0.5 to W - 0.5."""
     letterbox = Letterbox.fit((333, 217), (416, 320), placement)
     height, width = letterbox.resized
     corners = [letterbox.left, letterbox.top, letterbox.left + width, letterbox.top + height]
@@ -34,7 +34,7 @@ def test_letterbox_image_borders_round_trip_exactly(placement):
 
 @pytest.mark.parametrize("placement", Placement)
 def test_letterbox_blob_position_round_trips(placement):
-    """Resizing as OpenCV does and mapping back agree to a small part of a pixel: no half pixel is lost."""
+    """OpenCV's resizing and the inverse mapping agree to a small fraction of a pixel."""
     v, u = np.indices((120, 160))
     blob = 250 * np.exp(-((u - 101.0) ** 2 + (v - 37.0) ** 2) / (2 * 6.0**2))
     letterbox = Letterbox.fit((120, 160), (416, 416), placement)

@@ -1,4 +1,4 @@
-"""Masks from boxes by depth, on scenes whose answer is known."""
+"""Tests of masks from boxes and depth, on scenes with known masks."""
 
 import numpy as np
 import pytest
@@ -42,13 +42,13 @@ def test_masks_in_boxes_mask_is_clipped_to_box():
 
 def test_masks_in_boxes_thin_occluder_is_excluded():
     depth = np.where(disk(28), np.float32(1.5), wall())
-    depth[:, 66:70] = 0.8  # a pole before it
+    depth[:, 66:70] = 0.8  # a pole in front of it
     mask = mask_of(depth)
     assert not mask[:, 66:70].any()
     halves = disk(28) & ((U < 66) | (U > 69))
     assert not (mask & ~halves).any()
     assert mask.sum() > 0.45 * halves.sum(), "one of the two halves"
-    # with no demand on the foreground, the pole is it
+    # without a required foreground fraction, the pole is the foreground
     assert mask_of(depth, significance=0.0)[50, 66:70].all()
 
 
@@ -66,7 +66,7 @@ def test_masks_in_boxes_equal_depths_select_central_object():
 
 @pytest.mark.parametrize(("slant", "whole"), [(75.0, True), (84.0, False)])
 def test_masks_in_boxes_slanted_plane_is_whole_below_limit(slant, whole):
-    """The plane z = 3 + tan(slant) x m, seen along u: it falls apart where its slant is above 80 degrees."""
+    """The plane is z = 3 + tan(slant) x m; above 80 degrees it is split."""
     direction = (U - 69.5) / CAMERA.fx
     depth = np.clip(3 / (1 - np.tan(np.radians(slant)) * direction), 0, None).astype(np.float32)
     narrow = np.array([[63.5, 19.5, 75.5, 79.5]], np.float32)
@@ -74,7 +74,7 @@ def test_masks_in_boxes_slanted_plane_is_whole_below_limit(slant, whole):
     assert (mask.sum() == 12 * 60) == whole
 
 
-def test_grow_joins_pixels_below_largest_step():
+def test_masks_in_boxes_grow_joins_pixels_below_largest_step():
     for z in (0.5, 1.0, 4.0):
         limit = masks_from_boxes_kernels._largest_step(z, np.tan(np.radians(80)) / 150)
         assert limit == pytest.approx(z * np.tan(np.radians(80)) / 150 + 3 * (0.0012 + 0.0019 * (z - 0.4) ** 2))
@@ -87,7 +87,7 @@ def test_grow_joins_pixels_below_largest_step():
             assert mask.all() == joined
 
 
-def test_grow_and_hole_closing_match_labeling():
+def test_masks_in_boxes_grow_and_hole_closing_match_labeling():
     rng = np.random.default_rng(3)
     for _ in range(20):
         depth = np.where(rng.random((30, 40)) < 0.62, 1.0, rng.choice([0.0, 2.0], (30, 40))).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Networks of 8-bit integers: each operator against its definition, in float and in integers."""
+"""Tests of 8-bit networks: each operator compared with its definition, in float and in integers."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ def real(values, scale_zero):
 
 
 def run_one(kind, args, x_nhwc, tensors):
-    """One operator through the graph interpreter, from and to NHWC as in the graph's own definition."""
+    """Run one operator in the graph interpreter; input and output are NHWC, as in the graph."""
     operator = {"type": kind, "inputs": ["x", *tensors], "outputs": ["y"], "args": args}
     network = network_between([operator], tensors, ("x",), ("y",))
     (y,) = network(torch.from_numpy(x_nhwc.astype(np.float32)).permute(0, 3, 1, 2))
@@ -39,7 +39,7 @@ def run_one(kind, args, x_nhwc, tensors):
 
 @pytest.mark.parametrize(("stride", "pad", "group"), [(1, 1, 1), (2, 1, 1), (1, 1, 6), (2, 0, 3)])
 @pytest.mark.parametrize("relu", [False, True])
-def test_convolution_matches_dequantized_window_sum(stride, pad, group, relu):
+def test_caffe2_convolution_matches_dequantized_window_sum(stride, pad, group, relu):
     rng = np.random.default_rng(7)
     x = rng.normal(0, 1, (1, 7, 8, 6))
     weight, weight_scale = quantized_values(rng, (6, 3, 3, 6 // group))
@@ -57,7 +57,7 @@ def test_convolution_matches_dequantized_window_sum(stride, pad, group, relu):
 
 
 @pytest.mark.parametrize(("kernel", "pad"), [(2, 0), (4, 1)])
-def test_transposed_convolution_matches_definition(kernel, pad):
+def test_caffe2_transposed_convolution_matches_definition(kernel, pad):
     rng = np.random.default_rng(8)
     x = rng.normal(0, 1, (1, 5, 6, 3))
     weight, scale = quantized_values(rng, (3, kernel, kernel, 4))
@@ -71,7 +71,7 @@ def test_transposed_convolution_matches_definition(kernel, pad):
     np.testing.assert_allclose(y[0], expected[pad : pad + 10, pad : pad + 12], atol=1e-4)
 
 
-def test_fully_connected_mean_and_relu_match_definition():
+def test_caffe2_fully_connected_mean_and_relu_match_definition():
     rng = np.random.default_rng(9)
     x = rng.normal(0, 1, (2, 3, 3, 5))
     mean = run_one("Int8AveragePool", {"kernel": 3, "stride": 1}, x, {})
@@ -84,7 +84,7 @@ def test_fully_connected_mean_and_relu_match_definition():
     np.testing.assert_allclose(run_one("Int8Relu", {}, x, {}), np.maximum(x, 0), atol=1e-6)
 
 
-def test_network_runs_only_operators_needed_by_outputs():
+def test_caffe2_network_runs_only_operators_for_outputs():
     tensors = {"w": torch.ones(1, 1, 1, 1), "b": torch.zeros(1)}
     conv = {"type": "Int8Conv", "args": {"kernel": 1, "stride": 1, "pad": 0}}
     graph = [
@@ -101,7 +101,7 @@ def test_network_runs_only_operators_needed_by_outputs():
 # In integers
 
 IMAGE = {"type": "Int8Quantize", "inputs": ["image"], "outputs": ["x"], "args": {"Y_scale": 0.02, "Y_zero_point": 110}}
-LAST = {  # what leaves a network is computed in float from the integers before: here, from "y"
+LAST = {  # outputs are computed in float from the integers before, here from "y"
     "type": "Int8Relu", "inputs": ["y"], "outputs": ["z"], "args": {"Y_scale": 1.0, "Y_zero_point": 0}
 }  # fmt: skip
 
@@ -119,7 +119,7 @@ def integer_network(kind, args, weight, weight_scale, bias):
 
 
 @pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
-def test_quantize_rounds_half_to_even(memory_format):
+def test_caffe2_quantize_rounds_half_to_even(memory_format):
     quantization = Quantization(0.25, 100)
     steps = torch.arange(-1000, 1000).reshape(1, 5, 20, 20) / 2  # halves of steps, beyond both ends
     found = quantization.quantize((steps * 0.25).contiguous(memory_format=memory_format))
@@ -134,7 +134,7 @@ def test_quantize_rounds_half_to_even(memory_format):
 @in_integers
 @pytest.mark.parametrize(("stride", "pad", "group"), [(1, 1, 1), (2, 1, 1), (1, 1, 6), (2, 0, 3)])
 @pytest.mark.parametrize("kind", ["Int8Conv", "Int8ConvRelu"])
-def test_integer_convolution_is_exact_and_rounded_once(kind, stride, pad, group):
+def test_caffe2_integer_convolution_is_exact_and_rounded_once(kind, stride, pad, group):
     rng = np.random.default_rng(11)
     image = rng.integers(0, 256, (1, 6, 7, 8))
     weight = rng.integers(20, 220, (6, 3, 3, 6 // group)).astype(np.uint8)  # within 127 of the zero point: exact
@@ -148,14 +148,14 @@ def test_integer_convolution_is_exact_and_rounded_once(kind, stride, pad, group)
         first = out // (6 // group) * (6 // group)
         window = padded[0, first : first + 6 // group, i * stride : i * stride + 3, j * stride : j * stride + 3]
         y = int((window.transpose(1, 2, 0) * (weight[out].astype(int) - 120)).sum()) * 0.02 * 0.001 + bias[out]
-        if kind == "Int8ConvRelu" or group > 1:  # the others stay as they are
+        if kind == "Int8ConvRelu" or group > 1:  # the others are unchanged
             y = (np.clip(np.rint(y / result.scale) + result.zero_point, 0, 255) - result.zero_point) * result.scale
         assert z[0, out, i, j] == pytest.approx(max(y, 0), abs=1e-4), (out, i, j)
 
 
 @in_integers
-def test_int8_kernels_with_overflow_are_detected():
-    """Without VNNI, oneDNN adds pairs of products in 16 bits. It takes the variable when it is loaded."""
+def test_caffe2_int8_kernels_with_overflow_are_detected():
+    """Without VNNI, oneDNN adds pairs of products in 16 bits. It reads the variable when it is loaded."""
     asked = "from framework.detection.runtimes.caffe2_network import has_int8_kernels; print(has_int8_kernels())"
     for instructions, expected in (("AVX2", "False"), ("DEFAULT", "True")):
         environment = {**os.environ, "ONEDNN_MAX_CPU_ISA": instructions}
@@ -166,7 +166,7 @@ def test_int8_kernels_with_overflow_are_detected():
 
 
 @in_integers
-def test_int8_weight_overflow_rounds_only_its_channel():
+def test_caffe2_int8_weight_overflow_rounds_only_its_channel():
     rng = np.random.default_rng(12)
     image = rng.integers(0, 256, (1, 4, 3, 3))
     weight = rng.integers(100, 140, (2, 1, 1, 4)).astype(np.uint8)
@@ -182,7 +182,7 @@ def test_int8_weight_overflow_rounds_only_its_channel():
 
 
 @in_integers
-def test_blob_is_rounded_for_convolution_but_not_for_sum():
+def test_caffe2_blob_is_rounded_for_convolution_but_not_for_sum():
     """In y = x + linear(relu(x)), the sum uses x before the ReLU."""
     one = {"Y_scale": 0.02, "Y_zero_point": 100}
     convolution = {"kernel": 1, "stride": 1, "pad": 0, **one}
@@ -200,7 +200,7 @@ def test_blob_is_rounded_for_convolution_but_not_for_sum():
 
 
 @in_integers
-def test_integers_without_scale_raise():
+def test_caffe2_integers_without_scale_raise():
     tensors = {"w": torch.ones(1, 1, 1, 1), "b": torch.zeros(1)}
     args = {"kernel": 1, "stride": 1, "pad": 0, "Y_scale": 0.1, "Y_zero_point": 0}
     graph = [{"type": "Int8Conv", "inputs": ["x", "w", "b"], "outputs": ["y"], "args": args}, LAST]

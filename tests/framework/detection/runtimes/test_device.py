@@ -1,4 +1,4 @@
-"""Torch's threads, as threads of the pipeline find them."""
+"""Tests of torch's thread counts in threads of the pipeline."""
 
 import threading
 
@@ -10,7 +10,7 @@ PATIENCE_S = 10.0
 
 
 def test_one_torch_thread_overlapping_uses_restore_count():
-    """Torch gives the number that was set last to threads that are new to it, or have not asked yet."""
+    """Torch gives the last count to threads that have not used it before."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     first_is_in, second_is_in = threading.Event(), threading.Event()

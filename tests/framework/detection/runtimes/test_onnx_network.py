@@ -1,4 +1,4 @@
-"""ONNX networks: what they compute, and whatever does not fit is said in one line."""
+"""Tests of ONNX networks: their outputs, and one-line errors for unsupported files."""
 
 import sys
 
@@ -92,7 +92,7 @@ def test_onnx_network_cuda_unavailable_raises(tmp_path):
 
 
 @pytest.mark.parametrize(("device", "loaded"), [("cpu", 0), ("auto", 1)])
-def test_cuda_libraries_are_loaded_before_session(tmp_path, monkeypatch, device, loaded):
+def test_onnx_network_cuda_libraries_are_loaded_before_session(tmp_path, monkeypatch, device, loaded):
     import onnxruntime
 
     calls = []
@@ -119,14 +119,14 @@ def test_onnx_file_missing_or_invalid_raises(tmp_path):
 
 def test_onnx_network_rejected_by_onnxruntime_names_file(tmp_path):
     image = helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, 8, 8))
-    node = helper.make_node("NoSuchThing", ["images"], ["y"], domain="nobody")
+    node = helper.make_node("NoSuchThing", ["images"], ["y"], domain="unknown")
     graph = helper.make_graph(
         [node], "g", [image], [helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 3, 8, 8))]
     )
     path = tmp_path / "n.onnx"
     path.write_bytes(
         helper.make_model(
-            graph, opset_imports=[helper.make_opsetid("", 13), helper.make_opsetid("nobody", 1)]
+            graph, opset_imports=[helper.make_opsetid("", 13), helper.make_opsetid("unknown", 1)]
         ).SerializeToString()
     )
     with pytest.raises(DataError, match=r"n\.onnx: expected an ONNX file for onnxruntime, got ") as refused:
@@ -149,7 +149,7 @@ def test_onnx_network_input_type_unsupported_raises(tmp_path):
 
 
 def test_onnx_network_weights_listed_as_inputs_are_ignored(tmp_path):
-    """As they had to be before version 4 of the format."""
+    """This was required before version 4 of the format."""
     image, weight = (helper.make_tensor_value_info(n, TensorProto.FLOAT, (1, 3, 4, 4)) for n in ("images", "weight"))
     path = save(
         tmp_path / "n.onnx",

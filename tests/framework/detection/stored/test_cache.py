@@ -1,4 +1,4 @@
-"""The detection cache: the same to the bit, asked once, and never in the way."""
+"""Tests of the detection cache: byte-identical detections, one detector call per image, no effect of errors."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ FIELDS = ("masks", "boxes", "scores", "class_probabilities")
 
 @dataclass
 class Noise(Detector):
-    """Random detections of the colors and the parameter; counts how often it is asked."""
+    """Random detections from the colors and the parameter; counts its calls."""
 
     strength: float = 1.0
     broken_at: int = -1
@@ -86,7 +86,7 @@ def random_detections(seed: int, shape: tuple[int, int], n: int = 7) -> Detectio
 
 
 def assert_same(a: Detections, b: Detections) -> None:
-    """To the bit, and arrays that can be used in the same way."""
+    """Check that the arrays are byte-identical and equally usable."""
     assert (a.classes, a.exact) == (b.classes, b.exact)
     for name in FIELDS:
         x, y = getattr(a, name), getattr(b, name)
@@ -143,7 +143,7 @@ def test_cache_with_other_detector_misses(room: CornerRoom, tmp_path: Path, chan
 
 @dataclass
 class Named(Noise):
-    """Gets its weights by a name."""
+    """Resolves its weights by name."""
 
     revision: str = "main"
 
@@ -152,7 +152,7 @@ class Named(Noise):
 
 
 @dataclass
-class NamedAsOnce(Noise):
+class OldNamed(Noise):
     """Written when Detector itself had a fingerprint."""
 
     def fingerprint(self) -> str:
@@ -160,15 +160,15 @@ class NamedAsOnce(Noise):
 
 
 def test_cache_identity_uses_detector_fingerprint(tmp_path: Path) -> None:
-    """The contract knows of no cache: a detector says what it reads, and what it is, if it wants to."""
+    """The cache is not part of the contract: a detector may declare its identity and the fields that it reads."""
     assert not {"reads", "fingerprint"} & set(dir(Detector))
     silent = SphereDetector()
     assert identity_of(silent) == fingerprint(silent)
     assert CachedDetector(silent, tmp_path).reads == FRAME_FIELDS
     assert identity_of(Named()) == f"{fingerprint(Named())} main"
     assert CachedDetector(Named(), tmp_path).reads == ("color",)
-    with pytest.raises(ConfigError, match=r"NamedAsOnce.* call fingerprint\(\) of framework"):
-        CachedDetector(NamedAsOnce(), tmp_path)
+    with pytest.raises(ConfigError, match=r"OldNamed.* call fingerprint\(\) of framework"):
+        CachedDetector(OldNamed(), tmp_path)
 
 
 def test_cache_with_other_weights_misses(room: CornerRoom, tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_cache_with_other_weights_misses(room: CornerRoom, tmp_path: Path) -> No
 
 @dataclass
 class Weighted(Noise):
-    """With a file."""
+    """A detector with a file."""
 
     weights: Path = Path()
 
@@ -266,7 +266,7 @@ def test_cache_unknown_read_field_raises(tmp_path: Path) -> None:
 def test_detectors_read_only_declared_frame_fields(
     name: str, ready: Callable[..., Detector], room: CornerRoom, tmp_path: Path
 ) -> None:
-    """Else the cache would give one frame's detections to another."""
+    """Otherwise the cache could return the detections of another frame."""
     detector = ready("detector", name)
     frame = room[1]
     others = {
@@ -376,7 +376,7 @@ folder = Path(sys.argv[1])
 (folder / sys.argv[2]).touch()
 while len(list(folder.glob("ready*"))) < 2:
     time.sleep(0.001)
-for k in range(9):  # an entry is removed now and then, so that both write again, but for the last time
+for k in range(9):  # an entry is removed sometimes, so that both write again, except at the end
     detector = CachedDetector(SphereDetector(), folder / "cache")
     for frame in CornerRoom():
         detector.detect(frame)
@@ -448,7 +448,7 @@ def test_cache_default_folder_is_user_cache(monkeypatch: pytest.MonkeyPatch, tmp
 @pytest.mark.usefixtures("fakes_registered")
 @pytest.mark.usefixtures("fakes_registered")
 def test_run_with_cache_is_identical_to_run_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The whole record, but for times: without, while it fills, and from it."""
+    """All outputs except times are compared: without cache, with an empty one, and with a full one."""
     asked: list[int] = []
     detect = SphereDetector.detect
     monkeypatch.setattr(SphereDetector, "detect", lambda self, frame: asked.append(frame.index) or detect(self, frame))
@@ -470,7 +470,7 @@ def test_run_with_cache_is_identical_to_run_without(tmp_path: Path, monkeypatch:
 
 
 def test_cache_seeded_detector_is_keyed_by_frame_index(room: CornerRoom, tmp_path: Path) -> None:
-    """The simulated one draws by the frame's number: the same picture at another number is another entry."""
+    """The simulated detector draws by frame number, so that the same image at another number is another entry."""
     detector = CachedDetector(SimulatedDetector(min_pixels=1), tmp_path)
     frame = room[0]
     for index in (0, 1, 0):

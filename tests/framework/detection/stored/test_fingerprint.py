@@ -1,4 +1,4 @@
-"""What makes two detectors the same."""
+"""Tests of detector fingerprints."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Color(Enum):
 
 @dataclass
 class Network:
-    """A detector's parameters."""
+    """Parameters of a detector."""
 
     weights: Path = Path()
     threshold: float = 0.5
@@ -80,7 +80,7 @@ def test_fingerprint_missing_path_raises(tmp_path: Path) -> None:
 
 
 def test_fingerprint_depends_on_source_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same class path and parameters, after an edit of the module."""
+    """The class path and parameters are unchanged; the module is edited."""
     path = tmp_path / "mine.py"
     code = "from dataclasses import dataclass\n@dataclass\nclass Mine:\n    a: int = 1\n"
     seen = []
@@ -120,7 +120,7 @@ def test_fingerprint_auto_device_includes_its_name(monkeypatch: pytest.MonkeyPat
 
 
 def test_fingerprint_of_file_option_depends_on_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Labels may be `coco` or a file; a model a name or a folder."""
+    """Labels may be `coco` or a file; a model may be a name or a folder."""
     monkeypatch.chdir(tmp_path)
     before = fingerprint(Network(labels="labels.txt"))
     (tmp_path / "labels.txt").write_text("chair")

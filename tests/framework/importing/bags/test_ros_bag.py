@@ -1,4 +1,4 @@
-"""ROS bags of a small room in all their kinds: what is found in them, and what is said of damage."""
+"""Tests of ROS bags of a small room, in all formats, valid and damaged."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def add_poses(bag: BagWriter, topic: str = "/pose") -> None:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_ros_camera_with_poses_is_imported(tmp_path: Path, name: str) -> None:
+def test_ros_bag_of_camera_with_poses_is_imported(tmp_path: Path, name: str) -> None:
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
     add_poses(bag)
@@ -78,7 +78,7 @@ def test_ros_camera_with_poses_is_imported(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize(("folder", "suffix"), [("mcap_folder", ".mcap"), ("plain", ".db3")])
-def test_single_file_of_bag_folder_is_imported(tmp_path: Path, folder: str, suffix: str) -> None:
+def test_ros_bag_single_file_of_folder_is_imported(tmp_path: Path, folder: str, suffix: str) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     [file] = bag.write(tmp_path / folder).glob(f"*{suffix}")
@@ -90,7 +90,9 @@ def test_single_file_of_bag_folder_is_imported(tmp_path: Path, folder: str, suff
 @pytest.mark.parametrize(
     ("child", "T_camera_child"), [("camera_color_optical_frame", np.eye(4)), ("base", T_CAMERA_ROS)]
 )
-def test_odometry_is_read_in_axes_of_its_child_frame(tmp_path: Path, child: str, T_camera_child: np.ndarray) -> None:
+def test_ros_bag_odometry_is_read_in_axes_of_child_frame(
+    tmp_path: Path, child: str, T_camera_child: np.ndarray
+) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     for k in range(COUNT):
@@ -99,8 +101,8 @@ def test_odometry_is_read_in_axes_of_its_child_frame(tmp_path: Path, child: str,
     check_room(tmp_path / "out")
 
 
-def test_poses_are_interpolated(tmp_path: Path) -> None:
-    """A walk of 1 m/s along x, of which two poses are known."""
+def test_ros_bag_poses_are_interpolated(tmp_path: Path) -> None:
+    """The camera moves at 1 m/s along x, and two poses are known."""
     bag = BagWriter()
     add_camera_of_ros(bag)
     for x in (0.0, 0.13):
@@ -112,7 +114,7 @@ def test_poses_are_interpolated(tmp_path: Path) -> None:
     assert walked == pytest.approx([0.01 + k / 30 for k in range(COUNT)], abs=2e-6)
 
 
-def test_frames_far_from_poses_are_skipped(tmp_path: Path) -> None:
+def test_ros_bag_frames_far_from_poses_are_skipped(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.add_pose(time_of(0) - 0.08, "/pose", np.eye(4))
@@ -122,7 +124,7 @@ def test_frames_far_from_poses_are_skipped(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgba8", "bgra8", "mono8"])
-def test_color_encodings_are_decoded(tmp_path: Path, encoding: str) -> None:
+def test_ros_bag_color_encodings_are_decoded(tmp_path: Path, encoding: str) -> None:
     bag = BagWriter()
     color, depth = seen(0)
     stored = {
@@ -143,7 +145,7 @@ def test_color_encodings_are_decoded(tmp_path: Path, encoding: str) -> None:
 @pytest.mark.parametrize(
     "kind", ["16UC1", "mono16", "Z16", "32FC1", "big-endian", "compressed", "packed mm", "packed m"]
 )
-def test_depth_encodings_are_decoded(tmp_path: Path, kind: str) -> None:
+def test_ros_bag_depth_encodings_are_decoded(tmp_path: Path, kind: str) -> None:
     bag = BagWriter()
     for k in range(COUNT):
         color, depth = seen(k)
@@ -170,7 +172,7 @@ def test_depth_encodings_are_decoded(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["jpeg", "png"])
-def test_compressed_color_is_decoded(tmp_path: Path, kind: str) -> None:
+def test_ros_bag_compressed_color_is_decoded(tmp_path: Path, kind: str) -> None:
     bag = BagWriter(ros1=True)
     for k in range(COUNT):
         color, depth = seen(k)
@@ -183,14 +185,14 @@ def test_compressed_color_is_decoded(tmp_path: Path, kind: str) -> None:
     check_room(tmp_path / "out", posed=False)
 
 
-def test_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
+def test_ros_bag_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_realsense(bag, DEPTH_CAMERA)
     assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
     check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # readings are moved to the nearest pixel
 
 
-def test_unregistered_depth_raises(tmp_path: Path) -> None:
+def test_ros_bag_unregistered_depth_raises(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag, "depth")
     bag.messages = [entry for entry in bag.messages if entry[1] != "/camera/depth/camera_info"]
@@ -202,7 +204,7 @@ def test_unregistered_depth_raises(tmp_path: Path) -> None:
         open_source(path)
 
 
-def test_registered_depth_of_other_size_is_accepted(tmp_path: Path) -> None:
+def test_ros_bag_registered_depth_of_other_size_is_accepted(tmp_path: Path) -> None:
     bag = BagWriter()
     half = ROOM.scaled(0.5)
     for k in range(COUNT):
@@ -214,7 +216,7 @@ def test_registered_depth_of_other_size_is_accepted(tmp_path: Path) -> None:
     check_room(tmp_path / "out", posed=False)
 
 
-def test_lens_distortion_is_written_to_camera_json(tmp_path: Path) -> None:
+def test_ros_bag_lens_distortion_is_written_to_camera_json(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.messages = [entry for entry in bag.messages if not entry[1].endswith("camera_info")]
@@ -224,7 +226,7 @@ def test_lens_distortion_is_written_to_camera_json(tmp_path: Path) -> None:
     assert RgbdFolder(tmp_path / "out").calibration.lens is not None
 
 
-def test_unsupported_lens_model_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_ros_bag_unsupported_lens_model_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.messages = [entry for entry in bag.messages if not entry[1].endswith("camera_info")]
@@ -233,7 +235,7 @@ def test_unsupported_lens_model_is_logged(tmp_path: Path, caplog: pytest.LogCapt
     assert "expected a Brown-Conrady lens model, got 'equidistant'; images are not undistorted" in caplog.text
 
 
-def test_invalid_header_stamps_fall_back_to_recording_times(tmp_path: Path) -> None:
+def test_ros_bag_invalid_stamps_fall_back_to_recording_times(tmp_path: Path) -> None:
     bag = BagWriter()
     for k in range(COUNT):
         color, depth = seen(k)
@@ -244,7 +246,7 @@ def test_invalid_header_stamps_fall_back_to_recording_times(tmp_path: Path) -> N
     check_room(tmp_path / "out", posed=False)
 
 
-def test_images_without_time_match_are_dropped(tmp_path: Path) -> None:
+def test_ros_bag_images_without_time_match_are_dropped(tmp_path: Path) -> None:
     bag = BagWriter()
     color, depth = seen(0)
     for k in range(COUNT):
@@ -294,20 +296,20 @@ def two_cameras() -> BagWriter:
         ),
     ],
 )
-def test_ambiguous_or_invalid_topic_error_names_option(tmp_path: Path, given: dict[str, str], output: str) -> None:
+def test_ros_bag_ambiguous_or_invalid_topic_names_option(tmp_path: Path, given: dict[str, str], output: str) -> None:
     path = two_cameras().write(tmp_path / "bag")
     with pytest.raises(ConfigError, match=output):
         open_source(path, Topics(**given))
 
 
-def test_given_topics_are_used(tmp_path: Path) -> None:
+def test_ros_bag_given_topics_are_used(tmp_path: Path) -> None:
     path = two_cameras().write(tmp_path / "bag")
     given = {"depth": "/right/depth/image", "color": "/left/color/image", "poses": "/left/pose"}
     assert not imported(path, tmp_path / "out", **given, camera_info="/right/color/camera_info")
     assert len(RgbdFolder(tmp_path / "out")) == 1
 
 
-def test_registered_depth_and_raw_color_are_preferred(tmp_path: Path) -> None:
+def test_ros_bag_prefers_registered_depth_and_raw_color(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     color, depth = seen(0)
@@ -325,7 +327,7 @@ def test_registered_depth_and_raw_color_are_preferred(tmp_path: Path) -> None:
         ("camera_info", "expected a sensor_msgs/msg/CameraInfo topic next to .*, got none"),
     ],
 )
-def test_missing_topic_raises(tmp_path: Path, left_out: str, output: str) -> None:
+def test_ros_bag_missing_topic_raises(tmp_path: Path, left_out: str, output: str) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     bag.messages = [entry for entry in bag.messages if left_out not in entry[1]]
@@ -334,7 +336,7 @@ def test_missing_topic_raises(tmp_path: Path, left_out: str, output: str) -> Non
         open_source(path)
 
 
-def test_topics_for_phone_export_raise(tmp_path: Path) -> None:
+def test_ros_bag_topics_for_phone_export_raise(tmp_path: Path) -> None:
     (tmp_path / "a.r3d").touch()
     with pytest.raises(ConfigError, match="--color, --poses: expected a ROS bag for topics, got"):
         open_source(tmp_path / "a.r3d", Topics(color="/a", poses="/b"))
@@ -349,7 +351,7 @@ R_IMU_CAMERA = Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix()
 def add_accelerometer(
     bag: BagWriter, topic: str = "/camera/imu", frame_id: str = "imu", length: float = 9.81, late: float = 0.0
 ) -> None:
-    """At 300 Hz, on the camera, which turns slowly; trembling of 4 m/s^2 at 50 Hz."""
+    """Add an accelerometer at 300 Hz to a slowly rotating camera, with vibrations of 4 m/s^2 at 50 Hz."""
     for n in range(-30, 10 * COUNT + 30):
         acceleration = length * UP_WORLD + np.array([4.0, 0, 0]) * np.sin(2 * np.pi * n / 6)
         measured = R_IMU_CAMERA @ pose_at(n / 10)[:3, :3].T @ acceleration
@@ -368,8 +370,8 @@ def check_up(folder: Path, within: float = 1.0) -> None:
 
 
 @pytest.mark.parametrize("name", ["ros1.bag", "ros2_folder"])
-def test_accelerometer_gives_up_in_camera_axes(tmp_path: Path, name: str) -> None:
-    """Over a chain of frames, both up and down it; a gyroscope's topic has no acceleration."""
+def test_ros_bag_accelerometer_gives_up_vector_in_camera_axes(tmp_path: Path, name: str) -> None:
+    """The frame chain is used in both directions; the topic of a gyroscope has no acceleration."""
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
     add_accelerometer(bag)
@@ -385,7 +387,7 @@ def test_accelerometer_gives_up_in_camera_axes(tmp_path: Path, name: str) -> Non
     check_up(tmp_path / "out")
 
 
-def test_realsense_accelerometer_gives_up_in_camera_axes(tmp_path: Path) -> None:
+def test_ros_bag_realsense_accelerometer_gives_up_vector(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_realsense(bag, DEPTH_CAMERA)
     add_accelerometer(bag, "/device_0/sensor_2/Accel_0/imu/data", "2")
@@ -406,7 +408,7 @@ def test_realsense_accelerometer_gives_up_in_camera_axes(tmp_path: Path) -> None
         ({"late": 100.0}, r"/camera/imu: expected a measurement within 0\.05 s of a frame"),
     ],
 )
-def test_unusable_accelerometer_logs_one_line(
+def test_ros_bag_unusable_accelerometer_logs_one_line(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, changed: dict[str, Any], output: str
 ) -> None:
     bag = BagWriter()
@@ -420,7 +422,7 @@ def test_unusable_accelerometer_logs_one_line(
     assert "\n" not in line
 
 
-def test_damaged_accelerometer_messages_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_ros_bag_damaged_accelerometer_messages_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     add_accelerometer(bag)
@@ -456,7 +458,7 @@ def spoilt(message: Any, name: str) -> Any:
 
 @pytest.mark.parametrize("topic", ["/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"])
 @pytest.mark.parametrize("name", ["encoding", "height", "step", "width", "data"])
-def test_damaged_message_loses_one_frame(tmp_path: Path, topic: str, name: str) -> None:
+def test_ros_bag_damaged_message_loses_one_frame(tmp_path: Path, topic: str, name: str) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     number = [k for k, entry in enumerate(bag.messages) if entry[1] == topic][1]
@@ -469,7 +471,7 @@ def test_damaged_message_loses_one_frame(tmp_path: Path, topic: str, name: str) 
 
 
 @pytest.mark.parametrize("depth", [b"", b"123", bytes(12), bytes(12) + b"\x89PNG\r\n\x1a\n" + bytes(40)])
-def test_damaged_compressed_depth_loses_one_frame(tmp_path: Path, depth: bytes) -> None:
+def test_ros_bag_damaged_compressed_depth_loses_one_frame(tmp_path: Path, depth: bytes) -> None:
     bag = BagWriter()
     for k in range(COUNT):
         color, metric = seen(k)
@@ -481,7 +483,7 @@ def test_damaged_compressed_depth_loses_one_frame(tmp_path: Path, depth: bytes) 
     assert "/depth/image/compressedDepth" in fault
 
 
-def test_rvl_compressed_depth_raises(tmp_path: Path) -> None:
+def test_ros_bag_rvl_compressed_depth_raises(tmp_path: Path) -> None:
     bag = BagWriter()
     bag.add_image(time_of(0), "/rgb/image", seen(0)[0], "rgb8")
     bag.add_compressed(time_of(0), "/depth/image/compressedDepth", bytes(100), "16UC1; compressedDepth rvl")
@@ -495,7 +497,7 @@ def test_rvl_compressed_depth_raises(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
-def test_truncated_bag_is_imported_or_raises_one_line(tmp_path: Path, name: str, share: float) -> None:
+def test_ros_bag_truncated_is_imported_or_raises_one_line_error(tmp_path: Path, name: str, share: float) -> None:
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
     path = bag.write(tmp_path / name)
@@ -511,7 +513,7 @@ def test_truncated_bag_is_imported_or_raises_one_line(tmp_path: Path, name: str,
         assert 0 < len(RgbdFolder(tmp_path / "out")) <= COUNT
 
 
-def test_inverted_byte_loses_at_most_one_frame(tmp_path: Path) -> None:
+def test_ros_bag_inverted_byte_loses_at_most_one_frame(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_camera_of_ros(bag)
     path = bag.write(tmp_path / "a.bag")
@@ -522,7 +524,7 @@ def test_inverted_byte_loses_at_most_one_frame(tmp_path: Path) -> None:
     assert len(RgbdFolder(tmp_path / "out")) >= COUNT - 1
 
 
-def test_missing_package_error_names_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ros_bag_missing_package_error_names_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.bag").touch()
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(ConfigError, match=r"rosbags: expected an installed package \(it reads ROS bags\), got none"):

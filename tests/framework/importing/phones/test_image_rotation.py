@@ -1,4 +1,4 @@
-"""Turned images show the same world: pixels, rays and lenses."""
+"""Tests of rotated images, whose pixels, rays and lenses show the same world."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ QUARTERS = [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("quarters", QUARTERS)
-def test_rotated_camera_sees_rotated_image(quarters: int) -> None:
+def test_image_rotation_camera_sees_rotated_image(quarters: int) -> None:
     turn = Turn(quarters)
     depth, _, color, _ = look(CAMERA, pose_at(3))
     turned_depth, _, turned_color, _ = look(turn.camera(CAMERA), turn.pose(pose_at(3)))
@@ -23,13 +23,13 @@ def test_rotated_camera_sees_rotated_image(quarters: int) -> None:
     assert np.abs(turn.image(color).astype(int) - turned_color).max() <= 1
 
 
-def test_quarter_turn_is_clockwise() -> None:
+def test_image_rotation_quarter_turn_is_clockwise() -> None:
     np.testing.assert_array_equal(Turn(1).image(np.array([[1, 2], [3, 4]])), [[3, 1], [4, 2]])
     assert Turn(1).camera(CAMERA) == Camera(48, 64, 62.0, 60.0, 47 - 25.5, 30.0)
 
 
 @pytest.mark.parametrize("quarters", QUARTERS)
-def test_lens_is_rotated_with_its_camera(quarters: int) -> None:
+def test_image_rotation_rotates_lens_with_camera(quarters: int) -> None:
     turn, lens = Turn(quarters), Distortion(0.1, -0.2, 0.01, 0.02, 0.03)
     pixels = np.array([[3.0, 5.0], [60.0, 40.0], [10.0, 44.0]])
 

@@ -1,4 +1,4 @@
-"""Polycam and 3D Scanner App, which store each frame in files of its own: as they write them, and damaged."""
+"""Tests of the exports of Polycam and 3D Scanner App, which store each frame separately; valid and damaged."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write(path: Path, tmp_path: Path, least: int = 1) -> list[str]:
 
 
 @pytest.mark.parametrize("least", [0, 1, 2])
-def test_export_matches_room_geometry(export: tuple[str, Path], tmp_path: Path, least: int) -> None:
+def test_keyframe_apps_export_matches_room_geometry(export: tuple[str, Path], tmp_path: Path, least: int) -> None:
     name, path = export
     source = open_source(path)
     assert (source.format, source.count) == (name, len(FRAMES))
@@ -54,7 +54,7 @@ def test_polycam_optimized_poses_and_images_are_used(tmp_path: Path) -> None:
 
 
 def test_polycam_optimized_poses_without_images_are_used(tmp_path: Path) -> None:
-    """As in exports of which the app has left out the images, and of the camera all but the pose."""
+    """Such exports have no optimized images, and only the pose of the camera."""
     drifted = [replace(frame, T_world_camera=DRIFT @ frame.T_world_camera) for frame in FRAMES]
     write_polycam(tmp_path / "export", drifted)
     write_polycam(tmp_path / "export", FRAMES, "corrected_")
@@ -79,7 +79,7 @@ def test_scanner_app_frames_without_color_are_dropped(tmp_path: Path) -> None:
         open_source(tmp_path / "export")
 
 
-def test_scan_without_times_is_timed_by_frame_number(tmp_path: Path) -> None:
+def test_scanner_app_scan_without_times_uses_frame_number(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "export", FRAMES)
     for path in (tmp_path / "export").glob("frame_*.json"):
         change(path, lambda content: content.pop("time"))
@@ -101,7 +101,7 @@ def change(path: Path, how: Callable[[dict[str, Any]], Any]) -> None:
 
 
 def second(folder: Path, pattern: str) -> Path:
-    """The file of the second frame."""
+    """Return the file of the second frame."""
     return sorted(folder.rglob(pattern))[1]
 
 
@@ -128,7 +128,7 @@ SPOILT_CAMERAS = {
 @pytest.mark.parametrize(
     ("app", "how", "message"), [(app, *case) for app, cases in SPOILT_CAMERAS.items() for case in cases]
 )
-def test_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, message: str) -> None:
+def test_keyframe_apps_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, message: str) -> None:
     WRITERS[app](tmp_path / "export", FRAMES)
     change(second(tmp_path / "export", "frame_*.json" if app == "3D Scanner App" else "cameras/*.json"), how)
     [fault] = write(tmp_path / "export", tmp_path)
@@ -143,7 +143,7 @@ def test_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, message: 
         *(("Polycam", f"{kind}/*") for kind in ("cameras", "images", "depth", "confidence")),
     ],
 )
-def test_truncated_file_loses_one_frame(tmp_path: Path, app: str, pattern: str) -> None:
+def test_keyframe_apps_truncated_file_loses_one_frame(tmp_path: Path, app: str, pattern: str) -> None:
     WRITERS[app](tmp_path / "export", FRAMES)
     path = second(tmp_path / "export", pattern)
     path.write_bytes(path.read_bytes()[:-10])

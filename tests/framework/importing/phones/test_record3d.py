@@ -1,4 +1,4 @@
-"""Record3D's export and .r3d files: as the app writes them, damaged, and a real export."""
+"""Tests of Record3D's export and .r3d files: valid, damaged, and a real export."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.support.recordings.phone_exports import (
 )
 
 FRAMES = room_frames()
-REAL_FRAMES = 4  # whose images are there; the metadata is of all 345
+REAL_FRAMES = 4  # frames with images; the metadata covers all 345
 
 
 @pytest.fixture
@@ -44,25 +44,25 @@ def r3d(tmp_path: Path) -> Path:
     return tmp_path / "room.r3d"
 
 
-def test_exr_export_matches_room_geometry(export: Path, tmp_path: Path) -> None:
+def test_record3d_exr_export_matches_room_geometry(export: Path, tmp_path: Path) -> None:
     write_folder(open_source(export), tmp_path / "out", Writing())
     check_imported(tmp_path / "out", FRAMES, least=0)  # the export has no confidence
 
 
 @pytest.mark.parametrize("least", [0, 1, 2])
-def test_r3d_file_matches_room_geometry(r3d: Path, tmp_path: Path, least: int) -> None:
+def test_record3d_r3d_file_matches_room_geometry(r3d: Path, tmp_path: Path, least: int) -> None:
     write_folder(open_source(r3d), tmp_path / "out", Writing(width=160, confidence=least))
     check_imported(tmp_path / "out", FRAMES, 0.5, least)
 
 
-def test_r3d_without_confidence_keeps_all_depth(tmp_path: Path) -> None:
+def test_record3d_r3d_without_confidence_keeps_all_depth(tmp_path: Path) -> None:
     pytest.importorskip("lzfse")
     write_r3d(tmp_path / "room.r3d", FRAMES, confident=False)
     write_folder(open_source(tmp_path / "room.r3d"), tmp_path / "out", Writing(confidence=2))
     check_imported(tmp_path / "out", FRAMES, least=0)
 
 
-def test_older_export_uses_common_camera_and_frame_rate(export: Path, tmp_path: Path) -> None:
+def test_record3d_older_export_uses_common_camera_and_rate(export: Path, tmp_path: Path) -> None:
     metadata = record3d_metadata(FRAMES, own_intrinsics=False)
     del metadata["frameTimestamps"]
     (export / "metadata.json").write_text(json.dumps(metadata))
@@ -72,8 +72,8 @@ def test_older_export_uses_common_camera_and_frame_rate(export: Path, tmp_path: 
     assert [frame.timestamp for frame in sequence] == pytest.approx([k / 30 for k in range(4)])
 
 
-def test_poses_starting_at_identity_give_no_gravity_file(export: Path, tmp_path: Path) -> None:
-    """As the app wrote them in 2022: of the world of the first frame."""
+def test_record3d_poses_from_identity_give_no_gravity_file(export: Path, tmp_path: Path) -> None:
+    """In 2022 the app wrote poses in the world of the first frame."""
     changed(export, lambda m: m["poses"].__setitem__(0, [0, 0, 0, 1, 0, 0, 0]))
     write_folder(open_source(export), tmp_path / "out", Writing())
     assert len(RgbdFolder(tmp_path / "out")) == 4
@@ -98,7 +98,7 @@ def changed(export: Path, change: Callable[[dict[str, Any]], Any]) -> None:
         (lambda m: m["frameTimestamps"].__setitem__(1, 0.0), "expected a timestamp > "),
     ],
 )
-def test_damaged_pose_loses_one_frame(export: Path, tmp_path: Path, change, message: str) -> None:
+def test_record3d_damaged_pose_loses_one_frame(export: Path, tmp_path: Path, change, message: str) -> None:
     changed(export, change)
     written = write_folder(open_source(export), tmp_path / "out", Writing())
     [fault] = written.errors
@@ -120,14 +120,14 @@ def test_damaged_pose_loses_one_frame(export: Path, tmp_path: Path, change, mess
         (lambda m: (m.pop("frameTimestamps"), m.update(fps=0)), "fps: expected a value > 0 Hz"),
     ],
 )
-def test_invalid_metadata_raises(export: Path, change, message: str) -> None:
+def test_record3d_invalid_metadata_raises(export: Path, change, message: str) -> None:
     changed(export, change)
     with pytest.raises(DataError, match=rf"metadata\.json: .*{message}|metadata\.json: {message}"):
         open_source(export)
 
 
 @pytest.mark.parametrize("spoil", [lambda data: data[:1000], lambda data: b"", lambda data: data[:300] + data[400:]])
-def test_damaged_exr_image_loses_one_frame(export: Path, tmp_path: Path, spoil) -> None:
+def test_record3d_damaged_exr_image_loses_one_frame(export: Path, tmp_path: Path, spoil) -> None:
     path = export / "depth/1.exr"
     path.write_bytes(spoil(path.read_bytes()))
     written = write_folder(open_source(export), tmp_path / "out", Writing())
@@ -135,7 +135,7 @@ def test_damaged_exr_image_loses_one_frame(export: Path, tmp_path: Path, spoil) 
     assert "depth/1.exr" in fault
 
 
-def test_depth_size_mismatch_raises(export: Path, tmp_path: Path) -> None:
+def test_record3d_depth_size_mismatch_raises(export: Path, tmp_path: Path) -> None:
     changed(export, lambda m: m.update(dw=1000))
     with pytest.raises(DataError, match=r"depth/0\.exr: expected 1000x60 px of R, got 80x60 px of R"):
         write_folder(open_source(export), tmp_path / "out", Writing())
@@ -163,7 +163,7 @@ def rewritten(r3d: Path, name: str, content: bytes | None) -> Path:
         ("rgbd/1.conf", b"", r"rgbd/1\.conf: cannot be decompressed"),
     ],
 )
-def test_damaged_r3d_member_loses_one_frame(
+def test_record3d_damaged_r3d_member_loses_one_frame(
     r3d: Path, tmp_path: Path, name: str, content: bytes | None, message: str
 ) -> None:
     written = write_folder(open_source(rewritten(r3d, name, content)), tmp_path / "out", Writing())
@@ -172,7 +172,7 @@ def test_damaged_r3d_member_loses_one_frame(
     assert len(RgbdFolder(tmp_path / "out")) == 3
 
 
-def test_decompression_bomb_loses_its_frame(r3d: Path, tmp_path: Path) -> None:
+def test_record3d_decompression_bomb_loses_its_frame(r3d: Path, tmp_path: Path) -> None:
     lzfse = pytest.importorskip("lzfse")
     packed = lzfse.compress(bytes(10**6))
     bomb = 100 * packed[:-4] + packed[-4:]  # the last four bytes end the stream
@@ -181,7 +181,7 @@ def test_decompression_bomb_loses_its_frame(r3d: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no zip at all" * 100])
-def test_r3d_file_other_than_zip_raises(tmp_path: Path, content: bytes) -> None:
+def test_record3d_r3d_file_other_than_zip_raises(tmp_path: Path, content: bytes) -> None:
     pytest.importorskip("lzfse")
     (tmp_path / "room.r3d").write_bytes(content)
     with pytest.raises(DataError, match=r"room\.r3d: cannot be read: File is not a zip file"):
@@ -189,7 +189,7 @@ def test_r3d_file_other_than_zip_raises(tmp_path: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize(("module", "source"), [("OpenEXR", "export"), ("lzfse", "r3d")])
-def test_missing_package_error_names_extra(
+def test_record3d_missing_package_error_names_extra(
     module: str, source: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = request.getfixturevalue(source)
@@ -198,7 +198,7 @@ def test_missing_package_error_names_extra(
         open_source(path)
 
 
-def test_real_export_is_imported(shared_data: Path, tmp_path: Path) -> None:
+def test_record3d_real_export_is_imported(shared_data: Path, tmp_path: Path) -> None:
     pytest.importorskip("OpenEXR")
     original = shared_data / "originals" / "record3d" / "EXR_RGBD"
     if not original.is_dir():
@@ -213,7 +213,7 @@ def test_real_export_is_imported(shared_data: Path, tmp_path: Path) -> None:
     assert frame.timestamp == pytest.approx(0.05000420800206484)
     assert (frame.depth > 0).mean() > 0.99
     assert np.median(frame.depth) == pytest.approx(0.247, abs=0.003)
-    # it looks down at a door handle: the view is 50 degrees below the horizon, and up is up
+    # it looks down at a door handle, 50 degrees below the horizon
     T_world_camera = frame.T_world_camera
     assert T_world_camera is not None
     assert T_world_camera[1, 2] == pytest.approx(-0.77, abs=0.02)

@@ -1,4 +1,4 @@
-"""Stray Scanner's folders: as the app writes them, damaged, and a real one."""
+"""Tests of Stray Scanner's folders: valid, damaged, and a real one."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("width", "scale"), [(0, 1.0), (160, 0.5), (1000, 1.0)])
-def test_export_matches_room_geometry(folder: Path, tmp_path: Path, width: int, scale: float) -> None:
+def test_stray_scanner_export_matches_room_geometry(folder: Path, tmp_path: Path, width: int, scale: float) -> None:
     written = write_folder(open_source(folder), tmp_path / "out", Writing(width=width))
     assert str(written) == "4 frames"
     check_imported(tmp_path / "out", FRAMES, scale)
 
 
 @pytest.mark.parametrize("least", [0, 1, 2])
-def test_low_confidence_depth_is_dropped(folder: Path, tmp_path: Path, least: int) -> None:
+def test_stray_scanner_drops_low_confidence_depth(folder: Path, tmp_path: Path, least: int) -> None:
     write_folder(open_source(folder), tmp_path / "out", Writing(confidence=least))
     check_imported(tmp_path / "out", FRAMES, least=least)
 
 
-def test_older_export_uses_common_intrinsics(tmp_path: Path) -> None:
+def test_stray_scanner_older_export_uses_common_intrinsics(tmp_path: Path) -> None:
     frames = [FRAMES[0]]
     write_stray_scanner(tmp_path / "old", frames, own_intrinsics=False)
     write_folder(open_source(tmp_path / "old"), tmp_path / "out", Writing())
     check_imported(tmp_path / "out", frames)
 
 
-def test_stride_two_imports_alternate_frames(folder: Path, tmp_path: Path) -> None:
+def test_stray_scanner_stride_two_imports_alternate_frames(folder: Path, tmp_path: Path) -> None:
     write_folder(open_source(folder), tmp_path / "out", Writing(stride=2))
     sequence = RgbdFolder(tmp_path / "out")
     assert [frame.timestamp for frame in sequence] == pytest.approx([FRAMES[0].timestamp, FRAMES[2].timestamp])
@@ -80,7 +80,7 @@ def spoil_row(folder: Path, number: int, change) -> None:
         ),
     ],
 )
-def test_damaged_odometry_row_loses_its_frame(folder: Path, tmp_path: Path, change, message: str) -> None:
+def test_stray_scanner_damaged_odometry_row_loses_its_frame(folder: Path, tmp_path: Path, change, message: str) -> None:
     spoil_row(folder, 2, change)
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
     [fault] = written.errors if "77" not in message else written.errors[:1]
@@ -89,7 +89,7 @@ def test_damaged_odometry_row_loses_its_frame(folder: Path, tmp_path: Path, chan
 
 
 @pytest.mark.parametrize("name", ["depth/000002.png", "confidence/000002.png"])
-def test_damaged_image_loses_one_frame(folder: Path, tmp_path: Path, name: str) -> None:
+def test_stray_scanner_damaged_image_loses_one_frame(folder: Path, tmp_path: Path, name: str) -> None:
     path = folder / name
     path.write_bytes(path.read_bytes()[:-20])
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
@@ -100,7 +100,7 @@ def test_damaged_image_loses_one_frame(folder: Path, tmp_path: Path, name: str) 
     assert len(write_folder(open_source(folder), tmp_path / "again", Writing()).timestamps) == 3
 
 
-def test_short_video_keeps_decoded_frames(folder: Path, tmp_path: Path) -> None:
+def test_stray_scanner_short_video_keeps_decoded_frames(folder: Path, tmp_path: Path) -> None:
     write_video(folder / "rgb.mp4", [frame.color for frame in FRAMES[:2]])
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
     assert (len(written.timestamps), len(written.errors)) == (2, 2)
@@ -120,7 +120,7 @@ def test_short_video_keeps_decoded_frames(folder: Path, tmp_path: Path) -> None:
         ("camera_matrix.csv", b"1, 0, 2\n0, x, 2\n0, 0, 1\n", r"camera_matrix\.csv, line 2: .* got ' x'"),
     ],
 )
-def test_invalid_export_raises_and_leaves_no_folder(
+def test_stray_scanner_invalid_export_leaves_no_folder(
     folder: Path, tmp_path: Path, name: str, content: bytes | None, message: str
 ) -> None:
     (folder / name).unlink()
@@ -131,8 +131,8 @@ def test_invalid_export_raises_and_leaves_no_folder(
     assert not (tmp_path / "out").exists()
 
 
-def test_real_recording_is_imported(shared_data: Path, tmp_path: Path) -> None:
-    """Its poses, depth and confidence; the video is not there, and another one stands in for it."""
+def test_stray_scanner_real_recording_is_imported(shared_data: Path, tmp_path: Path) -> None:
+    """Poses, depth and confidence are real; the video is a replacement."""
     original = shared_data / "originals" / "stray_scanner"
     if not original.is_dir():
         pytest.skip(f"{original} is not there")

@@ -1,4 +1,4 @@
-"""Exact small cases of association."""
+"""Tests of association on small exact cases."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -28,7 +28,7 @@ SHAPE = (4, 5)
 
 
 def clusters_of(masks: list[np.ndarray], scores: list[float]) -> PointClusters:
-    """Point clusters under these (4, 5) masks; places in the world do not matter here."""
+    """Return point clusters under these (4, 5) masks; world positions are not used here."""
     cluster, v, u = np.nonzero(np.array(masks))
     return PointClusters(
         points_world=np.zeros((len(u), 3), np.float32),
@@ -41,7 +41,7 @@ def clusters_of(masks: list[np.ndarray], scores: list[float]) -> PointClusters:
 
 
 def overlaps_of(clusters: PointClusters, seen: np.ndarray, stride: int = 1) -> Overlaps:
-    """How the clusters lie on the instances `seen` at every stride-th pixel of an image."""
+    """Return the overlaps of the clusters with the instances `seen` at every stride-th pixel of an image."""
     points = list_points_by_pixel(clusters, (stride * seen.shape[0], stride * seen.shape[1]))
     return count_overlaps(points, seen, stride)
 
@@ -76,7 +76,7 @@ def test_class_agreement_is_bhattacharyya_coefficient() -> None:
 
 
 def best_first(overlap: np.ndarray, threshold: float) -> np.ndarray:
-    """Matches above `threshold`, the largest overlap first."""
+    """Return the matches above `threshold`, the largest overlap first."""
     return match_one_to_one(overlap > threshold, overlap)
 
 
@@ -125,14 +125,14 @@ def test_match_prefers_best_overlap_and_is_one_to_one() -> None:
 def test_overlap_stray_pixels_do_not_win_cluster() -> None:
     seen = np.zeros(SHAPE, np.int32)
     seen[:, :3] = 1  # the object, of which the cluster sees most
-    seen[0, 0] = 2  # a stray voxel of another one
+    seen[0, 0] = 2  # a single voxel of another instance
     overlaps = overlaps_of(clusters_of([columns(0, 2)], [1]), seen)
     assert best_first(overlaps.over_smaller(min_pixels=1), 0.35).tolist() == [1], "7/8 of 1 lose against 1/1 of 2"
     assert best_first(overlaps.over_smaller(min_pixels=4), 0.35).tolist() == [0]
 
 
 def test_match_table_is_not_assigned_to_book_on_it() -> None:
-    """Its mask covers all of the book, and not quite all of the table."""
+    """The table's mask covers all of the book, and not quite all of the table."""
     seen = np.full(SHAPE, 1, np.int32)
     seen[:, 2] = 2  # the book
     overlaps = overlaps_of(clusters_of([columns(0, 4), columns(2, 3)], [1, 1]), seen)
@@ -151,14 +151,14 @@ def test_match_is_independent_of_detection_order(seed: int) -> None:
 
 
 @pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
-def test_points_outside_image_raise(pixel: tuple[int, int]) -> None:
+def test_points_by_pixel_outside_image_raise(pixel: tuple[int, int]) -> None:
     clusters = clusters_of([columns(0, 2)], [1])
     clusters.pixels[3] = pixel
     with pytest.raises(DataError, match="image of 5x4"):
         list_points_by_pixel(clusters, SHAPE)
 
 
-def test_points_without_cluster_are_ignored() -> None:
+def test_association_ignores_points_without_cluster() -> None:
     clusters = clusters_of([columns(0, 3), columns(1, 4)], [1, 0.5])
     clusters.cluster[clusters.pixels[:, 0] == 1] = -1
     seen = np.full(SHAPE, 4, np.int32)
@@ -170,7 +170,7 @@ def test_points_without_cluster_are_ignored() -> None:
 
 
 def clusters_at(points: PixelLists) -> list[list[int]]:
-    """The clusters in each pixel's list, row by row."""
+    """Return the clusters in each pixel's list, row by row."""
     lists = [points.clusters[first:last].tolist() for first, last in pairwise(points.offsets.tolist())]
     assert points.pixel_counts.tolist() == np.bincount(points.list_ids.ravel(), minlength=len(lists)).tolist()
     return [lists[i] for i in points.list_ids.ravel()]
@@ -184,14 +184,14 @@ def test_keep_on_top_assigns_pixels_to_smaller_object() -> None:
     assert clusters_at(keep_on_top(points, ids, 0.25)) == 4 * [[0], [0], [1], [0], [0]]
     assert clusters_at(keep_on_top(points, ids, 0.2)) == 4 * [[0], [0], [0, 1], [0], [0]]
     unmatched = keep_on_top(points, np.int32([7, 0]), 0.25)
-    assert clusters_at(unmatched) == 4 * [[0], [0], [0], [0], [0]], "it takes nothing, and has no say"
-    assert clusters_at(points) == 4 * [[0], [0], [0, 1], [0], [0]], "the lists given stay as they are"
+    assert clusters_at(unmatched) == 4 * [[0], [0], [0], [0], [0]], "it takes no pixels and has no votes"
+    assert clusters_at(points) == 4 * [[0], [0], [0, 1], [0], [0]], "the input lists are unchanged"
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10_000))
 def test_points_by_pixel_keep_point_order(seed: int) -> None:
-    """Points in any order, some of no cluster, some twice at one pixel under one cluster."""
+    """The points are in any order, some without a cluster, some twice at one pixel in one cluster."""
     rng = np.random.default_rng(seed)
     clusters = clusters_of([rng.random(SHAPE) < filled for filled in rng.random(4)], [1] * 4)
     count = len(clusters.cluster)
@@ -246,4 +246,4 @@ def test_remove_supports_matches_reference(seed: int) -> None:
     both = [[k for k in left if k in top] for left, top in zip(expected, clusters_at(on_top), strict=True)]
     assert clusters_at(remove_supports(on_top, lying, seen, stride)) == both
     unchanged = remove_supports(points, lying & False, seen, stride)
-    assert clusters_at(unchanged) == clusters_at(points), "the lists given stay as they are"
+    assert clusters_at(unchanged) == clusters_at(points), "the input lists are unchanged"

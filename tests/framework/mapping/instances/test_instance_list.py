@@ -1,4 +1,4 @@
-"""When an instance counts."""
+"""Tests of the confirmation of instances."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is known of an instance over time."""
+"""Tests of the table of instances over time."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ frames = st.lists(st.integers(0, 40))
 
 @given(frames, frames)
 def test_frame_set_behaves_like_set(ours: list[int], theirs: list[int]) -> None:
-    """In whatever order frames are added."""
+    """Frames may be added in any order."""
     a, b = FrameSet(), FrameSet()
     for found, expected in ((a, ours), (b, theirs)):
         for k in expected:
@@ -24,8 +24,8 @@ def test_frame_set_behaves_like_set(ours: list[int], theirs: list[int]) -> None:
 
 
 @pytest.mark.parametrize("second", [range(10, 20), range(5, 15)], ids=["one after the other", "half together"])
-def test_merged_fragments_have_confidence_of_whole(second: range) -> None:
-    """Each detected in every other frame that had it in view."""
+def test_instance_table_merge_keeps_confidence_of_whole(second: range) -> None:
+    """Each fragment is detected in every other frame in which it is visible."""
     table = InstanceTable()
     seen = {table.create(1, 0).id: range(10), table.create(1, 0).id: second, table.create(1, 0).id: range(second.stop)}
     for instance_id, in_view in seen.items():

@@ -1,4 +1,4 @@
-"""What the default refiner and fuser make of exact scenes: objects that touch come apart, one object stays one."""
+"""Acceptance tests of the default refiner and fuser: touching objects are separated, one object stays one."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ CHAIR, TABLE, COUCH = 0, 1, 2
 
 
 def mapped(frames: list[Frame], detections: list[Detections], refiner: str = "chain") -> MapFuser:
-    """The map made with the true poses."""
+    """Return the map with true poses."""
     cleaner = built("refiner", refiner)
     fuser = built("fuser", "bayesian_tsdf", f"fuser.voxel_size={VOXEL}")
     for frame, found in zip(frames, detections, strict=True):
@@ -26,7 +26,7 @@ def mapped(frames: list[Frame], detections: list[Detections], refiner: str = "ch
 
 
 def shares(scene: BoxScene, fuser: MapFuser) -> np.ndarray:
-    """(objects + 1, instances + 1) of the vertices on each object, which share each instance has; 0 = room, none."""
+    """Return (objects + 1, instances + 1) the fraction of each object's vertices per instance; 0 = room, none."""
     mesh = fuser.scene.mesh()
     owners = scene.owners(mesh.vertices, VOXEL)
     ids = [0, *fuser.scene.instances()]
@@ -40,7 +40,7 @@ def true_mask(frame: Frame, *objects: int) -> np.ndarray:
 
 
 def assert_one_each(scene: BoxScene, fuser: MapFuser, least: float) -> None:
-    """Each object has one instance on `least` of its vertices, no two the same, and the room has next to none."""
+    """Check that each object has one own instance on `least` of its vertices, and the room has almost none."""
     found = shares(scene, fuser)
     assert found.shape[1] == scene.count, f"{scene.count - 1} objects became {found.shape[1] - 1} instances"
     assert sorted(found[1:, 1:].argmax(axis=1)) == list(range(scene.count - 1))
@@ -52,8 +52,8 @@ def assert_one_each(scene: BoxScene, fuser: MapFuser, least: float) -> None:
 TOUCHING = [[(-0.6, 1.0, 0.0, 0.0, 1.6, 1.5)], [(0.0, 0.9, 0.0, 0.9, 1.6, 0.7)]]
 
 
-def test_touching_objects_under_one_mask_are_separated() -> None:
-    """Every other frame, the first too, has one mask over both, the others have a mask for each; all bleed by 8 px."""
+def test_instances_of_touching_objects_are_separated() -> None:
+    """Every other frame, including the first, has one mask over both; the others have one each; all bleed by 8 px."""
     scene = BoxScene(TOUCHING)
     frames = [scene.frame(look_from(-1.2 + 0.1 * k, -1.6, 1.4, (0.1, 1.2, 0.5)), k) for k in range(24)]
     detections = []
@@ -64,7 +64,7 @@ def test_touching_objects_under_one_mask_are_separated() -> None:
     assert_one_each(scene, mapped(frames, detections), 0.9)
 
 
-def test_bleeding_mask_does_not_claim_undetected_neighbor() -> None:
+def test_instance_of_bleeding_mask_excludes_neighbor() -> None:
     scene = BoxScene(TOUCHING)
     frames = [scene.frame(look_from(-1.2 + 0.1 * k, -1.6, 1.4, (0.1, 1.2, 0.5)), k) for k in range(24)]
     detections = [detected([bled(true_mask(frame, 1), 8)], [TABLE]) for frame in frames]
@@ -76,8 +76,8 @@ def test_bleeding_mask_does_not_claim_undetected_neighbor() -> None:
     assert bleeding[2, 1] > 2 * found[2, 1]
 
 
-def test_adjacent_chairs_stay_separate() -> None:
-    """10 cm apart, alike, seen along the row: one behind the other, then side by side; a third of them is missed."""
+def test_instances_of_adjacent_chairs_stay_separate() -> None:
+    """Identical chairs 10 cm apart are seen along the row and from the side; a third of the detections is missed."""
     scene = BoxScene([chair(-0.275, 1.2), chair(0.275, 1.2)])
     frames = [
         scene.frame(look_from(2.4 * np.sin(a), 1.2 - 2.4 * np.cos(a), 1.3, (0.0, 1.2, 0.5)), k)
@@ -90,8 +90,8 @@ def test_adjacent_chairs_stay_separate() -> None:
     assert_one_each(scene, mapped(frames, detections), 0.9)
 
 
-def test_table_seen_from_two_sides_stays_one_instance() -> None:
-    """From the one side, from low down; then, after a jump, from the other."""
+def test_instance_of_table_stays_one_from_two_sides() -> None:
+    """The camera sees one side from low down and then, after a jump, the other side."""
     scene = BoxScene([table(0.0, 0.0)])
     sides = [(x, y, 1.2) for y in (-2.2, 1.8) for x in np.linspace(-0.8, 0.8, 12)]
     frames = [scene.frame(look_from(*at, (0.0, 0.0, 0.5)), k) for k, at in enumerate(sides)]

@@ -1,4 +1,4 @@
-"""Embeddings of objects: their mean and spread, and that they stay with their objects."""
+"""Tests of object embeddings: mean, spread, and their assignment to objects."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_embedding_mean_is_unit_and_spread_is_lost_length() -> None:
     assert np.isfinite(opposite.mean).all()
 
 
-def test_merged_instances_combine_embeddings() -> None:
+def test_embeddings_of_merged_instances_are_combined() -> None:
     table = InstanceTable()
     for embedding in (X, Y, None):
         record = table.create(1, 0)
@@ -70,7 +70,7 @@ def test_merged_instances_combine_embeddings() -> None:
         (np.eye(2, 3, dtype=np.float32), "w" * 301, "at most 300 characters"),
     ],
 )
-def test_invalid_embeddings_raise(kind: type, embeddings: np.ndarray | None, space: str, fault: str) -> None:
+def test_embeddings_invalid_values_raise(kind: type, embeddings: np.ndarray | None, space: str, fault: str) -> None:
     scores, rows = np.ones(2, np.float32), np.ones((2, 1), np.float32)
     given = {"embeddings": embeddings, "embedding_space": space, "scores": scores, "class_probabilities": rows}
     if kind is Detections:
@@ -83,7 +83,7 @@ def test_invalid_embeddings_raise(kind: type, embeddings: np.ndarray | None, spa
 
 
 def mapped(name: str, frames: int = 4, embeddings: np.ndarray | None = None, space: str = "words@1") -> MapFuser:
-    """The analytic room with its three objects, the last of which is never embedded."""
+    """Map the analytic room with three objects, the last of which has no embedding."""
     fuser: MapFuser = registered.built("fuser", name, "fuser.voxel_size=0.08")
     for k, T in enumerate(walk(4)[:frames]):
         frame = room().frame(T, k)
@@ -162,7 +162,7 @@ def test_embeddings_of_other_space_raise() -> None:
         ("embedding_counts", None, "expected embedding_counts with an embedding space, got none"),
     ],
 )
-def test_damaged_embeddings_in_file_raise(tmp_path: Path, array: str, value: np.ndarray | None, fault: str) -> None:
+def test_embeddings_damaged_in_file_raise(tmp_path: Path, array: str, value: np.ndarray | None, fault: str) -> None:
     path = tmp_path / "map.npz"
     mapped("bayesian_tsdf", embeddings=EMBEDDINGS).scene.save(path)
     with np.load(path) as file:

@@ -1,4 +1,4 @@
-"""The evidence of a map's blocks against the same, voxel by voxel: updates, merging, and slots that grow."""
+"""Tests of the evidence of map blocks, compared voxel by voxel: updates, merging, and growing slots."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.integration
 
 
 def with_voxels(count: int) -> EvidenceRows:
-    """Labels of a map from before, of so many voxels, whose slots hold anything."""
+    """Return the labels of an earlier map with this many voxels."""
     labeled = np.full(-(-count // 512) * 512, -1, np.int32)
     labeled[:count] = np.arange(count)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 100))
@@ -37,7 +37,7 @@ def with_voxels(count: int) -> EvidenceRows:
         ([1, 3, 4, 0], [5, 4, 3, 0], [1, 3, 4, 0], [5, 4, 3, 0]),  # the dropped one not there: nothing changes
     ],
 )
-def test_merge_adds_evidence_and_keeps_best_first(
+def test_evidence_merge_adds_evidence_and_keeps_best_first(
     ids: list[int], logs: list[float], merged_ids: list[int], merged_logs: list[float]
 ) -> None:
     rows = with_voxels(1)
@@ -50,8 +50,8 @@ def test_merge_adds_evidence_and_keeps_best_first(
 
 
 @pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
-def test_merge_updates_all_labeled_voxels(count: int) -> None:
-    """Of thousands, a few know the instance: the first and the last in use, and some between; none beyond."""
+def test_evidence_merge_updates_all_labeled_voxels(count: int) -> None:
+    """Of thousands of voxels, a few have the instance: the first, the last, and some between them."""
     rows = with_voxels(count)
     evidence = rows.evidence
     evidence.instance_ids[: count + 100], evidence.instance_value[: count + 100] = [4, 2, 0, 0], [7, 5, 0, 0]
@@ -74,14 +74,14 @@ def test_evidence_rows_with_256_classes_raise() -> None:
 
 
 def at_pixel(block: int, *voxels: int) -> SeenBlocks:
-    """A frame that sees these voxels of one block at the one pixel that there is."""
+    """Return a frame that sees these voxels of one block at its only pixel."""
     pixel = np.full((1, 512), -1, np.int32)
     pixel[0, voxels] = 0
     return seen_at(np.array([block], np.int32), pixel)
 
 
 def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
-    """A frame that sees the voxels of some blocks at pixels (A, 512), -1 = not near."""
+    """Return a frame that sees the voxels of some blocks at pixels (A, 512), -1 = not near."""
     block, voxel = np.nonzero(pixels >= 0)
     count = np.bincount(block, minlength=len(blocks))
     return SeenBlocks(
@@ -104,7 +104,7 @@ def test_evidence_rows_allocate_only_named_voxels() -> None:
         assert rows.voxels.grid.label_row[:2].tolist() == [-1, 0]
         assert best_class(rows.evidence, rows.evidence.labeled[0, 7]) == 2
         rows.update(at_pixel(0, 3), voted([0], [1.0], [3], Combine.SUM))
-        assert (rows.row_count, rows.voxel_count) == (1, 1), "nothing was said"
+        assert (rows.row_count, rows.voxel_count) == (1, 1), "there was no output"
         assert len(rows.in_use().class_ids) == 1
 
 
@@ -112,7 +112,7 @@ def test_evidence_rows_allocate_only_named_voxels() -> None:
 def test_evidence_update_of_many_blocks_matches_voxelwise(
     blocks: int, frames: int, max_blocks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Update pixels under no, one or several clusters, with and without instance, with and without new slots."""
+    """Pixels are under zero to several clusters, with and without instance, with and without new slots."""
     monkeypatch.setattr(evidence_rows, "RESERVED", 1 if max_blocks == 4 else 128)
     first, other = by_one_thread_and_two(lambda: _updated(blocks, frames, max_blocks))
     for one, two in zip(first, other, strict=True):
@@ -120,7 +120,7 @@ def test_evidence_update_of_many_blocks_matches_voxelwise(
 
 
 def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
-    """The evidence of some blocks after a few frames, compared with each voxel's own."""
+    """Return the evidence of some blocks after a few frames, compared voxel by voxel."""
     rng = np.random.default_rng(3)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, max_blocks))
     rows.begin(6)
@@ -170,7 +170,7 @@ def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
     return evidence
 
 
-def test_evictions_of_new_voxel_are_counted() -> None:
+def test_evidence_rows_count_evictions_of_new_voxel() -> None:
     message = voted([1, 2, 3, 4, 5, 6], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0] * 6, Combine.SUM)
     expected = update_voxel(blank(), 0, message, COVERED)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
@@ -180,8 +180,8 @@ def test_evictions_of_new_voxel_are_counted() -> None:
     assert rows.evicted == expected == 2
 
 
-def test_exact_storage_keeps_all_evidence() -> None:
-    """Many more instances and classes than the compact slots: every sum is there."""
+def test_evidence_rows_exact_storage_keeps_all_evidence() -> None:
+    """There are many more instances and classes than compact slots, and every sum is kept."""
     rng = np.random.default_rng(0)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=Storage.EXACT)
     rows.begin(30)

@@ -1,4 +1,4 @@
-"""The compact Bayesian update against the two recursions written out over all labels."""
+"""Tests of the compact Bayesian update, compared with both recursions over all labels."""
 
 import numpy as np
 import pytest
@@ -21,8 +21,8 @@ from tests.support.one_pixel import BARE, COVERED, FLOOR, SCORE_SCALE, blank, di
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 10_000), labels=st.integers(1, INSTANCE_SLOTS))
-def test_update_matches_full_recursion_if_labels_fit(seed: int, labels: int) -> None:
-    """With no more labels than slots, nothing is ever dropped, so posteriors are exact: eqs. [7] and [8]."""
+def test_label_update_matches_full_recursion_if_labels_fit(seed: int, labels: int) -> None:
+    """With no more labels than slots, no label is evicted and posteriors are exact: eqs. [7] and [8]."""
     rng = np.random.default_rng(seed)
     classes = labels  # every class is named
     evidence = blank()
@@ -49,8 +49,8 @@ def test_update_matches_full_recursion_if_labels_fit(seed: int, labels: int) -> 
     assert best_class(evidence, 0) == np.argmax(class_log)
 
 
-def test_update_matches_full_recursion_for_80_classes() -> None:
-    """More classes than slots: the argmax still agrees nearly always, and evictions are counted."""
+def test_label_update_matches_full_recursion_for_80_classes() -> None:
+    """With more classes than slots, the argmax almost always agrees, and evictions are counted."""
     rng = np.random.default_rng(0)
     agree = 0
     evictions = 0
@@ -71,7 +71,7 @@ def test_update_matches_full_recursion_for_80_classes() -> None:
     assert evictions > 0
 
 
-def test_voxel_under_two_masks_gets_both_updates() -> None:
+def test_label_update_of_voxel_under_two_masks_applies_both() -> None:
     evidence = blank()
     p = np.full((2, 3), 1 / 3)
     update_voxel(evidence, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), COVERED)
@@ -80,7 +80,7 @@ def test_voxel_under_two_masks_gets_both_updates() -> None:
     assert found[2] == np.float32(np.log(0.5 / FLOOR))
 
 
-def test_absence_counts_only_against_detected_instances() -> None:
+def test_label_update_absence_counts_only_if_detected() -> None:
     evidence = blank()
     one = np.full((1, 3), 1 / 3)
     update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), COVERED)
@@ -91,17 +91,17 @@ def test_absence_counts_only_against_detected_instances() -> None:
     assert float(evidence.instance_value[0, 0]) == np.float32(before + np.log(0.5))
     for _ in range(10):
         update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)
-    assert best_instance(evidence, 0) == 0, "the rest has become more likely"
+    assert best_instance(evidence, 0) == 0, "unnamed instances are more likely"
 
 
-def test_cluster_without_instance_adds_no_evidence() -> None:
+def test_label_update_without_instance_adds_no_evidence() -> None:
     evidence = blank()
     update_voxel(evidence, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), COVERED)
     assert (evidence.instance_ids == 0).all()
     assert (evidence.class_ids == NO_CLASS).all()
 
 
-def test_class_gains_are_relative_to_unnamed_classes() -> None:
+def test_named_classes_are_relative_to_mean_of_unnamed_classes() -> None:
     p = np.array([[0.5, 0.2, 0.1, 0.06, 0.04, 0.03, 0.025, 0.02, 0.01, 0.009, 0.006]])
     relative, named, bits = named_classes(np.log(p), logarithmic=True)
     assert named.tolist() == [list(range(NEW_CLASSES))]
@@ -111,10 +111,10 @@ def test_class_gains_are_relative_to_unnamed_classes() -> None:
     assert np.allclose(relative, np.log(p / rest), atol=1e-5)
 
 
-def test_full_slots_replace_least_likely_label() -> None:
+def test_label_slots_replace_least_likely_label_if_full() -> None:
     labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
     assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM, np.float32(9)) == 1
-    assert labels.tolist() == [1, 2, 3, 4], "the newcomer itself is the least likely"
+    assert labels.tolist() == [1, 2, 3, 4], "the new label is the least likely"
     assert add_evidence(labels, logs, 0, np.int32(9), np.float32(1.5), Combine.SUM, np.float32(9)) == 1
     assert dict(zip(labels.tolist(), logs.tolist(), strict=True)) == {1: 4, 9: 1.5, 3: 2, 4: 3}
 
@@ -127,7 +127,7 @@ def test_best_counted_instance_skips_uncounted() -> None:
     counts[1] = False
     assert best_counted_instance(evidence, 0, counts) == 3
     counts[[3, 5]] = False
-    assert best_counted_instance(evidence, 0, counts) == 0, "the rest is likelier than 2"
+    assert best_counted_instance(evidence, 0, counts) == 0, "unnamed instances are more likely than 2"
 
 
 SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2])]
@@ -183,7 +183,7 @@ def test_compact_scores_saturate_without_wrapping() -> None:
 
 @pytest.mark.parametrize(("classes", "best"), [(2, 0.7), (3, 0.6), (9, 0.8), (80, 0.5)])
 def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) -> None:
-    """The same distribution 1000 times, its best class the last one and most of the rest on the first."""
+    """The same distribution is fused 1000 times; its best class is the last one, and the first has most of the rest."""
     p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
     relative, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
@@ -197,7 +197,7 @@ def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) 
 
 
 def test_packed_scores_match_in_int32_and_int64() -> None:
-    """The largest relative that compact storage allows."""
+    """The scores are the largest that compact storage allows."""
     relative = np.array([[MAX_CLUSTER_SCORE, -MAX_CLUSTER_SCORE, 0.4, -0.6]])
     bits = np.zeros((1, NO_CLASS + 1), np.uint8)
     bits[0, :4] = 1 << np.arange(4)

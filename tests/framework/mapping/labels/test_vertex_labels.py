@@ -1,4 +1,4 @@
-"""The election of vertex labels, beside one written out voxel by voxel."""
+"""Tests of the vertex label vote, compared with a voxel-wise reference."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.scenes.analytic_scene import CAMERA, room, walk
 
 @pytest.fixture(scope="module")
 def fuser() -> BayesianTsdf:
-    """Three spheres, and a third of their masks each to a second instance, so that there are borders on objects."""
+    """Return three spheres with a third of each mask in a second instance, so that objects contain borders."""
     fuser = assemble(BayesianTsdf, voxel_size=0.03, max_depth=4.0, min_observations=1)
     for k, T in enumerate(walk(4)):
         frame = room().frame(T, k)
@@ -83,7 +83,7 @@ def test_vertex_labels_match_voxelwise_reference(fuser: BayesianTsdf, dropped: t
     counts[list(dropped)] = False
     surface = scene.volume.surface()
     instances, classes = labels_of(scene, counts, surface)
-    assert len(np.unique(instances)) >= 4 - len(dropped), "there must be something to tell apart"
+    assert len(np.unique(instances)) >= 4 - len(dropped), "the labels must differ"
     rng = np.random.default_rng(0)
     near_labels = np.flatnonzero(instances > 0)
     chosen = np.concatenate([rng.choice(near_labels, 400), rng.choice(len(instances), 400)])
@@ -94,7 +94,7 @@ def test_vertex_labels_match_voxelwise_reference(fuser: BayesianTsdf, dropped: t
     assert not set(dropped) & set(instances.tolist())
 
 
-def test_vertex_in_unmapped_space_has_no_label(fuser: BayesianTsdf) -> None:
+def test_vertex_labels_of_unmapped_space_are_none(fuser: BayesianTsdf) -> None:
     scene = fuser.scene
     counts = np.ones(scene.table.last_id + 1, np.bool_)
     far = UnlabeledMesh(np.full((1, 3), 1e3, np.float32), np.zeros((0, 3), np.int32), np.zeros(1, np.int32))

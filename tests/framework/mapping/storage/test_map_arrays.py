@@ -1,4 +1,4 @@
-"""A map's file whose arrays are not those of a map is refused in one line, before a kernel reads them."""
+"""Tests of invalid arrays in a map file, which raise a one-line error before a kernel reads them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FAR = 100_000_000
 
 @pytest.fixture(scope="module", params=registered.names("fuser"))
 def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[type[SceneMap], Path]:
-    """A map and its file."""
+    """Return a map and its file."""
     fuser: MapFuser = registered.built("fuser", request.param, "fuser.voxel_size=0.04")
     for k, T in enumerate(walk(2)):
         frame = room().frame(T, k)
@@ -36,7 +36,7 @@ def content(path: Path) -> dict[str, np.ndarray]:
 
 
 def refused(kind: type[SceneMap], path: Path, changes: dict[str, np.ndarray]) -> str:
-    """What is said of the file with some arrays replaced."""
+    """Return the error of the file with some arrays replaced."""
     np.savez(path.with_name("changed.npz"), **(content(path) | changes))
     with pytest.raises(DataError) as caught:
         kind.load(path.with_name("changed.npz"))

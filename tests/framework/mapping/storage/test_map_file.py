@@ -1,4 +1,4 @@
-"""A map's file: any array comes back, numpy reads it, and damage is found."""
+"""Tests of the map file: round trips of any array, numpy compatibility, and damage."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ def test_map_file_is_reproducible(saved: Path, tmp_path: Path) -> None:
     write_map(tmp_path / "again.npz", HEADER, {name: array.copy() for name, array in ARRAYS.items()})
     assert (tmp_path / "again.npz").read_bytes() == saved.read_bytes()
     with zipfile.ZipFile(saved) as archive:
-        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}, "the same at another time"
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}, (
+            "the same bytes at another time"
+        )
 
 
 def test_map_file_is_lightly_compressed(saved: Path) -> None:

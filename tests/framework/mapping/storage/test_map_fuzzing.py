@@ -1,4 +1,4 @@
-"""Whatever a map's file says, with valid checksums: it is a map that can be used, or it is refused in one line."""
+"""Fuzz tests of map files with valid checksums: a file is a usable map, or raises a one-line error."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from tests.support.true_masks import fuse_masks, masks_of
 
 pytestmark = pytest.mark.integration
 
-SLOWEST = 5.0  # s of this process: others may keep the machine busy
+SLOWEST = 5.0  # s of CPU time, because other processes may use the machine
 CAMERA = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
 KINDS = ("bayesian_tsdf", "words", "exact", "last_write", "object_volumes", "open3d_vbg", "class_only_fusion")
 
 
 @dataclass(frozen=True)
 class Saved:
-    """A map's file."""
+    """A map file."""
 
-    path: Path  # where changed ones go
+    path: Path  # folder of changed files
     arrays: dict[str, np.ndarray] = field(repr=False)
 
 
 @pytest.fixture(scope="module", params=KINDS)
 def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Saved:
-    """Each kind of map once."""
+    """Return one map of each kind."""
     name = request.param
     variants = {"exact": ["bayesian_tsdf", "fuser.storage=EXACT"], "words": ["bayesian_tsdf"]}
     chosen = variants.get(name, [name])
@@ -51,13 +51,13 @@ def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=np.eye(3, 5) if name == "words" else None)
     path = tmp_path_factory.mktemp(name) / "map.npz"
     fuser.scene.save(path)
-    use(load_scene(path))  # compiles what it takes
+    use(load_scene(path))  # compiles the needed kernels
     with np.load(path) as file:
         return Saved(path.with_name("changed.npz"), dict(file))
 
 
 def use(scene: SceneMap) -> None:
-    """All that a map is asked for."""
+    """Call all functions of a map."""
     instances = scene.instances()
     scene.mesh()
     for T in walk(4)[:2]:
@@ -76,7 +76,7 @@ def use(scene: SceneMap) -> None:
 
 
 def load_and_use(path: Path, content: bytes) -> str:
-    """The line that refuses the file; "" = it was used."""
+    """Return the error line of the file; "" if it was usable."""
     path.write_bytes(content)
     began = time.process_time()
     try:
@@ -94,14 +94,14 @@ def load_and_use(path: Path, content: bytes) -> str:
 
 
 def archive(arrays: dict[str, np.ndarray]) -> bytes:
-    """With checksums that hold."""
+    """Return the file with valid checksums."""
     file = io.BytesIO()
     np.savez(file, **arrays)  # type: ignore[arg-type]
     return file.getvalue()
 
 
 def changed_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
-    """The array with other numbers, another length, shape or type."""
+    """Return the array with other values, length, shape or type."""
     array = np.atleast_1d(array)
     match draw(st.sampled_from(("number", "number", "number", "all", "cut", "repeat", "type", "shape", "roll"))):
         case "number" if array.size:
@@ -126,7 +126,7 @@ def changed_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
 def odd_number(draw: st.DrawFn, dtype: np.dtype[Any]) -> Any:
     if dtype.kind == "f":
         return draw(st.sampled_from((0.0, -1.0, 1e38, -1e38, 1e-40, np.nan, np.inf, -np.inf)))
-    if dtype.kind not in "iu":  # what another change has made of it
+    if dtype.kind not in "iu":  # the result of another change
         return np.ones(1, dtype)[0]
     low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
     return draw(st.sampled_from([n for n in (*LARGE, low, high, low + 1) if low <= n <= high]))
@@ -153,7 +153,7 @@ def test_map_fuzz_changed_content_loads_or_raises(saved: Saved, data: st.DataObj
 )
 @given(data=st.data())
 def test_map_fuzz_damaged_bytes_load_or_raise(saved: Saved, data: st.DataObject) -> None:
-    """Bytes changed anywhere, headers of the archive and of its arrays among them."""
+    """Any bytes are changed, including the headers of the archive and of its arrays."""
     content = bytearray(archive(saved.arrays))
     headers = [match.start() for match in re.finditer(rb"PK|\x93NUMPY", content)]
     for _ in range(data.draw(st.integers(1, 4))):

@@ -1,4 +1,4 @@
-"""The TSDF against a slow reference and against exact surfaces."""
+"""Tests of the TSDF, compared with a slow reference and with exact surfaces."""
 
 import tracemalloc
 from dataclasses import replace
@@ -29,7 +29,7 @@ def new_integrator() -> Integrator:
 
 
 def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The blocks that a frame has updated, and the pixels that see their voxels near the surface, -1 for the others."""
+    """Return the updated blocks of a frame, and the pixels of their voxels near the surface, -1 for the others."""
     seen = integrator.integrate(frame, T_world_camera, VOXEL)
     pixels = np.full((len(seen.blocks), 512), -1)
     for a, (first, count) in enumerate(zip(seen.near_start, seen.near_count, strict=True)):
@@ -40,7 +40,7 @@ def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) ->
 
 
 def test_integration_of_one_frame_matches_reference() -> None:
-    """Every voxel of the active blocks, in double precision and plain numpy."""
+    """The reference computes every voxel of the active blocks in double precision and plain numpy."""
     frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
     integrator = new_integrator()
     active, near_pixel = seen_by(integrator, frame, frame.T_world_camera)
@@ -92,13 +92,13 @@ def test_integration_reuses_reserved_memory_for_more_blocks(monkeypatch: pytest.
 
 
 def near_pixels(seen: SeenBlocks) -> list[int]:
-    """The pixels that see voxels near the surface, as often as they see one."""
+    """Return the pixels of voxels near the surface, once per voxel."""
     parts = zip(seen.near_start.tolist(), seen.near_count.tolist(), strict=True)
     return sorted(p for first, count in parts for p in seen.near_pixel[first : first + count].tolist())
 
 
 def test_integration_allocates_blocks_near_surface() -> None:
-    """Blocks are allocated for the whole band, not only where a ray happens to pass."""
+    """Blocks are allocated in the whole truncation band instead of only along rays."""
     frame = room().frame(pose())
     integrator = new_integrator()
     integrator.integrate(frame, frame.T_world_camera, VOXEL)
@@ -107,20 +107,18 @@ def test_integration_allocates_blocks_near_surface() -> None:
     surface = np.stack([(u - CAMERA.cx) / CAMERA.fx * d, (v - CAMERA.cy) / CAMERA.fy * d, d], axis=-1)
     blocks = {tuple(c) for c in integrator.voxels.grid.block_coords[: integrator.voxels.block_count]}
     wanted = {tuple(c) for c in np.floor(surface / (8 * VOXEL)).astype(int)}
-    assert len(wanted - blocks) <= 0.02 * len(wanted), (
-        "only corners that less than a stride of pixels sees may be missed"
-    )
+    assert len(wanted - blocks) <= 0.02 * len(wanted), "only corners seen by less than a stride of pixels may be missed"
 
 
-def test_rounding_averages_are_unbiased() -> None:
-    """A constant that is no multiple of the stored unit is met on average, though values are stored as integers."""
+def test_integration_rounding_averages_are_unbiased() -> None:
+    """The average of a constant between two stored units is exact, although values are integers."""
     rounding = [(k * GOLDEN) % 1.0 for k in range(1, 1001)]
     assert abs(np.mean(np.floor(0.3 + np.array(rounding))) - 0.3) < 0.01
 
 
 @pytest.mark.parametrize("frame_number", [987, 2584, 121393])
-def test_rounding_does_not_wrap_around(frame_number: int) -> None:
-    """At these frames frac(k * GOLDEN) is all but 1; air at the widest truncation stays air and white stays white."""
+def test_integration_rounding_does_not_wrap_around(frame_number: int) -> None:
+    """At these frames frac(k * GOLDEN) is almost 1: air at the largest truncation stays air, and white stays white."""
     assert (frame_number * GOLDEN) % 1.0 > 0.9995
     scene = room()
     frame = scene.frame(pose())
@@ -137,12 +135,12 @@ def test_rounding_does_not_wrap_around(frame_number: int) -> None:
 
 
 def channels(packed: np.ndarray) -> np.ndarray:
-    """(N, 3) red, green, blue in levels."""
+    """Return (N, 3) red, green, blue in levels."""
     return np.stack([packed & 1023, (packed >> 10) & 1023, (packed >> 20) & 1023], axis=-1) / 4
 
 
 @pytest.mark.parametrize("depth", [0.0, 0.1, 7.0])
-def test_readings_outside_sensor_range_allocate_no_blocks(depth: float) -> None:
+def test_integration_outside_sensor_range_allocates_no_blocks(depth: float) -> None:
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), np.full(CAMERA.shape, depth, np.float32), CAMERA)
     integrator = new_integrator()
     integrator.integrate(frame, np.eye(4), VOXEL)
@@ -172,7 +170,7 @@ def test_readings_outside_sensor_range_allocate_no_blocks(depth: float) -> None:
         ),
     ],
 )
-def test_frame_exceeding_limits_raises_before_allocation(
+def test_integration_over_limits_raises_before_allocation(
     options: dict[str, float], T: float, error: type[Exception], message: str
 ) -> None:
     volume = assemble(VoxelHashing, max_blocks=1000, **options).new_volume()
@@ -189,7 +187,7 @@ def test_frame_exceeding_limits_raises_before_allocation(
         tracemalloc.stop()
 
 
-def test_color_is_stored_only_near_surface() -> None:
+def test_integration_stores_color_only_near_surface() -> None:
     frame = room().frame(pose())
     frame.color[:] = (10, 200, 90)
     sensor = SENSOR._replace(truncation_slope=np.float32(0.0))
@@ -202,8 +200,8 @@ def test_color_is_stored_only_near_surface() -> None:
     assert (grid.color[active][air] == 0).all()
 
 
-def test_air_color_is_not_averaged() -> None:
-    """A wall comes nearer to where air was seen before: its color is its own, not a mixture with black."""
+def test_integration_does_not_average_color_of_air() -> None:
+    """A wall is moved to previously empty space: its color is not mixed with black."""
     integrator = new_integrator()
     for depth, frames in ((1.5, 5), (1.4, 13)):
         wall = np.full(CAMERA.shape, depth, np.float32)
@@ -216,8 +214,8 @@ def test_air_color_is_not_averaged() -> None:
     assert np.abs(channels(packed[packed > 0]) - 200).max() <= 0.25
 
 
-def test_weight_is_limited_to_maximum() -> None:
-    """The weight stops at max_weight, in the stored unit, at the highest that may be set too."""
+def test_integration_limits_weight_to_maximum() -> None:
+    """The weight is limited to max_weight in the stored unit, including the largest valid value."""
     frame = room().frame(pose())
     for most in (3.0, 255.0):
         sensor = SENSOR._replace(max_weight=np.float32(most), full_weight_depth=np.float32(100.0))
@@ -227,8 +225,8 @@ def test_weight_is_limited_to_maximum() -> None:
         assert integrator.voxels.grid.weight[: integrator.voxels.block_count].max() == most * WEIGHT_ONE
 
 
-def test_noise_averages_out() -> None:
-    """40 frames with 10 mm noise leave about 10 / sqrt(40) mm in the voxels at the surface."""
+def test_integration_averages_noise() -> None:
+    """After 40 frames with 10 mm noise, about 10 / sqrt(40) mm remain in the voxels at the surface."""
     frame = room().frame(pose())
     integrator = new_integrator()
     rng = np.random.default_rng(0)
@@ -250,8 +248,8 @@ def test_noise_averages_out() -> None:
     assert np.std(np.concatenate(errors)) == pytest.approx(0.01 / np.sqrt(40), rel=0.15)
 
 
-def test_carving_removes_objects_seen_through() -> None:
-    """A sphere that is taken away disappears from the map once the wall behind it has been seen often enough."""
+def test_integration_removes_objects_seen_through() -> None:
+    """A removed sphere disappears from the map after the wall behind it was visible often enough."""
     scene, empty = room(), room()
     empty.spheres = []
     integrator = new_integrator()

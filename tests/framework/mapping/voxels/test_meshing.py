@@ -1,4 +1,4 @@
-"""Surface nets against a slow reference and exact surfaces, and updates against extraction from scratch."""
+"""Tests of surface nets, compared with a slow reference and exact surfaces; updates equal full extraction."""
 
 import itertools
 
@@ -30,13 +30,13 @@ MESH_ARRAYS = ("vertices", "triangles", "colors", "instance_ids", "class_ids")
 
 
 def block_of(distance: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """(512,) of a block at coordinates `block` >= 0 from a dense (X, Y, Z) array; x runs fastest."""
+    """Return (512,) a block at coordinates `block` >= 0 of a dense (X, Y, Z) array; x runs fastest."""
     x, y, z = 8 * block
     return distance[x : x + 8, y : y + 8, z : z + 8].transpose(2, 1, 0).ravel()
 
 
 def grid_of(distance: np.ndarray, blocks: np.ndarray, origin: tuple[int, int, int]) -> VoxelGrid:
-    """The blocks (N, 3) of a dense array of stored distances, moved by `origin` blocks."""
+    """Return the blocks (N, 3) of a dense array of stored distances, moved by `origin` blocks."""
     voxels = VoxelGrid(VOXEL, BAND, 1000)
     voxels.allocate((blocks + origin).astype(np.int32))
     for number, block in enumerate(blocks):
@@ -45,7 +45,7 @@ def grid_of(distance: np.ndarray, blocks: np.ndarray, origin: tuple[int, int, in
 
 
 def slow_surface_nets(stored: np.ndarray, most_jump: float) -> tuple[dict, set]:
-    """{cell: vertex in voxels} and the quads as tuples of cells, by the definition, cell by cell and edge by edge."""
+    """Return {cell: vertex in voxels} and the quads as tuples of cells, by the definition."""
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     vertices = {}
     for cell in itertools.product(*(range(n - 1) for n in stored.shape)):
@@ -74,7 +74,7 @@ def slow_surface_nets(stored: np.ndarray, most_jump: float) -> tuple[dict, set]:
 
 
 def test_surface_nets_match_reference() -> None:
-    """A random field with steps, voxels never seen and blocks that are absent, across the origin of coordinates."""
+    """The field is random with steps, unseen voxels and absent blocks, across the origin."""
     rng = np.random.default_rng(5)
     side, origin = 24, (-1, -2, 7)
     i, j, k = np.mgrid[:side, :side, :side] * 0.35
@@ -107,7 +107,7 @@ def test_surface_nets_match_reference() -> None:
 
 @pytest.fixture(scope="module")
 def sphere() -> VoxelGrid:
-    """The exact distances to a sphere of 0.6 m about (0.9, 0.85, 0.8)."""
+    """Return the exact distances to a sphere of 0.6 m about (0.9, 0.85, 0.8)."""
     blocks = np.array(list(itertools.product(range(5), repeat=3)))
     points = np.stack(np.mgrid[:40, :40, :40], axis=-1) * VOXEL
     distance = np.linalg.norm(points - (0.9, 0.85, 0.8), axis=-1) - 0.6
@@ -134,7 +134,7 @@ def copied(surface: UnlabeledMesh) -> UnlabeledMesh:
 
 
 def test_surface_nets_reread_only_changed_blocks(sphere: VoxelGrid) -> None:
-    """A block that is written without a word keeps its old surface; named, it and its neighbors get the new one."""
+    """A changed block keeps its old surface until it is listed; then it and its neighbors are updated."""
     nets = SurfaceNets(sphere)
     before = copied(nets.extract())
     block = int(np.bincount(before.voxels // 512).argmax())
@@ -150,7 +150,7 @@ def test_surface_nets_reread_only_changed_blocks(sphere: VoxelGrid) -> None:
         assert all(map(np.array_equal, after, SurfaceNets(sphere).extract()))
     finally:
         sphere.grid.tsdf[block] = kept
-    assert np.array_equal(before.vertices, SurfaceNets(sphere).extract().vertices), "what was given out stays as it was"
+    assert np.array_equal(before.vertices, SurfaceNets(sphere).extract().vertices), "returned arrays are unchanged"
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -167,7 +167,7 @@ def test_surface_nets_are_independent_of_thread_count(sphere: VoxelGrid, threads
 
 
 def detections(frame: Frame) -> Detections:
-    """Exact masks of the spheres, and a second one of each that shares no pixel with it: two instances an object."""
+    """Return exact masks of the spheres, each split into two instances without shared pixels."""
     assert frame.truth is not None
     ids = frame.truth.instance_ids
     u = np.arange(frame.camera.width)[None]
@@ -184,7 +184,7 @@ def fuse(fuser: BayesianTsdf, T_world_camera: np.ndarray, k: int) -> None:
 
 
 def same_mesh(ours: InstanceMap) -> bool:
-    """Whether the map's mesh equals that of a map which was never asked before."""
+    """Return True if the map's mesh equals a full extraction."""
     mesh = ours.mesh()
     ours.volume.changed()
     return equal(mesh, ours.mesh())
@@ -195,21 +195,21 @@ def equal(ours: InstanceMesh, theirs: InstanceMesh) -> bool:
 
 
 def test_mesh_updates_match_full_extraction() -> None:
-    """After every frame and every merge, to the last bit, while blocks, instances and what counts keep changing."""
+    """The meshes are bit-identical after every frame and merge, while blocks, instances and confirmations change."""
     updated, asked_late = (assemble(BayesianTsdf, voxel_size=0.019, max_depth=4.0) for _ in range(2))
     sizes, named = [], []
     for k, T in enumerate(walk(40)[::4]):
         fuse(updated, T, k)
         fuse(asked_late, T, k)
         mesh = updated.scene.mesh()
-        assert asked_late.scene.volume._nets is None, "who asks for no mesh pays for none"
+        assert asked_late.scene.volume._nets is None, "without mesh requests there is no mesh cost"
         reference = SurfaceNets(updated.scene.volume.voxels).extract()
         assert np.array_equal(mesh.vertices, reference.vertices)
         assert np.array_equal(mesh.triangles, reference.triangles)
         sizes.append(updated.scene.volume.voxels.block_count)
         named.append(len(np.unique(mesh.instance_ids)))
     assert sizes[0] < 1024 < sizes[-1], "the grid's arrays grew"
-    assert named[0] == 1, "nothing counts yet"
+    assert named[0] == 1, "no instance is confirmed"
     assert named[-1] > 2
     ours = updated.scene.mesh()
     assert equal(ours, asked_late.scene.mesh())
@@ -222,7 +222,7 @@ def test_mesh_updates_match_full_extraction() -> None:
 
 
 def test_mesh_of_furnished_room_lies_on_surface() -> None:
-    """Exact poses, no noise, 1 cm voxels: median 0.1 voxel, 95 % within 0.5 voxel, and next to nothing is missing."""
+    """With exact poses, no noise and 1 cm voxels, the median is 0.1 voxel and 95 % are within 0.5 voxel."""
     sequence = Synthetic(kind=RoomKind.LIVING_ROOM, frames=240, stride=12, noise=0.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.01)
     nothing = NoDetections()
@@ -248,7 +248,7 @@ def test_mesh_of_furnished_room_lies_on_surface() -> None:
 
 
 def distance_to(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """m, of points (N, 3) from a mesh."""
+    """Return the distance (m) of points (N, 3) from a mesh."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles.astype(np.uint32)))
     return np.asarray(scene.compute_distance(o3d.core.Tensor(points)).numpy())

@@ -1,4 +1,4 @@
-"""Views of the map against closed-form depth, normals and color."""
+"""Tests of rendered views of the map, compared with closed-form depth, normals and color."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def mapped(scene: Scene, poses: list[np.ndarray]) -> VoxelGrid:
 
 @pytest.mark.parametrize("slant", [0.0, 0.4, 0.8, 1.1])
 def test_raycast_slanted_plane_depth_is_unbiased(slant: float) -> None:
-    """Half-pixel and half-voxel faults show as a bias that changes sign with the slant."""
+    """Errors of half a pixel or half a voxel cause a bias that changes sign with the slant."""
     n = np.array([np.sin(slant), 0.3, -np.cos(slant)]) / np.linalg.norm([np.sin(slant), 0.3, -np.cos(slant)])
     scene = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.8]))])
     voxels = mapped(scene, walk(20))
@@ -44,7 +44,7 @@ def test_raycast_slanted_plane_depth_is_unbiased(slant: float) -> None:
 
 
 def test_raycast_noisy_distant_wall_is_unbiased() -> None:
-    """Readings too near and too far must weigh alike around a surface, where noise is wider than a voxel."""
+    """Depth in front of and behind the surface must have equal weight if noise exceeds a voxel."""
     voxel, depth = 0.01, 4.0
     sensor = Sensor(*map(np.float32, (4 * voxel, 0.01, 0.2, 5.0, 200.0, 1.5)))
     integrator = Integrator(VoxelGrid(voxel, sensor.max_truncation, 100_000), sensor)
@@ -108,7 +108,7 @@ def test_leave_cell_slanted_ray_exits_nearest_border(d: float) -> None:
 
 @pytest.mark.parametrize("k", range(6))
 def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
-    """Every pixel searched from the nearest to the farthest depth shows no surface that is missed otherwise."""
+    """Searching every pixel from the nearest to the farthest depth finds no additional surface."""
     voxels = mapped(room(), [pose()])
     camera = Camera(161, 119, 90.0, 95.0, 70.0, 61.0) if k % 2 else CAMERA
     rng = np.random.default_rng(k)
@@ -116,7 +116,7 @@ def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
     depth, _ = cast_view(voxels, SENSOR, camera, T)
     exhaustive = every_ray(voxels, T, camera)
     assert (exhaustive > 0).mean() > 0.1
-    # at ragged borders of the map, where a step starts decides about a hair's breadth
+    # at ragged borders of the map, the start of a step decides tiny gaps
     assert ((depth == 0) & (exhaustive > 0)).mean() < 4e-3
     assert ((depth > 0) & (exhaustive == 0)).mean() < 15e-3
     both = (depth > 0) & (exhaustive > 0)
@@ -125,7 +125,7 @@ def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
 
 @pytest.mark.parametrize("sparse", ["every pixel", "every fourth column", "one in ten"])
 def test_raycast_near_readings_finds_surface(sparse: str) -> None:
-    """Also where the readings miss all the coarse rays."""
+    """This includes depth between the coarse rays."""
     voxels = mapped(room(), [pose()])
     T = pose(0.1, -0.05, 0.1, (0.05, 0.1, 0.0))
     exhaustive = every_ray(voxels, T)
@@ -144,7 +144,7 @@ def test_raycast_near_readings_finds_surface(sparse: str) -> None:
 
 
 def test_raycast_ignores_surface_beyond_sensor_range() -> None:
-    """Of a map that a farther-sighted sensor has made."""
+    """The map may be from a sensor with a longer range."""
     voxels = mapped(room(), [pose()])
     farthest = cast_view(voxels, SENSOR, CAMERA, pose())[0].max()
     short = SENSOR._replace(max_depth=np.float32(0.8 * farthest))
@@ -155,7 +155,7 @@ def test_raycast_ignores_surface_beyond_sensor_range() -> None:
 
 
 def every_ray(voxels: VoxelGrid, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """(H, W) m: every pixel searched from the nearest to the farthest depth."""
+    """Return (H, W) m: every pixel searched from the nearest to the farthest depth."""
     tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
     near, far = (np.full(tiles, bound, np.float32) for bound in (SENSOR.min_depth, SENSOR.max_depth))
     depth = np.empty((camera.height + 1, camera.width + 1), np.float32)
@@ -163,7 +163,7 @@ def every_ray(voxels: VoxelGrid, T: np.ndarray, camera: Camera = CAMERA) -> np.n
     return depth[:-1, :-1]
 
 
-def test_tile_bounds_ignore_block_beside_camera() -> None:
+def test_tile_bounds_ignore_block_next_to_camera() -> None:
     voxels = mapped(room(), walk(3))
     voxels.allocate(np.int32([[0, 2, 0]]))  # 32 cm below the camera, out of view
     voxels.grid.solid[voxels.block_count - 1] = True

@@ -1,4 +1,4 @@
-"""The hash table and the blocks."""
+"""Tests of the hash table and of the blocks."""
 
 import resource
 
@@ -38,7 +38,7 @@ def test_find_block_returns_only_allocated_blocks() -> None:
 
 @pytest.mark.parametrize("promised", [64, 100_000])
 def test_voxel_grid_growth_keeps_content(promised: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the system promises memory for all blocks, nothing need be copied; some promise less."""
+    """If the system reserves memory for all blocks, nothing is copied; some systems reserve less."""
     monkeypatch.setattr(voxel_grid, "reserved", lambda most, make: make(min(most, promised)))
     voxels = VoxelGrid(0.01, 0.05, 100_000)
     voxels.allocate(np.zeros((1, 3), np.int32))
@@ -49,7 +49,7 @@ def test_voxel_grid_growth_keeps_content(promised: int, monkeypatch: pytest.Monk
     assert (voxels.grid.tsdf[1:8000] == UNSEEN).all()
 
 
-def test_reserved_memory_is_smaller_under_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxel_grid_reserves_less_memory_under_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     def make(length: int) -> int:
         if length > 3000:
             raise MemoryError

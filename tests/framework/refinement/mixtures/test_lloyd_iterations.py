@@ -1,4 +1,4 @@
-"""Lloyd's algorithm compared with scikit-learn's, and the starts compared with a reference."""
+"""Tests of Lloyd's algorithm, compared with scikit-learn, and of its start, compared with a reference."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_nearest_centers_tie_returns_first_center():
 
 
 def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:
-    """Sets of (mask, ring) points in four blobs, and log-odds that are negative for a third of the mask."""
+    """Return sets of (mask, ring) points in four blobs, and log-odds that are negative for a third of the mask."""
     rng = np.random.default_rng(0)
     masks, rings = np.transpose(counts)
     starts = np.concatenate([[0], np.cumsum(masks + rings)])
@@ -71,7 +71,7 @@ def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:
 
 
 def groups_of(points: np.ndarray, groups: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and centers of Lloyd's algorithm from the means of equal parts by depth."""
+    """Return labels and centers of Lloyd's algorithm from the means of equal parts by depth."""
     by_depth = points[np.argsort(points[:, 2], kind="stable")]
     cuts = np.arange(groups + 1) * len(points) // groups
     centers = np.array([by_depth[a:b].mean(axis=0) for a, b in pairwise(cuts)])

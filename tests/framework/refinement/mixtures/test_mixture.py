@@ -1,4 +1,4 @@
-"""The mixtures beside scikit-learn's from the same start."""
+"""Tests of the Gaussian mixtures, compared with scikit-learn from the same start."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from framework.refinement.mixtures.mixture_kernels import EmSettings, Mixtures
 
 
 def blobs(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
-    """Points of four overlapping Gaussians far from the origin, float32, and start labels that are half wrong."""
+    """Return float32 points of four overlapping Gaussians far from the origin, and half wrong start labels."""
     rng = np.random.default_rng(seed)
     true = rng.integers(0, 4, count)
     mixing = rng.normal(0, 0.2, (4, 3, 3)) + 0.1 * np.eye(3)
@@ -22,7 +22,7 @@ def blobs(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sklearn_from(points: np.ndarray, labels: np.ndarray, iterations: int, floor: float = 0.0) -> GaussianMixture:
-    """scikit-learn's mixture started from the M-step of `labels`."""
+    """Return scikit-learn's mixture started from the M-step of `labels`."""
     covariances = np.array([np.cov(points[labels == j].T, bias=True) for j in range(4)], np.float64)
     reference = GaussianMixture(
         4,
@@ -61,7 +61,7 @@ def test_mixture_fit_matches_scikit_learn(iterations):
 
 @pytest.mark.parametrize("bound", [0.1, 0.5, 0.9])
 def test_likely_members_match_analytic_posterior(bound):
-    """One object and one background Gaussian in 1D at -1 and 1, unit covariance, and a uniform density."""
+    """One object and one background Gaussian are at -1 and 1 in 1D, with unit covariance and a uniform density."""
     ours = Mixtures(
         weights=np.array([[0.3, 0.6]]),
         means=np.array([[[-1.0, 0, 0], [1.0, 0, 0]]]),
@@ -87,7 +87,7 @@ def test_likely_members_match_analytic_posterior(bound):
 
 @pytest.mark.parametrize("components", [1, 3, 8])
 def test_likely_members_match_full_posterior(components):
-    """Near the border and far from it: the points that are decided without a sum, and those that are not."""
+    """The points are near the border and far from it, so that some are decided without a sum."""
     rng = np.random.default_rng(components)
     n = components + 2
     ours = Mixtures(
@@ -124,7 +124,7 @@ def test_mixture_fit_likelihood_increases_until_tolerance():
         mixture.fit(points, starts, labels, 4, EmSettings(i, -np.inf, 1e-6, 0.02))
         for i in range(1, 20)
     ]  # fmt: skip
-    assert (np.diff([fit.log_likelihoods[0] for fit in fits]) > -1e-4).all(), "but for single precision"
+    assert (np.diff([fit.log_likelihoods[0] for fit in fits]) > -1e-4).all(), "except for single precision"
     stopped = mixture.fit(points, starts, labels, 4, EmSettings(1000, 1e-3, 1e-6, 0.02))
     assert stopped.iterations[0] < 1000
     before = fits[stopped.iterations[0] - 2].log_likelihoods[0]
@@ -134,7 +134,7 @@ def test_mixture_fit_likelihood_increases_until_tolerance():
 
 
 def test_mixture_fit_floors_only_small_eigenvalues():
-    """Points on a slanted plane: the eigenvalue along the normal rises to the floor, the rest stays."""
+    """For points on a slanted plane, the eigenvalue along the normal rises to the floor."""
     rng = np.random.default_rng(0)
     plane = rng.normal(size=(5000, 2)) * [0.5, 0.3]
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -173,7 +173,7 @@ def test_mixture_fit_small_sets_stay_finite():
 
 
 def test_mixture_fit_prior_separates_equal_components():
-    """Two equal components cannot tell the points apart; the prior alone does, to the first M-step's exact means."""
+    """Two equal components do not separate the points; the prior alone gives the means of the first M-step."""
     points = np.zeros((200, 3), np.float32)
     points[:, 0] = np.linspace(-1, 1, 200)
     odds = np.where(points[:, 0] < 0, np.log(4), -np.log(4)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Trees of mixtures beside the same recursion in slow numpy, and beside flat mixtures."""
+"""Tests of mixture trees, compared with a slow numpy recursion and with flat mixtures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FLOOR = 0.02**2  # m^2
 
 
 def surface(seed: int, count: int) -> np.ndarray:
-    """(count, 3) float32 points on a wavy surface with a step, 2 m away, and one in fifty anywhere."""
+    """Return (count, 3) float32 points on a wavy surface with a step, 2 m away, with 2 % outliers."""
     rng = np.random.default_rng(seed)
     u, v = rng.uniform(-1, 1, (2, count))
     z = 2 + 0.4 * np.sin(3 * u) * np.cos(2 * v) + np.where(u > 0.2, 0.5, 0.0)
@@ -32,7 +32,7 @@ def grown(points: np.ndarray, starts: np.ndarray, **changed: float) -> MixtureTr
     return mixture_tree.fit(points, starts, settings, **parameters)
 
 
-# The recursion, in the plain words of the paper
+# The recursion as in the paper
 
 
 def slow_cut(points: np.ndarray, groups: int) -> np.ndarray:
@@ -119,12 +119,12 @@ def test_mixture_tree_single_level_equals_flat_mixture():
     np.testing.assert_allclose(tree.levels[0].outlier_densities, flat.outlier_densities, rtol=1e-6)
     more = mixture.fit(
         points, starts, mixture_tree.cut(points, starts, 8), 8, EmSettings(9, -np.inf, FLOOR, 0.02),
-    )  # its last E-step, which the log-likelihood is from, sees the parameters of eight  # fmt: skip
+    )  # the log-likelihood is that of its last E-step, with the parameters of eight steps  # fmt: skip
     np.testing.assert_allclose(log_likelihoods(tree, points, starts), more.log_likelihoods, atol=1e-4)
 
 
 def masses(tree: MixtureTree, depth: int, sets: int) -> np.ndarray:
-    """(N,) the weight of all leaves and uniform components of each tree."""
+    """Return (N,) the total weight of leaves and uniform components of each tree."""
     mass = np.zeros(sets)
     for k, rows in leaves(tree, depth):
         np.add.at(mass, owners(tree, k)[rows], tree.levels[k].weights[rows])
@@ -160,7 +160,7 @@ def test_mixture_tree_likelihood_increases_with_depth(seed):
 
 
 def test_mixture_tree_assigns_points_to_best_child():
-    """Two tight blobs and a far point: the blob's own node for each, -1 for the stray; shares by hand."""
+    """Two tight blobs get their own node, and an outlier gets -1; the weights are computed manually."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0.5, 5, 5], [0.4, 0, 0]], np.float32)
     level = Level(
         weights=np.array([0.3, 0.5]), means=np.array([[0.0, 0, 0], [1.0, 0, 0]]),
@@ -178,7 +178,7 @@ def test_mixture_tree_assigns_points_to_best_child():
     np.testing.assert_allclose(share, ours / (ours + theirs), atol=1e-5)
 
 
-def test_own_ratios_maximize_likelihood():
+def test_mixture_tree_own_ratios_maximize_likelihood():
     rng = np.random.default_rng(0)
     odds = rng.normal(0.4, 1.5, 60).astype(np.float32)
     starts = np.array([0, 60, 60, 63, 66])

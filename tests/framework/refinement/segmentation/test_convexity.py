@@ -1,4 +1,4 @@
-"""Convex segments of rendered boxes, and each step beside a slow obvious reference."""
+"""Tests of the convex segments of rendered boxes, and of each step compared with a slow reference."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ def cut(depth: np.ndarray, camera: Camera = CAMERA, **changed: int) -> tuple[np.
 def rendered(
     boxes: np.ndarray, floor: float | None, pitch: float, camera: Camera = CAMERA
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth (H, W) and ids: boxes (B, 6) lowest and highest corner, in a world whose y points down, 1, 2, ..; floor 0.
+    """Return depth (H, W) and ids of boxes (B, 6), lowest and highest corner, numbered from 1; the floor is 0.
 
-    The camera stands at the origin, looks along z and then down by `pitch` (rad). Where nothing is, depth is 0.
+    In the world y points down. The camera is at the origin and looks along z, rotated down by `pitch` (rad). Without a
+    surface, depth is 0.
     """
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     x, y, z = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)
@@ -53,7 +54,7 @@ def noisy(depth: np.ndarray, noise: float) -> np.ndarray:
 
 
 def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, float]:
-    """The segment that covers most of a region, its share of the region, and the region's share of it."""
+    """Return the largest segment in a region, its fraction of the region, and the region's fraction of it."""
     label = np.bincount(labels[region] + 1).argmax() - 1
     both = ((labels == label) & region).sum()
     return int(label), both / region.sum(), both / (labels == label).sum()
@@ -62,7 +63,7 @@ def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, fl
 @pytest.mark.parametrize("cell", [1, 2])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_segments_separate_boxes_adjacent_in_image(cell, noise):
-    """The nearer box's edge hides the other's: in the image they share a border of 60 px, 0.4 m apart in depth."""
+    """The nearer box hides the edge of the other: they share a border of 60 px with a depth step of 0.4 m."""
     boxes = np.array([[-0.5, -0.3, 1.2, 0.0, 0.3, 1.5], [-0.1, -0.4, 1.6, 0.6, 0.4, 2.0]])
     depth, ids = rendered(boxes, None, 0.0)
     labels, count = cut(noisy(depth, noise), cell=cell)
@@ -77,7 +78,7 @@ def test_segments_separate_boxes_adjacent_in_image(cell, noise):
 @pytest.mark.parametrize("cell", [1, 2])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_segments_separate_box_from_table_and_keep_it_whole(cell, noise):
-    """The camera looks down on it from aside: it sees the front, the top and the left face."""
+    """The camera looks down from the side and sees the front, the top and the left face."""
     camera = Camera(160, 120, 90.0, 90.0, 79.5, 59.5).scaled(cell)
     boxes = np.array([[0.35, 0.3, 0.9, 0.65, 0.6, 1.3]])
     depth, ids = rendered(boxes, 0.6, 0.5, camera)
@@ -95,7 +96,7 @@ def test_segments_separate_box_from_table_and_keep_it_whole(cell, noise):
 
 
 def faces_of(box: np.ndarray, pitch: float, camera: Camera, depth: np.ndarray, inside: np.ndarray) -> list[np.ndarray]:
-    """The pixels of the left, top and front face."""
+    """Return the pixels of the left, top and front face."""
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     x, y = (u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth
     point = [x, y * np.cos(pitch) + depth * np.sin(pitch), depth * np.cos(pitch) - y * np.sin(pitch)]
@@ -104,7 +105,7 @@ def faces_of(box: np.ndarray, pitch: float, camera: Camera, depth: np.ndarray, i
 
 @pytest.mark.parametrize("cell", [1, 2])
 def test_segments_split_at_depth_step_but_not_at_slope(cell):
-    """2.5 cm, as a book on a table: a slope may rise by more from pixel to pixel, but is no step."""
+    """The step is 2.5 cm, like a book on a table; a slope may change more per pixel."""
     depth = np.full(CAMERA.shape, 1.025)
     depth[30:90, 40:100] = 1.0
     labels, count = cut(depth, cell=cell)
@@ -117,7 +118,7 @@ def test_segments_split_at_depth_step_but_not_at_slope(cell):
 
 
 def test_segments_ball_is_one_segment():
-    """However much a surface bends away from the camera."""
+    """The surface may curve away from the camera by any angle."""
     v, u = np.mgrid[:120, :160]
     x, y = (u - 79.5) / 135, (v - 59.5) / 135
     # the ray's first hit with a ball of radius 0.3 around (0, 0, 1.2)
@@ -131,7 +132,7 @@ def test_segments_ball_is_one_segment():
 
 
 def test_fit_planes_on_plane_is_exact():
-    """In inverse depth a plane is linear: every window of it, at the image's border too, gives the same one."""
+    """A plane is linear in inverse depth, so every window gives the same plane."""
     v, u = np.mgrid[:12, :20]
     inverse = (0.5 + 0.004 * u - 0.003 * v).astype(np.float32)
     fits = convexity_kernels.fit_planes(inverse, 2, NOISE, np.float32(0.1))
@@ -173,7 +174,7 @@ def test_best_planes_at_crease_use_own_side():
 
 
 def test_normal_sigma_matches_spread_of_fitted_normals():
-    """A wall 1 m away with noise in a thousand windows: the angle between the normals of two windows."""
+    """The angle between the normals of two windows is measured on a noisy wall 1 m away."""
     rng = np.random.default_rng(0)
     cell, window, sigma = 1, 3, 0.002
     depth = 1 + rng.normal(0, sigma, (7 * 30, 7 * 40))
@@ -183,7 +184,7 @@ def test_normal_sigma_matches_spread_of_fitted_normals():
     assert np.sqrt(2) * slopes.std() == pytest.approx(normal_sigma(sigma, window, cell, camera), rel=0.1)
 
 
-def test_connected_components_match_scipy():
+def test_convexity_components_match_scipy():
     rng = np.random.default_rng(0)
     inverse = np.ones((70, 41), np.float32)
     for density in (0.2, 0.4):
@@ -198,7 +199,7 @@ def test_connected_components_match_scipy():
         assert large_count == (sizes[1:] >= 5).sum()
 
 
-def test_connected_components_split_at_depth_step():
+def test_convexity_components_split_at_depth_step():
     inverse = np.ones((4, 10), np.float32)
     inverse[:, 5:] = 0.5
     labels, count = convexity_kernels.connected(inverse, np.zeros((4, 10), bool), NOISE, np.float32(0.01), 1)
@@ -207,7 +208,7 @@ def test_connected_components_split_at_depth_step():
 
 
 @pytest.mark.parametrize("radius", [0, 1, 2])
-def test_edge_closing_matches_scipy(radius):
+def test_convexity_edge_closing_matches_scipy(radius):
     edges = np.random.default_rng(0).random((30, 43)) < 0.1
     square = np.ones((2 * radius + 1, 2 * radius + 1))
     spread = ndimage.binary_dilation(edges, square)

@@ -1,4 +1,4 @@
-"""Planes of a depth image: exact ones come back exactly, noisy ones as Open3D's RANSAC finds them."""
+"""Tests of plane detection in depth images: exact planes are recovered, noisy ones match Open3D's RANSAC."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def rays(camera: Camera = CAMERA) -> np.ndarray:
 
 
 def depth_of(*planes: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """The nearest of the planes at each pixel, 0 where none is in front of the camera."""
+    """Return the nearest of the planes at each pixel, 0 where none is in front of the camera."""
     q = np.max([rays(camera) @ m for m in planes], axis=0)
     return np.where(q > 0.02, 1 / np.maximum(q, 1e-9), 0)
 
@@ -66,7 +66,7 @@ def test_plane_area_matches_pixel_triangle_area():
 
 
 def test_find_planes_in_noisy_room_matches_open3d():
-    """Floor and wall with the noise of a Kinect: the larger one beside segment_plane, both beside the truth."""
+    """Floor and wall have Kinect noise: the larger one is compared with segment_plane, both with the truth."""
     open3d = pytest.importorskip("open3d")
     exact = depth_of(FLOOR, WALL)
     depth = exact + np.random.default_rng(0).normal(0, 0.002, exact.shape) * exact**2
@@ -110,7 +110,7 @@ def test_find_planes_separates_parallel_planes():
 
 
 def test_plane_image_assigns_depth_within_distance():
-    """A plane at 2 m that leans by 45 degrees, and readings 19 and 21 mm off it, along its normal."""
+    """The plane at 2 m has a slope of 45 degrees; points are 19 and 21 mm off it along its normal."""
     m = np.array([0.0, 0.5, 0.5])
     planes = found(depth_of(m))
     image = plane_image(frame_of(depth_of(m)), planes, 0.02)
@@ -161,7 +161,7 @@ def test_find_planes_is_independent_of_thread_count():
 
 
 def test_inverse_depth_of_plane_is_linear_in_pixel():
-    """What the method stands on, with the project's own back-projection."""
+    """The method relies on this; the project's own back-projection is used."""
     depth = depth_of(WALL).astype(np.float32)
     v, u = np.mgrid[:240, :320]
     points = back_project(CAMERA, np.stack([u.ravel(), v.ravel()], axis=1).astype(np.int32), depth.ravel())

@@ -1,4 +1,4 @@
-"""The camera's pose from the points that were lifted with it."""
+"""Tests of the camera pose that is recovered from the lifted points."""
 
 from __future__ import annotations
 

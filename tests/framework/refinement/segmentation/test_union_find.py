@@ -1,4 +1,4 @@
-"""Pieces of a forest."""
+"""Tests of the components of a union-find forest."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from framework.refinement.segmentation.union_find import root, unite
 
 
-def test_root_is_first_cell_of_component():
+def test_union_find_root_is_first_cell_of_component():
     parents = np.arange(8).astype(np.int32)
     for a, b in ((6, 7), (7, 3), (5, 4), (3, 6), (2, 5)):
         unite(parents, a, b)

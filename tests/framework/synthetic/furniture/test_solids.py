@@ -1,4 +1,4 @@
-"""Every shape is closed, turns outward and has normals to match."""
+"""Tests of the solids: closed, oriented outward, with matching normals."""
 
 import numpy as np
 import pytest
