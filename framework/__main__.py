@@ -13,7 +13,7 @@ from pathlib import Path
 import framework
 
 COMMANDS = {
-    "tables": "write the tables of an experiment: Markdown, LaTeX, CSV",
+    "tables": "write the tables of an experiment or sweep: Markdown, LaTeX, CSV",
     "figures": "draw the figures of an experiment",
     "raycast": "draw the ray-cast view of a map: depth, normals, vertices, RGB, object indices",
     "report": "write HTML reports of runs and compare them",
@@ -53,11 +53,11 @@ Without a command, KEY=VALUE ... starts a run. With -m or an experiment, it star
   {program} dataset=rgbd_folder dataset.root=DIR
   {program} -m refiner=identity,kmeans,gmm_em seed=0,1,2
 
-Commands (COMMAND --help lists the arguments):
+Commands (COMMAND --help lists the arguments and defaults):
 {commands}
 
-Exit status: 0 = success; 1 = error; 3 = a run ended early after an error and wrote its partial outputs;
-128 + N = ended by signal N (130 = Ctrl-C, 143 = SIGTERM); a run writes its partial outputs.
+Exit status: 0 = success; 1 = error; 2 = invalid command-line arguments; 3 = a run ended early after an error and
+wrote its partial outputs; 128 + N = ended by signal N (130 = Ctrl-C, 143 = SIGTERM), with the partial outputs of a run.
 
 debug=true adds the traceback to errors of any command. --cfg job lists the config keys of a run. --hydra-help lists
 Hydra's options.
@@ -120,7 +120,8 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     program = "python -m framework" if Path(sys.argv[0]).name == "__main__.py" else Path(sys.argv[0]).name
     word = sys.argv[1] if len(sys.argv) > 1 else ""
-    if word in ("--help", "-h", "help"):
+    of_run = "=" in word or word.startswith(("-", "~"))
+    if word in ("--help", "-h", "help") or (of_run and {"--help", "-h"} & {*sys.argv[1:]}):
         width = max(map(len, COMMANDS))
         listed = "\n".join(f"  {name:<{width}}  {summary}" for name, summary in COMMANDS.items())
         flush_output(HELP.format(program=program, commands=listed))
@@ -130,7 +131,7 @@ def main() -> None:
         return
     if word in COMMANDS:
         sys.argv[:2] = [f"{program} {word}"]
-    elif word and "=" not in word and not word.startswith(("-", "~")):
+    elif word and not of_run:
         close = get_close_matches(word, COMMANDS, n=1)
         suggestion = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(COMMANDS)}"
         sys.exit(f"error: {word!r}: unknown command; {suggestion}")

@@ -220,8 +220,8 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
 def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, Any]:
     """Return the keyword arguments for `plugin_class` from `node`, each with the type of its dataclass field.
 
-    Raises ConfigError that names `where` for an unknown parameter, a wrong type or a missing value. The metadata
-    `where` of a field is a hint for obtaining its value.
+    Raises ConfigError that names `where` for an unknown parameter, a wrong type or a missing value. The metadata key
+    `source` of a field is a hint for obtaining its value.
     """
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
@@ -231,7 +231,7 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
     if missing:
         stage = where.split()[0]
         needed = " ".join(f"{stage}.{name}=..." for name in missing)
-        hints = [str(fields[name][0].metadata["where"]) for name in missing if "where" in fields[name][0].metadata]
+        hints = [str(fields[name][0].metadata["source"]) for name in missing if "source" in fields[name][0].metadata]
         raise ConfigError(
             f"{where}: expected a value for {', '.join(missing)}, got none; set {'; '.join([needed, *hints])}"
         )

@@ -48,8 +48,8 @@ class BlockGridSettings:
     """The parameters of a grid."""
 
     voxel_size: float  # side of a voxel, m
-    block_resolution: int  # side of a block, voxels
-    truncation: float  # truncation distance, voxels
+    block_resolution: int  # number of voxels per side of a block
+    truncation: float  # truncation distance, in voxels
     min_depth: float  # minimum depth of integrated readings, m
     max_depth: float  # maximum depth of integrated readings, m
     max_blocks: int

@@ -34,7 +34,7 @@ FORMAT = "semantic 4"  # format of the map file; increment it when the meaning o
 class Elections(NamedTuple):
     """Parameters for the classes and instances from the evidence."""
 
-    missed: float  # P(no mask | surface of any class) / P(no mask | background)
+    missed: float  # likelihood ratio P(no mask | any class) / P(no mask | background)
     min_area: float  # minimum surface area of an instance, m^2
     smoothness: float  # log-odds for each neighboring vertex of the same class
 

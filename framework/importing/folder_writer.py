@@ -36,18 +36,18 @@ class Writing:
     width: int = 0  # px, before rotation, at most the stored width; 0 = LONGER_SIDE for the longer side
     stride: int = 1  # step between frames; 1 = every frame
     confidence: int = 1  # minimum depth confidence, 0, 1 or 2, if the recording has confidence
-    turn: int = 0  # rotation of the written images, degrees clockwise, 0, 90, 180 or 270
+    rotate: int = 0  # rotation of the written images, degrees clockwise, 0, 90, 180 or 270
 
     def __post_init__(self) -> None:
         require(0 <= self.width <= MOST_PIXELS, "--width", self.width, f"a value in [0, {MOST_PIXELS}] px")
         require(self.stride >= 1, "--stride", self.stride, "at least 1")
-        require(self.turn in range(0, 360, QUARTER), "--turn", self.turn, "0, 90, 180 or 270 degrees")
+        require(self.rotate in range(0, 360, QUARTER), "--rotate", self.rotate, "0, 90, 180 or 270 degrees")
         require(UNSURE <= self.confidence <= SURE, "--confidence", self.confidence, "0, 1 or 2")
 
     @property
     def turned(self) -> Turn:
         """Rotation of the images."""
-        return Turn(self.turn // QUARTER)
+        return Turn(self.rotate // QUARTER)
 
     def camera(self, stored: Camera) -> Camera:
         """Return the camera of the written images before rotation."""

@@ -127,7 +127,7 @@ class Surroundings:
 class Ring:
     """The ring around a mask, and limits on the points of mask and ring."""
 
-    ring_fraction: float = 0.25  # width of the ring over the square root of the mask's area, >= 0; 0 = no ring
+    ring_fraction: float = 0.25  # ratio of the ring's width to the square root of the mask's area, >= 0; 0 = no ring
     min_ring: int = 4  # minimum width of the ring, px, >= 1
     max_ring: int = 12  # maximum width of the ring, px, >= min_ring
     max_points: int = 1000  # maximum number of points of a mask and its ring in the fit, >= 100

@@ -55,11 +55,11 @@ class Reevaluation:
     metrics: Mapping[str, Any]  # the new metrics.json
 
     @classmethod
-    def of(cls, record: Record, truth: Truth, other_truth: bool = False) -> Reevaluation:
+    def of(cls, record: Record, truth: Truth, allow_changed: bool = False) -> Reevaluation:
         """Re-evaluate the instances, and keep all other metrics.
 
-        Raises DataError if the files are inconsistent or the ground truth is missing. Unless `other_truth` is set, also
-        raises DataError if the ground truth has changed since the run.
+        Raises DataError if the files are inconsistent or the ground truth is missing. Also raises DataError if the
+        ground truth has changed since the run, unless `allow_changed` is set.
         """
         if truth.scene is None:
             if any(map(is_evaluation, record.metrics)):
@@ -70,11 +70,11 @@ class Reevaluation:
         aligned = truth.in_world_of(record)
         assert aligned is not None
         found = evaluation_metrics(read_predictions(record), truth.scene, aligned, truth.annotation)
-        if not other_truth and record.metrics.get(TRUTH) not in (None, found[TRUTH]):
+        if not allow_changed and record.metrics.get(TRUTH) not in (None, found[TRUTH]):
             raise DataError(
                 f"{record.directory}: expected the ground truth of the run ({TRUTH} {record.metrics[TRUTH]!s:.8}), got "
                 f"{found[TRUTH]!s:.8} from {record.dataset['_target_']}; check the dataset and a relative "
-                "dataset.root, or set --other-truth to compare anyway"
+                "dataset.root, or set --allow-changed-ground-truth to evaluate anyway"
             )
         metrics: dict[str, Any] = {}
         for key, value in record.metrics.items():

@@ -83,6 +83,8 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
             raise DataError(
                 f"{made_by}: expected valid JSON, got a damaged file; delete the folder or set another folder"
             ) from error
+        if isinstance(found, dict) and "haste" in found:  # earlier name
+            found["camera_speed"] = found.pop("haste")
         if found != wanted:
             raise ConfigError(f"{root}: expected rooms with the parameters {wanted}, got {found}; set another folder")
     elif root.exists() and (not root.is_dir() or any(root.iterdir())):

@@ -33,7 +33,7 @@ ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrins
 NOISE, MAX_RANGE = 1.0, 6.0  # noise of the sensor, 1 = Kinect v1; range of the sensor, m
 EXPOSURE = 1 / 60  # s, exposure of color images, centered at the pose; typical for indoor light
 TRUTH_VIEWS = 60  # frames for the labeled mesh; neighboring frames have nearly the same view
-FASTEST = 5.0  # maximum haste: 2.2 m/s
+FASTEST = 5.0  # maximum camera speed relative to the recommended speed: 2.2 m/s
 LARGEST_ID = 934338  # largest label in SceneNN; labels are unordered
 PNG = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
@@ -75,18 +75,18 @@ class BenchmarkSettings:
     frames: int = 120  # number of frames of each scene
     rate: float = 10.0  # Hz, frame rate; a low rate limits redundant frames
     width: int = 640  # px; the height is 3/4 of the width
-    haste: float = 2.0  # relative camera speed, 1 = recommended speed; higher values give fewer views and more blur
+    camera_speed: float = 2.0  # relative to the recommended speed; higher values give fewer views and more blur
 
     def __post_init__(self) -> None:
         for name, lowest in (("seed", 0), ("frames", 1), ("width", 16)):
             if getattr(self, name) < lowest:
-                raise ConfigError(f"{name}: expected at least {lowest}, got {getattr(self, name)}")
+                raise ConfigError(f"--{name}: expected at least {lowest}, got {getattr(self, name)}")
         if not 0 < self.rate <= FRAME_RATE:
-            raise ConfigError(f"rate: expected a value in (0, {FRAME_RATE:.0f}] Hz, got {self.rate}")
-        if not 0 < self.haste <= FASTEST:
-            raise ConfigError(f"haste: expected a value in (0, {FASTEST:g}], got {self.haste}")
+            raise ConfigError(f"--rate: expected a value in (0, {FRAME_RATE:.0f}] Hz, got {self.rate}")
+        if not 0 < self.camera_speed <= FASTEST:
+            raise ConfigError(f"--camera-speed: expected a value in (0, {FASTEST:g}], got {self.camera_speed}")
         if self.width % 4:
-            raise ConfigError(f"width: expected a multiple of 4 px, for images of 4:3, got {self.width}")
+            raise ConfigError(f"--width: expected a multiple of 4 px, for images of 4:3, got {self.width}")
 
     @property
     def camera(self) -> Camera:
@@ -94,8 +94,8 @@ class BenchmarkSettings:
 
     @property
     def stride(self) -> float:
-        """Camera motion per frame, in frames of a path with haste 1 at FRAME_RATE."""
-        return self.haste * FRAME_RATE / self.rate
+        """Camera motion per frame, in frames of a path at the recommended speed and FRAME_RATE."""
+        return self.camera_speed * FRAME_RATE / self.rate
 
     @property
     def release(self) -> str:

@@ -34,20 +34,20 @@ class Synthetic(RGBDSequence):
     Frames are bit-identical for equal parameters, in any order and from any thread.
     """
 
-    seed: int = 0  # seed of the room and the camera path, combined with scene
-    scene: str = "room0"  # name of the room; every name is a different room
-    kind: RoomKind = RoomKind.STUDIO  # kind of room; a studio contains all nine classes
-    frames: int = 240  # number of frames, at 30 Hz
+    seed: int = 0  # seed of the scene and the camera path, >= 0; combined with the scene name
+    scene: str = "room0"  # name of the scene; every name gives a different scene
+    kind: RoomKind = RoomKind.STUDIO  # type of room; a studio contains all nine classes
+    frames: int = 240  # number of frames at 30 Hz
     width: int = 640  # width of the images, px
     height: int = 480  # height of the images, px
     noise: float = 1.0  # scale of the sensor noise; 0 = none, 1 = Kinect v1
-    max_depth: float = 6.0  # range of the sensor, m
+    max_depth: float = 6.0  # maximum depth of the sensor, m
     simulated_color_delay: float = 0.0  # time from depth to color, with equal timestamps, s, in [-0.2, 0.2]
     color_delay: str = AUTO  # this time as known by the pipeline, s, in [-0.2, 0.2]; AUTO = estimated
     start: int = 0  # index of the first frame
-    stop: int = TO_THE_END  # index after the last frame; -1 = to the end
+    stop: int = TO_THE_END  # index after the last frame; -1 = end of the sequence
     stride: int = 1  # step between frames; 1 = every frame
-    frame_fraction: float = 1.0  # fraction of these frames, selected at random with `seed`, in (0, 1]
+    frame_fraction: float = 1.0  # randomly selected fraction of the frames, in (0, 1]; 1 = all frames
     ground_truth_spacing: float = 0.02  # spacing of the ground-truth surface points, m
     domain = RENDERED_ROOMS
 

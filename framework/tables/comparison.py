@@ -51,7 +51,7 @@ class TableChoice:
         default_factory=list
     )  # keys of metrics.json, at least one; with `columns_by`, exactly one
     names: dict[str, str] = field(default_factory=dict)  # display names by row
-    published: str | None = None  # section of published.yaml, shown if all runs use the real SceneNN data; None = none
+    published: str | None = None  # section of published.yaml, if all runs use the original SceneNN data; None = none
 
     def __post_init__(self) -> None:
         for name in ("average_over", "columns"):
@@ -174,7 +174,7 @@ class ComparisonTable:
 
     @property
     def is_of_scenenn(self) -> bool:
-        """Return True if all runs use the real SceneNN data, as for published numbers, not synthetic scenes."""
+        """Return True if all runs use the original SceneNN data, as for published numbers, not synthetic scenes."""
         datasets = {record.metrics.get(f"{CHOICE}dataset") for record in self.records}
         return datasets == {DATASET} and not any(record.annotation.startswith(MADE_UP) for record in self.records)
 

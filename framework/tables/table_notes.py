@@ -111,7 +111,7 @@ def _protocol(comparison: ComparisonTable) -> Iterator[str]:
 
 def _published(comparison: ComparisonTable) -> Iterator[str]:
     if comparison.choice.published and not comparison.is_of_scenenn:
-        yield "Published numbers are for the real SceneNN data (sequences=scenenn) and omitted for other data."
+        yield "Published numbers are for the original SceneNN data (sequences=scenenn) and omitted for other data."
     for row in comparison.published_rows:
         yield f"Published, {row.system}: {row.source}{f'; {row.remark}' if row.remark else ''}."
     if unknown := [f"{row.system} ({row.source})" for row in comparison.published_unknown]:

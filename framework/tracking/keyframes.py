@@ -57,13 +57,13 @@ class Keyframes:
     number of keyframes, except for the comparison of bags of words.
     """
 
-    max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is dropped
-    min_distance: float = 0.25  # minimum distance between keyframes, m, > 0; added to the angle, in units of the minima
-    min_angle: float = 0.3  # minimum angle between keyframes, rad, > 0
+    max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed
+    min_distance: float = 0.25  # minimum distance between keyframes, m, > 0; see min_angle
+    min_angle: float = 0.3  # m. angle, rad, > 0; new keyframe if distance / min_distance + angle / min_angle >= 1
     max_features: int = 800  # maximum number of features of a frame, >= 1
     min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
     candidates: int = 6  # number of keyframes matched with a lost frame, >= 1
-    max_ratio: float = 0.8  # maximum distance of a match over the distance of the second-best match, in (0, 1]
+    max_ratio: float = 0.8  # maximum ratio of best to second-best descriptor distance (Lowe's ratio test), in (0, 1]
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
     min_inliers: int = 20  # minimum number of inliers, >= 4
     min_inlier_ratio: float = 0.15  # minimum fraction of inliers, in (0, 1]; low, because candidates may not overlap

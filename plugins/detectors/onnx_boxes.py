@@ -18,7 +18,7 @@ from framework.vocabulary.label_spaces import read_labels, to_coco
 
 log = logging.getLogger(__name__)
 
-WHERE = "yolox_nano.onnx (3.7 MB, COCO, Apache-2.0) is at https://github.com/Megvii-BaseDetection/YOLOX/releases"
+SOURCE = "yolox_nano.onnx (3.7 MB, COCO, Apache-2.0) is at https://github.com/Megvii-BaseDetection/YOLOX/releases"
 
 
 @dataclass
@@ -31,13 +31,13 @@ class OnnxBoxes(Detector):
     `boxes_without_depth`. The defaults match Megvii's YOLOX.
     """
 
-    weights: Path = field(metadata={"where": WHERE})  # ONNX file, relative to the working or project folder
+    weights: Path = field(metadata={"source": SOURCE})  # ONNX file, relative to the working or project folder
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
     label_space: str = "coco"  # class names: a label space, or a text file with one name per line
     layout: OutputLayout = OutputLayout.yolox  # layout of the outputs
     score_threshold: float = 0.1  # minimum score, in (0, 1); low, because weak detections can update instances
-    nms_iou: float = 0.45  # box IoU for suppression within a class, in (0, 1]
-    agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
+    nms_iou: float = 0.45  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
+    agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
     input_size: int = 0  # side of the input of a network with variable input size, px; 0 = size in the file
     placement: Placement = Placement.top_left  # position of the image in the input

@@ -38,12 +38,12 @@ class OnnxSegmentation(Detector):
     weights: Path  # ONNX file, relative to the working or project folder
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
     label_space: str = "coco"  # class names: a label space, or a text file with one name per line
-    objectness: bool = False  # objectness before the class scores, as in YOLOv5
+    objectness: bool = False  # True = the outputs have an objectness before the class scores, as in YOLOv5
     box_format: BoxKind = BoxKind.AUTO  # box format; AUTO = detected
-    class_spread: float = 1.0  # fraction of 1 - score for other classes after suppression in the network, in [0, 1]
+    class_spread: float = 1.0  # fraction of (1 - score) for other classes, if the network reports one class, in [0, 1]
     score_threshold: float = 0.1  # minimum score, in (0, 1); low, because weak detections can update instances
-    nms_iou: float = 0.45  # box IoU for suppression within a class, in (0, 1]
-    agnostic_nms_iou: float = 0.6  # mask IoU for suppression across classes, in (0, 1]; 1 = off
+    nms_iou: float = 0.45  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
+    agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1
     mask_threshold: float = 0.5  # minimum probability of a pixel inside a mask, in (0, 1)
     input_size: int = 0  # side of the input of a network with variable input size, px; 0 = size in the file

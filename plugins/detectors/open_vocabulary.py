@@ -32,16 +32,16 @@ class OpenVocabulary(Detector):
     evaluated.
     """
 
-    text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct names of the objects
+    text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct text queries
     model: str = "google/owlv2-base-patch16-ensemble"  # OWLv2 model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model id
     mask_model: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2, EdgeTAM: id or folder; "" = masks from depth
     mask_model_revision: str = "main"  # branch, tag or commit of the mask model id
     score_threshold: float = 0.1  # minimum probability of the best query for a box, in (0, 1)
-    nms_iou: float = 0.5  # box IoU for suppression across queries, in (0, 1]
-    agnostic_nms_iou: float = 0.6  # mask IoU for suppression across queries, in (0, 1]; 1 = off
+    nms_iou: float = 0.5  # box IoU threshold of non-maximum suppression across queries, in (0, 1]
+    agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across queries, in (0, 1]; 1 = off
     max_detections: int = 50  # maximum number of detections per image, >= 1
-    half_precision: bool = True  # half precision on CUDA; the CPU uses single precision
+    half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision
     device: str = "auto"  # device of the networks: auto, cpu or cuda; auto = cuda if available
     reads = ("color", "depth", "camera")
 

@@ -46,7 +46,7 @@ class Precomputed(Detector):
     label_space: str = "coco"  # label space of the file, or a text file with one name per line
     category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id
     score_threshold: float = 0.0  # minimum score of a detection, in [0, 1]
-    class_spread: float = 1.0  # fraction of 1 - score for other classes of detections without distribution, in [0, 1]
+    class_spread: float = 1.0  # fraction of (1 - score) for other classes of detections with one class, in [0, 1]
 
     reads = ("index", "camera")
 

@@ -21,13 +21,13 @@ class WithEmbeddings(Detector):
     detector: Detector  # wrapped detector; replace it with detector@detector.detector=NAME
     model: str = "google/siglip2-base-patch16-224"  # CLIP or SigLIP model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model id
-    frame_interval: int = 1  # interval between embedded frames, frames, >= 1; 1 = every frame
+    frame_interval: int = 1  # interval between embedded frames, in frames, >= 1; 1 = every frame
     min_score: float = 0.3  # minimum score of an embedded detection, in [0, 1]; weaker detections are wrong too often
     min_pixels: int = 200  # minimum mask size of an embedded detection, px, >= 1
-    context: float = 1.2  # side of the square crop over the longer side of the object's box, >= 1
+    context: float = 1.2  # ratio of the square crop's side to the longer side of the object's box, >= 1
     background_contrast: float = 0.4  # contrast of the background in the crop, in [0, 1]; 0 = gray, 1 = unchanged
     batch_size: int = 16  # number of crops per batch, >= 1
-    half_precision: bool = True  # half precision on CUDA; the CPU uses single precision
+    half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if available
 
     def __post_init__(self) -> None:

@@ -30,7 +30,7 @@ class BayesianTsdf(MapFuser):
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)
     class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
-    instance_floor: float = 0.05  # likelihood of every other instance, in [0, 1); 0 = 1 - score, divided equally
+    instance_floor: float = 0.05  # likelihood of each other instance, in [0, 1); 0 = equal parts of (1 - score)
     absence_likelihood: float = 0.7  # P(outside the mask | matched instance), in (0, 1]; 1 = no evidence of absence
 
     def __post_init__(self) -> None:

@@ -36,11 +36,11 @@ class ObjectVolumes(MapFuser):
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     min_overlap: float = 0.2  # minimum overlap of a detection and an object to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.IOU  # denominator of the overlap
-    require_same_class: bool = False  # restriction of matches to the same most likely class, as in MaskFusion
+    require_same_class: bool = False  # True = match only objects with the same most likely class, as in MaskFusion
     create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; updates have no minimum
-    create_points: int = 50  # minimum size of a detection to create an object, px, >= 1; also of an object in view
-    min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; other objects are removed
-    min_observations: int = 3  # minimum number of frames with a detection of a confirmed object, >= 1
+    create_points: int = 50  # minimum detection size to create an object, px, >= 1; also minimum overlap denominator
+    min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; objects below it are removed
+    min_observations: int = 3  # minimum number of frames with a detection to confirm an object, >= 1
     min_area: float = 0.01  # minimum surface area of a confirmed object in the mesh, m^2, >= 0
 
     def __post_init__(self) -> None:

@@ -28,7 +28,7 @@ class Connected(ClusterRefiner):
     gap_per_depth: float = 0.02  # increase of the maximum depth step with depth, m per m, >= 0
     connection_radius: int = 2  # maximum distance between connected pixels, px, >= 1; 2 bridges single missing readings
     min_piece_ratio: float = 0.05  # minimum size relative to the largest component, in [0, 1]; smaller ones are dropped
-    max_depth_slope: float = 2.0  # maximum depth difference over lateral distance of two components, m per m, >= 0
+    max_depth_slope: float = 2.0  # maximum ratio of depth difference to lateral distance of components, m per m, >= 0
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -38,7 +38,7 @@ class GmmEm(ClusterRefiner):
     outlier_fraction: float = 0.0  # initial fraction of outliers, in [0, 1); 0 = no uniform component
     min_posterior: float = 0.5  # minimum posterior of the object for a kept point, in (0, 1)
     mask_log_odds: float = 4.0  # prior log-odds of the object deep in the mask, nats, >= 0; 0 = initialization only
-    expected_bleed: float = 0.4  # distance inside the mask with log-odds 0, ring widths, in [0, 1)
+    expected_bleed: float = 0.4  # distance inside the mask with prior log-odds 0, in ring widths, >= 0 and < 1
     ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:

@@ -45,7 +45,7 @@ class GmmFrame(ClusterRefiner):
     max_iterations: int = 10  # maximum number of EM iterations in a node, >= 1
     tolerance: float = 1e-3  # minimum increase of the mean log-likelihood per EM iteration, nats per point
     std_floor: float = 0.005  # minimum standard deviation of a Gaussian along any axis, m
-    min_support: float = 1e-4  # minimum fraction of the frame's points in a Gaussian, in [0, 1); smaller = dropped
+    min_support: float = 1e-4  # minimum fraction of the frame's points in a Gaussian, in [0, 1); smaller: dropped
     min_points: int = 30  # minimum number of points of a refined cluster, >= 1; smaller clusters are dropped
     max_points: int = 20_000  # maximum number of points of a frame for the fit, >= 100; all points are assigned
 

@@ -167,6 +167,19 @@ def test_help_lists_all_commands(tmp_path: Path) -> None:
         assert find_spec(module_of(name))
 
 
+def test_help_after_override_lists_commands(tmp_path: Path) -> None:
+    assert "Commands (" in words("dataset=desk", "--help", directory=tmp_path).stdout
+
+
+@pytest.mark.parametrize("command", ["check", "detect", "show-refinement", "train-detector"])
+def test_help_of_hydra_command_states_arguments(tmp_path: Path, command: str) -> None:
+    done = words(command, "--help", directory=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(f"usage: instancemap {command} ")
+    assert all(part in done.stdout for part in ("Arguments:", "Examples:", "--cfg job"))
+    assert len(done.stdout.splitlines()) < 40
+
+
 def test_command_misspelled_name_suggests_nearest_name(tmp_path: Path) -> None:
     done = words("tabels", "outputs", directory=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")

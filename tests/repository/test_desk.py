@@ -18,7 +18,7 @@ DESK = PROJECT_ROOT / "data" / "desk"
 def test_desk_data_is_small_and_has_attribution() -> None:
     assert sum(path.stat().st_size for path in DESK.rglob("*") if path.is_file()) < 12e6
     card = (DESK / "README.md").read_text()
-    assert all(word in card for word in ("Sturm", "Attribution 4.0", "JPEG", "undone"))
+    assert all(word in card for word in ("Sturm", "Attribution 4.0", "JPEG", "corrected"))
 
 
 def test_desk_is_tracked_and_objects_are_detected() -> None:

@@ -15,26 +15,27 @@ from framework.errors import ConfigError
 def main() -> None:
     """Run the command `instancemap compile`."""
     parser = argparse.ArgumentParser(
-        description="Compile the kernels of a run with the default stages. numba stores them for later runs of this "
-        "installation. Compiled kernels are skipped."
+        description="Compile the kernels of a run with the default stages in advance. numba stores them for later runs "
+        "of this installation. Kernels that are already compiled are skipped."
     )
-    parser.add_argument("words", metavar="WORD", nargs="*", help="part of a kernel name; default: all kernels")
-    parser.add_argument("--all", action="store_true", help="also compile the kernels of other stages")
+    part = "part of a kernel name, searched in all stages; default: the kernels of the default stages"
+    parser.add_argument("names", metavar="NAME", nargs="*", help=part)
+    parser.add_argument("--all", action="store_true", help="compile the kernels of all stages")
     parsed = arguments(parser)
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     with one_line_errors():
-        print(compile_named(listed(DEFAULT, *([OTHERS] if parsed.all or parsed.words else [])), parsed.words))
+        print(compile_named(listed(DEFAULT, *([OTHERS] if parsed.all or parsed.names else [])), parsed.names))
 
 
-def compile_named(kernels: list[Kernel], words: list[str]) -> str:
-    """Compile the missing kernels with one of the words in their names ([] = all), and return a summary.
+def compile_named(kernels: list[Kernel], parts: list[str]) -> str:
+    """Compile the missing kernels whose names contain one of the `parts` ([] = all), and return a summary.
 
     Raises ConfigError if no kernel matches, DataError if a kernel cannot be compiled.
     """
-    if words:
-        kernels = [kernel for kernel in kernels if any(word in f"{kernel.module}.{kernel.name}" for word in words)]
+    if parts:
+        kernels = [kernel for kernel in kernels if any(part in f"{kernel.module}.{kernel.name}" for part in parts)]
     if not kernels:
-        raise ConfigError(f"kernels: expected part of a name, got {' or '.join(words)}; no name contains it")
+        raise ConfigError(f"kernels: expected part of a name, got {' or '.join(parts)}; no name contains it")
     missing = [kernel for kernel in kernels if not kernel.is_compiled()]
     if missing:
         started = time.perf_counter()

@@ -17,13 +17,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description="Convert Mask R-CNN weights of torchvision or detectron2 for detector=mask_rcnn."
     )
-    parser.add_argument("source", metavar="IN", type=Path, help="name of a published network, or .pth or .pkl file")
+    parser.add_argument("source", metavar="IN", type=Path, help=".pth or .pkl file, or name of a published network")
     parser.add_argument("target", metavar="OUT", type=Path, help="output .safetensors file")
     parser.add_argument("--kind", choices=["torchvision", "detectron2"], help="format of IN; default: detected")
-    parser.add_argument("--classes", help="comma-separated class names in network order, if other than COCO")
-    epsilon = "epsilon of batch normalization, torchvision only; default: 0, as in its COCO checkpoint"
-    parser.add_argument("--norm-eps", type=float, default=0.0, help=epsilon)
-    parser.add_argument("--half", action="store_true", help="store float16 weights: half the size")
+    classes = "comma-separated class names in network order; default: COCO"
+    parser.add_argument("--classes", metavar="NAMES", help=classes)
+    epsilon = "epsilon of batch normalization, for torchvision only; default: 0, as in its COCO checkpoint"
+    parser.add_argument("--norm-eps", metavar="EPS", type=float, default=0.0, help=epsilon)
+    parser.add_argument("--half", action="store_true", help="store weights as float16, which halves the file size")
     parsed = arguments(parser)
     with one_line_errors():
         convert(parsed.source, parsed.target, parsed.kind, parsed.classes, parsed.norm_eps, parsed.half)

@@ -25,7 +25,7 @@ def main() -> None:
     """Run the command `instancemap doctor`."""
     parser = argparse.ArgumentParser(
         description="Check the installation and print the fix for each problem. The output contains no user name or "
-        "home folder, so you can paste it into an issue. Exit status 1: a run with the default stages cannot work."
+        "home folder, so you can paste it into an issue. Exit status 1 means that the default pipeline cannot run."
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args([word for word in sys.argv[1:] if not word.startswith("debug=")])

@@ -75,17 +75,17 @@ VARIANTS = {  # by stage: parameter of a variant
 def main() -> None:
     """Run the command `instancemap new-plugin`."""
     parser = argparse.ArgumentParser(
-        description="Create a repository with a working plugin: package, option, tests, CI."
+        description="Create the files of a repository with a working plugin: package, config option, tests and CI."
     )
-    parser.add_argument("stage", metavar="STAGE", choices=GROUPS, help=", ".join(GROUPS))
-    parser.add_argument("name", metavar="NAME", help="option name, such as my_refiner for refiner=my_refiner")
+    parser.add_argument("stage", metavar="STAGE", choices=GROUPS, help=f"stage of the plugin: {', '.join(GROUPS)}")
+    parser.add_argument("name", metavar="NAME", help="name of the plugin, such as my_refiner for refiner=my_refiner")
     parser.add_argument(
         "--in",
         dest="folder",
         metavar="DIR",
         type=Path,
         default=Path(),
-        help="parent folder; default: working folder",
+        help="parent folder of the repository; default: working folder",
     )
     asked = arguments(parser)
     with one_line_errors():

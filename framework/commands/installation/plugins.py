@@ -146,8 +146,9 @@ def describe(option: Option) -> str:
 def main() -> None:
     """Run the command `instancemap plugins`."""
     parser = argparse.ArgumentParser(description="List the plugins of each stage and their parameters.")
-    parser.add_argument("stage", nargs="?", choices=GROUPS, help="stage to list; default: all")
-    parser.add_argument("name", nargs="?", help="option to list; default: all")
+    stages_listed = f"stage to list: {', '.join(GROUPS)}; default: all stages"
+    parser.add_argument("stage", metavar="STAGE", nargs="?", choices=GROUPS, help=stages_listed)
+    parser.add_argument("name", metavar="NAME", nargs="?", help="plugin to list; default: all plugins of the stage")
     asked = arguments(parser)
     with one_line_errors():
         stages = [asked.stage] if asked.stage else list(GROUPS)

@@ -27,10 +27,12 @@ PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # higher levels take longer than playbac
 def main() -> None:
     """Run the command `instancemap convert-oni`."""
     parser = argparse.ArgumentParser(
-        description="Convert an OpenNI recording to SceneNN images. Requires OpenNI 2: apt-get install libopenni2-0."
+        description="Convert an OpenNI recording to images for dataset=scenenn. Requires OpenNI 2: apt-get install "
+        "libopenni2-0."
     )
-    parser.add_argument("source", metavar="FILE.oni", type=Path, help="recording: oni/NNN.oni")
-    parser.add_argument("target", metavar="OUT", type=Path, help="scene folder without images: DIR/NNN")
+    parser.add_argument("source", metavar="FILE.oni", type=Path, help="recording of SceneNN, oni/NNN.oni")
+    scene = "SceneNN scene folder DIR/NNN; must not contain image/, depth/ or timestamp.txt yet"
+    parser.add_argument("target", metavar="OUT", type=Path, help=scene)
     parsed = arguments(parser)
     with one_line_errors():
         convert(parsed.source, parsed.target)

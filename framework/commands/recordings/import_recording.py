@@ -22,22 +22,24 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("source", metavar="SOURCE", type=Path, help="folder or file exported by the app")
+    add("source", metavar="SOURCE", type=Path, help="recording: a folder or file in a supported format")
     add("directory", metavar="DIR", type=Path, help="new or empty folder")
-    width = f"image width, px; default: {LONGER_SIDE} px for the longer side"
-    add("--width", type=int, default=default.width, help=width)
-    add("--stride", type=int, default=default.stride, help="frame step: import every n-th frame; default: 1")
+    width = f"image width before rotation, px; default: {LONGER_SIDE} px for the longer side"
+    add("--width", metavar="PX", type=int, default=default.width, help=width)
+    add("--stride", metavar="N", type=int, default=default.stride, help="step between imported frames; default: 1")
     confidence = "minimum depth confidence of phone recordings: 0 (low), 1 (medium), 2 (high); default: 1"
-    add("--confidence", type=int, default=default.confidence, help=confidence)
-    add("--turn", type=int, default=default.turn, help="clockwise image rotation, degrees: 90, 180 or 270")
-    add = parser.add_argument_group("topics of a ROS bag, if types and names are ambiguous").add_argument
+    add("--confidence", metavar="LEVEL", type=int, default=default.confidence, help=confidence)
+    rotation = "clockwise image rotation, degrees: 90, 180 or 270; default: no rotation"
+    add("--rotate", metavar="DEGREES", type=int, default=default.rotate, help=rotation)
+    add("--turn", dest="rotate", type=int, default=argparse.SUPPRESS, help=argparse.SUPPRESS)  # earlier name
+    add = parser.add_argument_group("topics of a ROS bag; default: detected from types and names").add_argument
     add("--color", metavar="TOPIC", default="", help="color images")
     add("--depth", metavar="TOPIC", default="", help="depth images")
     add("--camera-info", metavar="TOPIC", default="", help="intrinsics of the color camera")
     add("--poses", metavar="TOPIC", default="", help="camera poses: nav_msgs/Odometry or geometry_msgs/PoseStamped")
     parsed = arguments(parser)
     with one_line_errors():
-        writing = Writing(parsed.width, parsed.stride, parsed.confidence, parsed.turn)
+        writing = Writing(parsed.width, parsed.stride, parsed.confidence, parsed.rotate)
         check_new(parsed.directory)
         topics = Topics(parsed.color, parsed.depth, parsed.camera_info, parsed.poses)
         source = open_source(parsed.source, topics)
@@ -47,6 +49,6 @@ def main() -> None:
         best = upright(written.ups)
         if best is not None and best != writing.turned:
             degrees = QUARTER * best.quarters
-            print(f"the images are not upright, which lowers detection quality; rotate them with --turn {degrees}")
+            print(f"the images are not upright, which lowers detection quality; rotate them with --rotate {degrees}")
         print(f"check it: instancemap check dataset=rgbd_folder dataset.root={root}")
         print(f"map it: instancemap dataset=rgbd_folder dataset.root={root}")

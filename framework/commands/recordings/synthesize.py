@@ -10,25 +10,29 @@ from framework.errors import ConfigError
 from framework.runtime.process_settings import available_cores
 from framework.synthetic.benchmark import SCENES
 from framework.synthetic.scene_writers import write_scenes
-from framework.synthetic.scenenn_scene import BenchmarkSettings
+from framework.synthetic.scenenn_scene import FASTEST, BenchmarkSettings
 
 
 def main() -> None:
     """Run the command `instancemap synthesize`."""
     default = BenchmarkSettings()
     parser = argparse.ArgumentParser(
-        description="Write synthetic scenes to DIR in SceneNN format: images, depth, trajectory, labeled mesh. "
-        "Equal parameters give byte-identical files. Existing scenes are kept."
+        description="Write synthetic scenes to DIR in SceneNN format: images, depth, trajectory and labeled mesh.\n"
+        "Equal parameters give byte-identical files. Existing scenes are kept.\n\n"
+        f"Scenes: {', '.join(SCENES)}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
     add("directory", metavar="DIR", type=Path, help="new folder, or a partly written folder to complete")
-    add("--scenes", default=",".join(SCENES), help="comma-separated scenes; default: %(default)s")
-    add("--seed", type=int, default=default.seed, help="random seed of the scenes; default: 0")
-    add("--frames", type=int, default=default.frames, help="number of frames per scene; default: 120")
-    add("--rate", type=float, default=default.rate, help="frame rate, Hz; default: 10")
-    add("--width", type=int, default=default.width, help="image width, px; default: 640")
-    add("--haste", type=float, default=default.haste, help="speed factor of the camera: 1 = slow; default: 2")
-    add("--jobs", type=int, default=available_cores(), help="number of processes; default: all cores")
+    add("--scenes", metavar="NAMES", default=",".join(SCENES), help="comma-separated scene names; default: all scenes")
+    add("--seed", metavar="N", type=int, default=default.seed, help="random seed of the scenes; default: 0")
+    add("--frames", metavar="N", type=int, default=default.frames, help="number of frames per scene; default: 120")
+    add("--rate", metavar="HZ", type=float, default=default.rate, help="frame rate, Hz, in (0, 30]; default: 10")
+    add("--width", metavar="PX", type=int, default=default.width, help="image width, px, multiple of 4; default: 640")
+    speed = f"camera speed relative to the recommended recording speed, in (0, {FASTEST:g}]; default: 2"
+    add("--camera-speed", metavar="FACTOR", type=float, default=default.camera_speed, help=speed)
+    add("--haste", dest="camera_speed", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)  # earlier name
+    add("--jobs", metavar="N", type=int, default=available_cores(), help="number of processes; default: all cores")
     parsed = arguments(parser)
     with one_line_errors():
         names = parsed.scenes.split(",")
@@ -37,7 +41,7 @@ def main() -> None:
             raise ConfigError(f"--scenes: expected some of {', '.join(SCENES)}, got {unknown[0]!r}")
         if parsed.jobs < 1:
             raise ConfigError(f"--jobs: expected at least 1, got {parsed.jobs}")
-        recording = BenchmarkSettings(parsed.seed, parsed.frames, parsed.rate, parsed.width, parsed.haste)
+        recording = BenchmarkSettings(parsed.seed, parsed.frames, parsed.rate, parsed.width, parsed.camera_speed)
         write_scenes(parsed.directory, {name: SCENES[name] for name in names}, recording, parsed.jobs)
         root = parsed.directory.resolve()
         print(f"{root} is complete: instancemap dataset=scenenn dataset.root={root} dataset.scene={names[0]}")

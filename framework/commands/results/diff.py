@@ -29,8 +29,9 @@ def main() -> None:
     )
     parser.add_argument("before", metavar="FIRST", type=Path, help="run directory of the first visit")
     parser.add_argument("after", metavar="SECOND", type=Path, help="run directory of the second visit")
-    parser.add_argument("--all", action="store_true", help="also list objects that stayed or were not seen")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="JSON file for all changes")
+    unchanged = "also list objects that stayed, or that the other run did not see"
+    parser.add_argument("--all", action="store_true", help=unchanged)
+    parser.add_argument("--out", metavar="FILE", type=Path, help="JSON file for all changes; default: none")
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():

@@ -33,19 +33,29 @@ def main() -> None:
         "--transfer",
         choices=[transfer.value for transfer in Transfer],
         default=Transfer.TO_TRUTH.value,
-        help="label transfer of the printed metrics; both are evaluated",
+        help="direction of the label transfer for the printed metrics: to_truth (each ground-truth point gets the "
+        "instance of the nearest map vertex) or to_map (the reverse); both are stored; default: to_truth",
     )
     parser.add_argument(
         "--ground-truth",
         metavar="PATH",
-        help="ground truth, as in dataset.ground_truth: labeled mesh or run directory; '' = dataset ground truth",
+        help="ground truth, as in dataset.ground_truth: labeled mesh or run directory; '' = ground truth of the "
+        "dataset; default: ground truth of the run",
     )
-    parser.add_argument("--other-truth", action="store_true", help="accept a changed ground truth")
+    changed = "evaluate even if the ground truth changed since the run; implied by --ground-truth"
+    parser.add_argument("--allow-changed-ground-truth", action="store_true", help=changed)
+    parser.add_argument(  # earlier name
+        "--other-truth",
+        dest="allow_changed_ground_truth",
+        action="store_true",
+        default=argparse.SUPPRESS,
+        help=argparse.SUPPRESS,
+    )
     parser.add_argument("--dry-run", action="store_true", help="print the changes without writing them")
     parsed = arguments(parser)
     with one_line_errors():
         transfer, write = Transfer(parsed.transfer), not parsed.dry_run
-        failed = evaluate_runs(parsed.run, transfer, write, parsed.other_truth, parsed.ground_truth)
+        failed = evaluate_runs(parsed.run, transfer, write, parsed.allow_changed_ground_truth, parsed.ground_truth)
     if failed:
         sys.exit(EXIT_FAILED)
 
@@ -54,7 +64,7 @@ def evaluate_runs(
     roots: Sequence[Path],
     transfer: Transfer,
     write: bool,
-    other_truth: bool = False,
+    allow_changed: bool = False,
     ground_truth: str | None = None,
 ) -> int:
     """Evaluate all runs in `roots` and their subfolders, print a line per run, and return the number of failures.
@@ -76,7 +86,7 @@ def evaluate_runs(
             for record in group:
                 try:
                     truth = truth or Truth.of(dataset_of(record, ground_truth))
-                    found = Reevaluation.of(record, truth, other_truth or ground_truth is not None)
+                    found = Reevaluation.of(record, truth, allow_changed or ground_truth is not None)
                     if write:
                         found.write()
                     tqdm.write(f"{record.directory}: {summary(found, transfer)}")

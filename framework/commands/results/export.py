@@ -18,22 +18,26 @@ def main() -> None:
     add = parser.add_argument
     formats = ("glb", "ply", "usd", "obj", "floorplan", "graph")
     add("run", metavar="RUN", type=Path, help="run directory, complete or partial")
-    add("--to", nargs="+", default=["glb"], choices=formats, help="one or several formats; default: glb")
+    listed = f"one or several of {', '.join(formats)}; default: glb"
+    add("--to", metavar="FORMAT", nargs="+", default=["glb"], choices=formats, help=listed)
     add("--out", metavar="DIR", type=Path, help="output folder; default: RUN/export")
-    only = "object id or class to export; repeatable"
+    only = "id or class of the exported objects; repeatable; default: all objects"
     add("--object", metavar="OBJECT", action="append", default=[], help=only)
-    least = "minimum confidence of exported objects, ignored for explicit ids; default: 0.3"
+    least = "minimum confidence of exported objects, in [0, 1]; ignored for explicit ids; default: 0.3"
     add("--min-confidence", metavar="P", type=float, default=0.3, help=least)
-    add("--up", metavar=("X", "Y", "Z"), nargs=3, type=float, help="up direction, if the run has none")
-    add("--floor", metavar="M", type=float, help="floor height along the up direction, m, if the run has none")
+    up = "up direction in the world frame; default: up direction of the run"
+    add("--up", metavar=("X", "Y", "Z"), nargs=3, type=float, help=up)
+    floor = "floor height along the up direction, m; default: floor height of the run"
+    add("--floor", metavar="M", type=float, help=floor)
     add = parser.add_argument_group("surfaces").add_argument
-    add("--triangles", metavar="N", type=int, help="maximum number of triangles of the scene and of each object file")
+    most = "maximum number of triangles of the scene and of each object file, >= 4; default: no limit"
+    add("--triangles", metavar="N", type=int, help=most)
     colors = ("appearance", "instance", "class")
     add("--colors", choices=colors, default="appearance", help="vertex colors; default: appearance")
     add("--collision", choices=("hull", "box"), default="hull", help="collision shape of objects in USD; default: hull")
     add = parser.add_argument_group("floor plan and ROS map").add_argument
-    add("--resolution", metavar="M", type=float, default=0.05, help="cell size, m; default: 0.05")
-    height = "robot height, m: free cells are observed empty up to this height above the floor; default: 1"
+    add("--resolution", metavar="M", type=float, default=0.05, help="cell size, m, in [0.01, 1]; default: 0.05")
+    height = "minimum height of observed empty space above a free cell, m, in [0.1, 3]; default: 1"
     add("--robot-height", metavar="M", type=float, default=1.0, help=height)
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)

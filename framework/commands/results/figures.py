@@ -10,6 +10,6 @@ def main() -> None:
     """Run the command `instancemap figures`."""
     print_for_directories(
         "Write figure.png and figure.pdf of the experiment in DIR.",
-        "folder of an experiment",
+        "output folder of an experiment",
         lambda directory: "\n".join(map(str, write_figure(directory))),
     )

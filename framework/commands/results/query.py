@@ -18,10 +18,11 @@ def main() -> None:
         f"{WITH_EMBEDDINGS}, otherwise class names and surface colors."
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
-    parser.add_argument("text", metavar="WORDS", help='text query: "a red chair"')
-    parser.add_argument("--top", metavar="N", type=int, default=5, help="number of objects (default: 5)")
-    parser.add_argument("--by", choices=BY, help="ranking method (default: embeddings if available)")
-    parser.add_argument("--model", help="embedding model of the query (default: model of the run's detector)")
+    parser.add_argument("text", metavar="QUERY", help='text query, such as "a red chair"')
+    parser.add_argument("--top", metavar="N", type=int, default=5, help="number of listed objects; default: 5")
+    parser.add_argument("--by", choices=BY, help="ranking method; default: embeddings if available")
+    model = "embedding model of the query, id on huggingface.co or folder; default: model of the run's detector"
+    parser.add_argument("--model", metavar="MODEL", help=model)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parsed = arguments(parser)
     if parsed.top < 1:

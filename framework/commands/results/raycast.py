@@ -23,13 +23,15 @@ PICTURE = "raycast.png"
 def main() -> None:
     """Run the command `instancemap raycast`."""
     parser = argparse.ArgumentParser(
-        description="Draw the ray-cast view of a map in five panels: depth, normals, vertices, RGB and object indices."
+        description="Draw a ray-cast view of the map of a run in five panels: depth, normals, vertices, RGB and object "
+        "indices."
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="run directory")
     view = parser.add_mutually_exclusive_group()
     view.add_argument("--frame", metavar="N", type=int, help="number of a mapped frame; default: middle frame")
     pose = ("TX", "TY", "TZ", "QX", "QY", "QZ", "QW")
-    view.add_argument("--pose", metavar=pose, nargs=7, type=float, help="camera pose T_world_camera, m, in TUM order")
+    pose_help = "camera pose T_world_camera: position, m, and unit quaternion"
+    view.add_argument("--pose", metavar=pose, nargs=7, type=float, help=pose_help)
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"PNG file; default: {PICTURE} in the run directory")
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)

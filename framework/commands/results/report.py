@@ -25,7 +25,7 @@ def main() -> None:
         "truth is available. For several runs, also writes a comparison. Each report is a single file."
     )
     parser.add_argument("run", metavar="RUN", nargs="+", type=Path, help="run directory")
-    default = f"default: {REPORT} in the run directory, or {COMPARISON} in the common folder of the runs"
+    default = f"default: {REPORT} in the run directory, or {COMPARISON} in the common parent folder of the runs"
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"output file of the report or comparison; {default}")
     parsed = arguments(parser)
     with one_line_errors():

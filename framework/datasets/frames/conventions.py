@@ -63,8 +63,8 @@ class PoseReading:
     pose_kind: PoseKind = PoseKind.T_WORLD_CAMERA  # direction of the stored transforms
     camera_axes: CameraAxes = CameraAxes.OPENCV  # camera axes of the stored poses
     quaternion_order: QuaternionOrder = QuaternionOrder.XYZW  # order of the stored quaternions
-    pose_unit: float = 1.0  # unit of the translations, m, in [1e-6, 1e6]
-    pose_delay: int = 0  # offset of the pose, frames, in [-1000, 1000]: image k has pose k + offset
+    pose_unit: float = 1.0  # length of one unit of the translations, m, in [1e-6, 1e6]; 0.001 = millimeters
+    pose_delay: int = 0  # offset of the pose index, in [-1000, 1000]; image k has pose k + offset
 
     def __post_init__(self) -> None:
         require(1e-6 <= self.pose_unit <= 1e6, "dataset.pose_unit", self.pose_unit, "a value in [1e-6, 1e6] m")
@@ -104,7 +104,7 @@ class DepthReading:
     """Convention of stored depth images."""
 
     depth_scale: float = 0.0  # depth units per meter, in [1, 1e6]; 0 = as stored in the recording
-    depth_delay: int = 0  # offset of the depth image, frames, in [-1000, 1000]: color k has depth k + offset
+    depth_delay: int = 0  # offset of the depth image index, in [-1000, 1000]; color image k has depth image k + offset
 
     def __post_init__(self) -> None:
         fine = self.depth_scale == 0 or COARSEST_DEPTH <= self.depth_scale <= FINEST_DEPTH

@@ -110,12 +110,12 @@ class Recording(RGBDSequence):
     """
 
     root: Path  # folder of the recording or of the scenes, relative to the working or project folder
-    scene: str = ""  # sub-folder of root; "" = root itself
+    scene: str = ""  # subfolder of root; "" = root itself
     start: int = 0  # index of the first frame
-    stop: int = TO_THE_END  # index after the last frame; -1 = to the end
+    stop: int = TO_THE_END  # index after the last frame; -1 = end of the sequence
     stride: int = 1  # step between frames; 1 = every frame
-    frame_fraction: float = 1.0  # fraction of these frames, selected at random with `seed`, in (0, 1]
-    seed: int = 0  # seed of the random selection
+    frame_fraction: float = 1.0  # randomly selected fraction of the frames, in (0, 1]; 1 = all frames
+    seed: int = 0  # seed of the random frame selection
     max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
     ground_truth: Path | None = None  # labeled mesh or run directory for the evaluation; None = the recording's own
     pose_reading: PoseReading = field(default_factory=PoseReading)

@@ -265,5 +265,5 @@ def _distortion(topics: Topics, info: Any) -> Distortion | None:
     return Distortion(*values)
 
 
-NEEDS = "a .bag, .mcap or .db3 file or a folder with metadata.yaml, of ROS or RealSense"
+NEEDS = "a ROS 1 or ROS 2 bag, or a RealSense recording: .bag, .mcap, .db3 or a folder with metadata.yaml"
 FORMAT = Format("ros_bag", NEEDS, recognized, open_source, has_topics=True)

@@ -83,4 +83,4 @@ def _pose(path: Path, content: dict[str, Any]) -> Float64:
     return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
 
 
-FORMAT = Format("polycam", "a folder with keyframes/, Polycam's raw data", recognized, open_source)
+FORMAT = Format("polycam", "a folder with keyframes/, exported as raw data from Polycam", recognized, open_source)

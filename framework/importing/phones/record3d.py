@@ -250,6 +250,6 @@ def _is_r3d(path: Path) -> bool:
     return path.suffix.lower() == ".r3d" and path.is_file()
 
 
-EXPORT = "a folder with metadata.json, rgb/ and depth/, Record3D's EXR + RGB export"
+EXPORT = 'a folder with metadata.json, rgb/ and depth/, exported as "EXR + RGB" from Record3D'
 FOLDER_FORMAT = Format("record3d_exr", EXPORT, _is_export, open_folder)
-FILE_FORMAT = Format("record3d", "an .r3d file of Record3D", _is_r3d, open_file)
+FILE_FORMAT = Format("record3d", "an .r3d file exported from Record3D", _is_r3d, open_file)

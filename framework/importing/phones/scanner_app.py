@@ -63,4 +63,5 @@ def _read(folder: Path, number: str) -> DeviceFrame:
     )
 
 
-FORMAT = Format("scanner_app", 'a folder with frame_00000.json, "All Data" of 3D Scanner App', recognized, open_source)
+NEEDS = 'a folder with frame_00000.json, exported as "All Data" from 3D Scanner App'
+FORMAT = Format("scanner_app", NEEDS, recognized, open_source)

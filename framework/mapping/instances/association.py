@@ -186,15 +186,15 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 class Association:
     """Association of clusters with instances, and merging of instances detected as one object."""
 
-    association: InstanceSource = InstanceSource.SURFACE_LOOKUP  # source of the compared instances
+    association: InstanceSource = InstanceSource.SURFACE_LOOKUP  # source of the instances to compare with
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
     min_class_agreement: float = 0.0  # minimum Bhattacharyya coefficient of the classes to match, in [0, 1]
     create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; updates have no minimum
     create_points: int = 50  # minimum cluster size to create an instance, px, >= 1; also minimum overlap denominator
-    split_instances: bool = True  # new instance for the second of two clusters on one instance; False = none
-    merge_overlap: float = 1.0  # minimum overlap of two instances with one cluster to merge, in [0, 1]; 1 = no merging
-    merge_frames: int = 3  # minimum frames with a joint cluster, minus frames with separate clusters, to merge, >= 1
+    split_instances: bool = True  # True = create an instance for the second of two clusters on one instance
+    merge_overlap: float = 1.0  # minimum overlap with one cluster to merge two instances, in [0, 1]; 1 = no merging
+    merge_frames: int = 3  # minimum number of frames with a joint cluster minus with separate clusters, to merge, >= 1
     merge_agreement: float = 0.1  # minimum Bhattacharyya coefficient of the classes to merge, in [0, 1]
 
     def __post_init__(self) -> None:

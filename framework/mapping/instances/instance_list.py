@@ -34,8 +34,8 @@ class Confirmation:
     lost.
     """
 
-    min_observations: int = 3  # minimum number of frames with a detection of a confirmed instance, >= 1
-    min_confidence: float = 0.05  # minimum InstanceRecord.confidence of a confirmed instance, in [0, 1]
+    min_observations: int = 3  # minimum number of frames with a detection to confirm an instance, >= 1
+    min_confidence: float = 0.05  # minimum InstanceRecord.confidence to confirm an instance, in [0, 1]
     min_area: float = 0.01  # minimum surface area of a confirmed instance, m^2, >= 0: voxel_size^2 per mesh vertex
 
     def __post_init__(self) -> None:

@@ -26,7 +26,7 @@ class Sensor(NamedTuple):
     truncation_slope: np.float32  # increase of the truncation distance with depth, m per m
     min_depth: np.float32  # m
     max_depth: np.float32  # m
-    max_weight: np.float32  # maximum weight, observations
+    max_weight: np.float32  # maximum weight, in observations
     full_weight_depth: np.float32  # m; a depth reading has weight min(1, (full_weight_depth / depth)^2)
 
     @property

@@ -134,10 +134,10 @@ class Tsdf:
     """A truncated signed distance field with labels near the measured surface."""
 
     voxel_size: float = 0.01  # side of a voxel, m, > 0
-    truncation: float = 4.0  # truncation distance at depth 0, voxels, >= 1
+    truncation: float = 4.0  # truncation distance at depth 0, in voxels, >= 1
     min_depth: float = 0.2  # minimum depth of integrated readings, m, > 0
     max_depth: float = 5.0  # maximum depth of integrated readings, m, > min_depth
-    label_band: float = 2.0  # maximum distance of labeled voxels from the measured surface, voxels, >= 1
+    label_band: float = 2.0  # maximum distance of labeled voxels from the measured surface, in voxels, >= 1
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -156,7 +156,7 @@ class VoxelHashing:
 
     tsdf: Tsdf = field(default_factory=Tsdf)
     truncation_slope: float = 0.01  # increase of the truncation distance with depth, m per m, >= 0; as in VoxelHashing
-    max_weight: float = 200.0  # maximum TSDF weight, observations, in [1, 255]; limits the influence of old readings
+    max_weight: float = 200.0  # maximum TSDF weight (number of observations), in [1, 255]; limits old readings
     full_weight_depth: float = 1.5  # maximum depth with full weight, m, > 0; farther: (full_weight_depth / depth)^2
     max_blocks: int = 400_000  # maximum number of blocks of 8^3 voxels, > 0: 1.7 GB, about 1000 m^2 of surface at 1 cm
 

@@ -37,7 +37,7 @@ from framework.refinement.segmentation.convexity_kernels import (
 class Limits:
     """Limits for a continuous and convex surface."""
 
-    noise_factor: float  # depth difference that counts as noise, standard deviations
+    noise_factor: float  # depth difference that counts as noise, in standard deviations
     min_noise: float  # minimum standard deviation of depth for quantized readings, m
     max_slope: float  # maximum change of depth with lateral distance, m per m
     max_angle: float  # maximum angle of a concave bend in addition to noise, rad

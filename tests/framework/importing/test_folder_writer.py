@@ -104,7 +104,7 @@ def test_folder_writer_depth_above_uint16_range_is_zero(tmp_path: Path) -> None:
     assert set(np.unique(seen.depth)) == {0, np.float32(65.5)}
 
 
-@pytest.mark.parametrize("bad", [{"width": -1}, {"stride": 0}, {"confidence": 3}, {"turn": 45}])
+@pytest.mark.parametrize("bad", [{"width": -1}, {"stride": 0}, {"confidence": 3}, {"rotate": 45}])
 def test_folder_writer_option_out_of_range_raises(bad: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=f"--{next(iter(bad))}: expected"):
         Writing(**bad)

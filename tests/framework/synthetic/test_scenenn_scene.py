@@ -144,10 +144,10 @@ def test_benchmark_camera_matches_scenenn() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"seed": -1}, {"frames": 0}, {"width": 8}, {"width": 162}, {"haste": 0.0}, {"rate": 31.0}]
+    "wrong", [{"seed": -1}, {"frames": 0}, {"width": 8}, {"width": 162}, {"camera_speed": 0.0}, {"rate": 31.0}]
 )
 def test_benchmark_settings_out_of_range_raise(wrong: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
+    with pytest.raises(ConfigError, match=next(iter(wrong)).replace("_", "-")):
         BenchmarkSettings(**wrong)
 
 

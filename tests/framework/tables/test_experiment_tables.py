@@ -216,7 +216,7 @@ def test_table_on_other_data_has_no_published_numbers(
     assert "(published)" not in text
     assert "not known" not in text
     assert "not looked up" not in text
-    assert "- Published numbers are for the real SceneNN data (sequences=scenenn) and omitted" in text
+    assert "- Published numbers are for the original SceneNN data (sequences=scenenn) and omitted" in text
 
 
 def test_table_published_row_without_values_is_only_named(sweep: Path) -> None:

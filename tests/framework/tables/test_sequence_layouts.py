@@ -145,7 +145,7 @@ def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: d
     text = write_tables(sweep)
     assert "(published)" not in text
     assert "030" not in text
-    assert "- Published numbers are for the real SceneNN data" in text
+    assert "- Published numbers are for the original SceneNN data" in text
 
 
 def test_table_compares_rows_of_same_pose_source(sweep: Path) -> None:

@@ -34,7 +34,7 @@ def test_import_prints_written_frames_and_next_commands(
     out, err = capsys.readouterr()
     assert out.splitlines() == [
         f"{tmp_path}/out: from Stray Scanner, 2 frames",
-        "the images are not upright, which lowers detection quality; rotate them with --turn 180",
+        "the images are not upright, which lowers detection quality; rotate them with --rotate 180",
         f"check it: instancemap check dataset=rgbd_folder dataset.root={tmp_path}/out",
         f"map it: instancemap dataset=rgbd_folder dataset.root={tmp_path}/out",
     ]
@@ -48,8 +48,8 @@ def test_import_turned_images_have_turned_poses(
     """In the room y points down, in ARKit up, so that these images are upside down for a phone."""
     frames = room_frames()
     write_stray_scanner(tmp_path / "export", frames)
-    command(monkeypatch, tmp_path / "export", tmp_path / "out", "--turn", "180", "--confidence", "0")
-    assert "--turn" not in capsys.readouterr().out
+    command(monkeypatch, tmp_path / "export", tmp_path / "out", "--rotate", "180", "--confidence", "0")
+    assert "--rotate" not in capsys.readouterr().out
     for frame, seen in zip(frames, RgbdFolder(tmp_path / "out"), strict=True):
         assert seen.T_world_camera is not None
         depth, _, color, ids = look(seen.camera, seen.T_world_camera)

@@ -116,7 +116,8 @@ def test_evaluate_tiny_difference_prints_all_digits(stored: Path, command) -> No
     assert line.endswith(f"-> {true['instances.mean_iou']!r}")
 
 
-def test_evaluate_other_truth_requires_option(stored: Path, command) -> None:
+@pytest.mark.parametrize("option", ["--allow-changed-ground-truth", "--other-truth"])
+def test_evaluate_changed_ground_truth_requires_option(stored: Path, command, option: str) -> None:
     """A relative dataset.root is another folder elsewhere, whose ground truth does not belong to this run."""
     true = metrics_of(stored)
     write_metrics(stored, true | {"truth_sha256": "0" * 64})
@@ -125,7 +126,8 @@ def test_evaluate_other_truth_requires_option(stored: Path, command) -> None:
     assert "expected the ground truth of the run (truth_sha256 00000000), got " in err
     assert " from tests.support.scenes.corner_room.CornerRoom; check the dataset" in err
     assert metrics_of(stored)["truth_sha256"] == "0" * 64
-    assert command(stored, "--other-truth")[:2] == (0, f"{stored}: 1 other\n")
+    assert "set --allow-changed-ground-truth to evaluate anyway" in err
+    assert command(stored, option)[:2] == (0, f"{stored}: 1 other\n")
     assert metrics_of(stored) == true | CODE
 
 
