@@ -19,7 +19,7 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 
 def existence(record: InstanceRecord) -> float:
-    """Return Fusion++'s existence probability, the mean of Beta(1 + frames detected, 1 + other frames in view)."""
+    """Return Fusion++'s existence probability: the mean of Beta(1 + detections, 1 + in-view frames without one)."""
     return (1 + record.observations) / (2 + max(record.visible, record.observations))
 
 
@@ -38,7 +38,7 @@ class ObjectVolumes(MapFuser):
     overlap_rule: OverlapRule = OverlapRule.IOU  # denominator of the overlap
     require_same_class: bool = False  # restriction of matches to the same most likely class, as in MaskFusion
     create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; updates have no minimum
-    create_points: int = 50  # minimum size of a detection to create an object, px, >= 1; also of an object in view
+    create_points: int = 50  # minimum size of a detection to create an object, and of a visible object, px, >= 1
     min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; other objects are removed
     min_observations: int = 3  # minimum number of frames with a detection of a confirmed object, >= 1
     min_area: float = 0.01  # minimum surface area of a confirmed object in the mesh, m^2, >= 0
@@ -76,7 +76,7 @@ class ObjectVolumes(MapFuser):
         return count_overlaps(points, seen, stride)
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
-        """Match each cluster with the object of largest overlap, or create an object if score and size suffice."""
+        """Return the matches: the object of largest overlap, or a new object if score and size suffice."""
         ratios = overlaps.by(self.overlap_rule, self.create_points)
         ratios[~self._agree(clusters, overlaps.instance_ids)] = 0
         instance_ids = np.zeros(len(clusters), np.int32)
