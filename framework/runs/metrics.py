@@ -34,7 +34,7 @@ TRUTH = "truth_sha256"  # key of the hash of the ground truth
 
 
 def run_metrics(result: RunResult) -> Metrics:
-    """Return counts, speed, stage times and map size. For live video, add dropped frames and latency."""
+    """Return counts, speed, stage times and map size; for live video, also dropped frames and latency."""
     metrics: Metrics = {
         "frames": result.frames,
         "frames_lost": result.frames_lost,
@@ -114,7 +114,7 @@ def evaluation_metrics(
 
 
 def truth_sha256(truth: SceneTruth) -> str:
-    """Hash the ground truth of an evaluation."""
+    """Return the SHA-256 (hex) of the ground truth of an evaluation."""
     digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
     for array in (truth.points_world, truth.instance_ids):
         add_values(digest, array)

@@ -27,7 +27,7 @@ def main() -> None:
 
 
 def compile_named(kernels: list[Kernel], words: list[str]) -> str:
-    """Compile the missing kernels with one of the words in their names ([] = all), and return a summary.
+    """Compile the missing kernels whose names contain one of the words ([] = all), and return a summary.
 
     Raises ConfigError if no kernel matches, DataError if a kernel cannot be compiled.
     """
