@@ -148,17 +148,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="List the plugins of each stage and their parameters.")
     parser.add_argument("stage", nargs="?", choices=GROUPS, help="stage to list; default: all")
     parser.add_argument("name", nargs="?", help="option to list; default: all")
-    asked = arguments(parser)
+    parsed = arguments(parser)
     with one_line_errors():
-        stages = [asked.stage] if asked.stage else list(GROUPS)
+        stages = [parsed.stage] if parsed.stage else list(GROUPS)
         # garbage collection of torch's objects takes a fifth of the time here, and again at exit
         atexit.register(gc.freeze)
         gc.disable()
-        options = registered(*stages, only=asked.name)
+        options = registered(*stages, only=parsed.name)
         gc.enable()
-        if asked.name and not options:
-            there = ", ".join(options_of(asked.stage))
-            raise ConfigError(f"{asked.stage}: expected one of {there}, got {asked.name}")
+        if parsed.name and not options:
+            there = ", ".join(options_of(parsed.stage))
+            raise ConfigError(f"{parsed.stage}: expected one of {there}, got {parsed.name}")
         for stage in stages:
             print(f"{stage} ({GROUPS[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
             described = [describe(option) for option in options if option.stage == stage]

@@ -261,7 +261,7 @@ def test_file_names_differing_in_two_numbers_raise(folder, names):
 
 def test_file_name_without_number_raises(folder):
     shutil.copy(folder / "color/000001.png", folder / "color/cover.png")
-    with pytest.raises(DataError, match="expected a name that ends in a frame number"):
+    with pytest.raises(DataError, match="expected names that end in a frame number"):
         RgbdFolder(folder)
 
 
@@ -283,7 +283,7 @@ def test_unreadable_file_is_not_treated_as_missing(folder, name, kind):
 @pytest.mark.parametrize("key", ["Distortion", "distorsion", "depthscale", "Width"])
 def test_misspelled_camera_key_raises_with_suggestion(folder, key):
     change_camera(folder, **{key: 1})
-    with pytest.raises(DataError, match=f"unknown key '{key}'; did you mean"):
+    with pytest.raises(DataError, match=f"expected known keys, got '{key}'; did you mean"):
         RgbdFolder(folder)
 
 

@@ -28,8 +28,8 @@ def test_first_signal_is_deferred_and_second_raises(number: signal.Signals, capf
         interruption.check()
         with interruption.second_ends_at_once("after this frame"):
             signal.raise_signal(number)
-        assert interruption.asked is not None
-        assert interruption.asked.number == number
+        assert interruption.received is not None
+        assert interruption.received.number == number
         signal.raise_signal(number)  # between two steps: what the first has made must reach the second
         with pytest.raises(Interrupted) as second, interruption.second_ends_at_once("after the outputs are written"):
             signal.raise_signal(number)
@@ -57,9 +57,9 @@ def test_nested_signals_deferred_returns_outer_context() -> None:
         with signals_deferred(signal.SIGINT) as inner:
             assert inner is outer
         signal.raise_signal(signal.SIGTERM)
-        assert outer.asked is not None
+        assert outer.received is not None
     with signals_deferred(signal.SIGINT) as later:
-        assert later.asked is None
+        assert later.received is None
 
 
 def test_existing_signal_handlers_are_kept() -> None:
@@ -71,7 +71,7 @@ def test_existing_signal_handlers_are_kept() -> None:
     with signals_deferred(*ENDING) as interruption:
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGTERM)
-    assert (interruption.asked, heard) == (None, [signal.SIGTERM])
+    assert (interruption.received, heard) == (None, [signal.SIGTERM])
 
 
 def test_raise_on_signals_raises_for_each_signal() -> None:

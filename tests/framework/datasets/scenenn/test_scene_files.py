@@ -159,7 +159,7 @@ def test_malformed_trajectory_error_gives_file_and_line(path, line, new, message
 
 
 def test_missing_trajectory_raises(path):
-    with pytest.raises(DataError, match=r"trajectory.log: cannot be read: No such file"):
+    with pytest.raises(DataError, match=r"trajectory.log: expected a readable file, got No such file"):
         read_trajectory_log(path)
 
 
