@@ -133,8 +133,9 @@ def main() -> None:
         sys.argv[:2] = [f"{program} {word}"]
     elif word and not of_run:
         close = get_close_matches(word, COMMANDS, n=1)
-        suggestion = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(COMMANDS)}"
-        sys.exit(f"error: {word!r}: unknown command; {suggestion}")
+        expected = "a known command" if close else f"one of {', '.join(COMMANDS)}"
+        hint = f"; did you mean {close[0]}?" if close else ""
+        sys.exit(f"error: command: expected {expected}, got {word!r}{hint}")
     else:
         word = "run"
     if word in PRINTING and hasattr(signal, "SIGPIPE"):  # not on Windows
@@ -146,7 +147,7 @@ def main() -> None:
 
 
 def flush_output(rest: str = "") -> None:
-    """Write `rest` and flush stdout; exit with an error if that fails and no other error is being reported."""
+    """Write `rest` and flush stdout. If this fails, exit with an error unless another error is being reported."""
     reported = sys.exc_info()[0] is not None
     try:
         sys.stdout.write(rest)

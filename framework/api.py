@@ -103,7 +103,7 @@ def begin(config: DictConfig) -> Pipeline:
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
     viewer = build(Viewer, config.get("viewer"))
-    detector = with_cache(build(Detector, config.get("detector")), config)  # last: loading a network takes long
+    detector = with_cache(build(Detector, config.get("detector")), config)  # last, because loading a network is slow
     chosen = {key: config.get(key) for key in ("resume_from", "localize_in") if config.get(key) is not None}
     if len(chosen) > 1:
         raise ConfigError("resume_from and localize_in: expected at most one of these keys, got both; remove one")
@@ -267,7 +267,7 @@ def _override(name: str, value: object) -> str:
         return f"{name}={'null' if value is None else value}"
     if isinstance(value, str | Path):
         return f"{name}={QuotedString(str(value), Quote.single).with_quotes()}"
-    raise ConfigError(f"{name}: expected a name, a number, true, false or None, got {value!r:.60}")
+    raise ConfigError(f"{name}: expected a string, path, number, bool or None, got {value!r:.60}")
 
 
 def open_dataset(name: str, **parameters: object) -> RGBDSequence:

@@ -40,7 +40,7 @@ UInt16 = npt.NDArray[np.uint16]
 Bool = npt.NDArray[np.bool_]
 
 ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; published poses have 4 digits
-MOST_PIXELS = 2**25  # px of an image, such as 8K video
+MAX_PIXELS = 2**25  # px of an image, such as 8K video
 WIDEST = 10.0  # maximum lateral distance per depth, m/m: a field of view of 168 degrees
 LONGEST_FOCAL_LENGTH = 1e6  # px
 UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
@@ -69,8 +69,8 @@ class Camera:
                 raise DataError(f"Camera.{name}: expected {expected}, got {value!r}")
         if self.width < 1 or self.height < 1:
             raise DataError(f"Camera: expected an image of at least 1x1 px, got {self.width}x{self.height}")
-        if self.width * self.height > MOST_PIXELS:
-            raise DataError(f"Camera: expected an image of at most {MOST_PIXELS} px, got {self.width}x{self.height}")
+        if self.width * self.height > MAX_PIXELS:
+            raise DataError(f"Camera: expected an image of at most {MAX_PIXELS} px, got {self.width}x{self.height}")
         numbers = (self.fx, self.fy, self.cx, self.cy)
         if not np.isfinite(numbers).all() or self.fx <= 0 or self.fy <= 0:
             raise DataError(f"Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy = {numbers}")
@@ -219,7 +219,7 @@ class Pose:
 
     T_world_camera: Float64  # (4, 4); if lost, the last reliable pose
     lost: bool = False
-    reason: str = ""  # reason of the loss, for the log
+    reason: str = ""  # reason for the loss, for the log
 
     def __post_init__(self) -> None:
         check_rigid("Pose.T_world_camera", self.T_world_camera)

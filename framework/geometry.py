@@ -103,7 +103,7 @@ def nearest_rotation(R: Float64) -> Float64:
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """Remove the rounding errors of the rotation of a pose (4, 4). Raises DataError if it is not rigid."""
+    """Return a pose (4, 4) without the rounding errors of its rotation. Raises DataError if it is not rigid."""
     if not np.isfinite(matrix).all():
         raise DataError("pose: expected finite values, got NaN or infinity")
     if not np.allclose(matrix[3], (0, 0, 0, 1)):

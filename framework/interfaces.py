@@ -95,7 +95,13 @@ class RGBDSequence(RGBDVideo):
 
     @abstractmethod
     def __getitem__(self, k: int) -> Frame:
-        """Return selected frame k, 0 <= k < len. Called in order, from any thread. Raises FrameError if unusable."""
+        """Return the selected frame k, 0 <= k < len.
+
+        The pipeline requests frames in order, from any thread. Other callers use random access.
+
+        Raises:
+            FrameError: The frame is unusable.
+        """
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
@@ -145,7 +151,7 @@ class PoseTracker(ABC):
         world frame: its ground-truth pose if known, otherwise the identity.
 
         Raises:
-            NoPoseError: The tracker requires the poses of the sequence, and this frame has no pose. It is skipped.
+            NoPoseError: The tracker requires the poses of the sequence, but this frame has none. The frame is skipped.
         """
 
     def keyframes(self) -> Mapping[str, Array]:

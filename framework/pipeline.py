@@ -29,8 +29,8 @@ from framework.interfaces import (
 from framework.live_view.guarded_viewer import GuardedViewer
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
-from framework.runtime.cpu_budget import CoreSharing, parallel_kernels_are_thread_safe
-from framework.runtime.frame_stream import FrameStream, Turns, map_ahead, stream_of
+from framework.runtime.cpu_budget import CpuBudget, parallel_kernels_are_thread_safe
+from framework.runtime.frame_stream import FrameStream, Turns, prefetched_map, stream_of
 from framework.runtime.run_log import Journal, RunResult, StageTime
 from framework.runtime.signals import Interruption, signals_deferred
 from framework.tracking.color_to_depth import ColorToDepth
@@ -80,7 +80,7 @@ class Pipeline:
             video: The sequence or live video.
 
         Returns:
-            The map and the statistics of the run. `stopped_by` is the reason of an early end.
+            The map and the statistics of the run. `stopped_by` is the reason for an early end.
 
         Raises:
             DataError: No frame was mapped.
@@ -91,7 +91,7 @@ class Pipeline:
         raise result.stopped_by
 
     def run_to_any_end(self, video: RGBDVideo, directory: Path = Path()) -> RunResult:
-        """Map `video`, and return errors of stages in `stopped_by` after the first mapped frame.
+        """Map `video`. An error of a stage after the first mapped frame is returned in `stopped_by`.
 
         `directory` is the output folder of the viewer.
         """
@@ -118,14 +118,14 @@ class Pipeline:
         if journal.stopped_by is not None:
             if journal.frames_in_map == 0:
                 raise journal.stopped_by
-            if isinstance(video, LiveVideo) and journal.stopped_by is interruption.asked:
+            if isinstance(video, LiveVideo) and journal.stopped_by is interruption.received:
                 journal.stopped_by = None  # the normal end; a second signal raises another Interrupted
         elif journal.frames_in_map == 0 or self.fuser.scene.statistics.voxels == 0:
             raise DataError(f"{video.name}: {self.empty_map_reason(journal)}")
         return replace(journal.result(), keyframes=keyframes, color_delay=self.color_to_depth.estimate)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
-        """Return the keyframes of the tracker. An error of the last frame is raised only now, and ends the run."""
+        """Return the keyframes of the tracker. A pending error of its thread is raised here and recorded."""
         try:
             return self.tracker.keyframes()
         except Exception as error:
@@ -133,7 +133,7 @@ class Pipeline:
             return self.tracker.keyframes()
 
     def empty_map_reason(self, journal: Journal) -> str:
-        """Return the reason of an empty map."""
+        """Return why the map is empty."""
         result = journal.result()
         if result.frames == 0:
             return "expected at least one frame, got none"
@@ -160,10 +160,10 @@ class Pipeline:
         if prefetch > 0 and not parallel_kernels_are_thread_safe():
             log.info(WITHOUT_THREADS)
             prefetch = 0
-        sharing = CoreSharing(with_a_thread_ahead=prefetch > 0)
-        with closing(self.detect_ahead(video, journal, interruption, sharing, prefetch)) as detected:
+        budget = CpuBudget(with_prefetch=prefetch > 0)
+        with closing(self.detect_prefetched(video, journal, interruption, budget, prefetch)) as detected:
             for frame, detections in detected:
-                with sharing.mapping():
+                with budget.mapping():
                     self.map_and_show(frame, detections, journal)
                 interruption.check()
 
@@ -180,25 +180,25 @@ class Pipeline:
         journal.frame_skipped(error)
         self.viewer.skip(str(error))
 
-    def detect_ahead(
-        self, video: RGBDVideo, journal: Journal, interruption: Interruption, sharing: CoreSharing, prefetch: int
+    def detect_prefetched(
+        self, video: RGBDVideo, journal: Journal, interruption: Interruption, budget: CpuBudget, prefetch: int
     ) -> Generator[tuple[Frame, Detections]]:
         """Yield the usable frames with their detections, in order.
 
         Up to `prefetch` frames are read and detected while another frame is mapped, in parallel if the detector
         supports it. The results of a recording do not depend on `prefetch`.
         """
-        stream = stream_of(video, lambda: interruption.asked is not None)
-        prefetch = prefetch if stream.most_ahead is None else min(prefetch, stream.most_ahead)
-        workers = max(1, min(prefetch, sharing.cores)) if self.detector.concurrent else 1
+        stream = stream_of(video, lambda: interruption.received is not None)
+        prefetch = prefetch if stream.max_prefetched is None else min(prefetch, stream.max_prefetched)
+        workers = max(1, min(prefetch, budget.cores)) if self.detector.concurrent else 1
         turns = Turns()
 
         def work(number: int) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
-            with sharing.ahead(workers):
+            with budget.prefetching(workers):
                 return self.read_and_detect(stream, turns.turn(number), number)
 
         # close the stream first: a worker may be waiting for a frame
-        with closing(map_ahead(work, count(), prefetch, workers)) as outcomes, stream:
+        with closing(prefetched_map(work, count(), prefetch, workers)) as outcomes, stream:
             for outcome in outcomes:
                 interruption.check()  # after a possibly long wait
                 journal.frames_dropped = stream.dropped
@@ -263,7 +263,7 @@ class Pipeline:
 
 @contextmanager
 def watched(viewer: Viewer, scene: SceneMap, video: str, directory: Path) -> Iterator[None]:
-    """Start the viewer, and end it after the body, also after an error."""
+    """Start the viewer, and end it after the body, even after an error."""
     viewer.begin(scene, video, directory)
     try:
         yield

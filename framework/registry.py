@@ -151,7 +151,7 @@ def _options_loader() -> Iterator[Any]:
 
 
 def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
-    """Yield the class names in the options of a stage. Options with a name contained in `sought` come first."""
+    """Yield the class names in the options of a stage, first of the options whose name occurs in `sought`."""
     inheriting = []
     files: Any = CachingConfigRepository(loader.repository)
     for name in sorted(loader.get_group_options(stage), key=lambda name: name not in sought):
@@ -168,7 +168,7 @@ def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
 
 
 def composition(files: Any, stage: str, name: str) -> dict[str, str]:
-    """Return the packages of the configs in an option of a stage, by path, in order.
+    """Return the Hydra package of each config file of a stage's option, by path, in order.
 
     The option is composed as in a run, because it may override the choice of another stage. `files` is the caching
     repository of a loader. Raises HydraException for a broken option.
@@ -262,7 +262,8 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
         schema: DictConfig = OmegaConf.structured(dataclasses.make_dataclass(plugin_class.__name__, typed))
     except OmegaConfBaseException as error:
         raise ConfigError(
-            f"{where}: expected parameters of bool, int, float, str, Path, Enum or list[str]; {first_line(error)}"
+            f"{where}: expected parameters of bool, int, float, str, Path, Enum or list[str], got an error "
+            f"({first_line(error)})"
         ) from error
     plugins: dict[str, Any] = {}
     for key in map(str, node):
@@ -270,8 +271,9 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
             continue
         if key not in fields:
             hint = rename_hint(f"{where.split()[0]}.{key}")
-            suggestion = f"; {hint}" if hint else _did_you_mean(key, list(fields), "expected one of")
-            raise ConfigError(f"{where}: unknown parameter {key!r}{suggestion}")
+            suggestion = f"; {hint}" if hint else _did_you_mean(key, list(fields))
+            expected = "a known parameter" if suggestion else f"one of {', '.join(fields) or 'none'}"
+            raise ConfigError(f"{where}: expected {expected}, got {key!r}{suggestion}")
         if key in stages:
             plugins[key] = _inner(f"{where}: {key}", stages[key], node[key], holds_one(plugin_class, key))
             continue
@@ -325,7 +327,9 @@ def _import(where: str, module_name: str) -> ModuleType:
         ) from error
     except Exception as error:  # third-party code
         kind = type(error).__name__
-        raise ConfigError(f"{where}: {module_name}: import failed: {kind}: {first_line(error)}") from error
+        raise ConfigError(
+            f"{where}: {module_name}: expected an importable module, got {kind}: {first_line(error)}"
+        ) from error
 
 
 def _check_module(where: str, module_name: str) -> None:
@@ -347,9 +351,9 @@ def _check_module(where: str, module_name: str) -> None:
         spec = next((spec for spec in specs if spec and spec.loader), next(filter(None, specs), None))
         if spec is None:
             close = _did_you_mean(part, [module.name for module in pkgutil.iter_modules(folders)])
-            raise ConfigError(f"{where}: unknown module {name}{close}")
+            raise ConfigError(f"{where}: expected an existing module, got {name}{close}")
     if spec is None:
-        raise ConfigError(f"{where}: unknown module {name}")
+        raise ConfigError(f"{where}: expected an existing module, got {name}")
 
 
 def _check_plugins_package(plugins: ModuleSpec) -> None:
@@ -366,11 +370,9 @@ def _implements(found: Any, interface: type) -> bool:
     return isinstance(found, type) and issubclass(found, interface) and found is not interface
 
 
-def _did_you_mean(name: str, known: list[str], otherwise: str = "") -> str:
+def _did_you_mean(name: str, known: list[str]) -> str:
     close = get_close_matches(name, known, n=1)
-    if close:
-        return f"; did you mean {close[0]!r}?"
-    return f"; {otherwise} {', '.join(known) or 'none'}" if otherwise else ""
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def _shown(node: Any) -> str:

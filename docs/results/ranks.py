@@ -21,7 +21,7 @@ import numpy as np
 from framework.commands.command_line import arguments, one_line_errors
 from framework.data import Float64
 from framework.errors import DataError
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, RunRow
 from framework.tables.comparison import ComparisonTable, mean_by_sequence
 from framework.tables.grid import TextTable, decimals, figure, markdown_grid
@@ -171,7 +171,7 @@ def write_ranks(directories: Sequence[Path], keys: Sequence[str], out: Path | No
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         for name, content in (("ranks.md", text), ("ranks.csv", comma_separated(rankings))):
-            with written_whole(out / name) as temporary:
+            with atomic_write(out / name) as temporary:
                 temporary.write_text(content, "utf-8")
     return text
 

@@ -7,9 +7,9 @@ After SemanticFusion (McCormac et al. 2017), eq. 2, which is eq. [7] with one di
 In log space the update is a sum, from a uniform start. Only ratios matter, so a voxel stores the log ratio of each
 class to the background. The background wins if no class is above 0.
 
-A pixel under a mask has the distribution of the mask. All pixels under no mask are equal evidence for the background,
-so every block stores a count of frames. Evidence of masks is in rows of 512 voxels, only for blocks that were under a
-mask. A voxel of a row takes 5 bytes per class slot and 14 more bytes, so at most 94 bytes.
+A pixel under a mask has the distribution of the mask. All pixels outside the masks are equal evidence for the
+background, so a voxel only counts these frames. Mask evidence is stored in rows of 512 voxels, only for blocks that
+were under a mask. A voxel of a row takes 14 bytes and 5 bytes per class slot, so at most 94 bytes.
 
 A voxel stores the CLASS_SLOTS most likely classes and evicts the least likely class when another class is named. The
 unnamed classes share one sum, `rest`. A newly named class starts with this sum.
@@ -42,10 +42,10 @@ class ClassEvidence(NamedTuple):
     unmasked: UInt16  # (B, 512) frames with the voxel under no mask; B as in the grid
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
     log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames with the voxel under a mask
-    rest: Float32  # (R, 512) this sum for each unnamed class
+    rest: Float32  # (R, 512) the same sum for each of the unnamed classes
     masked: UInt16  # (R, 512) number of frames with the voxel under a mask
-    first_frame: Int32  # (R, 512) first of these frames, -1 = none
-    last_frame: Int32  # (R, 512) last of these frames, -1 = none
+    first_frame: Int32  # (R, 512) first frame with the voxel under a mask, -1 = none
+    last_frame: Int32  # (R, 512) last frame with the voxel under a mask, -1 = none
 
 
 ROW_ARRAYS = ClassEvidence._fields[1:]
@@ -64,7 +64,7 @@ class MaskClasses(NamedTuple):
 
 
 def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
-    """Return the evidence of a frame's clusters from their log P(class) / P(background) (N, C)."""
+    """Return the evidence of a frame's clusters from their `log_ratio` (N, C), log P(class) / P(background)."""
     relative, named, bits = named_classes(log_ratio, logarithmic=True)
     best = best_clusters(points.offsets, points.clusters, clusters.scores)
     return MaskClasses(
@@ -103,7 +103,7 @@ class ClassRows:
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
     def update(self, seen: SeenBlocks, masks: MaskClasses | None) -> None:
-        """Update the voxels near the measured surface in the seen blocks of a frame; None = no detection."""
+        """Update the voxels near the measured surface in the seen blocks; `masks` = None: the detector did not run."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.evidence.unmasked) < capacity:
             self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
@@ -153,10 +153,17 @@ def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: i
     named = class_ids != NO_CLASS
     ratios = np.where(named, log_ratio, np.float32(-np.inf))
     best = ratios.max(axis=-1, initial=-np.inf)
-    if (ratios[..., :1] < best[..., None]).any():
-        raise DataError("log_ratio: expected the best class of each voxel in slot 0, got another class")
-    if ((named.sum(axis=-1) == classes) & (rest - np.maximum(best, 0) > MAX_EXPONENT)).any():
-        raise DataError("rest: expected a smaller value in a voxel that names all classes, got a larger one")
+    wrong = ratios[..., 0] < best
+    if wrong.any():
+        raise DataError(
+            f"log_ratio: expected the maximum of each voxel, {best[wrong][0]:g}, in slot 0, got {ratios[wrong][0, 0]:g}"
+        )
+    excess = np.where(named.sum(axis=-1) == classes, rest - np.maximum(best, 0), np.float32(-np.inf))
+    if (excess > MAX_EXPONENT).any():
+        raise DataError(
+            f"rest: expected at most {MAX_EXPONENT:g} above the best class in voxels that name all classes, got "
+            f"{excess.max():g}"
+        )
 
 
 def _free_rows(class_slots: int) -> ClassEvidence:

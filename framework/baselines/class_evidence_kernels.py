@@ -28,7 +28,7 @@ def best_clusters(offsets, clusters, scores):
 def best_class(grid, evidence, log_missed, block, n):
     """Return the most likely class of a voxel, -1 = background; ties go to the background.
 
-    `log_missed` is the evidence for every class over the background from a frame with the voxel under no mask.
+    `log_missed` is the log ratio of every class to the background for a frame with the voxel outside all masks.
     """
     row = grid.label_row[block]
     if row < 0 or evidence.class_ids[row, n, 0] == NO_CLASS:
@@ -39,7 +39,7 @@ def best_class(grid, evidence, log_missed, block, n):
 
 @device
 def _add_class(labels, sums, label, total):
-    """Assign a free slot or the slot of the least likely class to a class. Returns 1 if a class was evicted."""
+    """Give a class a free slot or the slot of the least likely class. Returns 1 if a class was evicted."""
     least = 0
     for s in range(len(labels)):
         if labels[s] == NO_CLASS:
@@ -83,7 +83,7 @@ def observe_mask(evidence, row, n, masks, k):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_blocks_under_masks(grid, seen, cluster, wants_row):
-    """Fill wants_row (A,) with True for blocks without a row and with a voxel under a mask."""
+    """Set wants_row (A,) to True for blocks that have a voxel under a mask but no row."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
         start = seen.near_start[a]

@@ -27,7 +27,7 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.vertex_labels_kernels import color_vertices
 from framework.mapping.storage.map_file import (
     check_like,
-    faults_of,
+    map_file_errors,
     plain_table,
     read_map,
     table_arrays,
@@ -107,7 +107,7 @@ class ObjectMap(InstanceTableMap):
     def _integrate_object(
         self, volume: ObjectVolume, frame: Frame, T_world_camera: Float64, mask: Bool, band: float
     ) -> None:
-        """Integrate the part of the image with the object's volume or mask."""
+        """Integrate the image window around the object's volume and mask."""
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         u0, v0, u1, v1 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
         if volume.block_count:
@@ -118,7 +118,7 @@ class ObjectMap(InstanceTableMap):
         volume.integrate(_cropped(frame, u0, v0, u1, v1), T_world_camera, part, band)
 
     def _boxes(self, camera: Camera, T_world_camera: Float64, volumes: list[ObjectVolume]) -> Int32:
-        """See boxes_in_view()."""
+        """Return the pixel windows (N, 4) of the volumes; see `boxes_in_view`."""
         low, high = (np.array([getattr(volume, side) for volume in volumes]) for side in ("low", "high"))
         return boxes_in_view(camera, T_world_camera, low, high, float(self.background.sensor.min_depth))
 
@@ -209,7 +209,7 @@ class ObjectMap(InstanceTableMap):
     @classmethod
     def load(cls, path: Path | str) -> ObjectMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS)))
-        with faults_of(path):
+        with map_file_errors(path):
             scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation.of(header.part("confirmation")))
             scene.classes = header.classes()
             scene.table = table_of(header.part("table"), len(scene.classes), arrays)

@@ -6,7 +6,7 @@ the part with a probability above 1/2. So occasional mask errors are outvoted, b
 
 Every depth reading in the blocks of the volume is integrated, masked or not. So distances at the outline are as
 accurate as elsewhere. Blocks are aligned with the blocks of other volumes. Counts take 4 bytes per voxel in addition to
-8 bytes.
+the 8 bytes of the TSDF.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class ObjectVolume:
         return {name: arrays[name] for name in VOLUME_ARRAYS}
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Copy the saved arrays of another volume into this empty volume."""
+        """Fill this empty volume with the saved arrays of another volume."""
         self.volume.fill(arrays)
         self._grow()
         for name, counts in self.counts._asdict().items():
@@ -101,7 +101,7 @@ class ObjectVolume:
 def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: Float64, near: float) -> Int32:
     """Return the pixel windows u0, v0, u1, v1 (N, 4) of boxes in the world frame, u1 and v1 exclusive.
 
-    The windows are never too small. A box out of view has u1 <= u0 or v1 <= v0.
+    A window contains all of its box, but may be too large. A box out of view has u1 <= u0 or v1 <= v0.
 
     Args:
         camera: The camera.
@@ -116,7 +116,7 @@ def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: F
     left, top, z0 = (center - half).T
     right, bottom, z1 = (center + half).T
     z0, z1 = np.maximum(z0, near), np.maximum(z1, near)
-    # rays diverge: a side is farthest out at its nearest depth, or, across the axis, at its farthest depth
+    # rays diverge: a side projects farthest outwards at its nearest depth, or at its farthest depth across the axis
     first = np.stack([camera.fx * np.minimum(left / z0, left / z1), camera.fy * np.minimum(top / z0, top / z1)])
     last = np.stack([camera.fx * np.maximum(right / z0, right / z1), camera.fy * np.maximum(bottom / z0, bottom / z1)])
     middle, size = np.array([[camera.cx], [camera.cy]]), np.array([[camera.width], [camera.height]])

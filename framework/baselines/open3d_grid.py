@@ -22,7 +22,7 @@ from framework.geometry import inverse
 from framework.mapping.storage.map_file import check_blocks, check_like
 from framework.mapping.storage.map_header import MapHeader
 from framework.mapping.voxels.integration_parameters import BOUNDS
-from framework.mapping.voxels.voxel_grid import MOST_BLOCKS
+from framework.mapping.voxels.voxel_grid import MAX_BLOCKS
 
 ATTRIBUTES = {  # name: (type, channels) of a voxel; Open3D's `integrate` expects the first three
     "tsdf": (o3d.core.float32, 1),  # in truncation distances
@@ -39,7 +39,7 @@ NEAR = 0.05  # start depth of rays, m
 RANGE_TILE = 8  # image pixels per pixel of the range map that bounds rays, px; Open3D's default
 FRAGMENTS = 2**18  # capacity of the range map; a view of 10,000 blocks has 20,000 fragments
 FRAGMENT = 16 * 16  # range map pixels per fragment
-MOST_RANGE_PIXELS = 2**24  # maximum pixels of the first range map; coarse voxels need fewer fragments
+MAX_RANGE_PIXELS = 2**24  # maximum pixels of the first range map; coarse voxels need fewer fragments
 CPU = o3d.core.Device("CPU:0")
 
 
@@ -56,7 +56,7 @@ class BlockGridSettings:
     min_weight: float  # minimum number of observations of a surface voxel
 
     def __post_init__(self) -> None:
-        check_bounds(self, block_resolution=(2, 64), max_blocks=(1, MOST_BLOCKS), min_weight=(1.0, 1e6))
+        check_bounds(self, block_resolution=(2, 64), max_blocks=(1, MAX_BLOCKS), min_weight=(1.0, 1e6))
 
     @classmethod
     def of(cls, saved: MapHeader) -> BlockGridSettings:
@@ -94,7 +94,7 @@ class BlockGrid:
 
         Views have holes if the buffer is too small.
         """
-        side = int(np.ceil(np.sqrt(min(FRAGMENTS * FRAGMENT * self.settings.voxel_size, MOST_RANGE_PIXELS))))
+        side = int(np.ceil(np.sqrt(min(FRAGMENTS * FRAGMENT * self.settings.voxel_size, MAX_RANGE_PIXELS))))
         nowhere = Tensor(np.zeros((1, 3), np.int32))
         self.blocks.ray_cast(
             nowhere, Tensor(np.eye(3)), Tensor(np.eye(4)), side, side, ["depth"], METERS, range_map_down_factor=1
@@ -115,7 +115,7 @@ class BlockGrid:
 
     @property
     def min_weight(self) -> float:
-        """Minimum weight of the surface, lower in the first frames as in Open3D's SLAM."""
+        """Minimum weight of surface voxels; it is lower in the first frames, as in Open3D's SLAM."""
         return min(self.settings.min_weight, float(self.frames))
 
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
@@ -170,7 +170,7 @@ class BlockGrid:
             hashmap.reserve(min(max(needed, 2 * hashmap.capacity()), self.settings.max_blocks))
 
     def voxels_seen(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> tuple[Int64, Int64]:
-        """Return the voxels (V,) within `band` voxels of the depth reading at their pixels (V,), both as flat indices.
+        """Return the voxels within `band` voxels of the reading at their pixel, and the pixels, as flat indices (V,).
 
         Only pixels in `mask` (H, W) count. After integrate_custom.py of Open3D's examples.
         """
@@ -226,7 +226,7 @@ class BlockGrid:
         return SurfaceView(camera, T_world_camera, depth, normals, color)
 
     def _cast(self, blocks: Int32, far: float, camera: Camera, T_world_camera: Float64) -> dict[str, npt.NDArray[Any]]:
-        """Return the results of Open3D's ray casting, each (H, W, channels).
+        """Return the results of Open3D's ray casting by name, each (H, W, channels).
 
         The image is padded to multiples of RANGE_TILE, because the range map omits incomplete tiles.
         """
@@ -248,7 +248,7 @@ class BlockGrid:
         return {name: hit[name].numpy()[: camera.height, : camera.width] for name in names}
 
     def _distance(self, corners: Int64, weights: Float32) -> Float32:
-        """Return the trilinear field (P,) m from the voxels `corners` (P, 8) and the `weights` (P, 8) of seen voxels.
+        """Return the trilinear field (P,) m between the voxels `corners` (P, 8), with `weights` (P, 8), 0 if unseen.
 
         Open3D's rays sample the field at voxels, rounded down, and end half a voxel too far along each axis. The field
         falls by about 1 m per m behind the surface, so adding it is a Newton step.
@@ -363,7 +363,7 @@ def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -
 
 
 def _in_order(vertices: Float32, triangles: Int32, colors: UInt8) -> tuple[Float32, Int32, UInt8]:
-    """Sort vertices and triangles and merge equal vertices. Their order depends on Open3D's threads."""
+    """Return the mesh with merged equal vertices in a deterministic order; Open3D's order depends on its threads."""
     order = np.lexsort(vertices.T)
     sorted_vertices = vertices[order]
     is_new = np.ones(len(order), np.bool_)

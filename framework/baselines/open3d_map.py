@@ -17,7 +17,7 @@ from framework.mapping.instances.instance_list import Confirmation, InstanceTabl
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.storage.map_file import (
     check_known,
-    faults_of,
+    map_file_errors,
     plain_table,
     read_map,
     table_arrays,
@@ -69,7 +69,7 @@ class Open3DMap(InstanceTableMap):
         self.changed()
 
     def merge(self, kept: int, dropped: int) -> None:
-        """See LabeledMap."""
+        """Merge instance `dropped` into `kept`, in the table and in every voxel."""
         self.table.merge(kept, dropped)
         instance = self.grid.flat("instance")
         instance[instance == dropped] = kept
@@ -85,7 +85,7 @@ class Open3DMap(InstanceTableMap):
         return np.where(voxels >= 0, self.grid.flat("instance")[voxels], 0).astype(np.int32)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """See LabeledMap."""
+        """Return the instance at every stride-th depth reading; see `LabeledMap.instances_seen`."""
         v, u = np.nonzero(frame.depth[::stride, ::stride])
         pixels = np.stack([u * stride, v * stride], axis=1).astype(np.int32)
         points_camera = back_project(frame.camera, pixels, frame.depth[pixels[:, 1], pixels[:, 0]])
@@ -134,7 +134,7 @@ class Open3DMap(InstanceTableMap):
     @classmethod
     def load(cls, path: Path | str) -> Open3DMap:
         header, arrays = read_map(path, FORMAT, ("block_coords", *ATTRIBUTES))
-        with faults_of(path):
+        with map_file_errors(path):
             settings = BlockGridSettings.of(header.part("settings"))
             scene = cls(settings, Confirmation.of(header.part("confirmation")))
             scene.classes = header.classes()

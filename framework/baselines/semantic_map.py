@@ -21,7 +21,7 @@ from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, Int
 from framework.interfaces import Gravity, MapStatistics, SceneMap
 from framework.mapping.instances.association import agreed_classes
 from framework.mapping.instances.instance_list import aligned_box, box_around, vertices_by_id, vertices_of_area
-from framework.mapping.storage.map_file import faults_of, read_map, write_map
+from framework.mapping.storage.map_file import map_file_errors, read_map, write_map
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
@@ -32,7 +32,7 @@ FORMAT = "semantic 4"  # format of the map file; increment it when the meaning o
 
 
 class Elections(NamedTuple):
-    """Parameters for the classes and instances from the evidence."""
+    """Parameters that determine classes and instances from the evidence."""
 
     missed: float  # likelihood ratio P(no mask | any class) / P(no mask | background)
     min_area: float  # minimum surface area of an instance, m^2
@@ -40,7 +40,7 @@ class Elections(NamedTuple):
 
 
 class ComponentStatistics(NamedTuple):
-    """Sums over the nearest voxels of the vertices of K components by id; entry 0 is unused."""
+    """Statistics of K components by id, over the nearest voxel of each of their vertices; entry 0 is unused."""
 
     probability_sums: Float64  # (K + 1, C) sums of each class over the vertices; the rest belongs to the background
     masked: Int32  # (K + 1,) maximum number of frames with a voxel under a mask
@@ -170,7 +170,7 @@ class SemanticMap(SceneMap):
     @classmethod
     def load(cls, path: Path | str) -> SemanticMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
-        with faults_of(path):
+        with map_file_errors(path):
             volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))
             bounds = {"missed": MISSED, "min_area": AREA, "smoothness": SMOOTHNESS}
             scene = cls(volume, Elections(**{name: header.number(name, limits) for name, limits in bounds.items()}))

@@ -12,7 +12,7 @@ class Verdict(Enum):
     FINE = "ok"
     UNKNOWN = "?"  # the recording has too little information
     NOTE = "note"  # the recording can be mapped, with worse results
-    FAULT = "WRONG"  # the recording cannot be mapped with these settings
+    ERROR = "WRONG"  # the recording cannot be mapped with these settings
 
 
 @dataclass(frozen=True)

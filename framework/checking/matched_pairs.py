@@ -16,9 +16,9 @@ from framework.tracking.absolute_pose import AbsolutePoseEstimator
 from framework.tracking.features import FeatureExtractor, Features, match
 
 MAX_RATIO = 0.8  # maximum distance ratio of the best to the second-best match (Lowe 2004)
-FEWEST_POINTS = 30  # minimum number of matches of a pair
+MIN_POINTS = 30  # minimum number of matches of a pair
 STEPS = (1, 2, 4, 8, 16, 32)  # frame offsets between the two frames of a pair
-FARTHEST_APART = 0.25  # fraction of the image width; after a larger motion, larger steps are not tried
+MAX_MOTION = 0.25  # fraction of the image width; after a larger motion, larger steps are not tried
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Matcher:
     def __init__(self, sequence: RGBDSequence) -> None:
         self.sequence = sequence
         self._extractor = FeatureExtractor()
-        self._estimator = AbsolutePoseEstimator(min_inliers=FEWEST_POINTS)
+        self._estimator = AbsolutePoseEstimator(min_inliers=MIN_POINTS)
         self._features = lru_cache(maxsize=4 * len(STEPS))(self._extract)
 
     def pairs(self, starts: Sequence[int], steps: Sequence[int] = STEPS) -> Iterator[MatchedPair]:
@@ -55,7 +55,7 @@ class Matcher:
                 if pair is None:
                     break
                 yield pair
-                if pair.motion > FARTHEST_APART * pair.first.camera.width:
+                if pair.motion > MAX_MOTION * pair.first.camera.width:
                     break
 
     def pair(self, k: int, step: int) -> MatchedPair | None:
@@ -67,7 +67,7 @@ class Matcher:
             return None
         (first, features_first), (second, features_second) = found_first, found_second
         matches = match(features_first.descriptors, features_second.descriptors, MAX_RATIO)
-        if len(matches) < FEWEST_POINTS:
+        if len(matches) < MIN_POINTS:
             return None
         in_first, in_second = matches.T
         pixels_first, pixels_second = features_first.pixels[in_first], features_second.pixels[in_second]

@@ -12,14 +12,16 @@ import numpy as np
 
 from framework.checking import Finding, Verdict
 from framework.checking.matched_pairs import MatchedPair
-from framework.checking.pose_fit import ALIKE, POOR, SHORTEST_MOTION, PoseFit, error_of, motion_between
+from framework.checking.pose_fit import ALIKE, MAX_RELATIVE_ERROR, MIN_MOTION, PoseFit, error_of, motion_between
 from framework.data import Float64
 
-LONGEST_DELAY = 6  # frames, in both directions; one more is tried, to detect an error that is still decreasing
-CLEARLY = 0.75  # maximum ratio to the mean error without delay; real recordings have at least 0.88 for wrong delays
+MAX_DELAY = 6  # frames, in both directions; one more is tried, to detect an error that is still decreasing
+MAX_ERROR_RATIO = (
+    0.75  # maximum ratio to the mean error without delay; real recordings have at least 0.88 for wrong delays
+)
 MIN_GAIN = 1 / 640  # fraction of the image width, minimum error difference of a counted pair
-MOST = 0.75  # minimum fraction of improved pairs among the counted pairs
-FEWEST_PAIRS = 5  # minimum number of counted pairs
+MIN_IMPROVED_FRACTION = 0.75  # minimum fraction of improved pairs among the counted pairs
+MIN_PAIRS = 5  # minimum number of counted pairs
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class PoseDelay:
         if self.alike:
             others = " or ".join(f"dataset.pose_delay={applied + other}" for other in self.alike)
             text += f"; {others} fits this camera motion equally well"
-        return Finding(Verdict.FAULT, "poses", text, f"dataset.pose_delay={applied + self.frames}")
+        return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_delay={applied + self.frames}")
 
 
 def find_delay(
@@ -55,30 +57,30 @@ def find_delay(
     conventions.
     """
     known = {k: T for k, T in enumerate(poses) if T is not None}
-    delays = range(-LONGEST_DELAY - 1, LONGEST_DELAY + 2)
+    delays = range(-MAX_DELAY - 1, MAX_DELAY + 2)
     informative = [
         pair
         for pair in pairs
-        if pair.motion > SHORTEST_MOTION * pair.first.camera.width
+        if pair.motion > MIN_MOTION * pair.first.camera.width
         and all(frame.index + delay in known for frame in (pair.first, pair.second) for delay in delays)
     ]
-    if len(informative) < FEWEST_PAIRS:
+    if len(informative) < MIN_PAIRS:
         return None
     errors = np.array(
         [[[_error(pair, known, fit, delay) for pair in informative] for delay in delays] for fit in fits]
     )  # (fits, delays, pairs)
     means = errors.mean(axis=2)
-    now, (fit, best) = int(means[:, LONGEST_DELAY + 1].argmin()), np.unravel_index(int(means.argmin()), means.shape)
-    as_stored, shifted = errors[now, LONGEST_DELAY + 1], errors[fit, best]
+    now, (fit, best) = int(means[:, MAX_DELAY + 1].argmin()), np.unravel_index(int(means.argmin()), means.shape)
+    as_stored, shifted = errors[now, MAX_DELAY + 1], errors[fit, best]
     gains = as_stored - shifted
     counted = np.abs(gains) > MIN_GAIN * informative[0].first.camera.width
     motion = float(np.median([pair.motion for pair in informative]))
     if (
-        abs(delays[best]) > LONGEST_DELAY
-        or shifted.mean() > CLEARLY * as_stored.mean()
-        or counted.sum() < FEWEST_PAIRS
-        or (gains[counted] > 0).mean() < MOST
-        or np.median(shifted) > POOR * motion
+        abs(delays[best]) > MAX_DELAY
+        or shifted.mean() > MAX_ERROR_RATIO * as_stored.mean()
+        or counted.sum() < MIN_PAIRS
+        or (gains[counted] > 0).mean() < MIN_IMPROVED_FRACTION
+        or np.median(shifted) > MAX_RELATIVE_ERROR * motion
     ):
         return None
     alike = np.flatnonzero(means[fit] <= ALIKE * means[fit, best])

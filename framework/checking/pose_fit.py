@@ -14,15 +14,17 @@ from framework.data import Float64
 from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseReading, QuaternionOrder
 from framework.geometry import inverse, project, transform
 
-UNSEEN = 1.0  # fraction of the image width, maximum error; also used for points behind the camera
-SHORTEST_BASELINE = 0.02  # fraction of the median depth, minimum translation for a scale estimate
-FEWEST_PAIRS = 3  # minimum number of informative pairs
-SHORTEST_MOTION = 0.01  # fraction of the image width; pairs with less motion fit any poses
-POOR = 0.2  # fraction of the motion, maximum error of valid poses; real recordings have 0.01 to 0.06
+MAX_ERROR = 1.0  # fraction of the image width, maximum error; also used for points behind the camera
+MIN_BASELINE = 0.02  # fraction of the median depth, minimum translation for a scale estimate
+MIN_PAIRS = 3  # minimum number of informative pairs
+MIN_MOTION = 0.01  # fraction of the image width; pairs with less motion fit any poses
+MAX_RELATIVE_ERROR = 0.2  # fraction of the motion, maximum error of valid poses; real recordings have 0.01 to 0.06
 ALIKE, ALIKE_PX = 1.15, 0.2  # ratio, and offset in px, up to which two errors count as equal
-CLEARLY = 0.5  # maximum error of another convention, as a ratio to the configured convention
-UNCERTAIN = 0.07  # minimum log uncertainty of the depth factor, due to inaccurate poses and depth in real recordings
-NOT_WORSE = 1.3  # maximum error ratio for a wrong scale; pure rotation hardly constrains the scale
+MAX_OTHER_RATIO = 0.5  # maximum error of another convention, as a ratio to the configured convention
+MIN_LOG_UNCERTAINTY = (
+    0.07  # minimum log uncertainty of the depth factor, due to inaccurate poses and depth in real recordings
+)
+MAX_ERROR_INCREASE = 1.3  # maximum error ratio for a wrong scale; pure rotation hardly constrains the scale
 WRONG_SCALE = 2.5  # minimum ratio of a wrong scale; with rotation, the scale is uncertain by up to 1.6 times
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
 PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
@@ -71,23 +73,23 @@ def motion_between(T_world_first: Float64, T_world_second: Float64, reading: Pos
 
 
 def _depth_factor(pairs: Sequence[MatchedPair], motions: Sequence[Float64]) -> tuple[float, float]:
-    """Return the ratio of the translations of poses and images, and its uncertainty. Both are 1 if unknown."""
+    """Return the ratio of translations in the poses and in the images, and its uncertainty; both 1 if unknown."""
     ratios = []
     for pair, T_second_first in zip(pairs, motions, strict=True):
         seen, moved = np.linalg.norm(pair.T_second_first[:3, 3]), np.linalg.norm(T_second_first[:3, 3])
-        if seen > SHORTEST_BASELINE * np.median(pair.points_first[:, 2]) and moved > 0:
+        if seen > MIN_BASELINE * np.median(pair.points_first[:, 2]) and moved > 0:
             ratios.append(float(np.log(moved / seen)))
-    if len(ratios) < FEWEST_PAIRS:
+    if len(ratios) < MIN_PAIRS:
         return 1.0, 1.0
     middle = float(np.median(ratios))
     spread = 1.5 * float(np.median(np.abs(np.array(ratios) - middle)))
-    return float(np.exp(middle)), float(np.exp(UNCERTAIN + 3 * spread / np.sqrt(len(ratios))))
+    return float(np.exp(middle)), float(np.exp(MIN_LOG_UNCERTAINTY + 3 * spread / np.sqrt(len(ratios))))
 
 
 def error_of(pair: MatchedPair, T_second_first: Float64, factor: float) -> float:
     """Return the median reprojection error of a pair in px, with all depths multiplied by `factor`."""
     moved = transform(T_second_first, pair.points_first.astype(np.float64) * factor)
-    farthest = UNSEEN * pair.second.camera.width
+    farthest = MAX_ERROR * pair.second.camera.width
     with np.errstate(all="ignore"):
         distance = np.linalg.norm(project(pair.second.camera, moved) - pair.pixels_second, axis=1)
     return float(np.median(np.where((moved[:, 2] > 0) & (distance < farthest), distance, farthest)))
@@ -104,15 +106,13 @@ class PoseJudgment:
 
 
 def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, median_depth: float) -> PoseJudgment:
-    """Check stored poses against the images, and select the best pose convention.
+    """Return findings about the stored poses, and the pose convention that fits the images best.
 
     `given` is the configured convention, `depth_scale` is in units per meter, and `median_depth` is in m.
     """
-    informative = [pair for pair in pairs if pair.motion > SHORTEST_MOTION * pair.first.camera.width]
-    if len(informative) < FEWEST_PAIRS:
-        text = (
-            f"expected at least {FEWEST_PAIRS} pairs of frames with motion to check the poses, got {len(informative)}"
-        )
+    informative = [pair for pair in pairs if pair.motion > MIN_MOTION * pair.first.camera.width]
+    if len(informative) < MIN_PAIRS:
+        text = f"expected at least {MIN_PAIRS} pairs of frames with motion to check the poses, got {len(informative)}"
         return PoseJudgment((Finding(Verdict.UNKNOWN, "poses", text),), None, None)
     motion = float(np.median([pair.motion for pair in informative]))
     as_given = fit(informative, given, 1.0)
@@ -121,14 +121,14 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     alike = _equal_to_best((as_given, *others, *scaled))
     best = min(alike, key=lambda one: (len(_settings(one.reading, given)), one.error))
     now = as_given.error
-    reading = best.reading if now > POOR * motion and best.error < CLEARLY * now else given
+    reading = best.reading if now > MAX_RELATIVE_ERROR * motion and best.error < MAX_OTHER_RATIO * now else given
     chosen = _with_plain_factor(informative, reading)
     measured = f"median error of {now:.1f} px in {len(informative)} pairs of frames with a motion of {motion:.0f} px"
-    if reading == given and now <= POOR * motion and chosen.depth_factor == 1.0:
+    if reading == given and now <= MAX_RELATIVE_ERROR * motion and chosen.depth_factor == 1.0:
         return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
-    if chosen.error > POOR * motion:
+    if chosen.error > MAX_RELATIVE_ERROR * motion:
         text = f"inconsistent with the images in any axes: {measured}"
-        finding = Finding(Verdict.FAULT, "poses", text, "tracker=voxel_hashing_icp, which needs no poses")
+        finding = Finding(Verdict.ERROR, "poses", text, "tracker=voxel_hashing_icp, which needs no poses")
         return PoseJudgment((finding,), as_given, best, others)
     findings = []
     if reading != given:
@@ -136,7 +136,7 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
         settings = {_settings(one.reading, given) for one in alike if one.reading not in (reading, given)}
         if settings:
             text += f"; {' or '.join(sorted(map(' '.join, settings)))} fits this camera motion equally well"
-        findings.append(Finding(Verdict.FAULT, "poses", text, " ".join(_settings(reading, given))))
+        findings.append(Finding(Verdict.ERROR, "poses", text, " ".join(_settings(reading, given))))
     else:
         text = f"valid with the correct scale: {measured}, and {chosen.error:.1f} px with the correct scale"
         findings.append(Finding(Verdict.FINE, "poses", text))
@@ -149,7 +149,7 @@ def _with_plain_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> Po
     """Return the fit with depth as stored, or with an estimated factor if its error is clearly smaller."""
     as_stored, scaled = fit(pairs, reading, 1.0), fit(pairs, reading)
     far = not 1 / WRONG_SCALE < scaled.depth_factor < WRONG_SCALE
-    needed = NOT_WORSE if far else CLEARLY
+    needed = MAX_ERROR_INCREASE if far else MAX_OTHER_RATIO
     return scaled if scaled.error < needed * as_stored.error else as_stored
 
 
@@ -159,12 +159,12 @@ def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> 
     if low <= median_depth <= high and not low <= median_depth * factor <= high:
         text = f"translations are {factor:.3g} times as long as in the images at a median depth of {median_depth:.2f} m"
         unit = chosen.reading.pose_unit * 10.0 ** round(np.log10(1 / factor))
-        return Finding(Verdict.FAULT, "poses", text, f"dataset.pose_unit={unit:g}")
+        return Finding(Verdict.ERROR, "poses", text, f"dataset.pose_unit={unit:g}")
     scale = depth_scale / factor
     fitting = [usual for usual in USUAL_SCALES if abs(np.log(usual / scale)) < np.log(chosen.factor_within)]
     setting = fitting[0] if fitting else float(f"{scale:.3g}")
     text = f"expected {scale:.3g} units per m according to the poses, got {depth_scale:g}"
-    return Finding(Verdict.FAULT, "depth", text, f"dataset.depth_scale={setting:g}")
+    return Finding(Verdict.ERROR, "depth", text, f"dataset.depth_scale={setting:g}")
 
 
 def _named(reading: PoseReading) -> str:
@@ -177,7 +177,7 @@ def _named(reading: PoseReading) -> str:
 
 
 def _equal_to_best(fits: Sequence[PoseFit]) -> list[PoseFit]:
-    """Return all fits as good as the best fit. Some axes are equivalent for a panning camera."""
+    """Return all fits as good as the best fit. For a panning camera, some axes fit equally well."""
     least = min(one.error for one in fits)
     return [one for one in fits if one.error <= ALIKE * least + ALIKE_PX]
 

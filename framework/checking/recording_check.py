@@ -23,15 +23,15 @@ from framework.interfaces import RGBDSequence, RGBDVideo
 
 CHECKED_FRAMES = 12  # evenly spaced over the sequence
 QUICK_STARTS, QUICK_STEPS = (0.1, 0.35, 0.6, 0.85), (1, 4, 16)  # fractions of the sequence; steps in frames
-MOST_MISSING = 0.7  # maximum fraction of pixels without a depth reading, for a good map
-MOST_BEYOND = 0.3  # maximum fraction of depth readings beyond the mapped range, for a good map
+MAX_MISSING = 0.7  # maximum fraction of pixels without a depth reading, for a good map
+MAX_BEYOND = 0.3  # maximum fraction of depth readings beyond the mapped range, for a good map
 # maximum width of sharp color edges, as a fraction of the image width; real recordings have 4 to 9 px of 640
-WIDEST_EDGE = 12 / 640
+MAX_EDGE_WIDTH = 12 / 640
 EDGE_WINDOW = 15 / 640  # fraction of the image width, window for the contrast of an edge
-FASTEST = 0.2  # fraction of the image width, maximum motion per frame for the trackers
+MAX_MOTION = 0.2  # fraction of the image width, maximum motion per frame for the trackers
 TYPICAL = 0.5, 4.5  # m, median depth of most rooms; real recordings have 1 to 3.5
 SHOWN_MOTION = 0.06  # fraction of the image width, motion of the pair in the figure; makes errors visible
-LONGEST_GAP = 0.5  # s, maximum interval between frames without a gap, or five times the median interval if larger
+MAX_GAP = 0.5  # s, maximum interval between frames without a gap, or five times the median interval if larger
 
 log = logging.getLogger(__name__)
 
@@ -49,12 +49,12 @@ class RecordingCheck:
     meant: MatchedPair | None  # pair in the figure, with the pose delay corrected
 
     @property
-    def faults(self) -> tuple[Finding, ...]:
-        return tuple(finding for finding in self.findings if finding.verdict is Verdict.FAULT)
+    def errors(self) -> tuple[Finding, ...]:
+        return tuple(finding for finding in self.findings if finding.verdict is Verdict.ERROR)
 
 
 def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
-    """Check some frames of a sequence, and their neighbors, for mapping up to `farthest` meters.
+    """Return findings from some frames of a sequence and their neighbors, for mapping up to `farthest` meters.
 
     Raises DataError if no frame is readable.
     """
@@ -71,7 +71,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
         text = f"{len(errors)} of {len(chosen)} cannot be read; first error: {errors[0]}"
         findings.append(Finding(Verdict.NOTE, "frames", text))
     depth_finding, median_depth = _check_depth(frames, farthest, _scale_of(sequence))
-    longest = registration.LONGEST_DELAY
+    longest = registration.MAX_DELAY
     room = min(longest, (count - 1) // 4)  # number of frames before and after each checked frame
     edges = EdgeComparison(sequence, sorted({min(max(k, room), count - 1 - room) for k in chosen}))
     by_delay = edges.alignments((delay, 1.0) for delay in range(-longest, longest + 1))
@@ -110,10 +110,10 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
 
 
 def _judge_poses(
-    sequence: RGBDSequence, pairs: Sequence[MatchedPair], asked: PoseReading, median_depth: float
+    sequence: RGBDSequence, pairs: Sequence[MatchedPair], given_reading: PoseReading, median_depth: float
 ) -> tuple[PoseJudgment, int]:
     """Return the findings about the poses and the pose delay in frames."""
-    given, scale = replace(asked, pose_delay=0), _scale_of(sequence)
+    given, scale = replace(given_reading, pose_delay=0), _scale_of(sequence)
     judgment = pose_fit.judge(pairs, given, scale, median_depth)
     if judgment.given is None or judgment.best is None:
         return judgment, 0
@@ -127,7 +127,7 @@ def _judge_poses(
     others = [finding for finding in then.findings if finding.verdict is not Verdict.FINE]
     assert isinstance(sequence, Recording)  # only recordings have stored poses
     step = float(np.median(np.diff([recorded.timestamp for recorded in sequence.contents.frames])))
-    findings = (late.finding(asked.pose_delay, step), *others)
+    findings = (late.finding(given_reading.pose_delay, step), *others)
     return replace(then, findings=findings, given=judgment.given), late.frames
 
 
@@ -137,7 +137,7 @@ def _stored_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
 
 
 def warn_of_poses(sequence: RGBDVideo) -> None:
-    """Log a warning at the start of a run if the given poses do not fit a few frames."""
+    """Log a warning at the start of a run if the given poses do not fit the images of a few frames."""
     if not isinstance(sequence, RGBDSequence) or not sequence.has_poses():
         return
     starts = [int(fraction * len(sequence)) for fraction in QUICK_STARTS]
@@ -146,7 +146,7 @@ def warn_of_poses(sequence: RGBDVideo) -> None:
         return
     median_depth = float(np.median(np.concatenate([pair.points_first[:, 2] for pair in pairs])))
     for finding in pose_fit.judge(pairs, PoseReading(), _scale_of(sequence), median_depth).findings:
-        if finding.verdict is Verdict.FAULT:
+        if finding.verdict is Verdict.ERROR:
             log.warning("%s: %s; run `instancemap check` for details", finding.subject, finding.text)
 
 
@@ -190,7 +190,9 @@ def _read(sequence: RGBDSequence, chosen: Sequence[int]) -> tuple[list[Frame], l
         except FrameError as error:
             errors.append(error)
     if not frames:
-        raise DataError(f"expected readable frames, got none of {len(chosen)} checked; first error: {errors[0]}")
+        raise DataError(
+            f"{sequence.name}: expected readable frames, got none of {len(chosen)} checked; first error: {errors[0]}"
+        )
     return frames, errors
 
 
@@ -198,7 +200,7 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
     """Return the finding about depth and the median depth in m."""
     readings = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
     if not len(readings):
-        return Finding(Verdict.FAULT, "depth", "no readings in any checked frame"), 0.0
+        return Finding(Verdict.ERROR, "depth", "no readings in any checked frame"), 0.0
     median = float(np.median(readings))
     missing = 1 - len(readings) / sum(frame.depth.size for frame in frames)
     beyond = float((readings > farthest).mean())
@@ -211,8 +213,8 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
         low, high = TYPICAL
         fitting = [usual for usual in USUAL_SCALES if low <= median * scale / usual <= high]
         setting = f"dataset.depth_scale={fitting[0]:g}" if fitting else ""
-        return Finding(Verdict.FAULT, "depth", f"{text}; implausible for a room", setting), median
-    poor = missing > MOST_MISSING or beyond > MOST_BEYOND
+        return Finding(Verdict.ERROR, "depth", f"{text}; implausible for a room", setting), median
+    poor = missing > MAX_MISSING or beyond > MAX_BEYOND
     return Finding(Verdict.NOTE if poor else Verdict.FINE, "depth", text), median
 
 
@@ -227,15 +229,15 @@ def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
     text = f"median of {width * np.median(steps):.0f} px per frame, maximum of {width * steps.max():.0f} px"
     if lost:
         text += f"; {lost} of {neighbors} pairs of neighboring frames have too little overlap"
-    fast = float(np.median(steps)) > FASTEST or lost > neighbors // 2
+    fast = float(np.median(steps)) > MAX_MOTION or lost > neighbors // 2
     return Finding(Verdict.NOTE if fast else Verdict.FINE, "motion", text)
 
 
 def _check_sharpness(frames: Sequence[Frame]) -> Finding:
-    """Return the finding about sharpness, measured by the width of color edges."""
+    """Return the finding about image sharpness, measured by the width of color edges."""
     widths = [_edge_width(frame) for frame in frames]
     text = f"median edge width of {np.median(widths):.1f} px, maximum of {max(widths):.1f} px in {len(frames)} frames"
-    blurred = sum(width > WIDEST_EDGE * frames[0].camera.width for width in widths)
+    blurred = sum(width > MAX_EDGE_WIDTH * frames[0].camera.width for width in widths)
     if blurred > len(frames) // 3:
         return Finding(Verdict.NOTE, "sharpness", f"{text}; move the camera more slowly, or add light")
     return Finding(Verdict.FINE, "sharpness", text)
@@ -258,7 +260,7 @@ def _check_times(sequence: RGBDSequence) -> list[Finding]:
     times: Float64 = np.array([sequence.contents.frames[k].timestamp for k in sequence.chosen])
     steps = np.diff(times)
     usual = float(np.median(steps))
-    gaps = int((steps > max(LONGEST_GAP, 5 * usual)).sum())
+    gaps = int((steps > max(MAX_GAP, 5 * usual)).sum())
     text = f"{1 / usual:.3g} Hz for {times[-1] - times[0]:.1f} s"
     if gaps:
         return [Finding(Verdict.NOTE, "time", f"{text}, with {gaps} gaps of up to {steps.max():.1f} s")]

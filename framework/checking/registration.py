@@ -19,16 +19,16 @@ from framework.errors import FrameError
 from framework.interfaces import RGBDSequence
 
 WIDTH = 320  # px, width of the compared images
-LONGEST_SHIFT = 16  # px at WIDTH, in both directions
-LONGEST_DELAY = 6  # frames, in both directions
+SEARCHED_SHIFT = 16  # px at WIDTH, in both directions
+MAX_DELAY = 6  # frames, in both directions
 ZOOMS = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.11, 1.18, 1.25)  # scale of the depth image about its center
 DEPTH_STEP = 0.05  # fraction of the depth; a larger step is an edge
-STRONG = 200.0  # Sobel units; stronger gradients are clipped, so that lamps do not dominate
-FEWEST_FRAMES = 3
-FEWEST_EDGES = 20.0  # px at WIDTH; frames with fewer edge pixels are ignored
-CLEARLY = 1.2  # minimum strength of another alignment, as a ratio to the stored alignment
-LARGEST_SHIFT = 0.007  # fraction of the image width, due to lenses and rolling shutters; real recordings have 0.003
-WEAKEST = 0.25  # standard deviations, minimum strength of a match that is not random
+MAX_GRADIENT = 200.0  # Sobel units; stronger gradients are clipped, so that lamps do not dominate
+MIN_FRAMES = 3
+MIN_EDGES = 20.0  # px at WIDTH; frames with fewer edge pixels are ignored
+MIN_STRENGTH_RATIO = 1.2  # minimum strength of another alignment, as a ratio to the stored alignment
+MAX_SHIFT = 0.007  # fraction of the image width, due to lenses and rolling shutters; real recordings have 0.003
+MIN_STRENGTH = 0.25  # standard deviations, minimum strength of a match that is not random
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class EdgeAlignment:
     @property
     def moved(self) -> bool:
         """True if the best shift is significant."""
-        return max(map(abs, self.shift)) > LARGEST_SHIFT
+        return max(map(abs, self.shift)) > MAX_SHIFT
 
 
 class EdgeComparison:
@@ -61,11 +61,11 @@ class EdgeComparison:
             pairs = [(k, k + delay) for k in self.chosen if 0 <= k + delay < len(self.sequence)]
             correlations = [self._correlation(color, depth, zoom) for color, depth in pairs]
             known = [correlation for correlation in correlations if correlation is not None]
-            if len(known) < FEWEST_FRAMES:
+            if len(known) < MIN_FRAMES:
                 continue
             mean = np.mean(known, axis=0)
             row, column = np.unravel_index(int(mean.argmax()), mean.shape)
-            shift = (int(column) - LONGEST_SHIFT) / WIDTH, (int(row) - LONGEST_SHIFT) / WIDTH
+            shift = (int(column) - SEARCHED_SHIFT) / WIDTH, (int(row) - SEARCHED_SHIFT) / WIDTH
             found.append(EdgeAlignment(delay, zoom, float(mean.max()), shift))
         return found
 
@@ -79,20 +79,20 @@ class EdgeComparison:
             height, width = edges.shape
             about = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), 0, zoom)
             edges = np.asarray(cv2.warpAffine(edges, about, (width, height)), np.float32)
-        if edges.sum() < FEWEST_EDGES:
+        if edges.sum() < MIN_EDGES:
             return None
-        L = LONGEST_SHIFT
+        L = SEARCHED_SHIFT
         padded = cv2.copyMakeBorder(gradient, L, L, L, L, cv2.BORDER_CONSTANT, value=0.0)
         return np.asarray(cv2.matchTemplate(padded, edges, cv2.TM_CCORR) / edges.sum(), np.float32)
 
     def _find_edges(self, k: int) -> tuple[Float32, Float32] | None:
-        """Return the normalized color gradient and the depth edges, both (h, WIDTH), or None."""
+        """Return the normalized color gradient and the depth edges, both (h, WIDTH); None = unusable frame."""
         try:
             frame = self.sequence[k]
         except FrameError:
             return None
         size = (WIDTH, max(1, round(WIDTH * frame.camera.height / frame.camera.width)))
-        gradient = cv2.resize(np.minimum(color_gradient(frame), STRONG), size, interpolation=cv2.INTER_AREA)
+        gradient = cv2.resize(np.minimum(color_gradient(frame), MAX_GRADIENT), size, interpolation=cv2.INTER_AREA)
         edges = cv2.resize(depth_edges(frame.depth).astype(np.float32), size, interpolation=cv2.INTER_AREA)
         deviation = float(gradient.std())
         if deviation == 0:
@@ -121,22 +121,22 @@ def judge(
 ) -> tuple[Finding, int]:
     """Return the finding and the delay of the depth images in frames.
 
-    `by_zoom` has the best delay, and `applied_delay` is the configured delay. `step` is the image motion per frame as a
-    fraction of the width. A shift of less than half of this motion may be due to a time offset.
+    `by_zoom` contains the alignments at the best delay. `applied_delay` is the configured delay. `step` is the image
+    motion per frame as a fraction of the width. A shift of less than half of it may be due to a time offset.
     """
     subject = "color and depth"
     here = next((alignment for alignment in by_delay if alignment.delay == 0), None)
     if here is None:
         return Finding(Verdict.UNKNOWN, subject, "too few frames or depth edges for a comparison"), 0
     best = max(by_delay, key=lambda alignment: alignment.strength)
-    clearly = best.strength > CLEARLY * here.strength or (here.moved and not best.moved)
-    if best.delay and clearly and best.strength > WEAKEST:
+    clearly = best.strength > MIN_STRENGTH_RATIO * here.strength or (here.moved and not best.moved)
+    if best.delay and clearly and best.strength > MIN_STRENGTH:
         text = f"depth images are {abs(best.delay)} frames {'late' if best.delay > 0 else 'early'}"
-        return Finding(Verdict.FAULT, subject, text, f"dataset.depth_delay={applied_delay + best.delay}"), best.delay
+        return Finding(Verdict.ERROR, subject, text, f"dataset.depth_delay={applied_delay + best.delay}"), best.delay
     zoomed = max(by_zoom, key=lambda alignment: alignment.strength, default=here)
-    if zoomed.strength < WEAKEST:
+    if zoomed.strength < MIN_STRENGTH:
         return Finding(Verdict.UNKNOWN, subject, "edges do not match; the images may lack contrast"), 0
-    if zoomed.strength < CLEARLY * here.strength:
+    if zoomed.strength < MIN_STRENGTH_RATIO * here.strength:
         zoomed = here
     apart = max(map(abs, zoomed.shift))
     if zoomed.zoom == 1.0 and zoomed.moved and apart <= step / 2:
@@ -151,5 +151,5 @@ def judge(
             f"depth is not registered to color: edges fit best {x:+.1f} % of the width to the right and {y:+.1f} % "
             f"down, scaled by {zoomed.zoom:g}; enable the alignment of depth to color in the camera's driver"
         )
-        return Finding(Verdict.FAULT, subject, text), 0
+        return Finding(Verdict.ERROR, subject, text), 0
     return Finding(Verdict.FINE, subject, "edges match without a delay"), 0

@@ -109,7 +109,7 @@ class Jobs:
     status: int = 0
 
     def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
-        """Return `job` with logged errors: one line for a known error, otherwise (or with `debug`) a traceback."""
+        """Return `job` with error logging: one line for a known error, otherwise (or with `debug`) a traceback."""
 
         @wraps(job)
         def reported_job(config: DictConfig) -> None:
@@ -128,7 +128,7 @@ class Jobs:
         return reported_job
 
     def run(self, command: Callable[[], None]) -> None:
-        """Run Hydra's command for a reported job, and exit with an error status if a job has failed."""
+        """Run Hydra's `command`, and exit with an error status if a job has failed."""
         with one_line_errors():
             for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra reports a missing folder
                 add_config_dir(folder)  # for steps after Hydra, such as the figure of a sweep

@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 LIST = Path(__file__).with_name("kernels.txt")
 CHECKOUT = Path(__file__).resolve().parents[2]
 DEFAULT, OTHERS = "# a run with the default stages", "# additional kernels of other stages"
-MOST_WORKERS = 4  # each takes 0.5 GB and compiles shared functions again
+MAX_WORKERS = 4  # each takes 0.5 GB and compiles shared functions again
 SECONDS_EACH = 0.65  # of a core (AMD EPYC, Zen 5), for an estimate of the time
 
 
@@ -87,7 +87,7 @@ class Kernel:
 
 
 def listed(*sections: str) -> list[Kernel]:
-    """Return the kernels in these sections of kernels.txt: DEFAULT, OTHERS."""
+    """Return the kernels in the given sections of kernels.txt, DEFAULT or OTHERS."""
     found, section = [], ""
     for line in LIST.read_text(encoding="utf-8").splitlines():
         if line.startswith("#"):
@@ -154,7 +154,7 @@ def compile_all(kernels: list[Kernel]) -> None:
 
 
 def _workers(kernels: list[Kernel]) -> int:
-    return min(MOST_WORKERS, available_cores(), len({kernel.module for kernel in kernels}))
+    return min(MAX_WORKERS, available_cores(), len({kernel.module for kernel in kernels}))
 
 
 def _worker() -> subprocess.Popen[str]:
@@ -173,7 +173,7 @@ def _worker() -> subprocess.Popen[str]:
 def _feed(
     process: subprocess.Popen[str], waiting: queue.SimpleQueue[list[Kernel]], events: queue.SimpleQueue[tuple[str, str]]
 ) -> None:
-    """Send kernels to a worker, module by module. Report `begun`, and `done` with an error or ""."""
+    """Send kernels to a worker, module by module. Add the events `begun` and `done`; an error of "" = success."""
     assert process.stdin is not None
     assert process.stdout is not None
     with suppress(queue.Empty):
@@ -220,7 +220,7 @@ def _watch(count: int, threads: list[threading.Thread], events: queue.SimpleQueu
 
 @contextmanager
 def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
-    """Serialize compilation across processes: the jobs of a sweep start at the same time."""
+    """Serialize compilation across processes, because the jobs of a sweep start at the same time."""
     folder = Path(kernels[0].dispatcher._cache.cache_path)
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / "compiling.lock")
@@ -231,7 +231,7 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
             log.info("another process is compiling kernels; waiting for it")
             lock.acquire()
     except OSError as error:  # without locks, several processes may compile the same kernels
-        log.warning("%s: expected a file system with locks (%s); compiling without a lock", folder, error.strerror)
+        log.warning("%s: expected a file system with locks, got %s; compiling without a lock", folder, error.strerror)
     try:
         yield
     finally:

@@ -56,7 +56,7 @@ def work() -> None:
 
 
 def make_code_only_for(names: set[str]) -> None:
-    """Make numba generate machine code only for functions with these names. They contain all other functions."""
+    """Make numba generate machine code only for functions with these names; it contains all other functions."""
     from numba.core.codegen import CPUCodeLibrary, JITCPUCodegen
     from numba.core.registry import cpu_target
 
@@ -80,7 +80,7 @@ def make_code_only_for(names: set[str]) -> None:
 
 
 def optimize_fully(names: set[str]) -> None:
-    """Make numba optimize only functions with these names; for others only remove reference counts."""
+    """Make numba optimize only functions with these names; for all others, it only removes reference counts."""
     from numba.core.codegen import CPUCodeLibrary
 
     optimize = CPUCodeLibrary._optimize_final_module

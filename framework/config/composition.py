@@ -27,7 +27,7 @@ from framework.config.renamed_keys import rename_hint
 from framework.errors import ConfigError, DataError, printable
 from framework.files.atomic_write import read_text
 from framework.files.search_paths import CONF
-from framework.files.yaml_file import LARGEST_FILE, check_yaml, yaml_faults
+from framework.files.yaml_file import LARGEST_FILE, check_yaml, yaml_errors
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +91,7 @@ class FileConfigSource(hydra_api.FileConfigSource):
         path = Path(self.path, self._normalize_file_name(config_path))
         if not path.is_file():
             return super().load_config(config_path)
-        with yaml_faults(path):
+        with yaml_errors(path):
             check_yaml(path, read_text(path, LARGEST_FILE))
             found = super().load_config(config_path)
         config: Any = found.config
@@ -176,10 +176,10 @@ def running_loader() -> Any | None:
 
 def one_line(error: BaseException) -> str:
     """Return an error message on one line, with the fix."""
-    return printable(_said(error))
+    return printable(_message_of(error))
 
 
-def _said(error: BaseException) -> str:
+def _message_of(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _no_such_option(error)
     if isinstance(error, OverrideParseException):
@@ -222,8 +222,8 @@ def _known_keys(error: OmegaConfBaseException) -> str:
     if hint := rename_hint(path):
         return hint
     if close:
-        return f"{path}: unknown key; did you mean {path[: -len(str(error.key))]}{close[0]}?"
-    return f"{path}: unknown key; expected one of {', '.join(keys) or 'none'}"
+        return f"{path}: expected a known key, got {error.key}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
+    return f"{path}: expected one of {', '.join(keys) or 'none'}, got {error.key}"
 
 
 def _joined(text: str) -> str:

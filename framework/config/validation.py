@@ -11,8 +11,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.errors import ConfigError, first_line
 
-MOST_DETECTIONS = 1000  # per image, each with a mask of the image size; COCO evaluates 100
-MOST_PROPOSALS = 100_000  # of a network
+MAX_DETECTIONS = 1000  # per image, each with a mask of the image size; COCO evaluates 100
+MAX_PROPOSALS = 100_000  # of a network
 LONGEST_SIDE = 2**13  # px, of the input image of a network
 
 
@@ -41,7 +41,7 @@ def check_intervals(stage: str, plugin: object, **intervals: str) -> None:
 
 
 def require(holds: bool, name: str, value: object, allowed: str) -> None:
-    """Raise ConfigError unless the condition holds: "detector.nms_iou: expected a value in (0, 1], got 2"."""
+    """Raise ConfigError unless `holds`, such as "detector.nms_iou: expected a value in (0, 1], got 2"."""
     if not holds:
         raise ConfigError(f"{name}: expected {allowed}, got {value}")
 

@@ -32,7 +32,7 @@ from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Reco
 from framework.datasets.ground_truth.named_truth import read_class_names
 from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.errors import DataError, FrameError
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 from framework.files.image_files import read_uint16
 from framework.files.number_lines import read_gravity, read_image_times
 from framework.files.tum_trajectory import TumLine, read_tum_lines
@@ -109,9 +109,9 @@ class RgbdFolder(Recording):
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
         """Return the class of each instance and the instance image of each frame, both empty without labels."""
         folder, names = self.folder / "instance", self.folder / "instances.json"
-        if self.named_truth is not None or (not is_there(folder) and not is_there(names)):
+        if self.named_truth is not None or (not path_exists(folder) and not path_exists(names)):
             return {}, []
-        if not is_there(names):
+        if not path_exists(names):
             raise DataError(f"{names}: expected the class of each instance in {folder}, got no such file")
         class_names = read_class_names(names, LARGEST_ID)
         images = numbered_images(folder, (".png",))
@@ -147,7 +147,7 @@ def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
 
 def _read_optional(path: Path, read: Callable[[Path], list[Entry]], name: str, frames: int) -> list[Entry] | None:
     """Return the entry of each frame, or None if the file does not exist."""
-    if not is_there(path):
+    if not path_exists(path):
         return None
     entries = read(path)
     if len(entries) != frames:

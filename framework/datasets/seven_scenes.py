@@ -25,7 +25,7 @@ from framework.files.number_lines import read_matrix
 DEPTH_SCALE = 1000.0  # units per meter
 DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)  # as published
 # Not published: fitted by aligning depth edges to color edges in 50 frames of redkitchen. The cameras are assumed to be
-# parallel and 25 mm apart, as in a Kinect. Fitting the offset, too, does not improve the alignment.
+# parallel and 25 mm apart, as in a Kinect. Fitting this offset as well does not improve the alignment.
 COLOR_CAMERA = Camera(640, 480, 529.0, 529.0, 320.0, 239.0)
 BASELINE = 0.025  # m, from the depth camera to the color camera along the x axis of the depth camera
 _IMAGE_NAME = re.compile(r"frame-([0-9]{6})\.(color|depth)\.png")

@@ -31,7 +31,7 @@ from framework.datasets.calibration.camera_json import CAMERA_KEYS, StoredCamera
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.sequence_reader import Contents, RecordedFrame, Recording, StoredImages
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 from framework.files.number_lines import SHOWN, read_lines
 from framework.files.tum_trajectory import TumLine, read_tum_lines
 from framework.geometry import interpolate
@@ -93,7 +93,7 @@ class TumRgbd(Recording):
         if len(pairs) < len(color):
             log.info("%s: %d of %d color images have no depth image", self.name, len(color) - len(pairs), len(color))
         path = self.folder / "groundtruth.txt"
-        truth = Trajectory.of(path, read_tum_lines(path) if is_there(path) else [], self.max_time_difference)
+        truth = Trajectory.of(path, read_tum_lines(path) if path_exists(path) else [], self.max_time_difference)
         frames = []
         for i, j in pairs:
             images, time = StoredImages.of_files(color[i].path, depth[j].path), color[i].timestamp
@@ -106,7 +106,7 @@ class TumRgbd(Recording):
         intrinsics, own = self.intrinsics, self.folder / "camera.json"
         if intrinsics is Intrinsics.AUTO:
             named = re.search(r"freiburg[123]", self.name)
-            if not named and is_there(own):
+            if not named and path_exists(own):
                 return read_camera(own), own
             if not named:
                 raise ConfigError(
@@ -185,7 +185,12 @@ def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]
         at.setdefault(item.timestamp, item)
     if len(at) < len(items):
         repeated = len(items) - len(at)
-        log.warning("%s: expected unique timestamps; skipped %d %s with a repeated timestamp", path, repeated, name)
+        log.warning(
+            "%s: expected unique timestamps, got repeated ones; skipped %d %s with a repeated timestamp",
+            path,
+            repeated,
+            name,
+        )
     return list(at.values())
 
 

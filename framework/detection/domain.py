@@ -13,7 +13,7 @@ RENDERED_ROOMS = "rendered rooms"
 
 
 def warn_outside_domain(detector: Detector, video: RGBDVideo | None) -> None:
-    """Log a warning if the detector was trained on another domain than the images of `video`; None = unknown images."""
+    """Log a warning if the images of `video` are outside the detector's training domain; None = unknown images."""
     if detector.domain in ("", video.domain if video else ""):
         return
     log.warning(

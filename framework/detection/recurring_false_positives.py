@@ -11,7 +11,7 @@ from framework.geometry import transform
 
 CELL = 0.5  # m, side of a cell
 STEP = 8  # px between the sampled depth readings
-LEAST_READINGS = 4  # minimum number of readings in a visible cell
+MIN_READINGS = 4  # minimum number of readings in a visible cell
 KEYS = 2**30  # number of keys; negated keys serve as instance ids, which are otherwise positive
 
 
@@ -42,7 +42,7 @@ def false_positive_cells(frame: Frame, seed: int, count: int) -> list[FalsePosit
     cells = np.floor(transform(frame.T_world_camera, points_camera) / CELL).astype(np.int64)
     keys, cell, readings = np.unique(_keys(cells, seed), return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(cell, values, len(keys)) / readings for values in (u, v, z)], axis=1)
-    often = readings >= LEAST_READINGS
+    often = readings >= MIN_READINGS
     found = zip(keys[often].tolist(), means[often].tolist(), strict=True)
     return [FalsePositiveCell(key, *mean) for key, mean in found][:count]
 

@@ -21,7 +21,7 @@ Outcomes = Mapping[str, tuple[str, str]]  # by code: last printed line and error
 
 
 def run_all(codes: Iterable[str]) -> Outcomes:
-    """Run pieces of Python code in separate processes."""
+    """Run pieces of Python code, each in a separate process, and return their outcomes."""
     codes = [*codes]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return dict(zip(codes, pool.map(_run, codes), strict=True))

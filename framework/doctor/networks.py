@@ -18,7 +18,7 @@ MODEL_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # on huggingface.co
 
 
 def included_and_hub() -> Iterator[Check]:
-    """Check the weights included in the project, and the cache of huggingface_hub for the model ids of options."""
+    """Check the weights included in the project, and the options' models in the cache of huggingface_hub."""
     from framework.detection.hub.hub_model import forbidden_by
 
     choices = _content(CONF / "config.yaml")["defaults"]
@@ -54,7 +54,7 @@ def published() -> Iterator[Check]:
 
 
 def _named() -> Iterator[tuple[str, str]]:
-    """Yield the weight paths and model ids of all options, by option, or by option.parameter if there are several."""
+    """Yield each option with its weight path or model id; OPTION.PARAMETER if the option has several."""
     for path in sorted((CONF / "detector").glob("*.yaml")):
         content = _content(path).items()
         values = {key: value for key, value in content if isinstance(value, str) and MODEL_ID.match(value)}

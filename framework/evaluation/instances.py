@@ -44,9 +44,9 @@ class Transfer(Enum):
 class PredictedInstances:
     """The K instances of a map, as labeled points."""
 
-    points_world: Float32  # (V, 3) m, the whole surface: points without an instance are transferred, too
+    points_world: Float32  # (V, 3) m, the whole surface, because points without an instance are also transferred
     instance_ids: Int32  # (V,), 0 = no instance
-    ids: Int64  # (K,) every instance of the map, also without points
+    ids: Int64  # (K,) every instance of the map, including instances without points
     confidences: Float64  # (K,) in [0, 1]
     class_names: tuple[str, ...]  # K, most probable classes
 
@@ -187,7 +187,7 @@ def evaluate(
     max_distance: float = MAX_DISTANCE,
     min_points: int = MIN_POINTS,
 ) -> InstanceEvaluation:
-    """Compare a map's instances with the ground truth by the rules in the module's docstring.
+    """Return the evaluation of a map's instances by the rules in the module's docstring.
 
     The result does not depend on the order of points or predictions. Ties in confidence are ranked by id.
     """
@@ -243,7 +243,7 @@ class _Overlaps:
     def between(
         cls, predictions: PredictedInstances, truth: SceneTruth, transfer: Transfer, reach: float, min_points: int
     ) -> _Overlaps:
-        """Count the points of each pair of labels after a transfer over at most `reach` m."""
+        """Return the overlaps of predictions and ground truth after a label transfer over at most `reach` m."""
         truth_ids, truth_sizes = np.unique(truth.instance_ids[truth.instance_ids > 0], return_counts=True)
         ranks = np.lexsort((predictions.ids, -predictions.confidences))
         ids = predictions.ids[ranks]
@@ -271,7 +271,7 @@ class _Overlaps:
         )
 
     def score(self, threshold: float, predicted: Bool, truths: Bool, allowed: Bool) -> Score:
-        """Match the chosen predictions (K,) in order of confidence with `allowed` (K, T) ground-truth instances."""
+        """Return the score of the `predicted` (K,) instances, matched with `allowed` (K, T) ground-truth instances."""
         matches = self.matches(threshold, predicted, allowed)
         hits = [match >= 0 for _, match in matches if match != IGNORED]  # evaluated predictions, best first
         count = int((truths & self.evaluated).sum())
@@ -285,7 +285,7 @@ class _Overlaps:
         )
 
     def matches(self, threshold: float, predicted: Bool, allowed: Bool) -> list[tuple[int, int]]:
-        """Return pairs of a chosen prediction (K,) and the column of its match, NO_MATCH or IGNORED, best first."""
+        """Return (prediction, match) pairs, best first; a match is a column of `allowed`, NO_MATCH or IGNORED."""
         ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
         unknown = self.ignorable | (ignored_iou >= threshold)
         free = np.ones(len(self.truth_ids), np.bool_)

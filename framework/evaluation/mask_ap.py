@@ -31,7 +31,9 @@ class MaskAp:
 def mask_ap(
     pictures: Iterable[tuple[Bool, Sequence[str | None], Detections]], classes: Sequence[str], min_pixels: int = 1
 ) -> MaskAp:
-    """Return the AP over images: ground-truth masks (N, H, W), class names (N,), None = unknown, and detections.
+    """Return the AP over images, given as ground-truth masks (N, H, W), class names (N,) and detections.
+
+    A class name of None means unknown.
 
     A detection has its most likely class. Objects of unknown class and objects smaller than `min_pixels` count neither
     for nor against a detection (COCO's `iscrowd`).

@@ -15,7 +15,7 @@ from framework.interfaces import ClusterRefiner
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 
-TIMED = 5  # number of timed calls for the median; the call before them may compile kernels
+TIMED_CALLS = 5  # number of timed calls for the median; the call before them may compile kernels
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Refinement:
 
     @classmethod
     def of(cls, refiner: ClusterRefiner, detections: Detections, frame: Frame) -> Refinement:
-        """Lift the detections at the frame's ground-truth pose and refine them.
+        """Return the clusters of detections, lifted at the frame's ground-truth pose, before and after refinement.
 
         Without a ground-truth pose, they are lifted in the camera frame.
         """
@@ -37,7 +37,7 @@ class Refinement:
         before = lift(detections, frame, pose)
         after = refine(refiner, before, frame)
         times = []
-        for _ in range(TIMED):
+        for _ in range(TIMED_CALLS):
             started = time.perf_counter()
             refine(refiner, before, frame)
             times.append(1e3 * (time.perf_counter() - started))
@@ -90,13 +90,13 @@ class Refinement:
 
     @cached_property
     def judged_before(self) -> Bool:
-        """Mask (N,) of the evaluated clusters: not on an object of unknown class. All False without ground truth."""
+        """Mask (N,) of the clusters that are not on an object of unknown class; all False without ground truth."""
         fit = self.fit_before
         return np.zeros(len(self.before), np.bool_) if fit is None else ~fit.unknown
 
     @cached_property
     def judged_after(self) -> Bool:
-        """Mask (M,) of the refined clusters with an evaluated original cluster."""
+        """Mask (M,) of the refined clusters whose original cluster is evaluated."""
         fit = self.fit_after
         if fit is None:
             return np.zeros(len(self.after), np.bool_)
@@ -130,7 +130,7 @@ def _membership(clusters: PointClusters, frame: Frame) -> csr_array:
 
 
 def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:
-    """Compare clusters with the ground-truth objects over the pixels with a depth reading.
+    """Return the fit of clusters to the ground-truth objects over the pixels with a depth reading.
 
     Clusters contain no other pixels.
     """

@@ -43,7 +43,7 @@ class TrajectoryError:
 
 
 def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> TrajectoryError:
-    """Compare the poses of consecutive frames with the ground-truth T_world_camera (4, 4); None = unknown.
+    """Return the errors of estimated poses; both sequences are T_world_camera (4, 4) by frame, None = unknown.
 
     Raises DataError if the numbers of poses differ.
     """
@@ -103,7 +103,7 @@ def _axis_points(P: Float64) -> Float64:
 
 
 def _inverse(T: Float64) -> Float64:
-    """Invert rigid transforms (n, 4, 4)."""
+    """Return the inverses of rigid transforms (n, 4, 4)."""
     inverse = np.zeros_like(T)
     inverse[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
     inverse[:, :3, 3] = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])

@@ -14,24 +14,24 @@ from scipy.spatial import cKDTree
 
 from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, Int64
 
-OBJECTS_SHARE = 0.5  # fraction of the triangles for objects
-FEWEST = 4  # minimum triangles of a closed surface
+OBJECTS_FRACTION = 0.5  # fraction of the triangles for objects
+MIN_TRIANGLES = 4  # minimum triangles of a closed surface
 QUADRIC_STEP = 2.5  # maximum ratio of triangles for quadric decimation alone, which takes quadratic time in the ratio
 LEFT_TO_QUADRIC = 1.8  # ratio of triangles after clustering and after quadric decimation
-FEW = 20_000  # minimum triangles after clustering; for fewer triangles, cells would be as large as objects
+MIN_CLUSTERED = 20_000  # minimum triangles after clustering; for fewer triangles, cells would be as large as objects
 RELIEF = 0.03  # m, offset between white and black vertices
 BRIGHTNESS = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R BT.601
 COARSER = 1.3  # ratio of successive cell sizes
 
 
 def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Return the mesh with at most the given number of triangles (at least FEWEST).
+    """Return the mesh with at most the given number of triangles (at least MIN_TRIANGLES).
 
     Method: quadric decimation by Open3D (Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics",
     SIGGRAPH 1997), after vertex clustering of much larger meshes.
     """
-    most = max(triangles, FEWEST)
-    wanted = max(most, FEW)
+    most = max(triangles, MIN_TRIANGLES)
+    wanted = max(most, MIN_CLUSTERED)
     if len(mesh.triangles) > QUADRIC_STEP * wanted:
         cell, model = _cell(mesh, int(LEFT_TO_QUADRIC * wanted)), _open3d(mesh)
         model = model.simplify_vertex_clustering(cell)
@@ -43,7 +43,7 @@ def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Decimate a mesh, with finer objects than background.
+    """Return the decimated mesh, with finer objects than background.
 
     Objects and background are decimated separately to preserve their border. Vertices outside objects lose their
     labels.
@@ -51,7 +51,7 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
     owners = triangle_labels(mesh.triangles, mesh.instance_ids)
     of_object = owners > 0
     counts = int(of_object.sum()), int((~of_object).sum())
-    objects = min(counts[0], max(int(OBJECTS_SHARE * triangles), triangles - counts[1]))
+    objects = min(counts[0], max(int(OBJECTS_FRACTION * triangles), triangles - counts[1]))
     ids = mesh.instance_ids.copy()
     corners = mesh.triangles[of_object]
     bare = ids[corners] == 0  # corners on the border; all corners of a coarse triangle may be on the border
@@ -62,7 +62,7 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_of_triangle: int) -> InstanceMesh:
-    """Cluster vertices until the mesh has at most `most_bytes`.
+    """Return the mesh with clustered vertices, of at most `most_bytes`.
 
     Unlike edge collapse, clustering also reduces triangles without a common edge.
     """
@@ -74,13 +74,13 @@ def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_o
 
 
 def triangle_labels(triangles: Int32, labels: Int32) -> Int32:
-    """Return the label (F,) of at least two corners, otherwise of the first corner; triangles (F, 3), labels (V,)."""
+    """Return the label (F,) of most corners, or of the first corner if all differ; triangles (F, 3), labels (V,)."""
     corners = labels[triangles]
     return np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])
 
 
 def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Collapse edges by quadrics on a brightness relief, which preserves the texture of flat surfaces.
+    """Return the mesh after edge collapse by quadrics. A brightness relief preserves the texture of flat surfaces.
 
     Each remaining vertex is replaced by the nearest original vertex with its color and labels.
     """
@@ -124,7 +124,7 @@ def _vectors(rows: Float32 | Float64) -> Any:
 
 
 def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
-    """Convert an Open3D mesh. Each vertex gets the labels of the nearest vertex of `mesh`."""
+    """Return an Open3D mesh as an InstanceMesh. Each vertex gets the labels of the nearest vertex of `mesh`."""
     model.remove_unreferenced_vertices()
     kept = np.asarray(model.vertices).astype(np.float32).reshape(-1, 3)
     nearest = _nearest(mesh.vertices, kept)
@@ -133,15 +133,15 @@ def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
     return InstanceMesh(kept, triangles, colors, mesh.instance_ids[nearest], mesh.class_ids[nearest], mesh.classes)
 
 
-def _nearest(places: Float32 | Float64, asked: Float32 | Float64) -> Int64:
+def _nearest(places: Float32 | Float64, queries: Float32 | Float64) -> Int64:
     """Return the index (N,) of the nearest position (M, 3) to each query position (N, 3)."""
-    if not len(asked):
+    if not len(queries):
         return np.zeros(0, np.int64)
-    return np.asarray(cKDTree(places, balanced_tree=False).query(asked)[1])
+    return np.asarray(cKDTree(places, balanced_tree=False).query(queries)[1])
 
 
 def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
-    """Return the mesh of masked vertices (V,) and triangles (F,); None = all triangles between these vertices."""
+    """Return the mesh of the vertices (V,) and triangles (F,) in the masks; None = all triangles between them."""
     number = np.cumsum(kept, dtype=np.int32) - 1
     chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
     return InstanceMesh(
@@ -155,14 +155,14 @@ def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> In
 
 
 def corners_of(mesh: InstanceMesh, triangles: Bool) -> Bool:
-    """Return the mask (V,) of the vertices of the masked triangles (F,)."""
+    """Return the mask (V,) of the corners of the triangles in the mask (F,)."""
     used = np.zeros(len(mesh.vertices), np.bool_)
     used[mesh.triangles[triangles]] = True
     return used
 
 
 def joined(meshes: Sequence[InstanceMesh]) -> InstanceMesh:
-    """Join one or more meshes of a map."""
+    """Return the union of one or more meshes of a map."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return InstanceMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

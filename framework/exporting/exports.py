@@ -23,7 +23,7 @@ from framework.exporting.occupancy import plan, write_ros_map
 from framework.exporting.scene_graph import write_scene_graph
 from framework.exporting.upright_room import UprightRoom, read_room
 from framework.exporting.usd import Collision, check_usd, write_usd
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.geometry import transform
 from framework.runs.mesh_file import write_mesh
 from framework.runs.run_directory import LIKELY
@@ -129,13 +129,13 @@ def export(
     written: list[Path] = []
     if surfaces := [one for one in formats if one in MESHES]:
         written += _write_surfaces(room, surfaces, directory, chosen)
-    asked = [one for one in formats if one not in MESHES]
-    found = plan(room, chosen.resolution, chosen.robot_height) if asked and room.floor_known else None
-    if ExportFormat.FLOORPLAN in asked and found is not None:
+    others = [one for one in formats if one not in MESHES]
+    found = plan(room, chosen.resolution, chosen.robot_height) if others and room.floor_known else None
+    if ExportFormat.FLOORPLAN in others and found is not None:
         write_floor_plan(directory / "floor_plan.png", room, found, chosen.robot_height)
         write_geojson(directory / "floor_plan.geojson", room)
         written += [directory / "floor_plan.png", directory / "floor_plan.geojson", *write_ros_map(directory, found)]
-    if ExportFormat.GRAPH in asked:
+    if ExportFormat.GRAPH in others:
         write_scene_graph(directory / "scene_graph.json", room, found)
         written.append(directory / "scene_graph.json")
     return written
@@ -176,10 +176,10 @@ def _write_parts(path: Path, kind: ExportFormat, shown: Sequence[Part], chosen: 
     if kind is ExportFormat.USD:
         write_usd(path, shown, chosen.coloring, chosen.collision)
     elif kind is ExportFormat.GLB:
-        with written_whole(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_bytes(glb(shown, chosen.coloring))
     elif kind is ExportFormat.OBJ:
-        with written_whole(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(_obj(_placed(shown, chosen.coloring)))
     else:
         write_mesh(path, joined(list(_placed(shown, chosen.coloring).values())))

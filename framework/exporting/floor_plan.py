@@ -19,7 +19,7 @@ from matplotlib.transforms import Bbox
 from framework.data import Float64, UInt8
 from framework.exporting.occupancy import Plan
 from framework.exporting.upright_room import RoomObject, UprightRoom
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.files.json_file import write_json
 from framework.rendering.palette import FAINT_INK, INK, PAPER
 
@@ -39,7 +39,7 @@ FOOT = 0.72  # height of the legend, inches
 EDGE = 0.15  # inches
 TEXT_PT, SMALL_PT = 8.0, 7.0
 BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # possible lengths of the scale bar, m
-BAR_SHARE = 0.25  # maximum length of the scale bar, as a fraction of the plan's width
+MAX_BAR_FRACTION = 0.25  # maximum length of the scale bar, as a fraction of the plan's width
 MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1), (-0.6, -1))
 """Candidate offsets of a name, in its own widths and heights."""
 COORDINATES = "x, y in meters in the room frame (z up, floor at z = 0), not longitude and latitude"
@@ -48,7 +48,7 @@ DIGITS = 4  # decimal places, of meters
 
 def write_floor_plan(path: Path, room: UprightRoom, plan: Plan, robot_height: float) -> None:
     """Draw the plan as a PNG file. The file is deterministic."""
-    with warnings.catch_warnings(), written_whole(path) as temporary:
+    with warnings.catch_warnings(), atomic_write(path) as temporary:
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)  # drawn as boxes
         _drawn(room, plan, robot_height).savefig(temporary, dpi=DPI)
 
@@ -66,10 +66,10 @@ def _drawn(room: UprightRoom, plan: Plan, robot_height: float) -> Figure:
     scale = LONGER_SIDE / max(right - left, top - bottom)
     width, height = max((right - left) * scale, SHORTEST_SIDE), max((top - bottom) * scale, SHORTEST_SIDE / 2)
     page = width + 2 * EDGE, height + FOOT + EDGE
-    figure = Figure(page, facecolor=_share(PAPER))
+    figure = Figure(page, facecolor=_unit_rgb(PAPER))
     FigureCanvasAgg(figure)
     frame = EDGE / page[0], FOOT / page[1], width / page[0], height / page[1]
-    axes = figure.add_axes(frame, facecolor=_share(UNSEEN), xticks=[], yticks=[])
+    axes = figure.add_axes(frame, facecolor=_unit_rgb(UNSEEN), xticks=[], yticks=[])
     axes.set_aspect("equal", adjustable="datalim")
     axes.spines[:].set_visible(False)
     image = tones(plan)
@@ -86,12 +86,12 @@ def _drawn(room: UprightRoom, plan: Plan, robot_height: float) -> Figure:
 def _draw_outlines(axes: Axes, room: UprightRoom) -> None:
     """Draw the outlines of the objects in ascending order of height, so that upper objects stay visible."""
     for one in sorted(room.objects, key=lambda one: (one.top, one.id)):
-        dark = _share([round(DARKER * channel) for channel in one.color.tolist()])
+        dark = _unit_rgb([round(DARKER * channel) for channel in one.color.tolist()])
         axes.add_patch(Polygon(outline(room, one), fill=False, edgecolor=dark, linewidth=1.0, joinstyle="round"))
 
 
 def _draw_names(axes: Axes, objects: Sequence[RoomObject]) -> None:
-    """Write class and id at each object, large objects first. Without space, write only the id or nothing."""
+    """Write class and id at each object, large objects first; in small spaces, only the id or nothing."""
     figure = axes.figure
     assert isinstance(figure, Figure)
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -106,10 +106,10 @@ def _draw_names(axes: Axes, objects: Sequence[RoomObject]) -> None:
                 center_y,
                 text.replace("$", r"\$"),
                 fontsize=TEXT_PT,
-                color=_share(INK),
+                color=_unit_rgb(INK),
                 ha="center",
                 va="center",
-                path_effects=[withStroke(linewidth=2.2, foreground=_share(PAPER))],
+                path_effects=[withStroke(linewidth=2.2, foreground=_unit_rgb(PAPER))],
             )
             box = label.get_window_extent(renderer)
             shifts = [(x * box.width, y * box.height) for x, y in moves]
@@ -132,20 +132,22 @@ def _fits(box: Bbox, taken: Sequence[Bbox], inside: Bbox) -> bool:
 def _draw_bar(axes: Axes) -> None:
     """Draw a scale bar in the lower left corner."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    length = max([bar for bar in BARS if bar <= BAR_SHARE * (right - left)], default=BARS[0])
+    length = max([bar for bar in BARS if bar <= MAX_BAR_FRACTION * (right - left)], default=BARS[0])
     unit = 0.012 * (right - left)
     x, y = left + 2 * unit, bottom + 2.2 * unit
     patch = (left + unit, bottom + unit), length + 2 * unit, 4.2 * unit
-    axes.add_patch(Rectangle(*patch, color=_share(PAPER), zorder=4, alpha=0.85))
-    axes.add_patch(Rectangle((x, y), length, 0.6 * unit, color=_share(INK), zorder=5))
+    axes.add_patch(Rectangle(*patch, color=_unit_rgb(PAPER), zorder=4, alpha=0.85))
+    axes.add_patch(Rectangle((x, y), length, 0.6 * unit, color=_unit_rgb(INK), zorder=5))
     axes.text(x + length / 2, y + unit, f"{length:g} m", fontsize=SMALL_PT, ha="center", va="bottom", zorder=5)
     axes.set_xlim(left, right)
     axes.set_ylim(bottom, top)
 
 
 def _draw_foot(figure: Figure, page: tuple[float, float], plan: Plan, robot_height: float) -> None:
-    edge = _share(FAINT_INK)
-    patches = [Patch(facecolor=_share(tone), edgecolor=edge, linewidth=0.4, label=name) for name, tone in TONES.items()]
+    edge = _unit_rgb(FAINT_INK)
+    patches = [
+        Patch(facecolor=_unit_rgb(tone), edgecolor=edge, linewidth=0.4, label=name) for name, tone in TONES.items()
+    ]
     figure.legend(
         handles=patches,
         loc="upper left",
@@ -161,7 +163,7 @@ def _draw_foot(figure: Figure, page: tuple[float, float], plan: Plan, robot_heig
     figure.text(EDGE / page[0], 0.1 / page[1], note, fontsize=SMALL_PT, color=edge, va="bottom")
 
 
-def _share(color: Sequence[int]) -> tuple[float, float, float]:
+def _unit_rgb(color: Sequence[int]) -> tuple[float, float, float]:
     """Return an RGB color in [0, 1] for matplotlib."""
     red, green, blue = (channel / 255 for channel in color)
     return red, green, blue
@@ -184,7 +186,7 @@ def write_geojson(path: Path, room: UprightRoom) -> None:
 
 
 def outline(room: UprightRoom, one: RoomObject) -> Float64:
-    """Return the outline (N, 2) of an object on the floor, m, counterclockwise: convex hull, or box without an area."""
+    """Return the counterclockwise outline (N, 2) m of an object on the floor: its convex hull, or its box if flat."""
     points = room.mesh.vertices[one.vertices, :2]
     hull = cv2.convexHull(np.ascontiguousarray(points), clockwise=False)[:, 0].astype(np.float64)
     return hull if len(hull) >= 3 else one.footprint

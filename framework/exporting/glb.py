@@ -68,7 +68,7 @@ def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
 
 
 def _node(part: Part, colors: UInt8) -> Node:
-    """Convert a part. Its own frame is y up, too."""
+    """Return a part as a node; the node's own frame is also y up."""
     vertices = (part.mesh.vertices @ T_GLTF_ROOM[:3, :3].T).astype(np.float32)
     T_gltf_part = T_GLTF_ROOM @ part.T_room_part @ T_GLTF_ROOM.T
     return Node(part.name, vertices, part.mesh.triangles, colors, T_gltf_part, part.object is None, extras(part))
@@ -83,7 +83,7 @@ def extras(part: Part) -> dict[str, Any]:
 
 
 def _unit(normals: Float32) -> Float32:
-    """Replace zero normals (V, 3) of degenerate triangles; glTF forbids zero normals."""
+    """Return normals (V, 3) without the zero normals of degenerate triangles, which glTF forbids."""
     return np.where(np.abs(normals).max(axis=1, keepdims=True) > 0.1, normals, np.array([0, 1, 0], np.float32))
 
 

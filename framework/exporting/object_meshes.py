@@ -77,7 +77,7 @@ def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
 
 
 def _decimated(found: Sequence[Part], most: Sequence[int]) -> list[Part]:
-    """Decimate parts to at most `most` triangles each, with a progress bar: a million triangles take ten seconds."""
+    """Return parts decimated to at most `most` triangles each, with a progress bar: a million triangles take 10 s."""
     fewer = []
     total = sum(len(part.mesh.triangles) for part in found)
     with Progress(total, " triangles", unit_scale=True, leave=False) as bar:

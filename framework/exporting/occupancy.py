@@ -23,7 +23,7 @@ from PIL import Image
 from framework.data import Bool, Float64, Int32, Int64, UInt8
 from framework.errors import DataError
 from framework.exporting.upright_room import SurfacePoints, UprightRoom, surface_points
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.geometry import inverse, project, transform
 from framework.queries.changes import EYE, LOOKS
 from framework.rendering.rasterizer import Rasterizer
@@ -33,7 +33,7 @@ LEVEL_STEP = 0.1  # vertical sampling of free space, m
 SLACK = 0.03  # minimum distance of a surface behind free space, m
 FARTHEST = 5.0  # range of the camera, m: the default of fuser.max_depth
 WALL_SPAN = 1.0  # minimum height of a wall, m
-MOST_CELLS = 2**24  # maximum cells of a plan
+MAX_CELLS = 2**24  # maximum cells of a plan
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Plan:
 def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
     """Return the plan of a room with a known floor height; cell size and robot height in m.
 
-    Raises DataError for an empty map or more than MOST_CELLS cells.
+    Raises DataError for an empty map or more than MAX_CELLS cells.
     """
     found = surface_points(room, resolution / 2)
     if not len(found.points):
@@ -76,9 +76,9 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
     low, high = found.points[:, :2].min(axis=0).astype(np.float64), found.points[:, :2].max(axis=0).astype(np.float64)
     origin = (np.floor(low / resolution) - 1) * resolution
     columns, rows = (np.floor((high - origin) / resolution) + 2).astype(np.int64).tolist()
-    if rows * columns > MOST_CELLS:
+    if rows * columns > MAX_CELLS:
         cells = f"{columns} x {rows} cells of {resolution:g} m"
-        raise DataError(f"plan: expected at most {MOST_CELLS} cells, got {cells}; increase resolution")
+        raise DataError(f"plan: expected at most {MAX_CELLS} cells, got {cells}; increase resolution")
     column, row = np.floor((found.points[:, :2] - origin) / resolution).astype(np.int64).T
     number = row * columns + column  # (P,) cell of each point
     heights = found.points[:, 2]
@@ -107,21 +107,21 @@ def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
 
 
 def looked_through(room: UprightRoom, places: Float64) -> Bool:
-    """Return the mask (P,) of the points (P, 3) m, room, with observed free space."""
+    """Return a mask (P,), True for points (P, 3) m in the room frame that were observed as free space."""
     through = np.zeros(len(places), np.bool_)
     rasterizer = Rasterizer(room.mesh.vertices, room.mesh.triangles)
     for k in np.unique(np.linspace(0, len(room.poses) - 1, LOOKS).round().astype(int)) if len(room.poses) else []:
-        asked = np.flatnonzero(~through)
-        if not len(asked):
+        remaining = np.flatnonzero(~through)
+        if not len(remaining):
             break
         depth = rasterizer.draw(EYE, room.poses[k]).depth
-        in_camera = transform(inverse(room.poses[k]), places[asked])
+        in_camera = transform(inverse(room.poses[k]), places[remaining])
         ahead = np.flatnonzero(in_camera[:, 2] > 0)
         u, v = np.rint(project(EYE, in_camera[ahead])).T
         inside = (u >= 0) & (u < EYE.width) & (v >= 0) & (v < EYE.height)
         at = ahead[inside]
         surface = depth[v[inside].astype(np.int64), u[inside].astype(np.int64)]
-        through[asked[at[(surface > in_camera[at, 2] + SLACK) & (surface < FARTHEST)]]] = True
+        through[remaining[at[(surface > in_camera[at, 2] + SLACK) & (surface < FARTHEST)]]] = True
     return through
 
 
@@ -150,7 +150,7 @@ OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # of (255 - level) / 255; UNKN
 def write_ros_map(directory: Path, found: Plan) -> list[Path]:
     """Write map.pgm and map.yaml for map_server and nav2_map_server of ROS, in the room frame."""
     image, yaml = directory / "map.pgm", directory / "map.yaml"
-    with written_whole(image) as temporary:
+    with atomic_write(image) as temporary:
         Image.fromarray(levels(found)).save(temporary)
     x, y = found.origin.tolist()
     lines = [
@@ -162,7 +162,7 @@ def write_ros_map(directory: Path, found: Plan) -> list[Path]:
         f"occupied_thresh: {OCCUPIED_THRESHOLD}",
         f"free_thresh: {FREE_THRESHOLD}",
     ]
-    with written_whole(yaml) as temporary:
+    with atomic_write(yaml) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
     return [image, yaml]
 

@@ -1,7 +1,7 @@
 """Spatial relations between objects by geometry alone: on, in, next to, attached to a wall.
 
 Contact surfaces are occluded: the table under a cup is not in the map. An object is therefore on another object in two
-cases: the other object has a level surface around the foot at the height of the base, or its top has this height.
+cases: the top of the other object has the height of the base, or a level surface around the foot has this height.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MAX_NEIGHBOR_DISTANCE = 0.3  # m
 ON_WALL = 0.10  # maximum distance from a wall, m
 HANGING = 0.7  # minimum fraction of points near a wall
 STRAY = 2.0  # %, noise fraction of a surface at its lower and upper end
-MOST_POINTS = 3000  # maximum number of points of an object for distances
+MAX_POINTS = 3000  # maximum number of points of an object for distances
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class _Thing:
 
     @cached_property
     def tree(self) -> KDTree:
-        return KDTree(self.points[:: max(1, len(self.points) // MOST_POINTS)])
+        return KDTree(self.points[:: max(1, len(self.points) // MAX_POINTS)])
 
     @cached_property
     def cells(self) -> set[tuple[int, int]]:

@@ -18,7 +18,7 @@ from framework.exporting.occupancy import Plan
 
 DOOR = 1.0  # m, maximum width of an opening between rooms; most doors have 0.7 to 0.95 m
 GAP = 0.3  # maximum width of filled gaps, m
-LEAST_INSIDE = 0.5  # minimum interior area of a room, m^2
+MIN_INSIDE = 0.5  # minimum interior area of a room, m^2
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def rooms(plan: Plan) -> Rooms:
     from_walls = ndimage.distance_transform_edt(~plan.wall) * plan.resolution if plan.wall.any() else np.inf
     inside, count = ndimage.label(domain & (from_walls > DOOR / 2))
     areas = np.bincount(inside.ravel(), minlength=count + 1)[1:] * plan.resolution**2
-    kept = np.flatnonzero(areas >= LEAST_INSIDE) + 1
+    kept = np.flatnonzero(areas >= MIN_INSIDE) + 1
     if len(kept) < 2:
         return Rooms(domain.astype(np.int32), (), plan)
     grown = _grown(np.where(np.isin(inside, kept), inside, 0).astype(np.int32), domain)
@@ -82,7 +82,7 @@ def rooms(plan: Plan) -> Rooms:
 
 
 def _grown(labels: Int32, domain: Bool) -> Int32:
-    """Spread labels (H, W) over the domain (H, W) cell by cell until they meet."""
+    """Return the labels (H, W), grown over the domain (H, W) cell by cell until they meet."""
     cross = ndimage.generate_binary_structure(2, 1)
     while True:
         spread = np.where((labels == 0) & domain, ndimage.maximum_filter(labels, footprint=cross), labels)

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from framework.data import Bool, Box, Float32, Float64, InstanceMesh, Int32, Int64, UInt8
 from framework.errors import DataError
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import skew, transform
 from framework.mapping.instances.instance_list import upright_box
@@ -30,13 +30,13 @@ from framework.runs.instances_file import StoredInstance
 from framework.runs.mesh_file import read_mesh
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_map import read_labeled_mesh
-from framework.runs.stored_runs import INSTANCES, MESH, TRAJECTORY, read_figures
+from framework.runs.stored_runs import INSTANCES, MESH, TRAJECTORY, read_metrics
 
 LONGEST_NAME = 60  # maximum characters of a class in names of files and nodes
 UP = np.array([0.0, 0.0, 1.0])
 HIGHEST = 1e4  # maximum absolute floor height, m; vertices are float32
 SPECK = 0.01  # maximum fraction of vertices in removed components; components at depth edges would enlarge the box
-MOST_POINTS = 2**24  # maximum points of a room; 100 m^2 of surface have 4 million points at 1 cm voxels
+MAX_POINTS = 2**24  # maximum points of a room; 100 m^2 of surface have 4 million points at 1 cm voxels
 LEVEL = float(np.cos(np.radians(30.0)))  # minimum z of the normal of a supporting surface
 UPRIGHT = float(np.sin(np.radians(20.0)))  # maximum |z| of the normal of a wall
 SHORTEST_UP = 1e-6  # minimum length of an up direction
@@ -94,16 +94,16 @@ class UprightRoom:
     def surface(self) -> Surface:
         return Surface(self.mesh.vertices, self.mesh.triangles)
 
-    def chosen(self, asked: Sequence[str], min_confidence: float) -> UprightRoom:
+    def chosen(self, selection: Sequence[str], min_confidence: float) -> UprightRoom:
         """Return the room with the objects of the given ids or classes; () = all.
 
         Objects selected by class need the minimum confidence. Raises DataError for an unknown id or class.
         """
         likely = [one for one in self.objects if one.confidence >= min_confidence]
-        if not asked:
+        if not selection:
             return replace(self, objects=tuple(likely))
         found: dict[int, RoomObject] = {}
-        for word in asked:
+        for word in selection:
             by_id = [one for one in self.objects if str(one.id) == word]
             by_class = [one for one in self.objects if one.class_name == word]
             if not by_id and not by_class:
@@ -129,16 +129,16 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
 
     Raises DataError for missing, invalid or inconsistent files.
     """
-    figures = read_figures(run)
+    figures = read_metrics(run)
     instances: Sequence[StoredInstance] = []
-    if is_there(run / INSTANCES):
+    if path_exists(run / INSTANCES):
         mesh, instances = read_labeled_mesh(run)
     else:  # a partial run
         mesh = read_mesh(run / MESH)
     direction = _direction(f"{run}: map.up", figures) if up is None else _unit("up", up)
     height = _height(f"{run}: map.floor_m", figures.get("map.floor_m") if floor is None and up is None else floor)
     T_room_world = upright(UP if direction is None else direction, height or 0.0)
-    _, poses = read_tum(run / TRAJECTORY) if is_there(run / TRAJECTORY) else (None, np.zeros((0, 4, 4)))
+    _, poses = read_tum(run / TRAJECTORY) if path_exists(run / TRAJECTORY) else (None, np.zeros((0, 4, 4)))
     placed = replace(mesh, vertices=transform(T_room_world, mesh.vertices.astype(np.float64)).astype(np.float32))
     return UprightRoom(
         mesh=placed,
@@ -151,7 +151,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
 
 
 def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple[RoomObject, ...]:
-    """Return the objects with vertices in a room's mesh by id, without connected components smaller than SPECK."""
+    """Return the objects of a room's mesh, sorted by id, without connected components smaller than SPECK."""
     pieces = _pieces(mesh)
     order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
     ids = mesh.instance_ids[order]
@@ -185,7 +185,7 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
 
 
 def _pieces(mesh: InstanceMesh) -> Int32:
-    """Return the connected component (V,) of each vertex; only triangles within one object are edges."""
+    """Return the connected component (V,) of each vertex; only triangles within one object connect vertices."""
     ids = mesh.instance_ids[mesh.triangles]
     joined = mesh.triangles[(ids > 0).all(axis=1) & (ids == ids[:, :1]).all(axis=1)]
     edges = np.concatenate([joined[:, :2], joined[:, 1:]]).T
@@ -263,15 +263,15 @@ class SurfacePoints:
 def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
     """Return the centers of a room's triangles, subdivided to sides of at most `spacing` m.
 
-    Raises DataError for more than MOST_POINTS points.
+    Raises DataError for more than MAX_POINTS points.
     """
     vertices, triangles = room.mesh.vertices, room.mesh.triangles
     corners = vertices[triangles]  # (F, 3, 3)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0)
     cuts = np.maximum(np.ceil(longest / spacing), 1)
-    if float((cuts**2).sum()) > MOST_POINTS:
+    if float((cuts**2).sum()) > MAX_POINTS:
         raise DataError(
-            f"surface: expected at most {MOST_POINTS} points at a spacing of {spacing:g} m, got "
+            f"surface: expected at most {MAX_POINTS} points at a spacing of {spacing:g} m, got "
             f"{float((cuts**2).sum()):.0f}; increase resolution, or map with larger voxels"
         )
     normals = room.surface.face_normals

@@ -23,10 +23,10 @@ from scipy.spatial import ConvexHull, QhullError
 from framework.data import Float32, Int32, UInt8
 from framework.errors import DataError
 from framework.exporting.object_meshes import Coloring, Part, linear, part_colors
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 
 MISSING = "usd: expected the package usd-core, got none; run pip install instancemap[usd]"
-NOT_WRITTEN = "the USD library failed to write the stage"
+NOT_WRITTEN = "a failure of the USD library"
 THINNEST = 0.002  # minimum side of a collision box, m; an object observed from one side may be flat
 GRAVITY = 9.81  # m/s^2
 
@@ -68,7 +68,7 @@ def write_usd(
             _add_rest(stage, part, colors)
         else:
             _add_object(stage, part, colors, collision)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         try:
             written = stage.GetRootLayer().Export(str(temporary))
         except Tf.ErrorException as error:

@@ -17,13 +17,13 @@ from framework.checking.recording_check import RecordingCheck
 from framework.checking.registration import depth_edges
 from framework.data import Float64, Frame, UInt8
 from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseReading, QuaternionOrder
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.geometry import back_project, project, transform
 
 SIZE_IN, DPI = (15.0, 9.4), 100
 TITLE_PT, TEXT_PT = 10.0, 9.0
 LINE = 180  # maximum characters per line of findings
-COLORS = {Verdict.FINE: "#1a7f37", Verdict.UNKNOWN: "#787e86", Verdict.NOTE: "#9a6700", Verdict.FAULT: "#cf222e"}
+COLORS = {Verdict.FINE: "#1a7f37", Verdict.UNKNOWN: "#787e86", Verdict.NOTE: "#9a6700", Verdict.ERROR: "#cf222e"}
 CHOSEN, OTHER = "#1a7f37", "#b0b6be"
 
 
@@ -44,7 +44,7 @@ def write_check(path: Path, check: RecordingCheck) -> None:
         _warped(figure.add_subplot(grid[1, 1]), "best fit", check.meant, check.poses.best)
     _readings(figure.add_subplot(grid[1, 2:]), check.poses)
     _findings(figure.add_subplot(grid[2, :]), check)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=DPI)
 
 

@@ -72,7 +72,7 @@ def _colors(count: int) -> UInt8:
 
 
 def _colors_after(refinement: Refinement) -> UInt8:
-    """Return the colors (M, 3): the largest part of a cluster keeps its color, all other clusters get new colors."""
+    """Return the colors (M, 3). The largest part of a cluster keeps its color; all other parts get new colors."""
     n, m = len(refinement.before), len(refinement.after)
     color_index = np.full(m, -1)
     known = np.flatnonzero(refinement.main_part >= 0)
@@ -86,7 +86,7 @@ def _owner(clusters: PointClusters, frame: Frame) -> Int32:
 
 
 def _painted(clusters: PointClusters, frame: Frame, values: Array, nothing: int) -> Array:
-    """Return the values (P,) of the points as an image (H, W), small clusters over large ones."""
+    """Return the values (P,) of the points as an image (H, W), with small clusters in front of large ones."""
     held = np.flatnonzero(clusters.cluster >= 0)
     held = held[np.argsort(-point_counts(clusters)[clusters.cluster[held]], kind="stable")]
     image = np.full(frame.depth.size, nothing, values.dtype)

@@ -95,7 +95,7 @@ class Pictured:
         return [record for row in self.rows.values() if row for record in row.records.values()]
 
     def called(self, run: Run) -> str:
-        """Return the name of the sequence, with the seed for several seeds."""
+        """Return the name of the run's sequence, with the seed if there are several."""
         seeds = {other[0] for other in self.runs}
         return run[-1] if len(run) == 1 or len(seeds) == 1 else f"{run[-1]}, seed {run[0]}"
 
@@ -173,7 +173,7 @@ def _truth(record: Record) -> SceneTruth | None:
 
 
 def _caption(stored: StoredMap | None, with_frames: bool) -> str:
-    """Return the caption of a map; the note has the number of frames if it is the same for all maps."""
+    """Return the caption of a map: the number of frames (optional) and of instances, and AP50."""
     if stored is None:
         return ""
     metrics = stored.record.metrics

@@ -15,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.textpath import text_to_path
 
 from framework.data import Int32
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.rendering.labels import place_labels
 
 COLUMN_MM, PAGE_MM = 88.0, 181.0  # widths of one and two columns of a journal
@@ -43,25 +43,25 @@ class Page:
 
     def axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
         """Add axes without ticks, in a thin frame."""
-        x, y = self._share(left, bottom)
+        x, y = self._fraction(left, bottom)
         axes = self.figure.add_axes((x, y, width / self._size[0], height / self._size[1]))
         axes.set(xticks=[], yticks=[])
         axes.spines[:].set(color=FAINT_INK, linewidth=0.3)
         return axes
 
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
-        self.figure.text(*self._share(x, y), text, **style)
+        self.figure.text(*self._fraction(x, y), text, **style)
 
     def write(self, path: Path) -> list[Path]:
         """Write `path`.png and `path`.pdf and return their paths. The bytes are deterministic."""
         png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
-        with written_whole(png) as temporary:
+        with atomic_write(png) as temporary:
             self.figure.savefig(temporary, dpi=PNG_DPI)
-        with written_whole(pdf) as temporary, rc_context({"pdf.fonttype": 42}):  # searchable text
+        with atomic_write(pdf) as temporary, rc_context({"pdf.fonttype": 42}):  # searchable text
             self.figure.savefig(temporary, dpi=PDF_DPI, metadata={"CreationDate": None})
         return [png, pdf]
 
-    def _share(self, x: float, y: float) -> tuple[float, float]:
+    def _fraction(self, x: float, y: float) -> tuple[float, float]:
         return x / self._size[0], (y + self._foot) / self._size[1]
 
 
@@ -72,7 +72,7 @@ def text_width(text: str, size: float) -> float:
 
 
 def _wrapped(text: str, width: float) -> list[str]:
-    """Wrap the note into lines of at most `width` mm."""
+    """Return the note as lines of at most `width` mm."""
     lines: list[str] = []
     for word in text.split():
         longer = f"{lines[-1]} {word}" if lines else word
@@ -105,6 +105,6 @@ def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, wi
             axes.annotate(label.text, label.target, (label.u, label.v), arrowprops=line, **style)
 
 
-def say_inside(axes: Axes, text: str) -> None:
+def write_message(axes: Axes, text: str) -> None:
     """Write a message into empty axes."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=TEXT_PT, color=FAINT_INK)

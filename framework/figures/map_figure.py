@@ -20,8 +20,8 @@ from framework.figures.figure_page import (
     TEXT_PT,
     Page,
     draw_names,
-    say_inside,
     text_width,
+    write_message,
 )
 from framework.figures.map_panels import Panel, PanelLine
 from framework.rendering.camera_path import ProjectedPath
@@ -52,7 +52,7 @@ def panel_size(columns: int) -> tuple[int, int]:
 
 
 def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) -> Page:
-    """Draw the page.
+    """Return the page with maps side by side.
 
     Args:
         heads: Column headings; the last column is the ground truth.
@@ -97,7 +97,7 @@ def _panel_mm(columns: int) -> float:
 
 def _draw(axes: Axes, panel: Panel | None, otherwise: str) -> None:
     if panel is None:
-        say_inside(axes, otherwise)
+        write_message(axes, otherwise)
         return
     height, width = panel.image.shape[:2]
     axes.imshow(panel.image, interpolation="antialiased", aspect="auto")

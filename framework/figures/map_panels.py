@@ -65,7 +65,7 @@ class PanelLine:
 def panel_line(
     maps: Sequence[StoredMap | None], truth: SceneTruth | None, size: tuple[int, int], zoom: bool
 ) -> PanelLine:
-    """Draw the maps of one scene. The last map determines the viewpoint and the surface of the ground truth.
+    """Return the images of one scene's maps. The last map determines the viewpoint and the ground-truth surface.
 
     Args:
         maps: Maps; at least one is not None.
@@ -128,7 +128,7 @@ class _Column:
 
 
 def _with_path(column: _Column, camera: Camera, T_world_camera: Float64) -> tuple[Camera, Float64]:
-    """Move the view back until it contains the camera path of the column."""
+    """Return the camera and pose of a view, moved back until it contains the camera path of the column."""
     R_world_camera = T_world_camera[:3, :3]
     hits = FrontSides(column.surface, T_world_camera[:3, 3]).seen_by(camera.scaled(FRAMING_SCALE), R_world_camera)
     path = column.poses[:, :3, 3].astype(np.float32)

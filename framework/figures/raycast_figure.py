@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.data import Array, Float64, Int32, UInt8, View
 from framework.figures.figure_page import FAINT_INK, INK, PAGE_MM, PNG_DPI, SMALL_PT, TEXT_PT, Page, draw_names
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.geometry import back_project, transform
 from framework.rendering.palette import object_colors
 
@@ -31,12 +31,12 @@ def write_raycast(path: Path, view: View, names: Mapping[int, str], centers: Map
         note: Note at the bottom of the page.
     """
     page = raycast_page(view, names, centers, note)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         page.figure.savefig(temporary, dpi=PNG_DPI)
 
 
 def raycast_page(view: View, names: Mapping[int, str], centers: Mapping[int, Float64], note: str) -> Page:
-    """Draw the page of `write_raycast`."""
+    """Return the page of `write_raycast`."""
     width = (PAGE_MM - 2 * LEFT_MM - BAR_SPACE_MM - GAP_MM * (COLUMNS - 1)) / COLUMNS
     height = width * view.depth.shape[0] / view.depth.shape[1]
     row_height = HEAD_MM + height + CAPTION_MM

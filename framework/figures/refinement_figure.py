@@ -17,7 +17,7 @@ from framework.evaluation.refined_points import Refinement, point_counts
 from framework.figures.cluster_marks import DROPPED, ClusterMarks
 from framework.figures.figure_page import FAINT_INK, INCH_MM, INK, draw_names
 from framework.figures.side_view import SideView, draw_side
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.rendering.palette import PAPER
 
 DPI = 100
@@ -33,12 +33,12 @@ BETTER, WORSE = "#188048", "#be2828"
 
 def write_refinement(path: Path, refinement: Refinement, title: str, refiner: str) -> None:
     """Write `refinement_figure` as a PNG."""
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         refinement_figure(refinement, title, refiner).savefig(temporary)
 
 
 def refinement_figure(refinement: Refinement, title: str, refiner: str) -> Figure:
-    """Draw the clusters of one frame before and after refinement.
+    """Return a figure of the clusters of one frame before and after refinement.
 
     Args:
         refinement: Clusters before and after refinement.

@@ -44,7 +44,7 @@ class SideView:
 
     @classmethod
     def of(cls, frame: Frame, before: ClusterMarks, after: ClusterMarks, aspect: float) -> SideView | None:
-        """Return the view from the left or right with more changed points, None without depth readings.
+        """Return the view from the left or the right, whichever shows more changed points; None = no depth readings.
 
         Args:
             frame: Frame with depth.

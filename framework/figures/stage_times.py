@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 from scipy.optimize import isotonic_regression
 
 from framework.data import Float64, Int64
-from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, say_inside
+from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, write_message
 from framework.runs.timings_file import StageTimes
 
 WINDOW = 9  # frames, of the running median
@@ -48,7 +48,7 @@ class MeanTimes:
 
     @classmethod
     def of(cls, runs: Sequence[StageTimes]) -> MeanTimes:
-        """Average one or more runs, each with at least one frame."""
+        """Return the mean times of one or more runs, each with at least one frame."""
         end = min(int(run.frames[-1]) for run in runs)
         frames = np.unique(np.concatenate([run.frames[run.frames <= end] for run in runs]))
         mean, lowest, highest = {}, {}, {}
@@ -89,7 +89,7 @@ def running_median(values: Float64, window: int) -> Float64:
 
 
 def spread(positions: Sequence[float], gap: float) -> list[float]:
-    """Move positions apart to a minimum distance of `gap` with the smallest sum of squared displacements."""
+    """Return positions at least `gap` apart, with the smallest sum of squared displacements."""
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(len(order))
     result = np.empty(len(order))
@@ -98,14 +98,14 @@ def spread(positions: Sequence[float], gap: float) -> list[float]:
 
 
 def stage_times_figure(rows: Mapping[str, MeanTimes | None], note: str) -> Page:
-    """Draw one diagram per row, None = no run. `note` is printed at the bottom."""
+    """Return a page with one diagram per row (None = no run) and `note` at the bottom."""
     step = HEAD_MM + PLOT_MM + AXIS_MM
     page = Page(COLUMN_MM, step * len(rows), note)
     for k, (name, times) in enumerate(rows.items(), start=1):
         axes = page.axes(LEFT_MM, step * (len(rows) - k) + AXIS_MM, PLOT_WIDTH_MM, PLOT_MM)
         axes.set_title(name, fontsize=TEXT_PT, loc="left", pad=3, color=INK)
         if times is None:
-            say_inside(axes, "incomplete")
+            write_message(axes, "incomplete")
         else:
             _draw(axes, times)
     return page

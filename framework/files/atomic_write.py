@@ -12,12 +12,12 @@ from pathlib import Path
 
 from framework.errors import DataError
 
-MOST_TEXT = 2**28  # bytes of text or JSON; one hour of poses takes 10 MB
-_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # names of `written_whole`
+MAX_TEXT = 2**28  # bytes of text or JSON; one hour of poses takes 10 MB
+_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # names of `atomic_write`
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to `path`. The file replaces `path` on success and is deleted on failure.
 
     The temporary name has the same suffix, because image and mesh writers derive the format from the suffix. Links are
@@ -35,14 +35,14 @@ def written_whole(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     except OSError as error:
         reason = error.strerror or f"{error}; the disk may be full"  # NumPy reports only the number of items
-        raise DataError(f"{path}: cannot be written: {reason}") from error
+        raise DataError(f"{path}: expected a writable file, got {reason}") from error
     finally:
         with suppress(OSError):  # the disk may be read-only
             temporary.unlink(missing_ok=True)
 
 
-def is_there(path: Path) -> bool:
-    """Return True if an optional file exists. Broken links and folders also count, so that the reader reports them."""
+def path_exists(path: Path) -> bool:
+    """Return True if an optional file exists. Broken links and folders count as well, so that reading reports them."""
     return os.path.lexists(path)
 
 
@@ -54,11 +54,11 @@ def remove_left_over(directory: Path) -> None:
 
 
 def check_regular(path: Path) -> os.stat_result:
-    """Return the status of a regular file. Raises DataError for others, because reading a pipe may never end."""
+    """Return the status of a regular file. Raises DataError for other types, because reading a pipe may never end."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        raise DataError(f"{path}: expected a readable file, got {getattr(error, 'strerror', None) or error}") from error
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
         raise DataError(f"{path}: expected a regular file, got {kind}")
@@ -73,12 +73,12 @@ def read_bytes(path: Path, most: int) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise DataError(f"{path}: expected a readable file, got {error.strerror or error}") from error
 
 
-def read_text(path: Path, most: int = MOST_TEXT) -> str:
+def read_text(path: Path, most: int = MAX_TEXT) -> str:
     """Read UTF-8 text and remove the byte order mark. Raises DataError."""
     try:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: expected UTF-8 text: {error}") from error
+        raise DataError(f"{path}: expected UTF-8 text, got an error ({error})") from error

@@ -12,7 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from framework.errors import DataError
-from framework.files.atomic_write import read_text, written_whole
+from framework.files.atomic_write import atomic_write, read_text
 
 # the owner has its own file, because locked files cannot be read on Windows
 LOCK, HOLDER = ".lock", ".lock_holder"
@@ -36,7 +36,7 @@ def new_directory(wanted: str) -> str:
                 number += 1
                 path = Path(f"{wanted}_{number}")
     except OSError as error:
-        raise DataError(f"{path}: directory cannot be created: {error.strerror}") from error
+        raise DataError(f"{path}: expected a writable parent folder, got {error.strerror}") from error
 
 
 @contextmanager
@@ -54,13 +54,18 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
         except Timeout as error:
             owner = holder(directory) or "another process"
             if not wait:
-                raise DataError(f"{directory}: in use by {owner}; wait for it to exit, or stop it") from error
+                raise DataError(
+                    f"{directory}: expected an unlocked directory, got one in use by {owner}; wait for it to exit, or "
+                    "stop it"
+                ) from error
             log.warning("%s: in use by %s; waiting for it to exit", directory, owner)
             lock.acquire()
     except OSError as error:
-        log.warning("%s: cannot be locked (%s); do not start other runs in it", directory, error.strerror)
+        log.warning(
+            "%s: expected a file system with locks, got %s; do not start other runs in it", directory, error.strerror
+        )
     try:
-        with written_whole(directory / HOLDER) as temporary:
+        with atomic_write(directory / HOLDER) as temporary:
             temporary.write_text(f"{holder_name(os.getpid())}\n")
         yield
     finally:

@@ -16,14 +16,14 @@ from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from framework.data import MOST_PIXELS, Array, UInt8, UInt16
+from framework.data import MAX_PIXELS, Array, UInt8, UInt16
 from framework.errors import DataError, FrameError, in_one_line
 from framework.files.atomic_write import read_bytes
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 JPEG_PADDING = b"\0\r\n"  # some cameras append zeros; some programs append a line break
-LARGEST_FILE = 2**28  # bytes, size of MOST_PIXELS with four 16-bit channels
+LARGEST_FILE = 2**28  # bytes, size of MAX_PIXELS with four 16-bit channels
 
 
 def read_color(path: Path) -> UInt8:
@@ -41,7 +41,7 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
         try:
             return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB", strict=True), np.uint8)
         except ValueError as error:
-            raise FrameError(f"{name}: damaged image: {in_one_line(error)}") from error
+            raise FrameError(f"{name}: expected a decodable JPEG, got an error ({in_one_line(error)})") from error
     image = _decode_png(name, data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image.dtype != np.uint8:
         raise FrameError(f"{name}: expected color with 8 bits per channel, got {image.dtype}")
@@ -85,12 +85,12 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
     except cv2.error:
         image = None
     if image is None:
-        raise FrameError(f"{name}: cannot be decoded; the file is damaged")
+        raise FrameError(f"{name}: expected a decodable PNG, got corrupt data")
     return np.asarray(image)
 
 
 def check_image(name: Path | str, data: bytes) -> None:
-    """Raise FrameError if `data` is not a complete PNG or JPEG file with an image of at most MOST_PIXELS.
+    """Raise FrameError if `data` is not a complete PNG or JPEG file with an image of at most MAX_PIXELS.
 
     Decoders allocate the size in the header, which may be 10^10 px in a damaged file.
     """
@@ -104,15 +104,17 @@ def check_image(name: Path | str, data: bytes) -> None:
     else:
         raise FrameError(f"{name}: expected a JPEG or PNG file, got a file that begins with {data[:8]!r}")
     if not ended:
-        raise FrameError(f"{name}: truncated image: no end marker in its {len(data)} bytes")
+        raise FrameError(
+            f"{name}: expected an image with an end marker, got none in {len(data)} bytes (truncated file)"
+        )
     try:
         image = kind(io.BytesIO(data))  # Image.open warns about large images and has its own limit
         width, height = image.size
         pictures = getattr(image, "n_frames", 1)
         image.verify()
     except Exception as error:  # Pillow has no common base exception
-        raise FrameError(f"{name}: damaged image: {in_one_line(error)}") from error
+        raise FrameError(f"{name}: expected a valid image, got an error ({in_one_line(error)})") from error
     if pictures > 1:
         raise FrameError(f"{name}: expected a single image, got an animation of {pictures} images")
-    if not 0 < width * height <= MOST_PIXELS:
-        raise FrameError(f"{name}: expected an image of 1 to {MOST_PIXELS} px, got {width}x{height} px")
+    if not 0 < width * height <= MAX_PIXELS:
+        raise FrameError(f"{name}: expected an image of 1 to {MAX_PIXELS} px, got {width}x{height} px")

@@ -9,20 +9,20 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import DataError, in_one_line
-from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
+from framework.files.atomic_write import MAX_TEXT, atomic_write, read_bytes
 
-DEEPEST = 50  # nested objects and lists
-TOO_DEEP = f"expected JSON with at most {DEEPEST} nested lists and objects, got deeper nesting"
-MOST_BITS = 63  # of an integer, limit of libraries; timestamps in ns have 61
+MAX_DEPTH = 50  # nested objects and lists
+TOO_DEEP = f"expected JSON with at most {MAX_DEPTH} nested lists and objects, got deeper nesting"
+MAX_BITS = 63  # of an integer, limit of libraries; timestamps in ns have 61
 
 
 def write_json(path: Path, content: Any) -> None:
     """Write `content` atomically, with floats in full precision."""
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
 
-def read_json(path: Path, most: int = MOST_TEXT) -> Any:
+def read_json(path: Path, most: int = MAX_TEXT) -> Any:
     """Read a JSON file of at most `most` bytes. Raises DataError."""
     return parse_json(path, read_bytes(path, most))
 
@@ -34,31 +34,31 @@ def parse_json(where: object, content: bytes | str) -> Any:
     except RecursionError as error:
         raise DataError(f"{where}: {TOO_DEEP}") from error
     except (ValueError, MemoryError) as error:
-        raise DataError(f"{where}: expected valid JSON: {in_one_line(error)}") from error
+        raise DataError(f"{where}: expected valid JSON, got an error ({in_one_line(error)})") from error
     if not _is_shallow(found):
         raise DataError(f"{where}: {TOO_DEEP}")
     return found
 
 
 def _whole(digits: str) -> int:
-    if len(digits) > MOST_BITS or (value := int(digits)).bit_length() > MOST_BITS:
-        raise ValueError(f"expected integers of at most {MOST_BITS} bits, got {digits[:20]}... of {len(digits)} digits")
+    if len(digits) > MAX_BITS or (value := int(digits)).bit_length() > MAX_BITS:
+        raise ValueError(f"expected integers of at most {MAX_BITS} bits, got {digits[:20]}... of {len(digits)} digits")
     return value
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object. Raises ValueError for duplicate keys, because JSON does not define their meaning."""
+    """Return the pairs as a dict. Raises ValueError for duplicate keys, because JSON does not define their meaning."""
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for k, (key, _) in enumerate(pairs) if key in {before for before, _ in pairs[:k]})
-        raise ValueError(f"duplicate key {twice!r} in an object")
+        raise ValueError(f"expected unique keys, got {twice!r} twice")
     return found
 
 
 def _is_shallow(content: Any) -> bool:
-    """Return True if the nesting depth is at most DEEPEST. Does not use recursion."""
+    """Return True if the nesting depth is at most MAX_DEPTH. Does not use recursion."""
     level = [content] if isinstance(content, list | dict) else []
-    for _ in range(DEEPEST):
+    for _ in range(MAX_DEPTH):
         nodes = [node.values() if isinstance(node, dict) else node for node in level]
         level = [below for node in nodes for below in node if isinstance(below, list | dict)]
         if not level:
@@ -67,7 +67,7 @@ def _is_shallow(content: Any) -> bool:
 
 
 def _finite(content: Any) -> Any:
-    """Replace NaN with null.
+    """Return the content with null for NaN.
 
     JSON does not support NaN, the value of undefined metrics such as the AP of an absent class.
     """

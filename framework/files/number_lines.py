@@ -15,14 +15,14 @@ import numpy as np
 
 from framework.data import Camera, Float64
 from framework.errors import DataError, errors_of
-from framework.files.atomic_write import read_text, written_whole
+from framework.files.atomic_write import atomic_write, read_text
 from framework.geometry import nearest_rigid
 
 SHOWN = 60  # maximum number of characters of a file in an error message
 COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is NaN in Microsoft's C library
 GRAVITY_COLUMNS = "x y z"
 IMAGE_TIME_COLUMNS = "color depth"
-SHORTEST, LONGEST = 1e-6, 1e6  # limits of the length of a direction, in any unit
+MIN_LENGTH, MAX_LENGTH = 1e-6, 1e6  # limits of the length of a direction, in any unit
 
 _NO_NUMBER = re.compile(r"[+-]?(1\.#\w+|nan\(\w+\))", re.ASCII | re.IGNORECASE)
 
@@ -64,7 +64,7 @@ def read_gravity(path: Path) -> list[Float64 | None]:
 
 def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
     """Write the up direction (3,) of each frame, None = unknown, in the format of `read_gravity`."""
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for up in ups:
             file.write("nan nan nan\n" if up is None else " ".join(f"{value:.9f}" for value in up) + "\n")
 
@@ -88,7 +88,7 @@ def read_image_times(path: Path) -> list[tuple[float, float]]:
 
 def write_image_times(path: Path, times: Sequence[tuple[float, float]]) -> None:
     """Write the timestamps of color and depth of each frame, s, in the format of `read_image_times`."""
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(f"# {IMAGE_TIME_COLUMNS}\n")
         for color, depth in times:
             file.write(f"{color:.9f} {depth:.9f}\n")
@@ -99,7 +99,7 @@ def _direction(where: str, words: Sequence[str]) -> Float64 | None:
     if all(map(math.isnan, values)):
         return None
     length = math.hypot(*values)
-    if not SHORTEST <= length <= LONGEST:
+    if not MIN_LENGTH <= length <= MAX_LENGTH:
         raise DataError(f"{where}: expected a direction, or nan nan nan if unknown, got {' '.join(words)!r}")
     return np.array(values) / length
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from framework.data import Array, Float32, Int32, Int64
 from framework.errors import DataError
-from framework.files.atomic_write import read_bytes, written_whole
+from framework.files.atomic_write import atomic_write, read_bytes
 from framework.files.ply_elements import TYPES, Element, read_elements
 
 LARGEST_FILE = 2**32  # bytes; the mesh of a room has about 2^26
@@ -79,7 +79,7 @@ def write_ply(
         "property list uchar int vertex_indices",
         "end_header\n",
     ]
-    with written_whole(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(header).encode("ascii", "replace"))
         rows.tofile(file)
         faces.tofile(file)
@@ -118,7 +118,7 @@ def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
 
 
 def _fans(corners: Int32, lengths: Int64) -> Int32:
-    """Split polygons with `lengths` corners into triangles (F, 3) of the corners 0 1 2, 0 2 3, ..."""
+    """Return the triangles (F, 3) of polygons with `lengths` corners: corners 0 1 2, 0 2 3, ..."""
     if (lengths == 3).all():
         return corners.reshape(-1, 3)
     triangles = lengths - 2  # number of triangles of each polygon

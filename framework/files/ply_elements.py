@@ -21,7 +21,7 @@ TYPES = {
     **dict(zip(("char", "uchar", "short", "ushort", "int", "uint", "float", "double"), "bBhHiIfd", strict=True)),
     **{str(np.dtype(code)): code for code in "bBhHiIfd"},  # int8, uint8, ...
 }
-MOST_DIGITS = 18  # of a number of rows
+MAX_DIGITS = 18  # of a number of rows
 
 
 @dataclass(frozen=True)
@@ -87,15 +87,15 @@ def _parse_header(path: Path, data: bytes) -> Header:
                 case ["format", name, "1.0"] if name in FORMATS and not format_name:
                     format_name = name
                 case ["element", name, rows]:
-                    if not (rows.isascii() and rows.isdigit() and len(rows) <= MOST_DIGITS):
+                    if not (rows.isascii() and rows.isdigit() and len(rows) <= MAX_DIGITS):
                         raise ValueError(f"element {shown(name)}: expected a number of rows, got {shown(rows)}")
                     if name in (element.name for element in elements):
-                        raise ValueError(f"duplicate element {shown(name)}")
+                        raise ValueError(f"expected unique elements, got {shown(name)} twice")
                     elements.append(Element(name, int(rows)))
                 case ["property", *declaration] if elements:
                     elements[-1] = _with_property(elements[-1], declaration)
                 case _:
-                    raise ValueError(f"unknown header line {shown(' '.join(words))}")
+                    raise ValueError(f"expected a header line of PLY 1.0, got {shown(' '.join(words))}")
         except ValueError as error:
             raise DataError(f"{path}, line {number}: {error}") from error
     if not format_name:
@@ -133,7 +133,7 @@ def _with_property(element: Element, declaration: list[str]) -> Element:
     if column.count is not None and column.count.kind == "f":
         raise ValueError(f"list {shown(name)}: expected an integer type for its length, got {count}")
     if name in (other.name for other in element.properties):
-        raise ValueError(f"element {shown(element.name)}: duplicate property {shown(name)}")
+        raise ValueError(f"element {shown(element.name)}: expected unique properties, got {shown(name)} twice")
     return replace(element, properties=(*element.properties, column))
 
 
@@ -260,7 +260,7 @@ class _Body:
         return lengths
 
     def _view(self, dtype: np.dtype[Any], start: int, rows: int, length: int, stride: int) -> npt.NDArray[Any]:
-        """Return numbers (rows, length) from position `start`, with `stride` between rows, or none beyond the end."""
+        """Return the numbers (rows, length) from position `start`, `stride` between rows; empty if beyond the end."""
         if start + (rows - 1) * stride + length * self._size(dtype) > self._end:
             return np.empty((0, 0))
         stored = np.dtype(np.float64) if self._text else dtype.newbyteorder(self._order)
@@ -291,7 +291,7 @@ class _Body:
         return counts + sum(n * self._size(c.dtype) for c, n in zip(element.properties, lengths, strict=True))
 
     def _uniform(self, element: Element, lengths: list[int]) -> Element:
-        """Read rows of equal length as strided views."""
+        """Return the element with rows of equal length, read as strided views."""
         stride, start, position = self._stride(element, lengths), self._position, self._position
         scalars: dict[str, Array] = {}
         lists: dict[str, tuple[Array, Int64]] = {}
@@ -311,7 +311,7 @@ class _Body:
         return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(start + row * stride))
 
     def _ragged(self, element: Element) -> Element:
-        """Read rows of different lengths, one after the other."""
+        """Return the element with rows of different lengths, read one after the other."""
         lengths = np.empty((len(element.properties), element.rows), np.int64)
         starts = np.empty(element.rows, np.int64)
         for row in range(element.rows):

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.files.number_lines import COMMENT, SHOWN, numbers, read_lines
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
@@ -37,7 +37,7 @@ class TumLine:
         """Return the rigid T_world_camera (4, 4). Raises DataError for an invalid pose."""
         return rigid_pose(self._place, self.position, self.quat_xyzw)
 
-    def fault(self, message: str) -> DataError:
+    def error(self, message: str) -> DataError:
         return DataError(f"{self._place}: {message}")
 
     @property
@@ -68,7 +68,7 @@ def read_tum(path: Path) -> tuple[Float64, Float64]:
     lines = read_tum_lines(path)
     for before, line in pairwise(lines):
         if line.timestamp <= before.timestamp:
-            raise line.fault(f"expected a timestamp > {before.timestamp:.12g} s, got {line.timestamp:.12g} s")
+            raise line.error(f"expected a timestamp > {before.timestamp:.12g} s, got {line.timestamp:.12g} s")
     timestamps = np.array([line.timestamp for line in lines], np.float64)
     return timestamps, np.array([line.pose() for line in lines], np.float64).reshape(-1, 4, 4)
 
@@ -93,7 +93,7 @@ def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence
     T_all = np.array(poses, np.float64).reshape(-1, 4, 4)
     quat_xyzw = Rotation.from_matrix(T_all[:, :3, :3]).as_quat(canonical=True) if len(T_all) else np.zeros((0, 4))
     rows = np.column_stack([T_all[:, :3, 3], quat_xyzw])
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for timestamp, row in zip(timestamps, rows, strict=True):
             file.write(f"{timestamp:.9f} " + " ".join(f"{value:.12g}" for value in row) + "\n")
 

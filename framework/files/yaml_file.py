@@ -15,9 +15,9 @@ from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import read_text
 
 LARGEST_FILE = 2**22  # bytes; the config of a run has 3 KB, the config of a sweep 20 KB
-DEEPEST = 50  # nested mappings and lists
-TOO_DEEP = f"expected at most {DEEPEST} nested mappings and lists, got deeper nesting"
-MOST_VALUES = 200_000  # keys and values after the expansion of aliases
+MAX_DEPTH = 50  # nested mappings and lists
+TOO_DEEP = f"expected at most {MAX_DEPTH} nested mappings and lists, got deeper nesting"
+MAX_VALUES = 200_000  # keys and values after the expansion of aliases
 
 _EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loader is ten times as fast
 
@@ -25,18 +25,18 @@ _EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loa
 def load_yaml(path: Path) -> Any:
     """Return the DictConfig or ListConfig of a YAML file. Raises DataError."""
     text = read_text(path, LARGEST_FILE)
-    with yaml_faults(path):
+    with yaml_errors(path):
         check_yaml(path, text)
         return OmegaConf.create(text)
 
 
 @contextmanager
-def yaml_faults(path: Path) -> Iterator[None]:
+def yaml_errors(path: Path) -> Iterator[None]:
     """Convert errors of loading a file to a DataError that names the file."""
     try:
         yield
     except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, OverflowError) as error:
-        raise DataError(f"{path}: cannot be read: {in_one_line(error)}") from error
+        raise DataError(f"{path}: expected valid YAML, got an error ({in_one_line(error)})") from error
 
 
 def _events(where: object, text: str) -> Iterator[Any]:
@@ -70,9 +70,9 @@ def check_yaml(where: object, text: str) -> None:
             count = counts.pop()
             counts[-1] += count
             anchors[open_anchors.pop()] = count
-        if len(counts) > DEEPEST:
+        if len(counts) > MAX_DEPTH:
             raise DataError(f"{where}: {TOO_DEEP}")
-        if counts[-1] > MOST_VALUES:
+        if counts[-1] > MAX_VALUES:
             raise DataError(
-                f"{where}: expected at most {MOST_VALUES} keys and values with aliases expanded, got {counts[-1]}"
+                f"{where}: expected at most {MAX_VALUES} keys and values with aliases expanded, got {counts[-1]}"
             )

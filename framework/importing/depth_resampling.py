@@ -34,7 +34,7 @@ class DepthRegistration:
 
 
 def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, target_color: UInt8) -> Float32:
-    """Return the depth (H, W) of the camera `target` in m from the depth (h, w) of the whole image of `camera` in m.
+    """Return the depth (H, W) m of the camera `target`, resampled from the depth (h, w) m of the view of `camera`.
 
     `color` and `target_color` are the images (., ., 3) of the two cameras, which have the same pose. If the four depth
     readings around a pixel belong to one surface, their inverses are interpolated, which is exact for a plane.

@@ -37,7 +37,7 @@ def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, reg
 
 @njit(cache=True, nogil=True)
 def upsample(depth: Float32, guide: UInt8, u: Float64, v: Float64, color: UInt8, found: Float32) -> None:
-    """Fill `found` (H, W) from the coordinates u (W,), v (H,) in depth (h, w) with the colors guide (h, w, 3)."""
+    """Fill `found` (H, W) with `depth` (h, w) at the coordinates u (W,), v (H,); `guide` (h, w, 3) is its color."""
     height, width = depth.shape
     for row in range(len(v)):
         if not -0.5 <= v[row] <= height - 0.5:

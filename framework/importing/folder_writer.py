@@ -12,11 +12,11 @@ import numpy as np
 from tqdm import tqdm
 
 from framework.config.validation import require
-from framework.data import MOST_PIXELS, Array, Camera, Float64
+from framework.data import MAX_PIXELS, Array, Camera, Float64
 from framework.datasets.calibration.camera_json import DISTORTION
 from framework.datasets.calibration.color_registration import ColorRegistration
 from framework.errors import DataError
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.files.json_file import write_json
 from framework.files.number_lines import write_gravity, write_image_times
 from framework.files.tum_trajectory import write_tum
@@ -39,7 +39,7 @@ class Writing:
     rotate: int = 0  # rotation of the written images, degrees clockwise, 0, 90, 180 or 270
 
     def __post_init__(self) -> None:
-        require(0 <= self.width <= MOST_PIXELS, "--width", self.width, f"a value in [0, {MOST_PIXELS}] px")
+        require(0 <= self.width <= MAX_PIXELS, "--width", self.width, f"a value in [0, {MAX_PIXELS}] px")
         require(self.stride >= 1, "--stride", self.stride, "at least 1")
         require(self.rotate in range(0, 360, QUARTER), "--rotate", self.rotate, "0, 90, 180 or 270 degrees")
         require(UNSURE <= self.confidence <= SURE, "--confidence", self.confidence, "0, 1 or 2")
@@ -109,7 +109,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
         written.ups.append(frame.up)
     if camera is None:
         reason = f"first error: {written.errors[0]}" if written.errors else "the recording has no frames"
-        raise DataError(f"expected usable frames, got none; {reason}")
+        raise DataError(f"{source.format}: expected usable frames, got none; {reason}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
     if any(time is not None for time in written.depth_timestamps):
@@ -143,5 +143,5 @@ def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int
 
 def _write_image(path: Path, image: Array, *parameters: int) -> None:
     _, data = cv2.imencode(path.suffix, image, parameters)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())

@@ -60,7 +60,7 @@ class Source:
     frames: Iterable[StoredFrame]  # in order of time
     count: int  # number of frames
     posed: bool  # True if the recording has poses; frames without a pose are then skipped
-    distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
+    distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ def arkit_up(T_world_camera: Float64) -> Float64:
 
 
 def meters(raw: NDArray[np.uint16]) -> Float32:
-    """Convert stored millimeters to depth (h, w) in m. The value 65535, no reading in some sensors, becomes 0."""
+    """Return stored millimeters (h, w) as depth in m. The value 65535 (no reading in some sensors) becomes 0."""
     return np.where(raw == np.iinfo(np.uint16).max, 0, raw).astype(np.float32) / np.float32(1000)
 
 
 def readings(depth: NDArray[np.floating]) -> Float32:
-    """Convert stored meters (h, w) to float32. Values that are not positive and finite become 0."""
+    """Return stored meters (h, w) as float32 depth. Values that are not positive and finite become 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

@@ -23,9 +23,9 @@ from framework.interfaces import SceneMap
 
 log = logging.getLogger(__name__)
 
-SNAPSHOT_SHARE = 0.02  # maximum fraction of the pipeline's time for snapshots of the map
+SNAPSHOT_FRACTION = 0.02  # maximum fraction of the pipeline's time for snapshots of the map
 FIRST_UP, UP_GROWTH = 2, 4  # the up direction is estimated at snapshots 2, 8, 32, ...; an estimate takes 0.1 s
-PICTURE_SHARE, MAP_SHARE = 0.08, 0.08  # maximum fractions of a core's time for drawing images and maps
+PICTURE_FRACTION, MAP_FRACTION = 0.08, 0.08  # maximum fractions of a core's time for drawing images and maps
 IDLE_S = 0.5  # delay before drawing pending data without a new frame
 LAST_S = 30.0  # maximum wait for the last drawing at the end of a run
 
@@ -63,7 +63,7 @@ class MapSnapshot:
 class Drawing(Protocol):
     """Receiver of updates, called from one thread only."""
 
-    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: FrameUpdate | None) -> None:
+    def draw_frames(self, notes: Sequence[FrameNote], skipped: Sequence[str], picture: FrameUpdate | None) -> None:
         """Draw the frames since the last call, the reasons for skipped frames, and a new image if available."""
 
     def draw_map(self, snapshot: MapSnapshot) -> None:
@@ -78,7 +78,7 @@ class _Pending:
     """Data for the next drawing."""
 
     notes: list[FrameNote] = field(default_factory=list)
-    faults: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
     picture: FrameUpdate | None = None
     snapshot: MapSnapshot | None = None
 
@@ -88,10 +88,10 @@ class DrawingThread:
 
     def __init__(self, scene: SceneMap, drawing: Drawing, frame_interval: int, map_interval: float) -> None:
         self._scene, self._drawing, self._frame_interval = scene, drawing, frame_interval
-        self._snapshots = Pace(map_interval, SNAPSHOT_SHARE)
+        self._snapshots = Pace(map_interval, SNAPSHOT_FRACTION)
         self._taken, self._next_up = 0, FIRST_UP  # snapshots
-        self._pictures = Pace(0.0, PICTURE_SHARE, time.thread_time)
-        self._maps = Pace(map_interval, MAP_SHARE, time.thread_time)
+        self._pictures = Pace(0.0, PICTURE_FRACTION, time.thread_time)
+        self._maps = Pace(map_interval, MAP_FRACTION, time.thread_time)
         self._frames = 0
         self._up: Float64 | None = None
         self._last: FrameNote | None = None  # of the integrated frames
@@ -119,11 +119,11 @@ class DrawingThread:
         if self._pending.snapshot is not None or self._pictures.due():
             self._wanted.set()
 
-    def skip(self, fault: str) -> None:
+    def skip(self, reason: str) -> None:
         """Add an unusable frame."""
         with self._lock:
             if not self._failed:
-                self._pending.faults.append(fault)
+                self._pending.skipped.append(reason)
 
     def end(self) -> None:
         """Draw pending data and the final map, and close the drawing."""
@@ -170,9 +170,9 @@ class DrawingThread:
     def _draw(self) -> None:
         with self._lock:
             pending, self._pending = self._pending, _Pending()
-        if pending.notes or pending.faults:
+        if pending.notes or pending.skipped:
             with self._pictures.kept():
-                self._drawing.draw_frames(pending.notes, pending.faults, pending.picture)
+                self._drawing.draw_frames(pending.notes, pending.skipped, pending.picture)
         if pending.snapshot is not None:
             with self._maps.kept():
                 self._drawing.draw_map(pending.snapshot)
@@ -189,9 +189,9 @@ class DrawingThread:
 class Pace:
     """Rate limiter: once per `interval` s, and at most a fraction of the time measured by `clock`."""
 
-    def __init__(self, interval: float, share: float, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(self, interval: float, fraction: float, clock: Callable[[], float] = time.perf_counter) -> None:
         self.interval = interval  # s
-        self.share = share  # in (0, 1]
+        self.fraction = fraction  # in (0, 1]
         self.clock = clock  # s; time.thread_time measures only the CPU time of the calling thread
         self._next = 0.0  # s, by time.perf_counter
 
@@ -204,4 +204,4 @@ class Pace:
         began, before = time.perf_counter(), self.clock()
         self._next = began + self.interval
         yield
-        self._next = began + max(self.interval, (self.clock() - before) / self.share)
+        self._next = began + max(self.interval, (self.clock() - before) / self.fraction)

@@ -46,17 +46,17 @@ class InstanceColors:
         return colors
 
 
-MOST_POINTS = 8_000  # maximum number of map points projected into a frame
+MAX_POINTS = 8_000  # maximum number of map points projected into a frame
 NEAR = 0.05  # maximum distance between a point and the depth reading, relative to depth
-LEAST_SHARE = 0.3  # minimum fraction of the points under a mask with its instance
+MIN_FRACTION = 0.3  # minimum fraction of the points under a mask with its instance
 
 
 def seen_instances(masks: Bool, frame: Frame, T_world_camera: Float64, mesh: InstanceMesh) -> Int32:
-    """Return the instance (N,) of most points under each mask (N, H, W); 0 = no instance has LEAST_SHARE of the points.
+    """Return the instance (N,) with the most points under each mask (N, H, W); 0 = below MIN_FRACTION of the points.
 
     The points are mesh vertices with or without an instance that agree with the frame's depth.
     """
-    chosen = slice(None, None, -(-len(mesh.vertices) // MOST_POINTS) or 1)
+    chosen = slice(None, None, -(-len(mesh.vertices) // MAX_POINTS) or 1)
     points_camera = transform(inverse(T_world_camera), mesh.vertices[chosen])
     ids = mesh.instance_ids[chosen]
     in_front = points_camera[:, 2] > 0
@@ -75,4 +75,4 @@ def _most(ids: Int32) -> int:
     counts = np.bincount(ids, minlength=1)
     counts[0] = 0
     best = int(counts.argmax())
-    return best if counts[best] > LEAST_SHARE * len(ids) else 0
+    return best if counts[best] > MIN_FRACTION * len(ids) else 0

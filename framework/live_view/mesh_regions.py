@@ -16,7 +16,7 @@ Region = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class MeshPart:
-    """The triangles with the first vertex in a region, and all vertices of these triangles."""
+    """The triangles whose first vertex is in a region, with all of their vertices."""
 
     vertices: Float32  # (V, 3) m, world
     triangles: Int32  # (F, 3); no vertices and no triangles = removed part

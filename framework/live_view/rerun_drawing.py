@@ -31,7 +31,7 @@ PATH_COLOR, LOST_COLOR = (40, 160, 255), (230, 60, 50)
 NAME_RADIUS = 0.005  # m
 PATH_RADIUS = 0.004  # m
 FRUSTUM_M = 0.25  # m, distance of the image plane from the camera
-LEAST_TURN = 0.01  # minimum change of the up direction (unit vector)
+MIN_TURN = 0.01  # minimum change of the up direction (unit vector)
 
 
 class RerunDrawing:
@@ -58,12 +58,12 @@ class RerunDrawing:
         recording.log(at.STAGE_MS, rerun.SeriesLines(names=stages, colors=colors), static=True)
         self._name_masks()
 
-    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: FrameUpdate | None) -> None:
+    def draw_frames(self, notes: Sequence[FrameNote], skipped: Sequence[str], picture: FrameUpdate | None) -> None:
         for note in notes:
             self._note(note)
         self._draw_times(notes)
-        for fault in faults:
-            self._recording.log(at.LOG, self._rr.TextLog(f"skipped: {fault}", level="WARN"))
+        for reason in skipped:
+            self._recording.log(at.LOG, self._rr.TextLog(f"skipped: {reason}", level="WARN"))
         if self._path:
             self._draw_path()
         if picture is not None:
@@ -104,7 +104,7 @@ class RerunDrawing:
 
     def _turn(self, up: Float64) -> None:
         """Rotate the world frame to align `up` (3,) with the z axis of the view."""
-        if self._up is None or not np.allclose(self._up, up, atol=LEAST_TURN):
+        if self._up is None or not np.allclose(self._up, up, atol=MIN_TURN):
             self._up = up
             self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._forward)))
 

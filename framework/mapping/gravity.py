@@ -17,7 +17,7 @@ from framework.errors import DataError
 from framework.interfaces import Gravity
 from framework.mapping.storage.map_header import MapHeader
 
-MOST_FRAMES = 1e9  # maximum number of frames of a map
+MAX_FRAMES = 1e9  # maximum number of frames of a map
 AGREED = 0.95  # minimum length of the mean of the sensor's unit vectors, as for vectors within 18 degrees of the mean
 DIGITS = 6  # decimals of a frame's contribution; the last digits of float64 depend on the memory layout
 SAMPLED = 20_000  # triangles that refine a direction; every VOTING-th triangle votes for candidates
@@ -27,10 +27,10 @@ SPREAD = np.radians(4.0)  # standard deviation of the normals of level and uprig
 NEAR = np.radians(10.0)  # maximum angle from the direction for surfaces that refine it
 HELD_WITHIN = np.radians(50.0)  # largest angle between up and the mean upper edge of the images
 FACING_UP = 2.0  # weight of surface that faces up; without it, the three axes of a box-shaped room have equal votes
-LEAST_SHARE = 0.15  # minimum fraction of the surface that is level or upright; a heap of objects has less
+MIN_FRACTION = 0.15  # minimum fraction of the surface that is level or upright; a heap of objects has less
 LEVEL = np.cos(np.radians(18.0))  # minimum dot product of up and the normal of a floor
 STEP = 0.05  # bin size of heights, m
-FLOOR_SHARE = 0.05  # minimum fraction of all level surfaces within a step of the floor height
+FLOOR_FRACTION = 0.05  # minimum fraction of all level surfaces within a step of the floor height
 BELOW_FLOOR = 0.02  # maximum fraction of all surface below the floor: noise, windows and mirrors
 
 
@@ -114,14 +114,14 @@ class GravityEstimator:
         directions = directions[directions @ camera_up > np.cos(HELD_WITHIN)]
         votes = level_or_upright(normals[::VOTING], areas[::VOTING], directions, FACING_UP)
         best = directions[int(votes.argmax())]
-        share = level_or_upright(normals[::VOTING], areas[::VOTING], best[None])
-        return _refined(best, normals, areas) if share[0] >= LEAST_SHARE else None
+        fraction = level_or_upright(normals[::VOTING], areas[::VOTING], best[None])
+        return _refined(best, normals, areas) if fraction[0] >= MIN_FRACTION else None
 
 
 def _vector(header: MapHeader, key: str) -> Float64:
     saved = header.items(key)
     numbers = [float(value) for value in saved if isinstance(value, int | float)]
-    if len(numbers) != 3 or len(saved) != 3 or not (np.abs(numbers) < MOST_FRAMES).all():
+    if len(numbers) != 3 or len(saved) != 3 or not (np.abs(numbers) < MAX_FRAMES).all():
         raise DataError(f"{key}: expected three numbers (a sum of unit vectors), got {saved!r:.60}")
     return np.array(numbers)
 
@@ -144,7 +144,7 @@ def half_sphere(count: int) -> Float64:
 
 
 def level_or_upright(normals: Float64, areas: Float64, directions: Float64, facing_up: float = 1.0) -> Float64:
-    """Return the fraction (D,) of the surface that is level or upright if a direction is up.
+    """Return the fraction (D,) of the surface that is level or upright, for each candidate up direction.
 
     Surface that faces the direction counts `facing_up` times.
     """
@@ -180,7 +180,7 @@ def floor_height(vertices: Float32, triangles: Int32, up: Float64) -> float | No
     edges = np.arange(heights[level].min(), heights[level].max() + 2 * STEP, STEP)
     area, _ = np.histogram(heights[level], edges, weights=areas[level])
     wide = area + np.append(area[1:], 0)  # a floor may lie on the edge between two steps
-    lowest = int(np.argmax(wide >= FLOOR_SHARE * area.sum()))
+    lowest = int(np.argmax(wide >= FLOOR_FRACTION * area.sum()))
     within = level & (heights >= edges[lowest]) & (heights < edges[lowest] + 2 * STEP)
     height = float(np.average(heights[within], weights=areas[within]))
     below = areas[heights < height - 2 * STEP].sum()

@@ -21,7 +21,7 @@ from framework.mapping.storage.map_file import (
     check_known,
     check_like,
     check_numbers,
-    faults_of,
+    map_file_errors,
     plain_table,
     read_map,
     table_arrays,
@@ -70,7 +70,7 @@ class InstanceMap(InstanceTableMap):
         super().begin(classes)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """See LabeledMap."""
+        """Return the instance at every stride-th depth reading; see `LabeledMap.instances_seen`."""
         instance_ids = np.empty(tuple(-(-side // stride) for side in frame.depth.shape), np.int32)
         view = pinhole(frame.camera, T_world_camera)
         look_up_instances(self.volume.voxels.grid, self.labels.evidence, frame.depth, view, stride, instance_ids)
@@ -85,7 +85,7 @@ class InstanceMap(InstanceTableMap):
         return {int(k): evidence[k] for k in np.flatnonzero(counts)}
 
     def merge(self, kept: int, dropped: int) -> None:
-        """See LabeledMap."""
+        """Merge instance `dropped` into `kept`, in the table and in every voxel."""
         self.table.merge(kept, dropped)
         self.labels.merge_instances(kept, dropped)
         self.volume.changed(NO_BLOCKS)
@@ -131,7 +131,7 @@ class InstanceMap(InstanceTableMap):
     @classmethod
     def load(cls, path: Path | str) -> InstanceMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields))
-        with faults_of(path):
+        with map_file_errors(path):
             classes, storage = header.classes(), header.option("storage", Storage)
             table = table_of(header.part("table"), len(classes), arrays)
             volume = TsdfVolume.load(header, arrays, len(arrays["labeled"]))
@@ -150,8 +150,10 @@ class InstanceMap(InstanceTableMap):
             check_numbers("labeled", arrays["labeled"], len(arrays["instance_ids"]))
             check_known("class_ids", arrays["class_ids"], [*range(len(classes)), NO_CLASS])
             check_known("instance_ids", arrays["instance_ids"], [0, *table.records])
-            if (arrays["class_ids"][:, 0] == NO_CLASS).any():
-                raise DataError("class_ids: expected a class in the first slot of each voxel with labels")
+            if count := int((arrays["class_ids"][:, 0] == NO_CLASS).sum()):
+                raise DataError(
+                    f"class_ids: expected a class in slot 0 of each labeled voxel, got a free slot 0 in {count} voxels"
+                )
             scene.labels.fill(Evidence(**{name: arrays[name] for name in Evidence._fields}))
             scene.labels.evicted = header.whole("evicted")
             scene.table = table

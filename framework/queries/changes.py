@@ -24,12 +24,12 @@ from framework.interfaces import SceneMap
 LOOKS = 60  # number of evenly spaced poses for rendering the map of a visit
 EYE = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)  # assumed camera of a visit: half the resolution of a Kinect
 SAMPLED = 400  # maximum number of sampled vertices of an object
-BEHIND, BEHIND_SHARE = 0.06, 0.02  # m and m per m of depth: minimum distance of a surface behind free space
-LEAST_SEEN = 0.3  # minimum fraction of an object's vertices observed in the other visit
+MIN_GAP, MIN_GAP_PER_DEPTH = 0.06, 0.02  # m and m per m of depth: minimum distance of a surface behind free space
+MIN_SEEN = 0.3  # minimum fraction of an object's vertices observed in the other visit
 MAX_DISTANCE = 0.05  # m, maximum distance to a vertex of the other map at the same position
-STAYS = 0.9  # prior probability that an object stays from one visit to the next
+STAY_PROBABILITY = 0.9  # prior probability that an object stays from one visit to the next
 CLUTTER = 0.1  # probability of another surface or object at the position of an absent object
-GONE = 0.5  # minimum probability of a vanished object
+MIN_GONE = 0.5  # minimum probability of a vanished object
 SAME_THING = 0.3  # minimum common fraction of the surface for the same object in both visits
 
 
@@ -80,7 +80,7 @@ class _Object:
 
     @property
     def is_gone(self) -> bool:
-        return self.gone >= GONE and self.seen >= LEAST_SEEN
+        return self.gone >= MIN_GONE and self.seen >= MIN_SEEN
 
     @property
     def confidence(self) -> float:
@@ -99,7 +99,7 @@ def changes(before: Visit, after: Visit) -> list[Change]:
         found.append(Change(Kind.MOVED, a.name, probability, a.instance.id, b.instance.id, end, distance))
     moved_before, moved_after = {a.instance.id for a, _, _ in pairs}, {b.instance.id for _, b, _ in pairs}
     found += [_change(a, Kind.VANISHED) for a in old if a.instance.id not in moved_before]
-    stayed = {a.match for a in old if a.gone < GONE and a.seen >= LEAST_SEEN}  # already listed
+    stayed = {a.match for a in old if a.gone < MIN_GONE and a.seen >= MIN_SEEN}  # already listed
     found += [_change(b, Kind.APPEARED) for b in new if b.instance.id not in moved_after | stayed]
     order = [Kind.MOVED, Kind.VANISHED, Kind.APPEARED, Kind.STAYED, Kind.NOT_SEEN]
     changed = {Kind.MOVED, Kind.VANISHED, Kind.APPEARED}
@@ -129,7 +129,7 @@ def _observe(visit: Visit, other: Visit) -> list[_Object]:
 
 
 def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
-    """Return two masks (P,) of the points (P, 3) m, world: observed surface, and observed free space.
+    """Return two masks (P,) of world points (P, 3) m: points on an observed surface, and in observed free space.
 
     A point is free space if it is free from at least one pose, regardless of the other poses.
     """
@@ -142,7 +142,7 @@ def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
         inside = (u >= 0) & (u < EYE.width) & (v >= 0) & (v < EYE.height)
         visible, surface = in_front[inside], depth[v[inside], u[inside]]
         behind = surface - points_camera[visible, 2]
-        tolerance = BEHIND + BEHIND_SHARE * points_camera[visible, 2]
+        tolerance = MIN_GAP + MIN_GAP_PER_DEPTH * points_camera[visible, 2]
         known = surface > 0
         there[visible[known & (np.abs(behind) <= tolerance)]] = True
         through[visible[known & (behind > tolerance)]] = True
@@ -162,13 +162,13 @@ def probability_gone(confidence: float, there: Bool, through: Bool, matched: boo
         matched: True if the other visit has an object at the same position.
     """
     observed = int(np.count_nonzero(there | through))
-    if observed < LEAST_SEEN * len(there):
-        return 1 - STAYS
-    share = np.count_nonzero(there) / observed
-    surface = (CLUTTER + (1 - CLUTTER) * share) / (CLUTTER + (1 - CLUTTER) * (1 - share))
+    if observed < MIN_SEEN * len(there):
+        return 1 - STAY_PROBABILITY
+    fraction = np.count_nonzero(there) / observed
+    surface = (CLUTTER + (1 - CLUTTER) * fraction) / (CLUTTER + (1 - CLUTTER) * (1 - fraction))
     detected = min(max(confidence, CLUTTER), 1 - CLUTTER)
     label = detected / CLUTTER if matched else (1 - detected) / (1 - CLUTTER)
-    odds = STAYS / (1 - STAYS) * surface * label
+    odds = STAY_PROBABILITY / (1 - STAY_PROBABILITY) * surface * label
     return float(1 / (1 + odds))
 
 
@@ -215,9 +215,9 @@ def _similarity(a: Instance, b: Instance) -> float:
 def _change(one: _Object, kind: Kind) -> Change:
     """Return the change of an unmoved object: STAYED, NOT_SEEN, or `kind` (VANISHED or APPEARED)."""
     found, probability, match = Kind.NOT_SEEN, one.confidence, None
-    if one.seen >= LEAST_SEEN and one.gone < GONE:
+    if one.seen >= MIN_SEEN and one.gone < MIN_GONE:
         found, probability, match = Kind.STAYED, probability * (1 - one.gone), one.match
-    elif one.seen >= LEAST_SEEN:
+    elif one.seen >= MIN_SEEN:
         found, probability = kind, probability * one.gone
     own = one.instance.id
     before, after = (own, match) if kind is Kind.VANISHED else (match, own)

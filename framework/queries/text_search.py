@@ -10,14 +10,14 @@ import numpy as np
 
 from framework.data import Float32, Float64, Instance, InstanceMesh
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 from framework.queries.map_queries import Map
 from framework.runs.stored_runs import CONFIG, read_yaml
 from framework.vocabulary.color_names import COLOR_NAMES, fits, nearest_names
 from framework.vocabulary.text_queries import object_words
 
 BY = ("embeddings", "names")
-LEAST_MATCH = 0.1  # minimum similarity by names
+MIN_MATCH = 0.1  # minimum similarity by names
 LONGEST_QUERY = 1000  # maximum characters of a query
 NAME_IT = "set --model (Python: model=)"
 WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instancemap[transformers])"
@@ -97,7 +97,7 @@ def _model_of(run: Path | None) -> tuple[str, str]:
     """Return the model and revision of a run's detector. Raises DataError if its config has no model."""
     if run is None:
         raise DataError(f"model: expected the model of the map's embeddings, got none; {NAME_IT}, or query its run")
-    node = read_yaml(run / CONFIG).get("detector") if is_there(run / CONFIG) else None
+    node = read_yaml(run / CONFIG).get("detector") if path_exists(run / CONFIG) else None
     if isinstance(node, dict) and isinstance(node.get("model"), str):
         return node["model"], str(node.get("revision", "main"))
     raise DataError(f"{run / CONFIG}: expected the model of the embeddings in detector.model, got none; {NAME_IT}")
@@ -135,7 +135,7 @@ def by_names(scene: Map, query: str) -> list[Match]:
         for k, instance in scene.instances().items():
             of_class = float(instance.class_probabilities[columns].sum()) if columns else 1.0
             match = of_class * (color_fit(mesh, instance, words.colors) if words.colors else 1.0)
-            if match >= LEAST_MATCH:
+            if match >= MIN_MATCH:
                 matches[k] = round(match, 2)  # finer differences are not significant
         return _found(scene, matches)
 

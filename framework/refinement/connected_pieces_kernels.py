@@ -106,7 +106,7 @@ def _keep_near(
 
 @njit(cache=True, nogil=True)
 def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
-    """Return the largest waiting component; ties go to the first. Few components; np.argsort compiles slowly."""
+    """Return the largest waiting component; ties go to the first. A scan, because np.argsort compiles slowly."""
     largest = -1
     for piece in pieces:
         if waiting[piece] and (largest < 0 or sizes[piece] > sizes[largest]):

@@ -88,7 +88,7 @@ class Surroundings:
         return np.diff(self.windows.firsts)
 
     def of_at_least(self, min_points: int) -> Bool:
-        """Return an array (N,), True for clusters with at least `min_points` points, also in the ring, if any."""
+        """Return an array (N,), True for clusters with `min_points` or more points in the mask and in any ring."""
         return np.asarray(
             (self.mask_counts >= min_points) & ((self.ring_counts >= min_points) | (self.ring_widths == 0))
         )
@@ -180,7 +180,7 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
 
 
 def thread_schedule(costs: Int64) -> ThreadSchedule:
-    """Distribute N clusters over the threads, costliest first, to the thread with the least work (Graham 1969).
+    """Return the clusters of each thread: costliest first, to the thread with the least work (Graham 1969).
 
     Numba splits a parallel loop into parts of equal length, but a few large clusters contain most of the points.
     """

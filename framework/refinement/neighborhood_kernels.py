@@ -36,7 +36,7 @@ class ThreadSchedule(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
-    """Return a stable sort of the points by cluster: indices (members,) and cluster starts (n + 1,).
+    """Return the points' indices (members,), stably sorted by cluster, and the cluster starts (n + 1,).
 
     Points of no cluster (-1) are omitted.
     """
@@ -57,7 +57,7 @@ def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
 
 @njit(cache=True, nogil=True)
 def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tuple[Int64, Int64]:
-    """Assign clusters to threads by cost; return the clusters in thread order, and the start of each thread."""
+    """Return the clusters in thread order, assigned by cost, and the start of each thread."""
     loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
     for k in longest_first:
         least = 0
@@ -222,7 +222,7 @@ def _spread_across(neighbors: Int16, row: Int16, middle: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
-    """Set row to min(row, across + step, before or behind + diagonal), vectorized without min() and offsets."""
+    """Set `row` to the minimum of row, across + step, and before or behind + diagonal, in vectorizable code."""
     for i in range(len(row)):
         diagonal = np.int16((before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL)
         straight = np.int16(across[i] + CHAMFER_STEP)
@@ -235,7 +235,7 @@ def gather(
     windows: Windows, steps: Int16, depth: Float32, pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64,
     schedule: ThreadSchedule, points: Float32, depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    """Set the points, like geometry.back_project, and their depth in the mask."""
+    """Set the points, as geometry.back_project would, and their depth in the mask."""
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:

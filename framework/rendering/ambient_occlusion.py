@@ -28,8 +28,8 @@ def openness(camera: Camera, depth: Float32, normals_camera: Float32) -> Float32
     trace_occlusion(depth, normals_camera, camera.K.astype(np.float32), _directions(), _reaches(), occluded)
     # mean of the valid pixels of a tile
     mean = cv2.blur(occluded, (TILE, TILE))
-    share = cv2.blur((depth > 0).astype(np.float32), (TILE, TILE))
-    return np.asarray(1 - DEPTH * mean / np.maximum(share, 1e-6), np.float32)
+    fraction = cv2.blur((depth > 0).astype(np.float32), (TILE, TILE))
+    return np.asarray(1 - DEPTH * mean / np.maximum(fraction, 1e-6), np.float32)
 
 
 def _directions() -> Float32:
@@ -41,8 +41,8 @@ def _directions() -> Float32:
 
 
 def _reaches() -> Float32:
-    """Return the sampled distances along a ray (TILE^2, STEPS) m: jittered distances and the end."""
+    """Return the sampled distances (TILE^2, STEPS) m along a ray: jittered distances, and the end of the ray."""
     pixel = np.arange(TILE**2)
     shift = (pixel * 5 % TILE**2 + 0.5) / TILE**2
-    share = (np.arange(STEPS) + shift[:, None]) / (STEPS - 1)
-    return np.asarray(RANGE_M * np.minimum(share, 1), np.float32)
+    fraction = (np.arange(STEPS) + shift[:, None]) / (STEPS - 1)
+    return np.asarray(RANGE_M * np.minimum(fraction, 1), np.float32)

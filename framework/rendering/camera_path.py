@@ -24,7 +24,7 @@ class ProjectedPath:
 
     @classmethod
     def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> ProjectedPath:
-        """Project the positions of `poses` (F, 4, 4) into `camera`; `hits` is the view of the surface."""
+        """Return the positions of `poses` (F, 4, 4) in the image of `camera`; `hits` is its view of the surface."""
         positions = poses[:, :3, 3]
         points = transform(inverse(T_world_camera), positions)
         points = points[points[:, 2] > 0.05]
@@ -37,8 +37,8 @@ class ProjectedPath:
 
     def shades(self) -> UInt8:
         """Return RGB colors (F, 3) from blue to orange."""
-        share = np.linspace(0, 1, max(2, len(self.pixels)))[: len(self.pixels), None]
-        mixed = (1 - share) * np.array(PATH_START) + share * np.array(PATH_END)
+        fraction = np.linspace(0, 1, max(2, len(self.pixels)))[: len(self.pixels), None]
+        mixed = (1 - fraction) * np.array(PATH_START) + fraction * np.array(PATH_END)
         return np.asarray(np.rint(mixed), np.uint8)
 
     def draw(self, image: Image.Image) -> None:

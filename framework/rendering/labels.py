@@ -40,7 +40,7 @@ class Label:
 
 
 def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tuple[float, float]]) -> list[Label]:
-    """Place the `names` by id in an image of `ids` (H, W), 0 = none, starting with large objects.
+    """Return the placed `names`, given by id, in an image of `ids` (H, W), 0 = none; large objects come first.
 
     Names do not overlap and are inside the image. Names without space are omitted. `size` returns the width and height
     of a text, px.
@@ -63,7 +63,7 @@ def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tup
     for key in shown:
         if key not in labels:
             u, v, _ = widest[key]
-            if place := _place_beside(u, v, size(names[key]), boxes, objects, objects & (ids != key)):
+            if place := _place_next_to(u, v, size(names[key]), boxes, objects, objects & (ids != key)):
                 boxes.append(_box(*place, *size(names[key])))
                 labels[key] = Label(names[key], *place, (u, v))
     return [labels[key] for key in shown if key in labels]
@@ -102,7 +102,7 @@ def _widest_part(mask: Bool) -> tuple[float, float, float]:
     return float(u + column - 1), float(v + row - 1), float(distance[row, column])
 
 
-def _place_beside(
+def _place_next_to(
     u: float, v: float, size: tuple[float, float], boxes: Sequence[Box], objects: Bool, others: Bool
 ) -> tuple[float, float] | None:
     """Return the best free position for the name of an object at (u, v).

@@ -52,7 +52,7 @@ class LitView:
         return self._developed(painted)
 
     def _developed(self, color: Float32) -> UInt8:
-        """Return the lit image at the camera's resolution. Modifies `color`."""
+        """Return the lit image at the camera's resolution; `color` is modified in place."""
         np.clip(color * self._light[..., None], 0, 255, out=color)
         color[self._fine.depth <= 0] = NOTHING
         return np.asarray(cv2.resize(color, self.hits.depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)

@@ -42,7 +42,7 @@ class ObjectColors:
 
 
 def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
-    """Match instances and ground-truth instances (V,) of the same points one-to-one; 0 = none.
+    """Return the ground-truth instance of each matched instance, from both ids (V,) of the same points; 0 = none.
 
     The matching maximizes the sum of IoU. Pairs with an IoU below SAME_OBJECT_IOU are omitted.
     """

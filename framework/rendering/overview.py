@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from framework.data import Float64, InstanceMesh, Int32, UInt8
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.rendering.camera_path import ProjectedPath
 from framework.rendering.labels import draw_labels, place_labels, text_size
 from framework.rendering.lit_view import LitView
@@ -39,7 +39,7 @@ def write_overview(
         title: Title above the images.
     """
     image = overview(mesh, instances, poses, title)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         Image.fromarray(image).save(temporary, compress_level=PNG_LEVEL)
 
 
@@ -80,7 +80,7 @@ def _text_panel(text: str, height: int, x: int, ink: tuple[int, int, int], ancho
 
 
 def _legend(entries: Iterable[tuple[UInt8, str, float]]) -> UInt8:
-    """Draw the names and confidences of the colors, most confident first."""
+    """Return the image of the legend: color, name and confidence of each object, most confident first."""
     ranked = sorted(entries, key=lambda entry: -entry[2])
     rows = min(LEGEND_ROWS, -(-len(ranked) // LEGEND_COLUMNS))
     image = Image.new("RGB", (2 * PANEL_WIDTH, LEGEND_ROW * rows + 20), PAPER)

@@ -26,7 +26,7 @@ def candidates(shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
 
 
 def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """Return RGB colors (N, 3) for objects at centroids (N, 3) m. Nearby objects get dissimilar colors, greedily."""
+    """Return RGB colors (N, 3) for objects at centroids (N, 3) m, greedily chosen dissimilar for nearby objects."""
     rgb = candidates(shades)
     lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
     likeness = np.exp(-np.linalg.norm(lab[:, None] - lab[None], axis=2) / ALIKE)  # (K, K)
@@ -46,7 +46,7 @@ def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[in
 
 
 def class_colors(objects: Sequence[tuple[str, float]]) -> dict[str, UInt8]:
-    """Return RGB colors (3,) by class, given class and confidence of objects; likely classes differ most."""
+    """Return RGB colors (3,) by class, from the class and confidence of objects; likely classes differ most."""
     most: dict[str, float] = {}
     for name, confidence in objects:
         most[name] = max(confidence, most.get(name, 0.0))

@@ -115,9 +115,9 @@ def draw_triangles(
             wa = ea[0] * x[u] + (ea[1] * y[v] + ea[2])
             wb = eb[0] * x[u] + (eb[1] * y[v] + eb[2])
             wc = ec[0] * x[u] + (ec[1] * y[v] + ec[2])
-            share = 1 / (wa + wb + wc)
+            fraction = 1 / (wa + wb + wc)
             triangle[v, u] = order[f]
-            depth[v, u], uv[v, u, 0], uv[v, u, 1] = 1 / closeness[v, u], wb * share, wc * share
+            depth[v, u], uv[v, u, 0], uv[v, u, 1] = 1 / closeness[v, u], wb * fraction, wc * fraction
 
 
 @njit(cache=True, nogil=True)
@@ -174,7 +174,7 @@ def _edge_functions(a, b, c):
 
 @njit(cache=True, nogil=True, inline="always")
 def _in_camera(T, x, y, z):
-    """Transform a world point into the camera frame."""
+    """Return the camera-frame coordinates of a world point."""
     x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
     return (
         T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,

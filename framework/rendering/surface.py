@@ -98,7 +98,7 @@ class Surface:
 
 
 class FrontSides:
-    """The front-facing triangles of a surface from a viewpoint, without back-facing walls and ceilings in between."""
+    """The triangles of a surface that face a viewpoint; back-facing walls and ceilings in front of them are omitted."""
 
     def __init__(self, surface: Surface, eye_world: Float64) -> None:
         self._eye_world = eye_world  # (3,) m

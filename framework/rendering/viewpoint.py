@@ -18,13 +18,13 @@ LEVEL_CONE_RAD = np.deg2rad(30)  # maximum angle of floor normals to the mean up
 
 
 def upward(poses: Float64, surface: Surface) -> Float64:
-    """Estimate the up direction (3,): the mean of the cameras' -y axes, refined by floors and table tops."""
+    """Return the up direction (3,): the mean of the cameras' -y axes, refined by floors and table tops."""
     up = -poses[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
     cone = LEVEL_CONE_RAD
     for _ in range(5):  # mean shift with a narrowing cone
-        mean, share = sum_level_normals(surface.face_normals, up, np.cos(cone))
-        if share < 0.02 or np.linalg.norm(mean) == 0:
+        mean, fraction = sum_level_normals(surface.face_normals, up, np.cos(cone))
+        if fraction < 0.02 or np.linalg.norm(mean) == 0:
             return np.asarray(up)
         up = mean / np.linalg.norm(mean)
         cone = max(cone / 1.5, np.deg2rad(6))
@@ -32,7 +32,7 @@ def upward(poses: Float64, surface: Surface) -> Float64:
 
 
 def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the camera of width x height px and its T_world_camera with the best view.
+    """Return the camera, of width x height px, and the T_world_camera with the best view of a surface.
 
     Args:
         surface: Surface in view.
@@ -76,12 +76,12 @@ def looking(forward: Float64, up: Float64) -> Float64:
 
 
 def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the nearest camera with this rotation and the points (P, 3) inside its image of width x height px."""
+    """Return the nearest camera and pose with this rotation that see the points (P, 3) in width x height px."""
     return _framed(R_world_camera, _without_strays(points_world), width, height)
 
 
 def _without_strays(points: Float32) -> Float32:
-    """Remove outliers at the border of points (P, 3)."""
+    """Return the points (P, 3) without outliers at their border."""
     low, high = np.percentile(points, [0.3, 99.7], axis=0)
     kept = points[((points >= low) & (points <= high)).all(axis=1)]
     return kept if len(kept) else points

@@ -109,9 +109,9 @@ def top_view(
     up: Float64,
     height: float = HEIGHT,
 ) -> tuple[str, float]:
-    """Draw the paths and objects from above; ground-truth paths are dashed.
+    """Return a chart of paths and objects from above, and the size of the paths relative to the view's width.
 
-    Also returns the size of the paths relative to the width of the view.
+    Ground-truth paths are dashed.
     """
     plot_height = height - FOOT
     plane = _horizontal(paths[0].positions, up)
@@ -152,7 +152,7 @@ def top_view(
 
 
 def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> str:
-    """Draw the position error of each frame, errors (n,) m."""
+    """Return a chart of the position error (n,) m of each frame."""
     figure, axes = _chart(height, frames[0], frames[-1], "Position error, mm")
     axes.plot(frames, 1e3 * errors, color=COLORS["accent"], linewidth=2, gid="chart-errors")
     axes.set_ylim(0, max(1.08e3 * float(errors.max(initial=0.0)), 1e-3))
@@ -160,7 +160,7 @@ def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT
 
 
 def stage_areas(times: StageTimes) -> str:
-    """Draw the stacked stage times as running medians."""
+    """Return a chart of the stacked stage times as running medians."""
     chosen = np.unique(np.linspace(0, len(times.frames) - 1, MAX_POINTS).astype(int))
     stages = [row.stage for row in stage_rows(times)]
     layers = [np.nan_to_num(running_median(times.milliseconds[stage], WINDOW))[chosen] for stage in stages]
@@ -174,7 +174,7 @@ def stage_areas(times: StageTimes) -> str:
 
 
 def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int], last_frame: int) -> str:
-    """Draw the fraction of the final surface and the number of final objects up to each frame.
+    """Return a chart of the fraction of the final surface and the number of final objects up to each frame.
 
     Args:
         frames: Frames of `fraction`.
@@ -206,7 +206,7 @@ def round_length(longest: float) -> float:
 
 
 def _chart(height: float, first: float, last: float, title: str, right: float = RIGHT) -> tuple[Figure, Axes]:
-    """Return a figure with empty axes over the frames."""
+    """Return a figure and its empty axes, with frame numbers on the x axis."""
     figure = Figure((WIDTH / 72, height / 72), dpi=72, facecolor="none")
     inner = 1 - (LEFT + right) / WIDTH, 1 - (TOP + BOTTOM) / height
     axes = figure.add_axes((LEFT / WIDTH, BOTTOM / height, *inner), facecolor="none")
@@ -247,7 +247,7 @@ def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, px: float, gid
 
 
 def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) -> str:
-    """Return an `<svg>` element without inline styles: the page's policy forbids inline styles."""
+    """Return an `<svg>` element without inline styles, which the page's policy forbids."""
     file = StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "instancemap"}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # the browser has additional fonts

@@ -22,7 +22,7 @@ from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
-MOST_MAPS = 6  # maximum runs with a map in the page; together they have the size limit of one map
+MAX_MAPS = 6  # maximum runs with a map in the page; together they have the size limit of one map
 
 
 @dataclass(frozen=True)
@@ -94,12 +94,12 @@ class Comparison:
     runs: Sequence[RunContents]
     names: Sequence[str]  # unique
     links: Sequence[str]  # to the page of each run, "" = none
-    scenes: Sequence[MapScene | None]  # of the first MOST_MAPS
+    scenes: Sequence[MapScene | None]  # of the first MAX_MAPS
 
     @classmethod
     def of(cls, runs: Sequence[RunContents], links: Sequence[str]) -> Comparison:
-        """Decimate the maps to a total size of one map."""
-        mapped = runs[:MOST_MAPS]
+        """Return the comparison of the runs, with maps decimated to the total size of one map."""
+        mapped = runs[:MAX_MAPS]
         no_footage = Footage(NOT_CAMERA, {}, {}, {}, {})
         scenes = [MapScene.of(run, no_footage, 1 / len(mapped)) for run in mapped]
         return cls(runs, short_names([run.record.directory for run in runs]), links, scenes)
@@ -133,8 +133,8 @@ class Comparison:
         notices = [
             f"{name} is partial: {run.partial}." for name, run in zip(self.names, self.runs, strict=True) if run.partial
         ]
-        if len(self.runs) > MOST_MAPS:
-            notices.append(f"Only the maps of the first {MOST_MAPS} runs are shown; see the pages of the other runs.")
+        if len(self.runs) > MAX_MAPS:
+            notices.append(f"Only the maps of the first {MAX_MAPS} runs are shown; see the pages of the other runs.")
         return notices
 
     def _metrics(self) -> Table:
@@ -201,7 +201,7 @@ class Comparison:
 
 
 def compared(values: Sequence[float | None], digits: int, better: int) -> list[Cell]:
-    """Mark the best value, and add nonzero rounded differences from the first value."""
+    """Return the cells of a row: the best value is marked, and nonzero rounded differences from the first are added."""
     known = [round(value, digits) for value in values if value is not None]
     best = None if not better or len(set(known)) < 2 else max(known) if better > 0 else min(known)
     cells = []

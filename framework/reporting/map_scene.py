@@ -20,7 +20,7 @@ from framework.rendering.viewpoint import FIELD_OF_VIEW_RAD, best_view, upward
 from framework.reporting.pictures import webp_url
 from framework.reporting.run_contents import RunContents
 from framework.reporting.run_source import Footage
-from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
+from framework.reporting.scene_glb import MAX_BYTES, MAX_TRIANGLES, light_enough, scene_glb
 from framework.reporting.visibility import Sightings, sightings, spread_out
 from framework.runs.instances_file import StoredInstance
 from framework.runs.run_directory import LIKELY
@@ -52,13 +52,13 @@ class MapScene:
     up: Float64  # (3,)
 
     @classmethod
-    def of(cls, contents: RunContents, footage: Footage, share: float = 1.0) -> MapScene | None:
-        """Decimate the map to a fraction `share` of the maximum triangles and bytes. Return None for an empty map."""
+    def of(cls, contents: RunContents, footage: Footage, fraction: float = 1.0) -> MapScene | None:
+        """Return the map, decimated to a fraction of the maximum triangles and bytes; None for an empty map."""
         if contents.mesh is None or not len(contents.poses):
             return None
         mesh = replace(contents.mesh, instance_ids=contents.instance_ids(contents.mesh))
-        mesh = with_finer_objects(mesh, int(share * MOST_TRIANGLES))
-        mesh = light_enough(mesh, int(share * MOST_BYTES))
+        mesh = with_finer_objects(mesh, int(fraction * MAX_TRIANGLES))
+        mesh = light_enough(mesh, int(fraction * MAX_BYTES))
         if not len(mesh.triangles):
             return None
         surface = Surface.seen_from(mesh.vertices, mesh.triangles, contents.poses)
@@ -87,7 +87,7 @@ class MapScene:
         return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
 
     def data(self) -> dict[str, Any]:
-        """Return the data of the viewer's script in addition to the GLB."""
+        """Return the data that the viewer's script needs in addition to the GLB."""
         poses = self.contents.poses
         _, T_world_camera = self.view
         eye, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
@@ -115,7 +115,7 @@ class MapScene:
         }
 
     def progress_pictures(self) -> list[ProgressPicture]:
-        """Render the visible instances at some frames from the initial view. Short runs have no images."""
+        """Return images of the instances visible up to some frames, from the initial view; none for short runs."""
         steps = len(self.sightings.chosen)
         if steps < PROGRESS_PICTURES:
             return []

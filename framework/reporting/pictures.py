@@ -18,7 +18,7 @@ from framework.rendering.surface import Surface
 from framework.reporting.run_source import Footage
 
 WIDTH, HEIGHT = 264, 198  # px
-MANY = 120  # objects; images are smaller for more objects
+MAX_LARGE_PICTURES = 120  # objects; images are smaller for more objects
 QUALITY = 78  # of WebP
 MARGIN = 0.25  # around an object, relative to its size
 MIN_CROP = 0.12  # relative to the width of the image
@@ -50,7 +50,7 @@ class Photographer:
             colors: RGB color (3,) by label.
         """
         taken: dict[int, Picture] = {}
-        scale = 1.0 if len(best) <= MANY else 0.6
+        scale = 1.0 if len(best) <= MAX_LARGE_PICTURES else 0.6
         for k in sorted(set(best.values())):
             image, source = self._seen_from(k)
             ids = self._rasterizer.draw(self._camera, self._poses[k]).nearest(self._mesh.triangles, labels)

@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.data import UNIT_TOLERANCE, Float64, InstanceMesh, Int32
 from framework.errors import DataError
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 from framework.files.tum_trajectory import read_tum
 from framework.runs.instances_file import StoredInstance, read_instances
 from framework.runs.mesh_file import read_mesh
@@ -46,15 +46,15 @@ class RunContents:
     @classmethod
     def read(cls, directory: Path) -> RunContents:
         """Read a run. Raises DataError for a missing run, a damaged file, or files of different runs."""
-        if is_there(directory / METRICS):
+        if path_exists(directory / METRICS):
             record, partial = read_record(directory), ""
-        elif is_there(directory / PARTIAL_METRICS):
+        elif path_exists(directory / PARTIAL_METRICS):
             record, partial = read_partial(directory)
         else:
             raise DataError(f"{directory}: expected a run directory, got no {METRICS} or {PARTIAL_METRICS}")
         mesh, objects = _map_of(record)
         timestamps, poses = np.zeros(0), np.zeros((0, 4, 4))
-        if is_there(directory / TRAJECTORY):
+        if path_exists(directory / TRAJECTORY):
             timestamps, poses = read_tum(directory / TRAJECTORY)
         timings = directory / "timings.csv"
         return cls(
@@ -64,7 +64,7 @@ class RunContents:
             tuple(sorted(objects, key=lambda one: one.id)),
             timestamps,
             poses,
-            read_timings(timings) if is_there(timings) and timings.stat().st_size > len(TIMINGS_HEADER) else None,
+            read_timings(timings) if path_exists(timings) and timings.stat().st_size > len(TIMINGS_HEADER) else None,
         )
 
     @property
@@ -117,6 +117,6 @@ class RunContents:
 def _map_of(record: Record) -> tuple[InstanceMesh | None, list[StoredInstance]]:
     """Read mesh.ply and instances.json. Raises DataError if they belong to different runs."""
     mesh, instances = record.directory / MESH, record.directory / INSTANCES
-    if is_there(mesh) and is_there(instances):
+    if path_exists(mesh) and path_exists(instances):
         return read_objects(record)
-    return read_mesh(mesh) if is_there(mesh) else None, read_instances(instances) if is_there(instances) else []
+    return read_mesh(mesh) if path_exists(mesh) else None, read_instances(instances) if path_exists(instances) else []

@@ -64,7 +64,7 @@ class RunReport:
 
     @classmethod
     def of(cls, contents: RunContents) -> RunReport:
-        """Read the sequence again, if possible."""
+        """Return the report of a run, with images of its sequence if the sequence is still readable."""
         source = RunSource.of(contents)
         chosen = spread_out(len(contents.poses))
         footage = Footage.of(source, chosen, source.camera or NOT_CAMERA)
@@ -149,8 +149,8 @@ class RunReport:
         ]
         path = PlottedPath(contents.poses[:, :3, 3], contents.lost_after)
         true_paths = [self.true_path.positions] if self.true_path is not None else []
-        whole, share = top_view([path], true_paths, footprints, up)
-        if share > SMALL_PATH:
+        whole, fraction = top_view([path], true_paths, footprints, up)
+        if fraction > SMALL_PATH:
             return whole, None
         return whole, top_view([path], true_paths, [], up, FLAT_HEIGHT if true_paths else HEIGHT)[0]
 
@@ -213,7 +213,7 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
 
 
 def overview_url(path: Path) -> str:
-    """Return the scaled overview.png as a `data:` URL, "" if it cannot be read."""
+    """Return the scaled overview.png as a `data:` URL; "" if it cannot be read."""
     try:
         small = Image.fromarray(read_color(path))
     except FrameError:

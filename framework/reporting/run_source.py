@@ -33,7 +33,7 @@ class RunSource:
 
     @classmethod
     def of(cls, contents: RunContents) -> RunSource:
-        """Open the sequence from the run's config. An unreadable sequence is None."""
+        """Return the sequence opened from the run's config. If it is unreadable, `video` is None."""
         dataset = contents.record.dataset
         if any("${" in str(value) for _, value in leaves({"dataset": dataset})):
             return cls(contents, None, "the config of the run is not resolved")
@@ -104,7 +104,7 @@ class Footage:
 
     @classmethod
     def of(cls, source: RunSource, chosen: Sequence[int], camera: Camera) -> Footage:
-        """Read the frames of the chosen poses."""
+        """Return the readable frames of the chosen poses."""
         small = camera.scaled(min(1.0, MAX_WIDTH / camera.width))
         images, frames, positions, sharpness = {}, {}, {}, {}
         for k in chosen:
@@ -131,7 +131,7 @@ class TruePath:
 
     @classmethod
     def of(cls, poses: Float64, true_positions: Mapping[int, Float64]) -> TruePath | None:
-        """Align the ground-truth positions (3,), given by pose index. Return None for fewer than three."""
+        """Return the path of aligned ground-truth positions (3,), given by pose index; None for fewer than three."""
         chosen = sorted(true_positions)
         if len(chosen) < 3:
             return None

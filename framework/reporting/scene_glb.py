@@ -12,9 +12,9 @@ from framework.exporting.glb import T_GLTF_ROOM, Node, glb_of
 from framework.exporting.object_meshes import REST
 from framework.exporting.upright_room import plain_name, upright
 
-MOST_BYTES = 9_500_000  # maximum size of the file, for browsers of phones
+MAX_BYTES = 9_500_000  # maximum size of the file, for browsers of phones
 BYTES_OF_VERTEX, BYTES_OF_TRIANGLE = 24, 12  # position, color, first view; three indices
-MOST_TRIANGLES = 300_000  # 7 MB together with their vertices
+MAX_TRIANGLES = 300_000  # 7 MB together with their vertices
 NOT_GEOMETRY = 200_000  # bytes for names and nodes
 FIRST_SEEN = "_FIRST_SEEN"
 
@@ -23,7 +23,7 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
     """Return the map as binary glTF 2.0, unlit, with the attribute `_FIRST_SEEN`.
 
     Vertices have the coordinates of the map; the matrix of each node rotates them upright. Extras contain the id and
-    the class. The file of a `light_enough` mesh has at most MOST_BYTES.
+    the class. The file of a `light_enough` mesh has at most MAX_BYTES.
 
     Args:
         mesh: Mesh of the map.
@@ -46,6 +46,6 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
     return glb_of(nodes, lit=False)
 
 
-def light_enough(mesh: InstanceMesh, most_bytes: int = MOST_BYTES) -> InstanceMesh:
+def light_enough(mesh: InstanceMesh, most_bytes: int = MAX_BYTES) -> InstanceMesh:
     """Return the mesh, decimated to at most `most_bytes` in its file."""
     return clustered(mesh, most_bytes - NOT_GEOMETRY, BYTES_OF_VERTEX, BYTES_OF_TRIANGLE)

@@ -82,7 +82,7 @@ class TruthCheck:
         photographer: Photographer | None,
         footage: Footage,
     ) -> TruthCheck | None:
-        """Compare the objects with the ground truth. Return None for a run without a mesh."""
+        """Return the comparison of the objects with the ground truth; None for a run without a mesh."""
         if contents.mesh is None:
             return None
         objects = contents.objects

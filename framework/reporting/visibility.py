@@ -14,7 +14,10 @@ from framework.rendering.rasterizer import Rasterizer
 
 LOOKS = 80  # maximum rendered poses of a trajectory
 LOOK_WIDTH = 200  # px, of the rendered images
-BEHIND, BEHIND_SHARE = 0.05, 0.03  # m and relative to depth: vertices farther behind the rendered depth are hidden
+TOLERANCE, TOLERANCE_PER_DEPTH = (
+    0.05,
+    0.03,
+)  # m and relative to depth: vertices farther behind the rendered depth are hidden
 NOT_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # Kinect, used if the camera is unknown
 
 
@@ -84,5 +87,5 @@ def _seen(vertices: Float32, T_world_camera: Float64, camera: Camera, depth: Flo
     # rounding may move a vertex at the border of the surface to a pixel outside
     bordered = np.where(depth > 0, depth, cv2.dilate(depth, np.ones((3, 3), np.uint8)))
     seen = bordered[v[inside].astype(int), u[inside].astype(int)]
-    visible[inside] = z[inside] < seen + BEHIND + BEHIND_SHARE * seen
+    visible[inside] = z[inside] < seen + TOLERANCE + TOLERANCE_PER_DEPTH * seen
     return inside, visible

@@ -17,7 +17,7 @@ from framework.files.search_paths import folder_of
 from framework.runs.provenance import leaves, relevant
 
 INPUTS = "inputs_sha256"  # the key of metrics.json
-MOST_FILES = 200_000  # of a recording (hashed in 3 s); the longest sequences of known datasets have 20,000
+MAX_FILES = 200_000  # of a recording (hashed in 3 s); the longest sequences of known datasets have 20,000
 OUTPUTS = {"outputs", "multirun"}  # Hydra's output folders
 
 
@@ -35,7 +35,7 @@ def inputs_sha256(config: Mapping[str, Any]) -> str:
             digest.update(f"{key} {_content(value)};".encode())
     dataset = config.get("dataset") or {}
     if root := dataset.get("root"):
-        for entry in islice(_listed(folder_of(Path(root)), str(dataset.get("scene") or "")), MOST_FILES):
+        for entry in islice(_listed(folder_of(Path(root)), str(dataset.get("scene") or "")), MAX_FILES):
             digest.update(f"{entry};".encode())
     return digest.hexdigest()
 
@@ -49,7 +49,7 @@ def _truth_files(value: str) -> list[str]:
 
 
 def _content(value: str) -> str:
-    """Hash a file or folder; "" if it does not exist."""
+    """Return the hash of a file or folder; "" if it does not exist."""
     try:
         return content_hash(Path(value))
     except (ConfigError, DataError, OSError, ValueError):
@@ -62,7 +62,7 @@ def _listed(root: Path, scene: str) -> Iterator[tuple[str, str, int, int]]:
     walks = [[(str(folder), [], [LABEL_TABLE, FIRST_LABEL_TABLE]) for folder in above]]
     if scene:
         walks.append(islice(os.walk(root), 1))  # files that scenes share, such as Replica's cam_params.json
-    walks.append(os.walk(root / scene, followlinks=True))  # MOST_FILES limits cyclic links
+    walks.append(os.walk(root / scene, followlinks=True))  # MAX_FILES limits cyclic links
     for folder, folders, files in chain.from_iterable(walks):
         folders[:] = sorted(set(folders) - OUTPUTS)
         for name in sorted(files):

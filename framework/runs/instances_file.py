@@ -43,7 +43,7 @@ class StoredInstance:
 def write_instances(
     path: Path, mesh: InstanceMesh, instances: Mapping[int, Instance], classes: tuple[str, ...]
 ) -> None:
-    """Write the objects by id; lengths in m. Confidences and probabilities are not rounded, which could create ties."""
+    """Write the objects by id; lengths in m. Confidences and probabilities are not rounded, to avoid ties."""
     write_json(
         path,
         [
@@ -112,7 +112,7 @@ def _stored(where: str, entry: Any) -> StoredInstance:
 
 
 def _integer(where: str, entry: Mapping[str, Any], key: str, lowest: int | None = None) -> int:
-    """Return an integer from `lowest` to LARGEST_ID; None = of any size."""
+    """Return an integer in [`lowest`, LARGEST_ID]; `lowest` None = any integer."""
     value = entry.get(key)
     if isinstance(value, int) and not isinstance(value, bool) and (lowest is None or lowest <= value <= LARGEST_ID):
         return value

@@ -120,7 +120,7 @@ def evaluation_metrics(
 
 
 def truth_sha256(truth: SceneTruth) -> str:
-    """Hash the ground truth of an evaluation."""
+    """Return the SHA-256 (hex) of the ground truth of an evaluation."""
     digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
     for array in (truth.points_world, truth.instance_ids):
         add_values(digest, array)

@@ -33,7 +33,7 @@ def config_hash(resolved: Mapping[str, Any]) -> str:
 
 
 def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the config without keys that do not change results."""
+    """Return the part of a config that changes results."""
     return {key: value for key, value in config.items() if key not in WITHOUT_EFFECT}
 
 
@@ -57,7 +57,7 @@ def speed_settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dic
 
 
 def code_version() -> dict[str, str | bool]:
-    """Return the commit of the checkout, and True if files are modified; "unknown" outside of a checkout."""
+    """Return the commit of the checkout, and whether files are modified; "unknown" outside of a checkout."""
     checkout = Path(framework.__file__).resolve().parent.parent
     top = _git(checkout, "rev-parse", "--show-toplevel")
     if top is None or Path(top).resolve() != checkout:  # installed from a wheel, possibly inside another repository
@@ -69,7 +69,7 @@ def code_version() -> dict[str, str | bool]:
 
 
 def environment() -> dict[str, str | int]:
-    """Return the machine and library versions, which change times and last digits."""
+    """Return the machine and library versions, which affect times and the last digits of results."""
     return {
         "environment.python": platform.python_version(),
         "environment.platform": platform.platform(),

@@ -56,7 +56,7 @@ class Reevaluation:
 
     @classmethod
     def of(cls, record: Record, truth: Truth, allow_changed: bool = False) -> Reevaluation:
-        """Re-evaluate the instances, and keep all other metrics.
+        """Return a run with re-evaluated instances; all other metrics are kept.
 
         Raises DataError if the files are inconsistent or the ground truth is missing. Also raises DataError if the
         ground truth has changed since the run, unless `allow_changed` is set.
@@ -130,5 +130,5 @@ def read_predictions(record: Record) -> PredictedInstances:
 
 
 def dataset_of(record: Record, ground_truth: str | None = None) -> dict[str, Any]:
-    """Return the dataset config of a run with a ground truth: "" = ground truth of the dataset, None = unchanged."""
+    """Return the dataset config of a run with `ground_truth`: "" = that of the dataset, None = that of the run."""
     return record.dataset | ({} if ground_truth is None else {"ground_truth": ground_truth or None})

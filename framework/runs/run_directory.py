@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from framework.config.composition import one_line
 from framework.data import Instance
 from framework.errors import InstanceMapError
-from framework.files.atomic_write import remove_left_over, written_whole
+from framework.files.atomic_write import atomic_write, remove_left_over
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import read_tum, write_tum
 from framework.interfaces import RGBDVideo
@@ -67,16 +67,16 @@ class RunRecord:
         """Start a run in `directory`: remove the metrics and report of an earlier run."""
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
-        asked = {str(key): value for key, value in resolved.items()}
-        inputs = inputs_sha256(asked)
+        plain = {str(key): value for key, value in resolved.items()}
+        inputs = inputs_sha256(plain)
         provenance: Metrics = {**code_version(), **environment()}
         directory.mkdir(parents=True, exist_ok=True)
         remove_left_over(directory)
         for name in (METRICS, PARTIAL_METRICS, REPORT):
             (directory / name).unlink(missing_ok=True)
-        _write_config(directory / CONFIG, asked)
+        _write_config(directory / CONFIG, plain)
         _reset_peak_memory()
-        return cls(directory, asked, choices, inputs, provenance)
+        return cls(directory, plain, choices, inputs, provenance)
 
     def write(
         self, video: RGBDVideo, result: RunResult, counts: Mapping[str, int] | None = None
@@ -92,7 +92,7 @@ class RunRecord:
             counts: Additional metrics.
 
         Returns:
-            The reason of a partial run: `result.stopped_by`, or the first write error. Other files are still written.
+            The reason for a partial run: `result.stopped_by`, or the first write error. Other files are still written.
             None = the run is complete.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -150,7 +150,7 @@ class RunRecord:
         }
 
     def _write_partial(self, video: RGBDVideo, figures: Metrics, error: BaseException | None) -> None:
-        """Write the metrics of a partial run with the reason; no error = the outputs are still being written."""
+        """Write the metrics of a partial run with the reason; `error` None = the outputs are still being written."""
         why = "the outputs were not completed" if error is None else reason(error)
         write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
 
@@ -190,7 +190,7 @@ class _Attempts:
 
 
 def _write_config(path: Path, config: Mapping[str, Any]) -> None:
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         OmegaConf.save(OmegaConf.create(dict(config)), temporary)
 
 
@@ -232,7 +232,7 @@ def headline(metrics: Mapping[str, Any]) -> str:
 
 
 def reason(error: BaseException) -> str:
-    """Return the reason of a partial run as text."""
+    """Return the reason for a partial run as text."""
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted by Ctrl-C"
     return one_line(error) if isinstance(error, InstanceMapError) else f"{type(error).__name__}: {one_line(error)}"
@@ -240,7 +240,7 @@ def reason(error: BaseException) -> str:
 
 def write_timings(path: Path, result: RunResult) -> None:
     """Write the time of each stage for each frame, in chronological order."""
-    with written_whole(path) as temporary, temporary.open("w", newline="") as file:
+    with atomic_write(path) as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("frame", "stage", "milliseconds"))
         writer.writerows((time.frame, time.stage, f"{time.milliseconds:.3f}") for time in result.timings)

@@ -22,7 +22,7 @@ Run = tuple[str, ...]  # values of the averaged keys: ("3",) is seed 3
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean over runs. NaN = undefined: the mean of no run, the deviation of a single run."""
+    """A mean over runs. NaN = undefined, such as the mean of no run or the deviation of a single run."""
 
     value: float
     deviation: float  # sample standard deviation, with n - 1
@@ -100,7 +100,7 @@ class RunRow:
 def rows_of(
     records: Sequence[Record], over: Sequence[str], overrides: Mapping[str, Sequence[str]] | None = None
 ) -> list[RunRow]:
-    """Group `records` into rows: rows in `overrides` first, then other rows by name.
+    """Return `records` grouped into rows: rows in `overrides` first, then other rows by name.
 
     A row is a `row` of an experiment. Other records are grouped by their differing options and parameters, except for
     the keys `over` and keys that follow them, as dataset.seed follows seed.
@@ -179,7 +179,7 @@ class _Variant:
 
 
 def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
-    """Return the keys that equal a key of `over` in every record, possibly by chance, but have another name."""
+    """Return the keys of other names whose value equals that of a key in `over` in every record, even by chance."""
     variants = [_Variant.of(record, over) for record in records]
     names = {key.rpartition(".")[2] for key in over}
     differing = set(_differing([("", one.parameters) for one in variants]))
@@ -187,7 +187,7 @@ def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
 
 
 def _following(variants: Sequence[_Variant], over: Sequence[str]) -> set[str]:
-    """Return the keys `over`, and the keys that equal one of them in every record."""
+    """Return the keys `over`, and the keys whose value equals that of one of them in every record."""
     found = set(over)
     for key in {key for one in variants for key in one.parameters}:
         for k in range(len(over)):
@@ -197,7 +197,7 @@ def _following(variants: Sequence[_Variant], over: Sequence[str]) -> set[str]:
 
 
 def _differing(groups: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
-    """Return the keys with several values in the same group, in order; `groups` are pairs of group and values."""
+    """Return the keys that have several values within a group, in order; `groups` are (group, values) pairs."""
     seen: dict[Any, dict[str, set[str]]] = {}
     for group, values in groups:
         for key, value in values.items():

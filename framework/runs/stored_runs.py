@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.errors import DataError, first_line
-from framework.files.atomic_write import MOST_TEXT, is_there, read_bytes
+from framework.files.atomic_write import MAX_TEXT, path_exists, read_bytes
 from framework.files.json_file import read_json
 from framework.files.yaml_file import load_yaml
 from framework.runs.inputs import INPUTS, inputs_sha256
@@ -101,7 +101,7 @@ def read_record(directory: Path) -> Record:
 
 
 def read_partial(directory: Path) -> tuple[Record, str]:
-    """Read the partial run in `directory`, and the reason of its early end. Raises DataError."""
+    """Read the partial run in `directory`, and the reason for its early end. Raises DataError."""
     record = _read(directory, PARTIAL_METRICS)
     return record, str(record.metrics.get("partial"))
 
@@ -122,7 +122,7 @@ def _read(directory: Path, name: str) -> Record:
 
 
 def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
-    """Return the completed and the incomplete runs in `root` and its subfolders, by path."""
+    """Return the completed and the incomplete runs in `root` and its subfolders, sorted by path."""
     records: list[Record] = []
     others: list[Incomplete] = []
     for directory in _run_directories(root):
@@ -151,15 +151,15 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
         return False
     resolved = OmegaConf.to_container(config, resolve=True)
     assert isinstance(resolved, dict)
-    asked = {str(key): value for key, value in resolved.items()}
-    if record.metrics["config_hash"] != config_hash(asked):
+    plain = {str(key): value for key, value in resolved.items()}
+    if record.metrics["config_hash"] != config_hash(plain):
         log.info("repeating the run: the config in %s differs", directory)
         return False
-    if record.metrics.get(INPUTS) not in (None, inputs_sha256(asked)):  # None: an older run
+    if record.metrics.get(INPUTS) not in (None, inputs_sha256(plain)):  # None: an older run
         log.info("repeating the run: weights or data changed since the run in %s", directory)
         return False
     settings = speed_settings(record.config, record.metrics)
-    if shows_speed(asked) and settings != speed_settings(asked, environment()):
+    if shows_speed(plain) and settings != speed_settings(plain, environment()):
         shown = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in settings.items())
         log.info(
             "repeating the run: the times in %s were measured with other settings or on another machine: %s",
@@ -195,16 +195,16 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _with_text_keys(node: Any) -> Any:
-    """Convert keys to text as in JSON: YAML keys such as 1 and true cannot be sorted."""
+    """Return the node with text keys as in JSON, because YAML keys such as 1 and true cannot be sorted."""
     if isinstance(node, dict):
         return {str(key): _with_text_keys(value) for key, value in node.items()}
     return [_with_text_keys(one) for one in node] if isinstance(node, list) else node
 
 
-def read_figures(directory: Path) -> dict[str, Any]:
+def read_metrics(directory: Path) -> dict[str, Any]:
     """Read metrics.json, or metrics.partial.json of a partial run. Raises DataError."""
     for name in (METRICS, PARTIAL_METRICS):
-        if is_there(directory / name):
+        if path_exists(directory / name):
             return _read_flat(directory / name)
     raise DataError(f"{directory}: expected a run directory, got no {METRICS} or {PARTIAL_METRICS}")
 
@@ -234,14 +234,14 @@ def _run_directories(root: Path) -> Iterator[Path]:
 
 
 def _why_incomplete(directory: Path) -> str:
-    """Return the reason of an incomplete run. The error of a job is the last message of its log."""
+    """Return why a run is incomplete. A failed job's error is the last message in its log."""
     if (directory / PARTIAL_METRICS).exists():
         try:
             return f"partial: {_read_flat(directory / PARTIAL_METRICS).get('partial')}"
         except DataError as error:
             return str(error)
     try:
-        lines = read_bytes(directory / LOG, MOST_TEXT).decode(errors="replace").splitlines()
+        lines = read_bytes(directory / LOG, MAX_TEXT).decode(errors="replace").splitlines()
     except DataError:
         lines = []
     matches = [match for match in map(_LOG_LINE.match, lines) if match]

@@ -21,21 +21,21 @@ _OF_ITSELF = re.compile(
 )  # references to its own keys, as in the included experiments
 
 SWEEP = "multirun.yaml"  # written by Hydra's sweeper
-MOST_VALUES = 1000  # of a key; a range may have any number of values
-MOST_RUNS = 100_000  # combinations of the values of all keys
+MAX_VALUES = 1000  # of a key; a range may have any number of values
+MAX_RUNS = 100_000  # combinations of the values of all keys
 
 
-def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:
+def requested_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:
     """Return the values of `keys` in each job of a sweep with this config; empty if they are not plain values."""
-    asked = {override.key_or_group: override for override in _overrides(sweep)}
-    if not all(key in asked for key in keys):
+    overrides = {override.key_or_group: override for override in _overrides(sweep)}
+    if not all(key in overrides for key in keys):
         return []
     try:
-        values = [_values(asked[key]) for key in keys]
+        values = [_values(overrides[key]) for key in keys]
     except HydraException:  # glob(*) depends on the config groups
         return []
     plain = not any("${" in value for column in values for value in column)
-    return list(itertools.islice(itertools.product(*values), MOST_RUNS)) if plain else []
+    return list(itertools.islice(itertools.product(*values), MAX_RUNS)) if plain else []
 
 
 def sweep_rows(sweep: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -72,7 +72,7 @@ def _without_hydra(sweep: Mapping[str, Any]) -> DictConfig:
 
 
 def _of_itself(node: Any) -> Any:
-    """Replace other references, such as the machine-dependent ${oc.env:...}, with "???"."""
+    """Return the node with "???" in place of other references, such as the machine-dependent ${oc.env:...}."""
     if isinstance(node, Mapping):
         return {key: _of_itself(value) for key, value in node.items()}
     if isinstance(node, list):
@@ -93,5 +93,5 @@ def _values(override: Override) -> list[str]:
     if not override.is_sweep_override():
         return [str(override.value())]
     parser = OverridesParser.create()
-    texts = itertools.islice(override.sweep_string_iterator(), MOST_VALUES)
+    texts = itertools.islice(override.sweep_string_iterator(), MAX_VALUES)
     return [str(parser.parse_override(f"x={text}").value()) for text in texts]

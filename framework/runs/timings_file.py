@@ -23,7 +23,7 @@ OLD_STAGES = {
     "fuse": "fusion",
 }
 """Current stage names by their names before 0.1.0, which stored runs and sweeps may contain."""
-LARGEST = 2**53  # limit of frame numbers: exact in float64
+MAX_FRAME = 2**53  # limit of frame numbers: exact in float64
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def read_timings(path: Path) -> StageTimes:
             frame, stage, milliseconds = int(line[0]), line[1], float(line[2])
         except (ValueError, IndexError):
             frame, stage, milliseconds = 0, "", np.nan
-        if not (0 <= milliseconds < np.inf and abs(frame) < LARGEST):
+        if not (0 <= milliseconds < np.inf and abs(frame) < MAX_FRAME):
             raise DataError(f"{path}, line {number}: expected a frame, a stage and a time, got {','.join(line)!r:.60}")
         taken[frame, OLD_STAGES.get(stage, stage)] = milliseconds
     if not taken:

@@ -40,7 +40,7 @@ def parallel_kernels_are_thread_safe() -> bool:
 
 @contextmanager
 def kernel_threads(threads: int) -> Iterator[None]:
-    """Run the kernels that the calling thread calls with this number of threads."""
+    """Set the number of threads of the kernels that the calling thread runs in the body."""
     before = numba.get_num_threads()
     numba.set_num_threads(threads)
     try:
@@ -51,7 +51,7 @@ def kernel_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limited_threads(threads: int) -> Iterator[None]:
-    """Limit the kernels and torch networks that the calling thread runs; 0 = no limit."""
+    """Limit the number of threads of kernels and torch networks in the calling thread; 0 = no limit."""
     if threads == 0:
         yield
         return
@@ -67,40 +67,40 @@ def limited_threads(threads: int) -> Iterator[None]:
                 torch.set_num_threads(before)
 
 
-class CoreSharing:
+class CpuBudget:
     """Division of the kernel threads between prefetching and mapping, by their work on recent frames."""
 
-    def __init__(self, with_a_thread_ahead: bool = True) -> None:
+    def __init__(self, with_prefetch: bool = True) -> None:
         self.cores = int(numba.get_num_threads())
-        self._alone = not with_a_thread_ahead
-        self._ahead: deque[float] = deque(maxlen=RECENT)  # CPU time per frame of one thread, s
+        self._alone = not with_prefetch
+        self._prefetching: deque[float] = deque(maxlen=RECENT)  # CPU time per frame of one thread, s
         self._mapping: deque[float] = deque(maxlen=RECENT)  # CPU time per frame times threads, s; mostly parallel loops
         self._lock = threading.Lock()
 
     @contextmanager
-    def ahead(self, workers: int = 1) -> Iterator[None]:
-        """Run the prefetching of one frame in one of `workers` threads."""
-        with kernel_threads(self.cores if self._alone else max(self.cores_ahead() // workers, 1)):
+    def prefetching(self, workers: int = 1) -> Iterator[None]:
+        """Run the body, the prefetching of one frame in one of `workers` threads, on the cores for prefetching."""
+        with kernel_threads(self.cores if self._alone else max(self.prefetch_cores() // workers, 1)):
             began = time.thread_time()
             yield
-            self._record(self._ahead, time.thread_time() - began)
+            self._record(self._prefetching, time.thread_time() - began)
 
     @contextmanager
     def mapping(self) -> Iterator[None]:
-        """Run the mapping of one frame."""
-        threads = self.cores if self._alone else max(self.cores - self.cores_ahead(), 1)
+        """Run the body, the mapping of one frame, on the cores for mapping."""
+        threads = self.cores if self._alone else max(self.cores - self.prefetch_cores(), 1)
         with kernel_threads(threads):
             began = time.thread_time()
             yield
             self._record(self._mapping, threads * (time.thread_time() - began))
 
-    def cores_ahead(self) -> int:
+    def prefetch_cores(self) -> int:
         """Return the rounded number of cores for prefetching: 0 or all cores if one side has almost no work."""
         with self._lock:
-            if not (self._ahead and self._mapping):
+            if not (self._prefetching and self._mapping):
                 return self.cores // 2
-            ahead, mapping = median(self._ahead), median(self._mapping)
-        return round(self.cores * ahead / max(ahead + mapping, 1e-9))
+            prefetching, mapping = median(self._prefetching), median(self._mapping)
+        return round(self.cores * prefetching / max(prefetching + mapping, 1e-9))
 
     def _record(self, spent: deque[float], seconds: float) -> None:
         with self._lock:

@@ -25,7 +25,7 @@ Outcome = TypeVar("Outcome")
 class FrameStream(AbstractContextManager["FrameStream"]):
     """Stream of frame readers in order. Any thread may take them."""
 
-    most_ahead: int | None = None  # maximum number of prefetched frames; None = no limit
+    max_prefetched: int | None = None  # maximum number of prefetched frames; None = no limit
     dropped: int = 0  # number of frames that were not taken
 
     @abstractmethod
@@ -61,7 +61,7 @@ class LiveFrames(FrameStream):
     A thread receives the frames, so that no queue builds up in the video. Only one frame is prefetched.
     """
 
-    most_ahead = 1
+    max_prefetched = 1
 
     def __init__(self, video: LiveVideo, ended: Callable[[], bool]) -> None:
         self._video, self._ended = video, ended
@@ -117,23 +117,23 @@ class LiveFrames(FrameStream):
             self._changed.notify_all()
 
 
-def map_ahead(
-    function: Callable[[Item], Outcome], items: Iterable[Item], ahead: int, workers: int = 1
+def prefetched_map(
+    function: Callable[[Item], Outcome], items: Iterable[Item], prefetch: int, workers: int = 1
 ) -> Generator[Outcome]:
-    """Yield `map(function, items)`, computed in order by `workers` threads, at most `ahead` outcomes in advance.
+    """Yield the outcomes of `map(function, items)`, computed by `workers` threads at most `prefetch` items in advance.
 
     Errors are raised in place of their outcome. Closing the generator ends the workers after their current items.
     """
-    if ahead == 0:
+    if prefetch == 0:
         yield from map(function, items)
         return
     # numba's thread count is per thread: the workers get the count of the consumer
-    pool = ThreadPoolExecutor(workers, "detect-ahead", numba.set_num_threads, (numba.get_num_threads(),))
+    pool = ThreadPoolExecutor(workers, "prefetch", numba.set_num_threads, (numba.get_num_threads(),))
     pending: deque[Future[Outcome]] = deque()
     try:
         for item in items:
             pending.append(pool.submit(function, item))
-            if len(pending) > ahead:
+            if len(pending) > prefetch:
                 yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()
@@ -142,7 +142,7 @@ def map_ahead(
 
 
 class Turns:
-    """Serialization of a critical section, in the order of turn numbers from 0."""
+    """Lock of a critical section that threads enter in the order of their turn numbers, from 0."""
 
     def __init__(self) -> None:
         self._next = 0

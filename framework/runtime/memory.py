@@ -12,18 +12,18 @@ import sys
 from functools import cache
 
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-MOST_KEPT = 2**28  # free bytes at the end of the heap
-MOST_SHARED = 2**25  # bytes of an array that reuses freed memory; the maximum of glibc
+MAX_KEPT = 2**28  # free bytes at the end of the heap
+MAX_SHARED = 2**25  # bytes of an array that reuses freed memory; the maximum of glibc
 
 
 @cache
 def keep_freed_memory() -> None:
-    """Keep about MOST_KEPT freed bytes in the process, if its C library is glibc.
+    """Keep about MAX_KEPT freed bytes in the process, if its C library is glibc.
 
     Environment variables of malloc take precedence.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     configured = {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES"} & os.environ.keys()
     if mallopt is not None and not configured:
-        mallopt(TRIM_THRESHOLD, MOST_KEPT)
-        mallopt(MMAP_THRESHOLD, MOST_SHARED)
+        mallopt(TRIM_THRESHOLD, MAX_KEPT)
+        mallopt(MMAP_THRESHOLD, MAX_SHARED)

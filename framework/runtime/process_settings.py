@@ -95,8 +95,8 @@ def configure_process(threads: int = 0, seed: int | None = None) -> None:
     set_environment()
     if late:
         log.warning(
-            "configure_process: expected a call before numpy and numba are imported; %s may have no effect; "
-            "call it before these imports, or set the variables before Python starts",
+            "configure_process: expected a call before numpy and numba are imported, got a later call; %s may have no "
+            "effect; call it before these imports, or set the variables before Python starts",
             ", ".join(late),
         )
     settings.limit_threads()

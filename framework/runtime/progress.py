@@ -9,7 +9,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-SIGN_OF_LIFE, LONGEST = 3.0, 60.0  # s, minimum and maximum interval of log lines
+MIN_INTERVAL, MAX_INTERVAL = 3.0, 60.0  # s, minimum and maximum interval of log lines
 
 
 class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
@@ -23,9 +23,9 @@ class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
         self._begun = self._spoken = time.monotonic()
 
     def line_is_due(self) -> bool:
-        """Return True if no bar is shown and a log line is due: every few seconds, less often in long runs."""
+        """Return True if no bar is shown and a log line is due: every few seconds, later at longer intervals."""
         now = time.monotonic()
-        interval = min(max(SIGN_OF_LIFE, 0.1 * (now - self._begun)), LONGEST)
+        interval = min(max(MIN_INTERVAL, 0.1 * (now - self._begun)), MAX_INTERVAL)
         if not self.disable or self.quiet or now - self._spoken < interval:
             return False
         self._spoken = now

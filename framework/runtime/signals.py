@@ -48,19 +48,19 @@ def raise_on_signals() -> None:
 class Interruption:
     """Record of the signals received while signals are deferred."""
 
-    asked: Interrupted | None = None
+    received: Interrupted | None = None
     quiet: bool = False  # true if another process prints messages
     _when: str = "after this frame"  # end of the current step, for the message
     _at_once: bool = False  # true if the second signal raises
 
     def check(self) -> None:
         """Raise Interrupted if a signal was received."""
-        if self.asked is not None:
-            raise self.asked
+        if self.received is not None:
+            raise self.received
 
     @contextmanager
     def second_ends_at_once(self, when: str) -> Iterator[None]:
-        """Let the second signal raise in the body. The message of the first signal announces the end `when`.
+        """Let the second signal raise Interrupted in the body. The message of the first signal contains `when`.
 
         Between such bodies no signal raises, so that the result of one body reaches the next body.
         """
@@ -71,10 +71,10 @@ class Interruption:
             self._at_once = False
 
     def receive(self, number: int, _frame: FrameType | None) -> None:
-        if self.asked is None:
-            self.asked = Interrupted(number)
+        if self.received is None:
+            self.received = Interrupted(number)
             if not self.quiet:
-                _print(f"{self.asked}: stopping {self._when}; a second signal stops immediately\n")
+                _print(f"{self.received}: stopping {self._when}; a second signal stops immediately\n")
         elif self._at_once:
             raise Interrupted(number)
 
@@ -142,11 +142,12 @@ def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterato
     """
 
     def end_workers(number: int, _frame: FrameType | None) -> None:
-        asked = Interrupted(number)
+        received = Interrupted(number)
         for each in taken:
             signal.signal(each, _raise_interrupted)
         _print(
-            f"{asked}: stopping after the active runs have written their outputs; a second signal stops immediately\n"
+            f"{received}: stopping after the active runs have written their outputs; "
+            "a second signal stops immediately\n"
         )
         signaled: set[int | None] = set()
         while busy := at_work():
@@ -155,7 +156,7 @@ def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterato
                     worker.terminate()
                     signaled.add(worker.pid)
             time.sleep(0.1)
-        raise asked
+        raise received
 
     taken = [number for number in ENDING if signal.getsignal(number) in OURS_TO_HANDLE]
     for number in taken:

@@ -34,7 +34,7 @@ from framework.synthetic.renderer import cast_ids
 from framework.synthetic.room import Room, furnish_with
 from framework.synthetic.walk import CameraPath, plan_path
 
-SMALLEST = (4.8, 4.2)  # m, width and depth of the smallest candidate room
+MIN_ROOM_SIZE = (4.8, 4.2)  # m, width and depth of the smallest candidate room
 STREWN = 9  # maximum number of objects on the floor next to furniture
 ATTEMPTS = 6  # candidate scenes; the trajectory with the best visibility is kept
 JUDGED_VIEWS = 30  # number of views for the visibility score of a trajectory
@@ -163,7 +163,7 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: floa
 
 
 def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
-    """Draw a random scene; return it with the well-visible fractions of its classes and of its objects."""
+    """Return a random scene, and the fractions of its classes and of its objects that are well visible."""
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
@@ -190,4 +190,4 @@ def furnish_scene(spec: SceneSpec, rng: Rng) -> Room:
         single("picture", clutter.painting(rng), z=1.4, hung=True),
     ]
     strewn = small_things.some(rng, small_things.ON_FLOORS, STREWN)
-    return furnish_with(contents, *SMALLEST, rng, strewn)
+    return furnish_with(contents, *MIN_ROOM_SIZE, rng, strewn)

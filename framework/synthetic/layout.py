@@ -43,7 +43,7 @@ class Layout:
 
 
 def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout:
-    """Arrange groups in the smallest possible room with space for a camera path.
+    """Return a layout of the groups in the smallest possible room with space for a camera path.
 
     The room has at least `width` x `depth` m. Raises DataError if a room with 1.5 times these sides is too small.
     """
@@ -109,7 +109,7 @@ def _try_layout(
 
 
 def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
-    """Return the pose (x, y, angle) of a group `along` a wall: 0 at -y, 1 at +x, 2 at +y, 3 at -x."""
+    """Return the pose of a group at `along` m on a wall; walls are 0 at -y, 1 at +x, 2 at +y and 3 at -x."""
     if wall == 0:
         return along, -depth / 2, 0.0
     if wall == 1:
@@ -120,7 +120,7 @@ def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
 
 
 def _turned_boxes(boxes: Float64, quarters: int, place: Place) -> Float64:
-    """Apply quarter turns and a translation to boxes (N, 2, 3)."""
+    """Return boxes (N, 2, 3) after quarter turns and a translation."""
     R = np.rint(axis_rotation("z", quarters * np.pi / 2))
     corners = boxes @ R.T + np.array([place[0], place[1], 0.0])
     return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
@@ -151,7 +151,7 @@ def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
 
 
 def strew(layout: Layout, things: Sequence[Furniture], rng: Rng) -> Layout:
-    """Place `things` on the floor next to furniture.
+    """Return the layout with `things` on the floor next to furniture.
 
     Objects are omitted if they do not fit or block the camera path. They are rotated by quarter turns, which keeps
     their boxes tight.
@@ -184,7 +184,7 @@ def _with_thing(layout: Layout, thing: Furniture, rng: Rng) -> Layout:
 
 
 def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
-    """Place `thing` at a random side of the box `host` (2, 3); at least half of the object is along the side."""
+    """Return `thing` at a random side of the box `host` (2, 3); at least half of the object is along the side."""
     turned = thing.placed(0, 0, 0, np.pi / 2 * int(rng.integers(4)))
     low, high = turned.bounds()
     axis, sign = int(rng.integers(2)), (-1 if rng.uniform() < 0.5 else 1)

@@ -1,4 +1,4 @@
-"""Light baked into the vertices: soft shadows of lamps and windows, and three diffuse bounces between surfaces.
+"""Baked light of vertices: direct light with soft shadows from lamps and windows, and three diffuse bounces.
 
 Light is static and surfaces are Lambertian, as assumed by photometric tracking. All vertices gather light along the
 same directions to avoid noise between neighbors.
@@ -50,7 +50,7 @@ def rectangle(corner: Float64, along: Float64, up: Float64, normal: Float64, pow
 
 
 def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
-    """Compute the irradiance (V, 3) of vertices, scaled to a mean of WALL_BRIGHTNESS on floor, walls and ceiling."""
+    """Return the irradiance (V, 3) of vertices, scaled to a mean of WALL_BRIGHTNESS on floor, walls and ceiling."""
     origins = surfaces.vertices + np.float32(LIFT) * surfaces.normals
     direct = np.zeros((len(origins), 3))
     for begin in range(0, len(origins), CHUNK):

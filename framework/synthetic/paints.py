@@ -100,7 +100,7 @@ def pick(rng: np.random.Generator, choices: tuple[Color, ...]) -> Color:
 
 
 def shade(color: Color, factor: float) -> Color:
-    """Make a color darker (factor below 1) or lighter (factor above 1)."""
+    """Return a darker (factor below 1) or lighter (factor above 1) color."""
     r, g, b = (min(1.0, factor * c) for c in color)
     return r, g, b
 

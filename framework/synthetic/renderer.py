@@ -58,7 +58,7 @@ class Renderer:
         self._rasterizer = Rasterizer(surfaces.vertices, surfaces.triangles)
 
     def render(self, camera: Camera, T_world_camera: Float64, material_table: Float32 | None = None) -> Rendering:
-        """Render the room, optionally with another paints.material_table under the same light."""
+        """Return images of the room, optionally with another paints.material_table under the same light."""
         surfaces = self._lit if material_table is None else self._lit._replace(table=material_table)
         buffer = self._rasterizer.draw(camera, T_world_camera)
         triangle, depth = buffer.triangle, buffer.depth
@@ -78,13 +78,13 @@ class Renderer:
         return Rendering(to_srgb(light), depth, _ids_of(self.surfaces, triangle), incidence, unread)
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Render only exact depth (H, W) m and instance ids (H, W)."""
+        """Return only exact depth (H, W) m and instance ids (H, W)."""
         buffer = self._rasterizer.draw(camera, T_world_camera)
         return buffer.depth, _ids_of(self.surfaces, buffer.triangle)
 
 
 def cast_ids(surfaces: Surfaces, caster: RayCaster, camera: Camera, T_world_camera: Float64) -> Int32:
-    """Render instance ids (H, W) by ray casting, which is faster than a Renderer for small images."""
+    """Return instance ids (H, W) from ray casting, which is faster than a Renderer for small images."""
     return _ids_of(surfaces, caster.cast(image_rays(camera, T_world_camera)).triangle)
 
 
@@ -94,7 +94,7 @@ def _ids_of(surfaces: Surfaces, triangle: Int32) -> Int32:
 
 
 def to_srgb(light: Float32) -> UInt8:
-    """Convert linear light to 8-bit sRGB by Reinhard's curve with a white point (Reinhard et al. 2002, eq. 4)."""
+    """Return linear light as 8-bit sRGB by Reinhard's curve with a white point (Reinhard et al. 2002, eq. 4)."""
     color = np.empty(light.shape, np.uint8)
     apply_tone_curve(light.reshape(-1), _tone_curve(), color.reshape(-1))
     return color

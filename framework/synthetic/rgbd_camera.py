@@ -51,7 +51,7 @@ class DepthSensor:
         rng: np.random.Generator,
         unread: Float32 | None = None,
     ) -> Float32:
-        """Simulate depth readings (H, W) m of the exact `depth` (H, W) m; 0 = no reading.
+        """Return simulated depth readings (H, W) m of the exact `depth` (H, W) m; 0 = no reading.
 
         `incidence`: (H, W), cosines of incidence. `unread`: (H, W), fraction of readings lost on materials, in patches;
         None = no loss.
@@ -76,7 +76,7 @@ class DepthSensor:
 
 
 def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
-    """Add the noise of an indoor camera, scaled by `noise`, to `color`."""
+    """Return `color` with the noise of an indoor camera, scaled by `noise`."""
     if noise == 0:
         return color
     noisy = np.empty_like(color)
@@ -88,7 +88,7 @@ def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
 def blurred(
     color: UInt8, depth: Float32, camera: Camera, T_world_camera: Float64, T_world_open: Float64, T_world_close: Float64
 ) -> UInt8:
-    """Add the motion blur from T_world_open to T_world_close to `color` (H, W, 3), rendered at T_world_camera.
+    """Return `color` (H, W, 3), rendered at T_world_camera, with motion blur from T_world_open to T_world_close.
 
     The motion of a pixel follows from the exact `depth` (H, W) m of the static scene; depth 0 = no blur.
     """

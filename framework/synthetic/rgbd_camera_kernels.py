@@ -111,7 +111,7 @@ def drop_patches(
 
 @njit(cache=True, nogil=True)
 def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> np.float32:
-    """Return the depth of a pixel, or of the pixel (dv, du) px away across a depth edge.
+    """Return the depth of a pixel, or of the pixel (dv, du) px away if it is across a depth edge.
 
     The offset is rounded. Smooth surfaces have no lateral error, because the axial noise contains all measured
     deviation.
@@ -141,7 +141,7 @@ def _near_edge(depth: Float32) -> Bool:
 
 @njit(cache=True, nogil=True)
 def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, noisy: UInt8) -> None:
-    """Add normal noise to `color` (N,), and round; `random` (N,) bits, `normal` = normal_quantiles."""
+    """Write `color` (N,) with normal noise, rounded, to `noisy`; `random` (N,) are bits, `normal` normal_quantiles."""
     for n in range(len(color)):
         value = np.rint(np.float32(color[n]) + sigma * normal[random[n] >> SPARE_BITS])
         noisy[n] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))
@@ -189,7 +189,7 @@ def blur(
 
 @njit(cache=True, nogil=True, inline="always")
 def _reprojected(T, K, u, v, z):
-    """Reproject pixel u, v at depth z to another pose; return its coordinates (px), or u, v for z = 0."""
+    """Return the coordinates (px) of pixel u, v at depth z, reprojected to another pose; u, v for z = 0."""
     px, py = (np.float32(u) - K[2]) / K[0] * z, (np.float32(v) - K[3]) / K[1] * z
     z_other = T[2, 0] * px + T[2, 1] * py + T[2, 2] * z + T[2, 3]
     if z <= 0 or z_other <= 0:

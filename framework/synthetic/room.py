@@ -36,7 +36,7 @@ class RoomKind(StrEnum):
     OFFICE = "office"
 
 
-SMALLEST = {  # m, width and depth of the smallest candidate room
+MIN_ROOM_SIZES = {  # m, width and depth of the smallest candidate room
     RoomKind.STUDIO: (5.6, 4.8),
     RoomKind.LIVING_ROOM: (4.6, 4.2),
     RoomKind.BEDROOM: (4.2, 3.8),
@@ -57,7 +57,7 @@ class Room:
 
 def furnish(kind: RoomKind, rng: Rng) -> Room:
     """Return a random room of this kind."""
-    return furnish_with(_groups(kind, rng), *SMALLEST[kind], rng)
+    return furnish_with(_groups(kind, rng), *MIN_ROOM_SIZES[kind], rng)
 
 
 def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, strewn: Sequence[Furniture] = ()) -> Room:

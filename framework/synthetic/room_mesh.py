@@ -24,7 +24,7 @@ class RoomMesh:
     instance_ids: Int32  # (V,), 0 = floor, wall or ceiling
 
     def only(self, kept: Bool) -> RoomMesh:
-        """Keep the vertices of the mask `kept` (V,) in order, and the triangles between them."""
+        """Return the mesh of the vertices in the mask `kept` (V,), in order, and the triangles between them."""
         number = np.cumsum(kept, dtype=np.int32) - 1
         triangles = self.triangles[kept[self.triangles].all(axis=1)]
         return RoomMesh(self.vertices[kept], number[triangles], self.instance_ids[kept])
@@ -48,7 +48,7 @@ def visible_mesh(
 
 
 def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
-    """Subdivide the surfaces into triangles with edges of at most `longest_edge` m.
+    """Return the surfaces, subdivided into triangles with edges of at most `longest_edge` m.
 
     Longer edges are halved repeatedly in all adjacent triangles, so that the mesh has no gaps.
     """
@@ -74,7 +74,7 @@ def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
 
 
 def _welded(mesh: RoomMesh) -> RoomMesh:
-    """Merge vertices of an instance at identical positions, and remove triangles without area."""
+    """Return the mesh with merged vertices of an instance at identical positions, without triangles of no area."""
     rows = np.empty((len(mesh.vertices), 4), np.int32)
     rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # turns -0 into 0
     rows[:, 3] = mesh.instance_ids

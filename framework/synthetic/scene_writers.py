@@ -28,7 +28,7 @@ from tqdm import tqdm
 from framework.datasets.scenenn.scene_files import write_intrinsics
 from framework.datasets.scenenn.scenenn import MADE_BY
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.files.json_file import read_json
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import GENERATION, BenchmarkSettings, SceneNNScene, frame_files, trajectory_file
@@ -93,9 +93,9 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
             f"{root}: expected a new or empty folder, or a benchmark folder, got {found}; set another folder"
         )
     (root / "intrinsic").mkdir(parents=True, exist_ok=True)
-    with written_whole(made_by) as temporary:
+    with atomic_write(made_by) as temporary:
         temporary.write_text(json.dumps(wanted) + "\n")
-    with written_whole(root / "release.txt") as temporary:
+    with atomic_write(root / "release.txt") as temporary:
         temporary.write_text(recording.release + "\n")
     write_intrinsics(root / "intrinsic" / "asus.ini", recording.camera)
 
@@ -134,7 +134,7 @@ class _Scene:
 
 
 def _choose(scenes: list[_Scene], last: _Scene | None) -> _Scene | None:
-    """Choose the next scene of a process: its `last` scene, else an unstarted scene, else the scene with most tasks."""
+    """Return the next scene of a process: its `last` scene, an unstarted scene, or the scene with the most tasks."""
     if last is not None and last.ready:
         return last
     ready = [scene for scene in scenes if scene.ready]

@@ -17,7 +17,7 @@ from framework.data import Array, Box, Camera, Float32, Int32
 from framework.datasets.scenenn.scene_files import write_trajectory_log
 from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
 from framework.errors import ConfigError
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.files.ply import write_ply
 from framework.geometry import transform
 from framework.synthetic.benchmark import SceneSpec, plan_scene
@@ -33,7 +33,7 @@ ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrins
 NOISE, MAX_RANGE = 1.0, 6.0  # noise of the sensor, 1 = Kinect v1; range of the sensor, m
 EXPOSURE = 1 / 60  # s, exposure of color images, centered at the pose; typical for indoor light
 TRUTH_VIEWS = 60  # frames for the labeled mesh; neighboring frames have nearly the same view
-FASTEST = 5.0  # maximum camera speed relative to the recommended speed: 2.2 m/s
+MAX_CAMERA_SPEED = 5.0  # maximum camera speed relative to the recommended speed: 2.2 m/s
 LARGEST_ID = 934338  # largest label in SceneNN; labels are unordered
 PNG = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
@@ -83,8 +83,8 @@ class BenchmarkSettings:
                 raise ConfigError(f"--{name}: expected at least {lowest}, got {getattr(self, name)}")
         if not 0 < self.rate <= FRAME_RATE:
             raise ConfigError(f"--rate: expected a value in (0, {FRAME_RATE:.0f}] Hz, got {self.rate}")
-        if not 0 < self.camera_speed <= FASTEST:
-            raise ConfigError(f"--camera-speed: expected a value in (0, {FASTEST:g}], got {self.camera_speed}")
+        if not 0 < self.camera_speed <= MAX_CAMERA_SPEED:
+            raise ConfigError(f"--camera-speed: expected a value in (0, {MAX_CAMERA_SPEED:g}], got {self.camera_speed}")
         if self.width % 4:
             raise ConfigError(f"--width: expected a multiple of 4 px, for images of 4:3, got {self.width}")
 
@@ -177,7 +177,7 @@ class SceneNNScene:
     def write_walk(self) -> int:
         """Write the timestamps and then the trajectory, which marks the scene as complete."""
         frames = range(self.recording.frames)
-        with written_whole(self.folder / "timestamp.txt") as temporary:
+        with atomic_write(self.folder / "timestamp.txt") as temporary:
             times = [round(1e6 * index / self.recording.rate) for index in frames]
             temporary.write_text("".join(f"{k} {time} {time}\n" for k, time in enumerate(times, start=1)))
         poses = {index: T_YUP_ZUP @ self.path.pose(index) for index in frames}
@@ -197,5 +197,5 @@ def trajectory_file(folder: Path) -> Path:
 
 def _write_png(path: Path, image: Array) -> None:
     _, data = cv2.imencode(".png", image, PNG)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())

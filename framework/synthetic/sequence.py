@@ -21,8 +21,8 @@ from framework.synthetic.rgbd_camera import DepthSensor, noisy_color
 from framework.synthetic.room import RoomKind, furnish
 from framework.synthetic.walk import FRAME_RATE, plan_path
 
-MOST_FRAMES = 10**6  # nine hours at 30 Hz
-MOST_SIDE = 5792  # px; its square is MOST_PIXELS
+MAX_FRAMES = 10**6  # nine hours at 30 Hz
+MAX_SIDE = 5792  # px; its square is MAX_PIXELS
 FOCAL_LENGTH = 525.0 / 640  # image widths, color camera of a Kinect
 TRUTH_VIEWS = 60  # frames for the ground-truth surface; neighboring frames have nearly the same view
 
@@ -53,7 +53,7 @@ class Synthetic(RGBDSequence):
 
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.frame_fraction)
-        bounds = {"frames": (1, MOST_FRAMES), "width": (16, MOST_SIDE), "height": (16, MOST_SIDE)}
+        bounds = {"frames": (1, MAX_FRAMES), "width": (16, MAX_SIDE), "height": (16, MAX_SIDE)}
         for name, (lowest, most) in bounds.items():
             if not lowest <= getattr(self, name) <= most:
                 raise ConfigError(f"dataset.{name}: expected a value in [{lowest}, {most}], got {getattr(self, name)}")

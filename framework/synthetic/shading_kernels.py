@@ -44,7 +44,7 @@ class Viewpoint(NamedTuple):
 def gather_light(
     triangle: Int32, uv: Float32, triangles: Int32, materials: Int32, reflectance: Float32, irradiance: Float32
 ) -> Float32:
-    """Return the mean reflected light (V, 3) of the visible points, the irradiance for cosine-distributed rays."""
+    """Return the mean reflected light (V, 3) of the visible points; for cosine-distributed rays, the irradiance."""
     out = np.zeros((len(triangle), 3), np.float32)
     for v in range(len(triangle)):
         for d in range(triangle.shape[1]):
@@ -111,7 +111,7 @@ def _cosine(view, normals, f, u, v):
 
 @njit(cache=True, nogil=True, inline="always")
 def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, cosine):
-    """Return the emitted and reflected RGB light at barycentric b, c of triangle f; `pixel`: width of a pixel, m."""
+    """Return the emitted and reflected RGB light at barycentric b, c of triangle f; a pixel is `pixel` m wide."""
     i, j, k = triangles[f, 0], triangles[f, 1], triangles[f, 2]
     a = np.float32(1) - b - c
     # The footprint is an ellipse at grazing angles; its geometric mean is the best compromise between both axes.

@@ -34,7 +34,7 @@ class Surfaces:
 
 
 def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:
-    """Combine all parts of (instance id, object) pairs in their final poses."""
+    """Return the surfaces of all parts of the (instance id, object) pairs; the objects are in their final poses."""
     vertices: list[Float64] = []
     normals: list[Float64] = []
     texture: list[Float64] = []

@@ -62,7 +62,7 @@ def _visible(wavelength: float, footprint: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, footprint: float, seed: int) -> float:
-    """Return the sum of noise octaves in [-1, 1] with halving wavelengths, without invisible octaves."""
+    """Return a sum of noise octaves, in [-1, 1]. Wavelengths are halved per octave; invisible octaves are omitted."""
     value, amplitude, total = 0.0, 1.0, 0.0
     x, y, z = x / wavelength, y / wavelength, z / wavelength
     for octave in range(octaves):
@@ -85,7 +85,7 @@ def _step(low: float, high: float, x: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _line(x: float, width: float, footprint: float) -> float:
-    """Return 1 on lines at integer x, else 0; x, width and footprint in periods."""
+    """Return the antialiased coverage, in [0, 1], of lines at integer x. x, width and footprint are in periods."""
     d = abs(x - float(np.floor(x + 0.5)))
     blur = max(footprint, 0.25 * width)
     return float((1.0 - _step(0.5 * width - 0.5 * blur, 0.5 * width + 0.5 * blur, d)) * min(1.0, 2.0 * width / blur))
@@ -93,7 +93,7 @@ def _line(x: float, width: float, footprint: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _within(x: float, low: float, high: float, soft: float) -> float:
-    """Return 1 for x between the limits, else 0, with borders `soft` wide."""
+    """Return 1 for x between the limits and 0 elsewhere, with smooth transitions of width `soft`."""
     soft = max(soft, 1e-4)
     inside = _step(low - 0.5 * soft, low + 0.5 * soft, x) * (1.0 - _step(high - 0.5 * soft, high + 0.5 * soft, x))
     return float(inside)
@@ -141,7 +141,7 @@ def _cloth(x: float, y: float, z: float, footprint: float, seed: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tuple[float, float]:
-    """Return the color mix and brightness factor of a floor of boards along x with different grain."""
+    """Return the color mix and brightness factor of a floor of boards along x, each with its own grain."""
     length, gap = 1.1, 0.004
     board = np.int64(np.floor(y / width))
     shift = _lattice(board, 3, 5, seed)

@@ -114,7 +114,7 @@ def _allowed_phase_speed(path: CameraPath) -> float:
 
 
 def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[int]) -> float:
-    """Return the start phase with the most visible wanted instances over `sweep` rad; then by visible pixels."""
+    """Return the start phase with the most visible wanted instances over `sweep` rad; visible pixels break ties."""
     phases = 2 * np.pi * np.arange(PHASES) / PHASES
     ids = sorted(wanted)
     pixels = np.array(

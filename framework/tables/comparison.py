@@ -13,12 +13,12 @@ from framework.errors import ConfigError, DataError
 from framework.runs.metrics import is_evaluation
 from framework.runs.run_rows import CHOICE, Mean, Run, RunRow, natural, rows_of
 from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
-from framework.runs.sweep_file import SWEEP, asked_runs, sweep_rows
+from framework.runs.sweep_file import SWEEP, requested_runs, sweep_rows
 from framework.runs.timings_file import current_key
 from framework.tables.published import (
     DATASET,
-    MADE_UP,
     NOTHING_PUBLISHED,
+    SYNTHETIC,
     Key,
     Published,
     PublishedRow,
@@ -99,7 +99,7 @@ class ComparisonTable:
     choice: TableChoice
     rows: list[RunRow]  # each with at least one run
     overrides: Mapping[str, Sequence[str]]  # by row of the experiment, also for rows without runs
-    asked: list[Run]  # requested runs of the last sweep for every row, also if not started
+    requested: list[Run]  # requested runs of the last sweep for every row, also if not started
     incomplete: list[Incomplete]
     superseded: int  # number of older records of the same runs
     root: Path  # base of relative run names
@@ -107,7 +107,7 @@ class ComparisonTable:
 
     @classmethod
     def below(cls, directory: Path) -> ComparisonTable:
-        """Return the table of the runs at and below `directory`, by its experiment or with the columns PLAIN.
+        """Return the table of the runs in and below `directory`, as set by its experiment or with the columns PLAIN.
 
         Raises DataError if no run is complete or the experiment's config cannot be read.
         """
@@ -122,7 +122,7 @@ class ComparisonTable:
             raise DataError(f"{directory}: expected a completed run, got none{f' ({why})' if why else ''}")
         keys = [*choice.average_over, choice.split_key] if choice.split_key else choice.average_over
         rows = rows_of(records, keys, overrides)
-        asked = asked_runs(sweep, keys)
+        requested = requested_runs(sweep, keys)
         superseded = len(records) - sum(len(row.records) for row in rows)
         left_out = () if sweep.get("table") else [c for c in choice.columns if not any(row.values(c) for row in rows)]
         if 0 < len(left_out) < len(choice.columns):
@@ -130,7 +130,7 @@ class ComparisonTable:
         else:
             left_out = ()
         return cls(
-            directory.resolve().name, choice, rows, overrides, asked, incomplete, superseded, directory, left_out
+            directory.resolve().name, choice, rows, overrides, requested, incomplete, superseded, directory, left_out
         )
 
     @property
@@ -176,7 +176,7 @@ class ComparisonTable:
     def is_of_scenenn(self) -> bool:
         """Return True if all runs use the original SceneNN data, as for published numbers, not synthetic scenes."""
         datasets = {record.metrics.get(f"{CHOICE}dataset") for record in self.records}
-        return datasets == {DATASET} and not any(record.annotation.startswith(MADE_UP) for record in self.records)
+        return datasets == {DATASET} and not any(record.annotation.startswith(SYNTHETIC) for record in self.records)
 
     @cached_property
     def published(self) -> Published:
@@ -211,7 +211,7 @@ class ComparisonTable:
         return list(dict.fromkeys([*self.published.sequences, *order]))
 
     def called(self, row: RunRow, without: str = "") -> str:
-        """Return a row's name in the table, without the value of the key `without`."""
+        """Return a row's name in the table; the value of the key `without` is omitted."""
         named = self.choice.names.get(row.system, row.system)
         variant = [part for part in row.variant if not without or not part.startswith(f"{without}=")]
         return ", ".join([named, *variant] if named else variant) or row.name
@@ -229,7 +229,7 @@ class ComparisonTable:
     @property
     def _runs(self) -> list[Run]:
         """Runs of all rows, and requested runs."""
-        return [*(run for row in self.rows for run in row.records), *self.asked]
+        return [*(run for row in self.rows for run in row.records), *self.requested]
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.tables.comparison import ComparisonTable, mean_difference
 from framework.tables.grid import TextTable, latex_grid, markdown_grid
 from framework.tables.layouts import across_grid, by_grid, difference_across_grid, difference_grid, row_grid
@@ -28,7 +28,7 @@ def write_tables(directory: Path) -> str:
     latex = "\n".join([*(f"% {note}" for note in explained), *(line for grid in grids for line in latex_grid(grid))])
     separated = comma_separated_runs if comparison.choice.split_key else comma_separated_rows
     for name, content in (("md", text), ("tex", latex), ("csv", separated(comparison))):
-        with written_whole(directory / f"table.{name}") as temporary:
+        with atomic_write(directory / f"table.{name}") as temporary:
             temporary.write_text(content, "utf-8")
     return text
 

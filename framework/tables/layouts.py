@@ -174,7 +174,7 @@ def by_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def difference_across_grid(comparison: ComparisonTable) -> TextTable:
-    """Return the baseline minus each other row, by sequence, and the mean with its standard error."""
+    """Return the baseline minus each other row, by sequence, and the mean difference with its standard error."""
     [key] = comparison.choice.columns
     differences = {row.name: base.differences(row, key) for row, base in comparison.compared}
     paired = {run[-1] for runs in differences.values() for run in runs}
@@ -221,7 +221,7 @@ def _decimals(figures: Iterable[_SequenceFigures]) -> int:
 
 
 def _by_variant(rows: Sequence[RunRow]) -> list[list[RunRow]]:
-    """Group the comparable rows, in the order of the first row of each group."""
+    """Return groups of comparable rows, in the order of the first row of each group."""
     groups: dict[tuple[str, ...], list[RunRow]] = {}
     for row in rows:
         groups.setdefault(row.variant, []).append(row)

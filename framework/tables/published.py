@@ -14,7 +14,7 @@ from framework.errors import ConfigError
 
 FILE = Path(__file__).with_suffix(".yaml")
 DATASET = "scenenn"  # dataset of the numbers
-MADE_UP = "synthetic"  # first word of the annotation release of scenes written by `instancemap synthesize`
+SYNTHETIC = "synthetic"  # first word of the annotation release of scenes written by `instancemap synthesize`
 NOT_KNOWN = "not known"  # printed for numbers that were not looked up
 
 Key = tuple[str, ...]  # ("fps",), ("011",) or ("011", "instances.ap50.bed"), depending on the layout

@@ -41,7 +41,7 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _averaging(comparison: ComparisonTable) -> Iterator[str]:
-    """Explain the means and the comparison of rows."""
+    """Yield notes about the means and the comparison of rows."""
     choice, over = comparison.choice, ", ".join(comparison.choice.average_over)
     if others := following(comparison.records, choice.average_over):
         yield f"Also averaged over keys with the value of {over} in every run: {', '.join(others)}."
@@ -71,7 +71,7 @@ def _averaging(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _with_needs(columns: Sequence[str]) -> str:
-    """Return the headings of metrics, with the required ground truth."""
+    """Return the headings of metrics, each with the ground truth that it requires."""
     heads: dict[str, list[str]] = {}
     for key in columns:
         what = "instances" if is_evaluation(key) else "poses" if key.startswith("trajectory.") else ""
@@ -95,7 +95,7 @@ def _winners(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _protocol(comparison: ComparisonTable) -> Iterator[str]:
-    """Explain the comparison of the instances with the ground truth."""
+    """Yield notes about the comparison of the instances with the ground truth."""
     kinds = {key.startswith("instances.to_map.") for key in comparison.choice.columns if is_evaluation(key)}
     if not kinds:
         return

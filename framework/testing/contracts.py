@@ -73,7 +73,7 @@ class SequenceContract:
     stage = "dataset"
 
     def plugin(self) -> RGBDSequence:
-        raise NotImplementedError("expected plugin() to return the recording under test")
+        raise NotImplementedError("expected plugin() to return the recording under test, got no override")
 
     def test_dataset_returns_frames_of_its_camera(self) -> None:
         sequence = self.plugin()
@@ -97,7 +97,7 @@ class DetectorContract:
     stage = "detector"
 
     def plugin(self) -> Detector:
-        raise NotImplementedError("expected plugin() to return the detector under test")
+        raise NotImplementedError("expected plugin() to return the detector under test, got no override")
 
     def test_detector_returns_valid_detections(self) -> None:
         detector = self.plugin()
@@ -161,7 +161,7 @@ class TrackerContract:
     stage = "tracker"
 
     def plugin(self) -> PoseTracker:
-        raise NotImplementedError("expected plugin() to return the tracker under test")
+        raise NotImplementedError("expected plugin() to return the tracker under test, got no override")
 
     def test_tracker_returns_pose_and_keeps_map(self) -> None:
         tracker = self.plugin()
@@ -199,7 +199,7 @@ class RefinerContract:
     stage = "refiner"
 
     def plugin(self) -> ClusterRefiner:
-        raise NotImplementedError("expected plugin() to return the refiner under test")
+        raise NotImplementedError("expected plugin() to return the refiner under test, got no override")
 
     def test_refiner_invents_no_points(self) -> None:
         frame = frame_at(1)
@@ -265,7 +265,7 @@ class FuserContract:
     stage = "fuser"
 
     def plugin(self) -> MapFuser:
-        raise NotImplementedError("expected plugin() to return the fuser under test")
+        raise NotImplementedError("expected plugin() to return the fuser under test, got no override")
 
     def test_fuser_starts_with_an_empty_map(self) -> None:
         scene = self.plugin().scene

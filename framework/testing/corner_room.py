@@ -93,12 +93,12 @@ def spheres_in(frame: Frame) -> Detections:
 
 
 def exact_clusters(frame: Frame) -> PointClusters:
-    """Lift both spheres with ground-truth masks and pose."""
+    """Return the clusters of both spheres, lifted with ground-truth masks and pose."""
     return lift(spheres_in(frame), frame, Pose(pose_at(frame.index)))
 
 
 def bleeding_clusters(frame: Frame) -> PointClusters:
-    """Lift both spheres with masks that extend onto the wall."""
+    """Return the clusters of both spheres, lifted with masks that extend onto the wall."""
     exact = spheres_in(frame)
     masks = exact.masks | np.roll(exact.masks, 3, axis=2)
     return lift(replace(exact, masks=masks), frame, Pose(pose_at(frame.index)))
@@ -132,8 +132,8 @@ class RoomMap(SceneMap):
         return {}
 
     def save(self, path: Path | str) -> None:
-        raise DataError("RoomMap.save: unsupported")
+        raise DataError("RoomMap.save: expected a map of a fuser, got the map of the contract tests")
 
     @classmethod
     def load(cls, path: Path | str) -> RoomMap:
-        raise DataError("RoomMap.load: unsupported")
+        raise DataError("RoomMap.load: expected a map of a fuser, got the map of the contract tests")

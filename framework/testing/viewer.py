@@ -35,14 +35,14 @@ class WatchedMap(RoomMap):
     """A map of one chair (a triangle). Records read accesses outside of viewer calls."""
 
     within_a_call: threading.Event = field(default_factory=threading.Event)
-    asked_outside: list[str] = field(default_factory=list)
+    reads_outside: list[str] = field(default_factory=list)
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        self._asked("render")
+        self._note_read("render")
         return super().render(camera, T_world_camera)
 
     def mesh(self) -> InstanceMesh:
-        self._asked("mesh")
+        self._note_read("mesh")
         return InstanceMesh(
             vertices=np.array([[-0.5, 0.4, 2.2], [-0.3, 0.7, 1.9], [-0.7, 0.7, 1.9]], np.float32),
             triangles=np.array([[0, 1, 2]], np.int32),
@@ -53,7 +53,7 @@ class WatchedMap(RoomMap):
         )
 
     def instances(self) -> dict[int, Instance]:
-        self._asked("instances")
+        self._note_read("instances")
         box = Box(np.array([-0.5, 0.55, 2.05]), np.array([0.4, 0.3, 0.3]), np.eye(3))
         sure = np.array([0.9, 0.1], np.float32)
         return {1: Instance(1, sure, 0.9, FRAMES, 0, FRAMES - 1, np.arange(3, dtype=np.int32), box, box)}
@@ -65,9 +65,9 @@ class WatchedMap(RoomMap):
         yield
         self.within_a_call.clear()
 
-    def _asked(self, what: str) -> None:
+    def _note_read(self, what: str) -> None:
         if not self.within_a_call.is_set():
-            self.asked_outside.append(what)
+            self.reads_outside.append(what)
 
 
 class ViewerContract:
@@ -76,7 +76,7 @@ class ViewerContract:
     stage = "viewer"
 
     def plugin(self) -> Viewer:
-        raise NotImplementedError("expected plugin() to return the viewer under test")
+        raise NotImplementedError("expected plugin() to return the viewer under test, got no override")
 
     def test_viewer_accepts_all_frames_and_keeps_them(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         scene, frames = WatchedMap(), [frame_with_found(k) for k in range(FRAMES)]
@@ -89,7 +89,7 @@ class ViewerContract:
     def test_viewer_reads_map_only_in_calls(self, tmp_path: Path) -> None:
         scene = WatchedMap()
         show_run(self.plugin(), scene, [frame_with_found(k) for k in range(FRAMES)], tmp_path)
-        assert not scene.asked_outside, "the fuser may write the map outside of viewer calls"
+        assert not scene.reads_outside, "the fuser may write the map outside of viewer calls"
 
     def test_viewer_accepts_run_without_frames(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         scene, viewer = WatchedMap(), self.plugin()

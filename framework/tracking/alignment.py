@@ -33,7 +33,7 @@ from framework.tracking.pyramid import PyramidLevel, intrinsics
 
 
 def _matrix_sums() -> npt.NDArray[np.int64]:
-    """Return the index (6, 6) among the sums of each element of the symmetric matrix A."""
+    """Return the position (6, 6) of each element of the symmetric matrix A in the array of sums."""
     indices = np.empty((6, 6), np.int64)
     for row in range(6):
         columns = (row + np.arange(4)) % 6

@@ -53,7 +53,7 @@ class FeatureExtractor:
         check_bounds(self, max_features=(1, 100_000), contrast=(1e-6, 1.0))
 
     def extract(self, frame: Frame) -> Features:
-        """Return the features of `frame`; an image without texture has none. Thread-safe."""
+        """Return the features of `frame`, none for an image without texture. This method is thread-safe."""
         gray, scale = _reduced(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))
         # without precise upscaling, OpenCV's keypoints are off by a quarter of a pixel
         sift = cv2.SIFT.create(self.max_features, contrastThreshold=self.contrast, enable_precise_upscale=True)

@@ -18,9 +18,9 @@ import numpy as np
 from framework.config.validation import check_bounds
 from framework.data import Array, Float32, Float64, Frame, UInt8, check_array, check_rigid
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 from framework.geometry import back_project, transform
-from framework.mapping.storage.map_file import faults_of, read_arrays, write_map
+from framework.mapping.storage.map_file import map_file_errors, read_arrays, write_map
 from framework.runtime.cpu_budget import lower_priority
 from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
 from framework.tracking.features import DESCRIPTOR_LENGTH, FeatureExtractor, Features, match
@@ -253,7 +253,7 @@ class VisualWords:
         self._directions = np.ascontiguousarray(rng.permuted(np.tile(half, (WORD_BITS, 1)), axis=1).T)
 
     def bag(self, descriptors: UInt8) -> Float32:
-        """Return the square root (2^WORD_BITS,) of each word's count."""
+        """Return the bag of words: the square root (2^WORD_BITS,) of each word's count."""
         if len(descriptors) == 0:
             return np.zeros(1 << WORD_BITS, np.float32)
         signs = cv2.gemm(descriptors.astype(np.float32), self._directions, 1, None, 0) > 0
@@ -279,7 +279,7 @@ def write_keyframes(path: Path, keyframes: Mapping[str, Array]) -> None:
 
 def read_keyframes(path: Path) -> dict[str, Array]:
     """Return the arrays written by `write_keyframes`; empty without a file. Raises DataError for an invalid file."""
-    if not is_there(path):
+    if not path_exists(path):
         return {}
-    with faults_of(path):
+    with map_file_errors(path):
         return read_arrays(path, FILE_FORMAT)

@@ -10,14 +10,14 @@ from framework.training.room_pictures import Example
 
 ZOOM = (0.55, 1.0)  # side length of a crop divided by the side length of the image
 ZOOMED = 0.5  # fraction of the images
-LEAST_LEFT = 0.25  # minimum fraction of an object's area inside the crop
-SMALLEST = 40  # px, minimum area of an object
+MIN_REMAINING = 0.25  # minimum fraction of an object's area inside the crop
+MIN_PIXELS = 40  # px, minimum area of an object
 GAIN, CHANNEL_GAIN, GAMMA = 0.35, 0.12, 0.35  # logarithms of the maximum factors
 BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of the images
 
 
 def augmented(example: Example, rng: np.random.Generator) -> Example:
-    """Randomly mirror, zoom, relight, blur and add noise to an image; drop objects outside of the crop."""
+    """Return a randomly mirrored, zoomed, relit, blurred and noisy image, without objects outside of the crop."""
     color, masks = example.color, example.masks
     if rng.uniform() < 0.5:
         color, masks = color[:, ::-1], masks[:, :, ::-1]
@@ -26,7 +26,7 @@ def augmented(example: Example, rng: np.random.Generator) -> Example:
         color, masks, scale = _zoomed(color, masks, rng)
         areas = areas * scale
     left = masks.sum(axis=(1, 2))
-    kept = (left >= SMALLEST) & (left >= LEAST_LEFT * areas)
+    kept = (left >= MIN_PIXELS) & (left >= MIN_REMAINING * areas)
     names = tuple(name for name, keep in zip(example.class_names, kept.tolist(), strict=True) if keep)
     return Example(_relit(color, rng), np.ascontiguousarray(masks[kept]), names)
 
@@ -34,8 +34,8 @@ def augmented(example: Example, rng: np.random.Generator) -> Example:
 def _zoomed(color: UInt8, masks: np.ndarray, rng: np.random.Generator) -> tuple[UInt8, np.ndarray, float]:
     """Return a random crop resized to the image size, its masks and the scale factor of areas."""
     height, width = color.shape[:2]
-    share = rng.uniform(*ZOOM)
-    h, w = round(share * height), round(share * width)
+    fraction = rng.uniform(*ZOOM)
+    h, w = round(fraction * height), round(fraction * width)
     v, u = int(rng.integers(height - h + 1)), int(rng.integers(width - w + 1))
     cut = cv2.resize(color[v : v + h, u : u + w], (width, height), interpolation=cv2.INTER_LINEAR)
     rows = v + ((np.arange(height) + 0.5) * h / height).astype(np.int64)

@@ -47,7 +47,7 @@ class Budget:
 def losses(
     network: MaskRCNN, images: Tensor, objects: Sequence[Objects], budget: Budget, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Compute the five terms of the loss as means over the images (N, 3, H, W), RGB 0..255; the loss is their sum."""
+    """Return the five terms of the loss, means over the images (N, 3, H, W), RGB 0..255; the loss is their sum."""
     shape = (images.shape[2], images.shape[3])
     pyramid = network.extract(network.normalize(images))
     objectness, deltas = (output.float() for output in network.score_anchors(pyramid))
@@ -116,7 +116,7 @@ def box_iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def match(iou: Tensor, foreground: float, background: float, each_object: bool) -> Tensor:
-    """Assign objects to boxes by `iou` (N, M); return `own` (N,).
+    """Return `own` (N,), the object assigned to each box by `iou` (N, M).
 
     A box gets its best object at an IoU of at least `foreground`, BACKGROUND below `background`, otherwise IGNORED.
     With `each_object`, the boxes with the highest IoU of an object also get their best object, if the IoU is above 0.
@@ -134,12 +134,12 @@ def match(iou: Tensor, foreground: float, background: float, each_object: bool) 
     return own
 
 
-def sample(own: Tensor, count: int, positive_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Draw at most `count` boxes; return the indices of boxes with an object and of background boxes.
+def sample(own: Tensor, count: int, positive_fraction: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Return the indices of at most `count` random boxes: boxes with an object, and background boxes.
 
-    `positive_share`: maximum fraction of boxes with an object.
+    `positive_fraction`: maximum fraction of boxes with an object.
     """
-    positive = _draw(torch.nonzero(own >= 0)[:, 0], int(count * positive_share), generator)
+    positive = _draw(torch.nonzero(own >= 0)[:, 0], int(count * positive_fraction), generator)
     negative = _draw(torch.nonzero(own == BACKGROUND)[:, 0], count - len(positive), generator)
     return positive, negative
 

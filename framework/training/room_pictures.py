@@ -43,7 +43,7 @@ TINT = 0.5  # logarithm of the maximum factor for the colors of a surface
 TINTED = 0.7  # fraction of the images with changed colors
 STUDIOS = 0.5  # fraction of rooms with all classes, because some classes occur only in studios
 QUALITY = 93  # of the JPEG files
-LEAST = 100  # px, minimum area of objects in an image
+MIN_PIXELS = 100  # px, minimum area of objects in an image
 TRIES = 20  # candidate views for each image
 
 
@@ -110,7 +110,7 @@ def _random_views(
             camera = Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
             T_world_camera = _view(room, centers, rng)
             _, ids = renderer.depth_and_ids(camera, T_world_camera)
-            if np.isin(ids, list(names)).sum() >= LEAST:
+            if np.isin(ids, list(names)).sum() >= MIN_PIXELS:
                 break
         yield camera, T_world_camera
 
@@ -123,7 +123,7 @@ def _centers(room: Room, ids: Sequence[int]) -> Float64:
 
 
 def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> Float64:
-    """Draw a random T_world_camera (4, 4) above free floor, roughly towards an object of a random class."""
+    """Return a random T_world_camera (4, 4) above free floor, roughly towards an object of a random class."""
     layout = room.layout
     rows, columns = np.nonzero(layout.free >= CLEAR)
     at = int(rng.integers(len(rows)))
@@ -137,7 +137,7 @@ def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> F
 
 
 def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Multiply the colors of each material in the table by random factors, in a fraction TINTED of the calls."""
+    """Return the table with colors multiplied by random factors per material, in a fraction TINTED of the calls."""
     if rng.uniform() > TINTED:
         return table
     gains = np.exp(rng.uniform(-TINT, TINT, (len(table), 1)) + rng.uniform(-TINT, TINT, (len(table), 3)))

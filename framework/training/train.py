@@ -29,11 +29,11 @@ from framework.detection.mask_rcnn.resnet import DEPTHS, ResNetShape
 from framework.detection.runtimes.device import torch_device
 from framework.errors import ConfigError
 from framework.evaluation.mask_ap import MaskAp, mask_ap
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.interfaces import Detector
 from framework.registry import build
 from framework.runtime.process_settings import Settings, available_cores
-from framework.training.augmentation import SMALLEST
+from framework.training.augmentation import MIN_PIXELS
 from framework.training.room_pictures import HEIGHT, WIDTH, RoomPictures, render_rooms
 from framework.training.trainer import Schedule, Trainer
 from framework.vocabulary.label_spaces import COCO, SCENENN_TO_COCO
@@ -76,10 +76,12 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
     save_network(trainer.trained(), weights, card, half=True)
     node = {"_target_": DETECTOR, "weights": str(weights.absolute()), "device": device}
     detector = build(Detector, OmegaConf.create(node))
-    precision = mask_ap(_detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out)), detector.classes, SMALLEST)
+    precision = mask_ap(
+        _detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out)), detector.classes, MIN_PIXELS
+    )
     card |= _known({"held_out_rooms": wanted.held_out, "mask_ap50": precision.ap50, "mask_ap": precision.ap})
     save_network(trainer.trained(), weights, card, half=True)
-    with written_whole(folder / PRECISION) as path:
+    with atomic_write(folder / PRECISION) as path:
         path.write_text(json.dumps(_known(asdict(precision)), indent=1))
     log.info("mask AP50 %.3f, AP %.3f on %d held-out rooms", precision.ap50, precision.ap, wanted.held_out)
     return precision
@@ -118,7 +120,7 @@ def architecture(network: DictConfig) -> Architecture:
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace non-finite numbers with None, because JSON cannot represent them."""
+    """Return the values with None for non-finite numbers, which JSON cannot represent."""
     inner = {name: _known(value) if isinstance(value, Mapping) else value for name, value in values.items()}
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in inner.items()}
 

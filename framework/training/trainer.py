@@ -20,7 +20,7 @@ from framework.config.validation import require
 from framework.detection.mask_rcnn.network import MaskRCNN
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.errors import DataError, in_one_line
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.training.augmentation import augmented
 from framework.training.losses import Budget, Objects, losses
 from framework.training.room_pictures import Example, RoomPictures
@@ -128,7 +128,7 @@ class Trainer:
         index = {name: k for k, name in enumerate(self.network.architecture.classes, start=1)}
         unknown = sorted(set(example.class_names) - set(index))
         if unknown:
-            raise DataError(f"pictures: expected classes of the network, got {', '.join(unknown)}")
+            raise DataError(f"images: expected classes of the network, got {', '.join(unknown)}")
         boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # from pixel centers to borders
         return Objects(
             boxes=torch.from_numpy(boxes),
@@ -153,13 +153,13 @@ class Trainer:
             "optimizer": self._optimizer.state_dict(),
             "history": self.history,
         }
-        with written_whole(self.folder / CHECKPOINT) as path:
+        with atomic_write(self.folder / CHECKPOINT) as path:
             torch.save(state, path)
-        with written_whole(self.folder / HISTORY) as path, path.open("w", newline="") as file:
+        with atomic_write(self.folder / HISTORY) as path, path.open("w", newline="") as file:
             writer = csv.DictWriter(file, ["step", *self.history[0]])
             writer.writeheader()
             writer.writerows({"step": k, **terms} for k, terms in enumerate(self.history))
-        with written_whole(self.folder / CURVE) as path:
+        with atomic_write(self.folder / CURVE) as path:
             draw_losses(self.history, path)
 
     def _resume(self) -> None:

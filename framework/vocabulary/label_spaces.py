@@ -47,7 +47,7 @@ class LabelMapping:
     meaning: Int32  # (C,) index of each label in `classes`; -1 = no object class of COCO
 
     def apply(self, probabilities: Float32) -> tuple[Float32, Bool]:
-        """Convert `probabilities` (N, C) of labels to float32 distributions (N, C') over `classes`.
+        """Return the float32 distributions (N, C') over `classes` for `probabilities` (N, C) of labels.
 
         Labels with the same meaning are added, labels without a meaning are removed, and the result is normalized. Also
         return a mask (N,) of the rows whose best label has a meaning. A row without any class becomes uniform, and its
@@ -63,7 +63,7 @@ class LabelMapping:
 
 
 def read_labels(name_or_path: str) -> tuple[str, ...]:
-    """Return the names of a label space ("coco", "nyu40", ...), or read a text file with one name per line.
+    """Return the names of a label space ("coco", "nyu40", ...), or the lines of a text file with one name per line.
 
     Raises ConfigError for other values.
     """

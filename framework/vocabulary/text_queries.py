@@ -13,7 +13,7 @@ STOP_WORDS = frozenset((
     "a", "an", "the", "that", "this", "these", "those", "some", "any", "all", "my", "our", "your", "of", "with", "and",
     "or", "one", "two", "three",
 ))  # fmt: skip
-SHADES = frozenset(("light", "dark", "bright", "pale", "deep"))  # ignored, because light changes them too
+SHADES = frozenset(("light", "dark", "bright", "pale", "deep"))  # ignored, because they also depend on the lighting
 IRREGULAR = {"people": "person", "men": "person", "women": "person", "mice": "mouse", "knives": "knife",
              "shelves": "shelf", "scissors": "scissors", "skis": "skis", "glasses": "glass"}  # fmt: skip
 EVERYDAY = {"fridge": "refrigerator", "plant": "potted plant", "phone": "cell phone", "mug": "cup", "screen": "tv",
@@ -21,7 +21,7 @@ EVERYDAY = {"fridge": "refrigerator", "plant": "potted plant", "phone": "cell ph
             "telly": "tv"}  # fmt: skip
 """Everyday words outside of all label spaces, with their COCO names."""
 
-LONGEST = 4  # maximum number of words in a class name
+MAX_WORDS = 4  # maximum number of words in a class name
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class ObjectWords:
 
 
 def object_words(query: str, classes: Collection[str]) -> ObjectWords:
-    """Parse a query into class names from `classes`, colors and unknown words.
+    """Return the class names from `classes`, the colors and the unknown words of a query.
 
     Case, articles, plurals and shades of colors are ignored. Words of other label spaces are mapped (sofa = couch). An
     ambiguous word (orange) is a color if a class follows, otherwise a class.
@@ -67,8 +67,8 @@ def _color(word: list[str]) -> str:
 
 
 def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, str]:
-    """Find the longest class name starting at word `at`; return its number of words and the name, or 0 and ""."""
-    for length in range(min(LONGEST, len(words) - at), 0, -1):
+    """Return the word count and name of the longest class name that starts at word `at`, or 0 and ""."""
+    for length in range(min(MAX_WORDS, len(words) - at), 0, -1):
         phrase = words[at : at + length]
         for last in _singulars(phrase[-1]):
             text = " ".join([*phrase[:-1], last])

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from framework.config.validation import (
     LONGEST_SIDE,
-    MOST_DETECTIONS,
-    MOST_PROPOSALS,
+    MAX_DETECTIONS,
+    MAX_PROPOSALS,
     check_count,
     check_intervals,
     require,
@@ -58,7 +58,7 @@ class MaskRCNNDetector(Detector):
     def __post_init__(self) -> None:
         check_intervals("detector", self, score_threshold="[0, 1)", mask_threshold="(0, 1)")
         check_intervals("detector", self, nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
-        most = {"proposals_before_nms": MOST_PROPOSALS, "proposals": MOST_PROPOSALS, "max_detections": MOST_DETECTIONS}
+        most = {"proposals_before_nms": MAX_PROPOSALS, "proposals": MAX_PROPOSALS, "max_detections": MAX_DETECTIONS}
         for name, limit in most.items():
             check_count(f"detector.{name}", getattr(self, name), limit)
         for name in ("short_side", "long_side"):

@@ -19,8 +19,8 @@ from torch.nn import functional
 
 from framework.config.validation import (
     LONGEST_SIDE,
-    MOST_DETECTIONS,
-    MOST_PROPOSALS,
+    MAX_DETECTIONS,
+    MAX_PROPOSALS,
     check_count,
     check_intervals,
     require,
@@ -85,8 +85,8 @@ class MaskRCNN2Go(Detector):
     def __post_init__(self) -> None:
         check_intervals("detector", self, score_threshold="[0, 1)", mask_threshold="(0, 1)")
         check_intervals("detector", self, nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
-        check_count("detector.proposals", self.proposals, MOST_PROPOSALS)
-        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
+        check_count("detector.proposals", self.proposals, MAX_PROPOSALS)
+        check_count("detector.max_detections", self.max_detections, MAX_DETECTIONS)
         require(self.short_side >= 32, "detector.short_side", self.short_side, "at least 32 px")
         allowed = f"at least {self.short_side} px and at most {LONGEST_SIDE}"
         require(self.short_side <= self.long_side <= LONGEST_SIDE, "detector.long_side", self.long_side, allowed)
@@ -115,7 +115,7 @@ class MaskRCNN2Go(Detector):
         self._mask_upsampling = tensors["mask_fcn_logits_up_w_int8"], tensors["mask_fcn_logits_up_b_int8"]
 
     def fingerprint(self) -> str:
-        """Include the arithmetic, because integer and float results differ slightly."""
+        """Return a hash that includes the arithmetic, because integer and float results differ slightly."""
         return f"{fingerprint(self)} {'int8' if self._integers else 'float32'}"
 
     @torch.inference_mode()
@@ -182,7 +182,7 @@ def _find_weights(folder: Path) -> Path:
 
 
 def _read_network(folder: Path) -> tuple[list[Operator], dict[str, Tensor], dict[str, float]]:
-    """Return the operators in order, the tensors in float, and the steps of the quantized tensors."""
+    """Return the operators in order, the float tensors, and the quantization steps of the quantized tensors."""
     content = {name: _read_checked(folder / name, sha256) for name, sha256 in SHA256.items()}
     description = json.loads(content["graph.json"])
     quantization: Mapping[str, tuple[float, int]] = description["quant"]
@@ -197,6 +197,7 @@ def _read_checked(path: Path, sha256: str) -> bytes:
     found = hashlib.sha256(content).hexdigest()
     if found != sha256:
         raise DataError(
-            f"detector.weights: {path}: expected sha256 {sha256[:12]}..., got {found[:12]}...; the file is damaged"
+            f"detector.weights: {path}: expected sha256 {sha256[:12]}..., got {found[:12]}...; restore the file from "
+            "the repository"
         )
     return content

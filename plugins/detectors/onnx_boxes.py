@@ -6,7 +6,7 @@ import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from framework.config.validation import MOST_DETECTIONS, check_count, check_intervals
+from framework.config.validation import MAX_DETECTIONS, check_count, check_intervals
 from framework.data import Bool, Detections, Frame
 from framework.detection.candidates import OutputLayout, decode
 from framework.detection.masks.binary_masks import without_duplicates
@@ -54,7 +54,7 @@ class OnnxBoxes(Detector):
     def __post_init__(self) -> None:
         check_intervals("detector", self, score_threshold="(0, 1)", nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
         check_intervals("detector", self, min_foreground_fraction="[0, 1]", max_slant="(0, 90)", min_readings="[0, 1]")
-        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
+        check_count("detector.max_detections", self.max_detections, MAX_DETECTIONS)
         self._labels = read_labels(self.label_space)
         self._meaning = to_coco(self._labels)
         self.classes = self._meaning.classes

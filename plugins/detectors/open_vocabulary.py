@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from framework.config.validation import MOST_DETECTIONS, check_count, check_intervals, require
+from framework.config.validation import MAX_DETECTIONS, check_count, check_intervals, require
 from framework.data import Detections, Float32, Frame
 from framework.detection.hub.hub_model import commit_of
 from framework.detection.hub.prompted_models import BoxPromptedMasks, TextPromptedBoxes
@@ -18,7 +18,7 @@ from framework.detection.stored.fingerprint import fingerprint
 from framework.interfaces import Detector
 
 SOMETHING_ELSE = "something else"
-MOST_WORDS = 500
+MAX_WORDS = 500
 SIGNIFICANCE, MAX_SLANT, MIN_READINGS = 0.4, 85.0, 0.1  # parameters of masks from depth, as in onnx_boxes
 
 
@@ -47,10 +47,10 @@ class OpenVocabulary(Detector):
 
     def __post_init__(self) -> None:
         check_intervals("detector", self, score_threshold="(0, 1)", nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
-        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
+        check_count("detector.max_detections", self.max_detections, MAX_DETECTIONS)
         names = [word.strip() for word in self.text_queries]
-        fits = 1 <= len(names) <= MOST_WORDS and all(names) and len({*names, SOMETHING_ELSE}) == len(names) + 1
-        allowed = f"1 to {MOST_WORDS} different text queries, none of them {SOMETHING_ELSE!r}"
+        fits = 1 <= len(names) <= MAX_WORDS and all(names) and len({*names, SOMETHING_ELSE}) == len(names) + 1
+        allowed = f"1 to {MAX_WORDS} different text queries, none of them {SOMETHING_ELSE!r}"
         require(fits, "detector.text_queries", self.text_queries, allowed)
         device = torch_device(self.device)
         self.classes = (*names, SOMETHING_ELSE)

@@ -77,10 +77,10 @@ class Precomputed(Detector):
         for of_frame in self._of_frame.values():
             of_frame.sort(key=lambda pair: -pair[0].score)  # stable: equal scores keep the order of the file
         self._matched = False
-        self._asked: set[int] = set()
+        self._requested: set[int] = set()
 
     def fingerprint(self) -> str:
-        """Include the labels, because they may come from a file."""
+        """Return a hash that includes the labels, because they may come from a file."""
         return hashlib.sha256(repr((fingerprint(self), self._labels)).encode()).hexdigest()
 
     def detect(self, frame: Frame) -> Detections:
@@ -122,7 +122,7 @@ class Precomputed(Detector):
         if self._matched or index in self._frames:
             self._matched = True
             return
-        self._asked.add(index)
+        self._requested.add(index)
         first, last = min(self._frames), max(self._frames)
         has = f"{self.path} with detections for frames {first} to {last}"
         if index > last:
@@ -130,7 +130,7 @@ class Precomputed(Detector):
                 f"detector.path: expected detections of this sequence, got {has} and none for the frames "
                 f"requested so far, up to {index}; check that the file is of this sequence"
             )
-        if len(self._asked) == FRAMES_IN_DOUBT:
+        if len(self._requested) == FRAMES_IN_DOUBT:
             log.warning(
                 "detector.path: expected detections of this sequence, got %s and none for the first %d frames; "
                 "check that the file is of this sequence",

@@ -9,7 +9,7 @@ from enum import IntEnum
 import cv2
 import numpy as np
 
-from framework.config.validation import MOST_DETECTIONS, check_intervals, require
+from framework.config.validation import MAX_DETECTIONS, check_intervals, require
 from framework.data import Bool, Detections, Float32, Float64, Frame, Int32
 from framework.detection.masks.binary_masks import paste_masks, tight_boxes
 from framework.detection.masks.binary_masks_kernels import contacts
@@ -32,8 +32,8 @@ LOOKALIKES = (
 CLUTTER_CLASSES = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
 """Classes of detections on things without a COCO class."""
 
-LOOKALIKE_SHARE = 0.8  # fraction of the probability lost by the ground-truth class; the other classes get the rest
-EVEN_SHARE = 0.01  # weight of the model's mean in each distribution, to avoid zeros as in a softmax
+LOOKALIKE_FRACTION = 0.8  # fraction of the probability lost by the ground-truth class; the other classes get the rest
+EVEN_FRACTION = 0.01  # weight of the model's mean in each distribution, to avoid zeros as in a softmax
 FALSE_SIZES = (24.0, 160.0)  # range of the sides of false detections, px, log-uniform
 RECURRING_SIZES = (0.2, 1.2)  # range of the sides of recurring false detections, m, log-uniform
 LARGEST_CLUTTER = 0.25  # maximum size of things detected as objects, fraction of the image; walls are larger
@@ -49,7 +49,7 @@ INTERVALS = {
     "boundary_scale": "[2, inf)",
     "confusion_concentration": "(0, inf)",
     "score_scale": "(0, 1]",
-    "false_positives": f"[0, {MOST_DETECTIONS}]",
+    "false_positives": f"[0, {MAX_DETECTIONS}]",
     "false_positive_score": "(0, 1)",
 }
 """Bounds of the parameters."""
@@ -169,7 +169,7 @@ class SimulatedDetector(Detector):
         return np.random.default_rng([self.seed, int(draw), *(k & 0xFFFFFFFF for k in key)])
 
     def _clutter(self, things: Mapping[int, Bool]) -> list[Candidate]:
-        """Return the things of unknown class detected as objects, equal in all frames."""
+        """Return the things of unknown class that are detected as objects, the same in all frames."""
         candidates = []
         for instance, mask in things.items():
             random = self._random(Draw.CLUTTER, instance)
@@ -306,16 +306,16 @@ class SimulatedDetector(Detector):
         return candidates
 
     def _classify(self, candidate: Candidate, frame: Frame) -> Float64:
-        """Return a random distribution (C,). Its mean is the kernel's row of the ground-truth class."""
+        """Return a random distribution (C,), with the confusion kernel's row of the ground-truth class as mean."""
         mean = self._kernel[candidate.class_id]
         random = self._random(Draw.CLASS, frame.index, candidate.instance, candidate.part)
         if random.random() < self.confusion_consistency:
             random = self._random(Draw.CLASS_OF_OBJECT, candidate.instance)
         drawn = _dirichlet(random, mean * self.confusion_concentration)
-        return np.asarray((1 - EVEN_SHARE) * drawn + EVEN_SHARE * mean, np.float64)
+        return np.asarray((1 - EVEN_FRACTION) * drawn + EVEN_FRACTION * mean, np.float64)
 
     def _score(self, candidate: Candidate, probabilities: Float64, frame: Frame) -> float:
-        """Return a Beta draw with the mean `score_scale` times mask IoU times largest class probability."""
+        """Return a Beta sample with the mean `score_scale` times mask IoU times largest class probability."""
         mean = self.false_positive_score
         if candidate.true_mask.any():
             union = np.count_nonzero(candidate.mask | candidate.true_mask)
@@ -336,9 +336,9 @@ def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
         alike[np.ix_(members, members)] = True
     np.fill_diagonal(alike, False)
     other = ~alike & ~np.eye(len(classes), dtype=np.bool_)
-    share = np.where(alike.any(axis=1, keepdims=True), LOOKALIKE_SHARE, 0.0)
-    kernel = share * alike / np.maximum(alike.sum(axis=1, keepdims=True), 1)
-    kernel += (1 - share) * other / other.sum(axis=1, keepdims=True)
+    fraction = np.where(alike.any(axis=1, keepdims=True), LOOKALIKE_FRACTION, 0.0)
+    kernel = fraction * alike / np.maximum(alike.sum(axis=1, keepdims=True), 1)
+    kernel += (1 - fraction) * other / other.sum(axis=1, keepdims=True)
     return np.asarray(confusion * kernel + (1 - confusion) * np.eye(len(classes)), np.float64)
 
 
@@ -368,7 +368,7 @@ def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: flo
 
 
 def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
-    """Return a Dirichlet draw (C,); a single positive alpha makes its class certain."""
+    """Return a sample (C,) of a Dirichlet distribution; with a single positive alpha, its class is certain."""
     weights = random.gamma(alpha)
     return np.asarray(weights / weights.sum(), np.float64) if weights.sum() > 0 else alpha / alpha.sum()
 
@@ -388,7 +388,7 @@ def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
 
 
 def _placed(crop: Bool, x: int, y: int, shape: tuple[int, int]) -> Bool:
-    """Return an empty mask (H, W) with `crop` at (x, y), possibly outside."""
+    """Return a mask (H, W), empty except for `crop` at (x, y), which may be partly outside."""
     image = np.zeros(shape, np.bool_)
     height, width = shape
     top, left = max(0, -y), max(0, -x)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.config.validation import LONGEST_SIDE, MOST_DETECTIONS, check_count, check_intervals, require
+from framework.config.validation import LONGEST_SIDE, MAX_DETECTIONS, check_count, check_intervals, require
 from framework.data import Detections, Float32, Frame, UInt8
 from framework.detection.hub.hub_model import PREPROCESSING, commit_of, find_model, imported_transformers, read_part
 from framework.detection.masks.binary_masks import without_duplicates
@@ -83,7 +83,7 @@ class TransformersSegmentation(Detector):
 
     def __post_init__(self) -> None:
         check_intervals("detector", self, score_threshold="[0, 1)", agnostic_nms_iou="(0, 1]", mask_threshold="(0, 1)")
-        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
+        check_count("detector.max_detections", self.max_detections, MAX_DETECTIONS)
         short, long = self.short_side, self.long_side
         require(short == 0 or short >= 32, "detector.short_side", short, "0 (as published) or at least 32 px")
         allowed = f"at least {short} px and at most {LONGEST_SIDE}" if short else "0 if short_side is 0"
@@ -164,8 +164,8 @@ def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int
     padding.
     """
     axes = [
-        (torch.arange(size, device=grids.device, dtype=torch.float32) + 0.5) * (2 * share / size) - 1
-        for size, share in zip(shape, covered, strict=True)
+        (torch.arange(size, device=grids.device, dtype=torch.float32) + 0.5) * (2 * fraction / size) - 1
+        for size, fraction in zip(shape, covered, strict=True)
     ]
     v, u = torch.meshgrid(*axes, indexing="ij")
     positions = torch.stack([u, v], dim=-1)[None]
@@ -195,7 +195,7 @@ class Preprocessing:
 
     @classmethod
     def parse(cls, content: Mapping[str, Any], where: str) -> Preprocessing:
-        """Parse the file `where`. Raises DataError for missing or unsupported settings."""
+        """Return the settings in the content of a file. Raises DataError for missing or unsupported settings."""
         if content.get("do_split_image"):
             raise DataError(
                 f"{where}: expected an instance model, got a model that splits images for semantic segmentation; "

@@ -15,7 +15,7 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.label_rule import DetectionEvidence, LabeledVoxels, LabelRule, floored_log
 
 RULE = LabelRule(Combine.SUM, logarithmic=True)
-LEAST_LIKELIHOOD = 1e-3  # minimum likelihood of an instance, so that no single score decides
+MIN_LIKELIHOOD = 1e-3  # minimum likelihood of an instance, so that no single score decides
 
 
 @dataclass
@@ -59,7 +59,7 @@ class BayesianTsdf(MapFuser):
         if self.instance_floor > 0:  # the score counts at least twice the floor: no evidence against its match
             log_odds = np.log(np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor)
         else:
-            scores = np.clip(clusters.scores, LEAST_LIKELIHOOD, 1 - LEAST_LIKELIHOOD)
+            scores = np.clip(clusters.scores, MIN_LIKELIHOOD, 1 - MIN_LIKELIHOOD)
             log_odds = np.log(scores * max(instances, 1) / (1 - scores))  # the other instances - 1, and no instance
         return DetectionEvidence(
             instances=np.asarray(log_odds, np.float32),

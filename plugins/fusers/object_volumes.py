@@ -19,7 +19,7 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 
 
 def existence(record: InstanceRecord) -> float:
-    """Return Fusion++'s existence probability, the mean of Beta(1 + frames detected, 1 + other frames in view)."""
+    """Return Fusion++'s existence probability: the mean of Beta(1 + detections, 1 + in-view frames without one)."""
     return (1 + record.observations) / (2 + max(record.visible, record.observations))
 
 
@@ -76,7 +76,7 @@ class ObjectVolumes(MapFuser):
         return count_overlaps(points, seen, stride)
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
-        """Match each cluster with the object of largest overlap, or create an object if score and size suffice."""
+        """Return the matches: the object of largest overlap, or a new object if score and size suffice."""
         ratios = overlaps.by(self.overlap_rule, self.create_points)
         ratios[~self._agree(clusters, overlaps.instance_ids)] = 0
         instance_ids = np.zeros(len(clusters), np.int32)

@@ -15,7 +15,7 @@ from framework.refinement.refine import refine
 class Chain(ClusterRefiner):
     """Refiners applied in order.
 
-    `refiner.links.gmm_em=null` removes a link, `refiner@refiner.links.gmm_em=kmeans` replaces it.
+    `refiner.links.gmm_em=null` removes a link. `refiner@refiner.links.gmm_em=kmeans` replaces it.
     """
 
     links: Mapping[str, ClusterRefiner]  # refiners by name, in order, at least one

@@ -53,7 +53,7 @@ class Dbscan(ClusterRefiner):
         return keep_points(clusters, kept)
 
     def _sampled(self, pixels: Int32) -> tuple[Bool, int]:
-        """Return an array (P,), True for pixels in every `step`-th row and column, and the smallest sufficient step."""
+        """Return an array (P,), True for pixels in every step-th row and column, and the smallest sufficient step."""
         for step in range(self.stride, 1 << 16):
             sampled = (pixels[:, 0] % step == 0) & (pixels[:, 1] % step == 0)
             if np.count_nonzero(sampled) <= self.max_points:

@@ -20,7 +20,7 @@ from framework.refinement.refine import keep_points
 
 
 class ForeignPoints(Enum):
-    """The treatment of points with a most probable Gaussian of another mask."""
+    """The treatment of points whose most probable Gaussian belongs to another mask."""
 
     MOVE = "they move to that mask's cluster"
     DROP = "they are dropped"

@@ -53,5 +53,5 @@ class PlaneRemoval(ClusterRefiner):
         """Return the frame's planes at the border of the scene."""
         planes = find_planes(frame, self.plane_distance, self.inverse_depth_noise, self.min_area)
         upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera's y axis points down
-        large = planes.shares >= self.min_frame_fraction
+        large = planes.fractions >= self.min_frame_fraction
         return planes.chosen(large & (planes.behind <= self.max_behind_ratio) & upright)

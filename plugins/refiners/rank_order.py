@@ -58,7 +58,7 @@ class RankOrder(ClusterRefiner):
 
 
 def _firsts_of_blocks(pixels: Int32, max_points: int) -> Int64:
-    """Return the first pixel of each block of pixels (P, 2), for the smallest blocks with at most `max_points`."""
+    """Return the first of the pixels (P, 2) in each square block; blocks are as small as `max_points` allows."""
     u, v = (pixels - pixels.min(axis=0)).T
     side = int(np.ceil(np.sqrt(len(pixels) / max_points)))
     while True:

@@ -97,7 +97,7 @@ class Open3dOdometry(PoseTracker):
     def _aligned(
         self, image: o3d.t.geometry.RGBDImage, reference: o3d.t.geometry.RGBDImage, frame: Frame
     ) -> tuple[Float64, str]:
-        """Return T_last_camera and a one-line reason for rejection, empty if the pose is trusted."""
+        """Return T_last_camera and a one-line reason for rejection; "" = the pose is trusted."""
         from open3d.t.pipelines import odometry
 
         readings = np.count_nonzero((frame.depth > 0) & (frame.depth <= self.max_depth))
@@ -130,7 +130,7 @@ def _rgbd_image(color: UInt8, depth: Float32) -> o3d.t.geometry.RGBDImage:
 
 
 def _tensor(array: Array) -> o3d.core.Tensor:
-    """Return a copy, because Open3D does not keep the array alive."""
+    """Return a tensor with a copy of the array, because Open3D does not keep the array alive."""
     import open3d as o3d
 
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array)).clone()

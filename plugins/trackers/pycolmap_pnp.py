@@ -60,7 +60,7 @@ class PycolmapPnp(PoseTracker):
         self._keyframes.restore(keyframes)
 
     def _begin(self, frame: Frame, features: Features) -> Pose:
-        """Define the world frame by the first frame with enough features."""
+        """Return the pose of the first frame with enough features, which defines the world frame."""
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         if not self._keyframes.add_with(frame, features, T_world_camera):
             reason = f"the frame has fewer than {self.min_features} features with depth"

@@ -109,14 +109,14 @@ class RerunViewer(Viewer):
             sinks.append(_open_window(rr, self.port, self.memory_limit))
         if self.mode is Mode.BROWSER:
             sinks.append(_server(rr, self.port, self.memory_limit))
-            with _faults(f"viewer.web_port: expected a free port, got {self.web_port}"):
+            with _named_errors(f"viewer.web_port: expected a free port, got {self.web_port}"):
                 self._page = SealedPage(self.web_port, self.port)
             log.info("viewer: %s until the run ends", self._page.url)
         return sinks
 
 
 def _file_sink(rr: Any, path: Path) -> Any:
-    with _faults(f"viewer.file: expected a writable file, got {path}"):
+    with _named_errors(f"viewer.file: expected a writable file, got {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.open("wb").close()  # rerun would report this only on stderr
         return rr.FileSink(path)
@@ -124,7 +124,7 @@ def _file_sink(rr: Any, path: Path) -> Any:
 
 def _server(rr: Any, port: int, memory_limit: str) -> Any:
     """Serve the data on 127.0.0.1."""
-    with _faults(f"viewer.port: expected a free port, got {port}"):
+    with _named_errors(f"viewer.port: expected a free port, got {port}"):
         with socket.socket() as probe:  # rerun would report this only on stderr
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((HERE, port))
@@ -134,14 +134,14 @@ def _server(rr: Any, port: int, memory_limit: str) -> Any:
 def _open_window(rr: Any, port: int, memory_limit: str) -> Any:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigError("viewer.mode: expected a screen for WINDOW, got none; set viewer.mode=BROWSER or RECORD")
-    with _faults("viewer.mode: expected rerun's viewer to start"):
+    with _named_errors("viewer.mode: expected rerun's viewer to start, got an error"):
         open_window(port, memory_limit)
     return rr.GrpcSink(f"rerun+http://{HERE}:{port}/proxy")
 
 
 @contextmanager
-def _faults(what: str) -> Iterator[None]:
+def _named_errors(what: str) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError, ValueError, subprocess.SubprocessError) as error:
-        raise ConfigError(f"{what}: {in_one_line(error)}") from error
+        raise ConfigError(f"{what} ({in_one_line(error)})") from error

@@ -137,7 +137,7 @@ def test_run_directory_creation_error_is_one_line(tmp_path: Path) -> None:
     line = command("seed=0")
     done = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
-    assert re.fullmatch(r"error: outputs/.*_fake: directory cannot be created: .*\n", done.stderr)
+    assert re.fullmatch(r"error: outputs/.*_fake: expected a writable parent folder, got .*\n", done.stderr)
 
 
 @pytest.mark.parametrize("sweep", [False, True])
@@ -183,7 +183,7 @@ def test_help_of_hydra_command_states_arguments(tmp_path: Path, command: str) ->
 def test_command_misspelled_name_suggests_nearest_name(tmp_path: Path) -> None:
     done = words("tabels", "outputs", directory=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "error: 'tabels': unknown command; did you mean tables?\n"
+    assert done.stderr == "error: command: expected a known command, got 'tabels'; did you mean tables?\n"
     assert "expected one of tables, figures" in words("xyz", directory=tmp_path).stderr
 
 

@@ -394,7 +394,7 @@ def test_concurrent_detector_is_serial_on_one_core(
     @dataclass
     class Alone(SphereDetector):
         def detect(self, frame: Frame) -> Detections:
-            found.append([thread.name for thread in threading.enumerate() if thread.name.startswith("detect-ahead")])
+            found.append([thread.name for thread in threading.enumerate() if thread.name.startswith("prefetch")])
             return super().detect(frame)
 
     found: list[list[str]] = []

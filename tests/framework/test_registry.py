@@ -159,19 +159,19 @@ def test_build_flattens_parameters_of_parts() -> None:
         ({"limit": 2.5}, ["limit", "2.5", "Integer"]),
         ({"limit": None}, ["limit", "not Optional"]),
         ({"storage": "exakt"}, ["storage", "exact, compact"]),
-        ({"treshold": 0.2}, ["unknown parameter", "did you mean 'threshold'?"]),
-        ({"zzz": 0.2}, ["unknown parameter", "expected one of weights, threshold, limit, storage, name"]),
+        ({"treshold": 0.2}, ["expected a known parameter", "did you mean 'threshold'?"]),
+        ({"zzz": 0.2}, ["got 'zzz'", "expected one of weights, threshold, limit, storage, name"]),
         ({"weights": "???"}, ["expected a value for weights", "set detector.weights=..."]),
         ({"limit": "${nowhere}"}, ["limit", "nowhere"]),
         ({"threshold": 2.0}, ["threshold: expected a value in [0, 1], got 2.0"]),
         ({"name": "broken"}, ["install instancemap[onnx]"]),
         ({"_target_": f"{HERE}.Undecorated"}, ["@dataclass"]),
         ({"_target_": f"{HERE}.Abstract"}, ["expected detect of Detector, got none in Abstract"]),
-        ({"_partial_": True}, ["unknown parameter '_partial_'"]),
+        ({"_partial_": True}, ["got '_partial_'"]),
         ({"_target_": f"{HERE}.OddField"}, ["bool, int, float, str, Path, Enum or list", "ndarray"]),
         ({"_target_": f"{HERE}.Assembled", "nms": 2}, ["Assembled", "nms", "[0, 1]", "got 2"]),
         ({"_target_": f"{HERE}.Assembled", "nms": "high"}, ["Assembled", "nms", "'high'", "Float"]),
-        ({"_target_": f"{HERE}.Assembled", "suppression": {"nms": 0.1}}, ["unknown parameter 'suppression'"]),
+        ({"_target_": f"{HERE}.Assembled", "suppression": {"nms": 0.1}}, ["got 'suppression'"]),
         ({"_target_": f"{HERE}.Assembled", "agnostik": True}, ["did you mean 'agnostic'?"]),
         ({"_target_": f"{HERE}.Ambiguous"}, ["Ambiguous: expected unique parameters, got two nms"]),
         ({"_target_": f"{HERE}.Prob"}, ["got Prob", "did you mean 'Probe'?"]),
@@ -181,9 +181,9 @@ def test_build_flattens_parameters_of_parts() -> None:
         ({"_target_": "framework.interfaces.Detector"}, ["implements Detector"]),
         (
             {"_target_": "framework.interface.Detector"},
-            ["unknown module framework.interface", "did you mean 'interfaces'?"],
+            ["expected an existing module, got framework.interface", "did you mean 'interfaces'?"],
         ),
-        ({"_target_": "nowhere.at.All"}, ["unknown module"]),
+        ({"_target_": "nowhere.at.All"}, ["expected an existing module, got nowhere"]),
         ({"_target_": "Probe"}, ["package.module.Class"]),
         ({"_target_": ""}, ["_target_"]),
         ({"_target_": None}, ["_target_"]),
@@ -214,7 +214,9 @@ def test_find_class_import_failure_raises_one_line_error(tmp_path: Path, monkeyp
     (tmp_path / "raises.py").write_text(failing + tracker)
     with pytest.raises(ConfigError, match=r".* expected an installed package 'surely_not_installed', got none"):
         find_class(PoseTracker, "needs_more.Tracker")
-    with pytest.raises(ConfigError, match=r"raises: import failed: RuntimeError: operator .* does not exist$"):
+    with pytest.raises(
+        ConfigError, match=r"raises: expected an importable module, got RuntimeError: operator .* does not exist$"
+    ):
         find_class(PoseTracker, "raises.Tracker")
 
 

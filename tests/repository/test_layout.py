@@ -43,7 +43,7 @@ LAYER = {part: k for k, layer in enumerate(LAYERS) for part in layer}
 ROOT = {"__init__", "__main__", "api", "data", "errors", "geometry", "interfaces", "pipeline", "registry"}
 """The modules at the root of framework/. Every other module is in the folder of its subject."""
 
-MOST_FILES = 20  # Python files in a folder
+MAX_FILES = 20  # Python files in a folder
 
 OPTIONAL = {
     "onnxruntime",
@@ -146,7 +146,7 @@ def test_framework_root_has_only_shared_modules() -> None:
 
 def test_folders_have_at_most_twenty_files() -> None:
     counts = Counter(path.parent.relative_to(CHECKOUT).as_posix() for path in MODULES)
-    assert not {folder: count for folder, count in counts.items() if count > MOST_FILES}
+    assert not {folder: count for folder, count in counts.items() if count > MAX_FILES}
 
 
 def test_framework_file_names_are_unique() -> None:

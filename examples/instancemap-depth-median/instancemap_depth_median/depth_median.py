@@ -10,7 +10,7 @@ from instancemap import ClusterRefiner, Frame, PointClusters, check_bounds, keep
 
 @dataclass
 class DepthMedian(ClusterRefiner):
-    """Keeps the points of each cluster with a depth near the cluster's median.
+    """Selection of the points of each cluster with a depth near the cluster's median.
 
     A mask that bleeds over an object's outline includes points of the background, at other depths. If these are fewer
     than half of the points, the median is a depth of the object. Clusters keep their index.

@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def examine() -> dict[str, list[Check]]:
-    """Return the results by section. Downloads, compiles and writes nothing."""
+    """Return the checks by section, without downloading, compiling or writing anything."""
     imports = [packages.import_statement(line.name) for line in packages.declared()[1]]
     outcomes = run_all([ACCELERATION, KERNELS, *imports])
     libraries, acceleration, kernels = (

@@ -87,11 +87,11 @@ def main() -> None:
         default=Path(),
         help="parent folder of the repository; default: working folder",
     )
-    asked = arguments(parser)
+    parsed = arguments(parser)
     with one_line_errors():
-        made = write_repository(asked.stage, asked.name, asked.folder)
-        names = names_of(asked.stage, asked.name)
-        print(f"written: {made}; the method is in {names['package']}/{asked.name}.py")
+        made = write_repository(parsed.stage, parsed.name, parsed.folder)
+        names = names_of(parsed.stage, parsed.name)
+        print(f"written: {made}; the method is in {names['package']}/{parsed.name}.py")
         print(f"  cd {made} && pip install -e '.[test]' && pytest")
         print(f"  {names['try']}")
 
@@ -130,8 +130,8 @@ def check_name(stage: str, name: str) -> None:
         )
     if is_value(name):
         raise ConfigError(
-            f"NAME: expected a name, got the value {name} of the command line and YAML; choose another name such "
-            f"as my_{name}"
+            f"NAME: expected a name, got {name}, a null, boolean or number in YAML; choose another name such as "
+            f"my_{name}"
         )
     if keyword.iskeyword(name) or name in FOLDERS:
         raise ConfigError(

@@ -149,17 +149,17 @@ def main() -> None:
     stages_listed = f"stage to list: {', '.join(GROUPS)}; default: all stages"
     parser.add_argument("stage", metavar="STAGE", nargs="?", choices=GROUPS, help=stages_listed)
     parser.add_argument("name", metavar="NAME", nargs="?", help="plugin to list; default: all plugins of the stage")
-    asked = arguments(parser)
+    parsed = arguments(parser)
     with one_line_errors():
-        stages = [asked.stage] if asked.stage else list(GROUPS)
+        stages = [parsed.stage] if parsed.stage else list(GROUPS)
         # garbage collection of torch's objects takes a fifth of the time here, and again at exit
         atexit.register(gc.freeze)
         gc.disable()
-        options = registered(*stages, only=asked.name)
+        options = registered(*stages, only=parsed.name)
         gc.enable()
-        if asked.name and not options:
-            there = ", ".join(options_of(asked.stage))
-            raise ConfigError(f"{asked.stage}: expected one of {there}, got {asked.name}")
+        if parsed.name and not options:
+            there = ", ".join(options_of(parsed.stage))
+            raise ConfigError(f"{parsed.stage}: expected one of {there}, got {parsed.name}")
         for stage in stages:
             print(f"{stage} ({GROUPS[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
             described = [describe(option) for option in options if option.stage == stage]

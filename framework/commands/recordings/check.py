@@ -39,8 +39,8 @@ def job(config: DictConfig) -> None:
     out.parent.mkdir(exist_ok=True)
     write_check(out, found)
     log.info("%s", out)
-    if found.faults:
-        settings = " ".join(dict.fromkeys(finding.setting for finding in found.faults if finding.setting))
+    if found.errors:
+        settings = " ".join(dict.fromkeys(finding.setting for finding in found.errors if finding.setting))
         raise DataError(f"dataset: expected a usable recording, got errors{f'; try {settings}' if settings else ''}")
 
 

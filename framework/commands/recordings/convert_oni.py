@@ -19,7 +19,7 @@ from framework.datasets.scenenn.oni import read_frames
 from framework.datasets.scenenn.oni_records import Stream, read_contents
 from framework.datasets.scenenn.scene_files import MICROSECONDS, write_timestamps
 from framework.errors import DataError
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 
 PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # higher levels take longer than playback
 
@@ -84,5 +84,5 @@ def convert(source: Path, target: Path) -> None:
 def _write_png(path: Path, image: Array) -> None:
     """Write an image: depth (H, W) uint16 or BGR (H, W, 3) uint8."""
     _, data = cv2.imencode(".png", image, PNG)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())

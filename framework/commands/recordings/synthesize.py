@@ -10,7 +10,7 @@ from framework.errors import ConfigError
 from framework.runtime.process_settings import available_cores
 from framework.synthetic.benchmark import SCENES
 from framework.synthetic.scene_writers import write_scenes
-from framework.synthetic.scenenn_scene import FASTEST, BenchmarkSettings
+from framework.synthetic.scenenn_scene import MAX_CAMERA_SPEED, BenchmarkSettings
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
     add("--frames", metavar="N", type=int, default=default.frames, help="number of frames per scene; default: 120")
     add("--rate", metavar="HZ", type=float, default=default.rate, help="frame rate, Hz, in (0, 30]; default: 10")
     add("--width", metavar="PX", type=int, default=default.width, help="image width, px, multiple of 4; default: 640")
-    speed = f"camera speed relative to the recommended recording speed, in (0, {FASTEST:g}]; default: 2"
+    speed = f"camera speed relative to the recommended recording speed, in (0, {MAX_CAMERA_SPEED:g}]; default: 2"
     add("--camera-speed", metavar="FACTOR", type=float, default=default.camera_speed, help=speed)
     add("--haste", dest="camera_speed", type=float, default=argparse.SUPPRESS, help=argparse.SUPPRESS)  # earlier name
     add("--jobs", metavar="N", type=int, default=available_cores(), help="number of processes; default: all cores")

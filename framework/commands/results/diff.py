@@ -9,7 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from framework.commands.command_line import arguments, one_line_errors
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 from framework.files.json_file import read_json, write_json
 from framework.files.tum_trajectory import read_tum
 from framework.files.yaml_file import load_yaml
@@ -56,11 +56,11 @@ def visit_of(run: Path) -> Visit:
 
 def in_world(run: Path, world: Path) -> bool:
     """Return True if the configs or metrics of two runs imply the same world frame."""
-    config = load_yaml(run / CONFIG) if is_there(run / CONFIG) else None
+    config = load_yaml(run / CONFIG) if path_exists(run / CONFIG) else None
     worlds = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
     if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in worlds):
         return True
-    records = [read_json(place / METRICS) if is_there(place / METRICS) else None for place in (run, world)]
+    records = [read_json(place / METRICS) if path_exists(place / METRICS) else None for place in (run, world)]
     return all(isinstance(record, dict) and record.get("pose_source") == "ground_truth" for record in records)
 
 

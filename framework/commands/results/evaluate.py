@@ -98,7 +98,7 @@ def evaluate_runs(
 
 
 def summary(found: Reevaluation, transfer: Transfer) -> str:
-    """Summarize the changes: the main metrics of one transfer, and the number of other changes."""
+    """Return the changes as text: the main metrics of one label transfer, and the number of other changes."""
     changed, added = found.changed, found.added
     prefix = "instances." if transfer is Transfer.TO_TRUTH else f"instances.{transfer.value}."
     shown = [key for key in (*(prefix + name for name in MAIN_FIGURES), "annotation_release") if key in changed]

@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def heading(answer: QueryResult, wanted: str | None) -> str:
-    """Describe the ranking method, and its reason if embeddings are unavailable."""
+    """Return a line with the ranking method, and the reason for it if embeddings are unavailable."""
     if answer.by == "embeddings":
         return f"by embeddings of {answer.space}"
     unavailable = wanted is None and not answer.space
@@ -54,7 +54,7 @@ def heading(answer: QueryResult, wanted: str | None) -> str:
 
 
 def table(found: Sequence[Match], measure: str) -> str:
-    """Format a table with lengths in meters."""
+    """Return the objects as a text table, with lengths in meters."""
     rows = [("id", "class", measure, "confidence", "color", "position", "size")]
     for one in found:
         x, y, z = one.centroid

@@ -71,7 +71,7 @@ def draw(run: Path, frame: int | None, pose: list[float] | None, out: Path) -> N
 
 
 def pose_of_frame(contents: RunContents, frame: int | None) -> int:
-    """Return the index of a frame's pose in the trajectory; None = middle pose. Raises DataError without a pose."""
+    """Return the index of a frame's pose in the trajectory; None = middle pose. Raises DataError without any pose."""
     numbers, lost = contents.frame_numbers, contents.lost_frames
     if not numbers:
         raise DataError(f"{contents.record.directory}: expected mapped frames, got none")

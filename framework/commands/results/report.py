@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.errors import DataError
-from framework.files.atomic_write import check_regular, written_whole
+from framework.files.atomic_write import atomic_write, check_regular
 from framework.runs.stored_runs import REPORT
 
 COMPARISON = "comparison.html"
@@ -65,5 +65,5 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
 
 
 def _write(path: Path, page: str) -> None:
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may be invalid Unicode

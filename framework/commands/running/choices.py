@@ -21,7 +21,7 @@ from framework.config.composition import config_loader
 from framework.config.validation import checked_rows
 from framework.errors import ConfigError
 
-MANY = 1_000_000  # upper bound on the values of a glob(), which depend on the file system
+GLOB_COUNT = 1_000_000  # upper bound on the values of a glob(), which depend on the file system
 COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)
 
 Choices = Mapping[str, str | None]
@@ -63,7 +63,7 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
     runs: dict[str, int] = {}  # by key; the last override takes precedence
     for override in _parsed(overrides):
         values = _values(override)
-        runs[override.get_key_element()] = len(values) or MANY
+        runs[override.get_key_element()] = len(values) or GLOB_COUNT
         if not values and override.value_type in COUNTED:
             raise ConfigError(f"{override.input_line}: expected at least one value, got none; the sweep would be empty")
         if override.key_or_group == "row" and rows:

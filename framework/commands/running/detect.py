@@ -26,12 +26,12 @@ from framework.interfaces import Detector, RGBDSequence
 if TYPE_CHECKING:  # heavy imports are local
     from framework.data import Bool, Detections
     from framework.detection.stored.coco_results import ResultWriter
-    from framework.evaluation.detection_faults import DetectionFaults
+    from framework.evaluation.detection_errors import DetectionErrors
 
 log = logging.getLogger(__name__)
 jobs = Jobs()
 
-SMALLEST = 100  # px, minimum size of evaluated objects
+MIN_PIXELS = 100  # px, minimum size of evaluated objects
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="detect")
@@ -66,13 +66,13 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
     """
     from framework.detection.domain import warn_outside_domain
     from framework.detection.stored.coco_results import results_file
-    from framework.evaluation.detection_faults import DetectionFaults
+    from framework.evaluation.detection_errors import DetectionErrors
     from framework.evaluation.mask_ap import mask_ap
 
     warn_outside_domain(detector, sequence)
-    faults = DetectionFaults()
+    errors = DetectionErrors()
     with results_file(path, detector.classes) as results:
-        precision = mask_ap(_written(results, detector, sequence, faults), detector.classes, SMALLEST)
+        precision = mask_ap(_written(results, detector, sequence, errors), detector.classes, MIN_PIXELS)
     log.info("%s: %d detections in %d frames of %s", path, results.count, results.frames, sequence.name)
     if precision.objects:
         log.info(
@@ -81,15 +81,15 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
             precision.ap,
             sum(not math.isnan(ap) for ap in precision.ap50_by_class.values()),
             precision.objects,
-            SMALLEST,
+            MIN_PIXELS,
         )
-        for name, value in faults.table().items():
+        for name, value in errors.table().items():
             log.info("%-40s %.2f", name, value)
     return results.count
 
 
 def _written(
-    results: ResultWriter, detector: Detector, sequence: RGBDSequence, faults: DetectionFaults
+    results: ResultWriter, detector: Detector, sequence: RGBDSequence, errors: DetectionErrors
 ) -> Iterator[tuple[Bool, list[str | None], Detections]]:
     """Write the detections frame by frame; with ground truth, count errors and yield the input of `mask_ap`."""
     with logging_redirect_tqdm(), tqdm(total=len(sequence), unit=" frames", disable=None, dynamic_ncols=True) as bar:
@@ -108,7 +108,7 @@ def _written(
                 log.warning("frame skipped in the evaluation: %s", error)
                 continue
             if frame.truth is not None and true_ids is not None:
-                faults.add(frame.truth, found)
+                errors.add(frame.truth, found)
                 names = frame.truth.class_names
                 ids = np.array([i for i in np.unique(true_ids).tolist() if i and i in names], np.int32)
                 yield true_ids == ids[:, None, None], [names[i] for i in ids.tolist()], found
@@ -118,10 +118,10 @@ def _written(
 
 def write_labels(path: Path, classes: tuple[str, ...]) -> Path:
     """Write the class names next to a result file, one per line."""
-    from framework.files.atomic_write import written_whole
+    from framework.files.atomic_write import atomic_write
 
     labels = path.with_suffix(".labels.txt")
-    with written_whole(labels) as temporary:
+    with atomic_write(labels) as temporary:
         temporary.write_text("".join(f"{name}\n" for name in classes))
     return labels
 

@@ -53,7 +53,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
     - completed: the outputs are complete. The returned Interruption contains a signal that arrived during writing, or
       that ended a live video.
-    - partial: a signal, a stage or the disk ended the run after something was mapped. The outputs are written as far
+    - partial: a signal, a stage or the disk ended the run after the first mapped frame. The outputs are written as far
       as possible, and marked as partial. Raises Interrupted, or PartialRunError from the cause.
     - nothing was mapped: raises the cause.
 
@@ -87,12 +87,12 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
         with frozen_garbage_collector():
             result = pipeline.run_to_any_end(video, directory)
         with interruption.second_ends_at_once("after the outputs are written"):
-            fault = record.write(video, result, cache_metrics(pipeline.detector))
-    if fault is None:
+            error = record.write(video, result, cache_metrics(pipeline.detector))
+    if error is None:
         return interruption
-    if isinstance(fault, Exception):
-        raise PartialRunError(reason(fault)) from fault
-    raise fault
+    if isinstance(error, Exception):
+        raise PartialRunError(reason(error)) from error
+    raise error
 
 
 def main() -> None:

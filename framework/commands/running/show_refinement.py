@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # heavy imports are local
 log = logging.getLogger(__name__)
 jobs = Jobs()
 
-TRIED = 6  # number of candidates of the default frame, evenly spaced
+CANDIDATES = 6  # number of candidates of the default frame, evenly spaced
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="show_refinement")
@@ -60,7 +60,7 @@ def job(config: DictConfig) -> None:
 
 
 def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tuple[int, Frame, Detections]:
-    """Return a position, its frame and its detections; None = the candidate with the most detections.
+    """Return a position with its frame and detections; None = the candidate frame with the most detections.
 
     Raises ConfigError for an invalid position, FrameError for an unusable frame, DataError if no candidate is usable.
     """
@@ -75,7 +75,7 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
             )
         frame = sequence[position]
         return position, frame, detector.detect(frame)
-    tried = sorted({k * len(sequence) // TRIED for k in range(TRIED)}) if len(sequence) else []
+    tried = sorted({k * len(sequence) // CANDIDATES for k in range(CANDIDATES)}) if len(sequence) else []
     best: tuple[int, Frame, Detections] | None = None
     for k in tried:
         try:

@@ -99,9 +99,9 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     """
     own = config.hydra
     swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
-    asked = [*swept, *own.overrides.task]
-    runs = checked_sweep(asked, checked_rows(config.get("rows")))
-    _name_by(own, swept_keys(asked))
+    overrides = [*swept, *own.overrides.task]
+    runs = checked_sweep(overrides, checked_rows(config.get("rows")))
+    _name_by(own, swept_keys(overrides))
     workers = 0
     if by_joblib(own):
         workers = min(joblib_workers(own.launcher.n_jobs), runs)
@@ -112,7 +112,7 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
 
 
 def _name_by(own: DictConfig, keys: Collection[str]) -> None:
-    """Add these keys to the names of job directories, although they change no result.
+    """Add these keys to the names of job directories, although they do not affect results.
 
     Jobs that differ only in such keys would share a directory. Workers compose each job again from the overrides that
     this function extends.
@@ -129,11 +129,11 @@ def by_joblib(own: DictConfig | HydraConf) -> bool:
     return str(own.launcher._target_).endswith(".JoblibLauncher")
 
 
-def joblib_workers(asked: int | None) -> int:
-    """Return the number of processes that joblib uses for `n_jobs`; with 1 it starts none."""
+def joblib_workers(n_jobs: int | None) -> int:
+    """Return the number of processes that joblib uses for `n_jobs`; 1 = jobs run in this process."""
     from joblib import effective_n_jobs  # type: ignore[import-untyped]
 
-    return int(effective_n_jobs(asked))
+    return int(effective_n_jobs(n_jobs))
 
 
 @contextmanager

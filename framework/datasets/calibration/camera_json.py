@@ -13,7 +13,7 @@ from framework.data import Camera
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError, errors_of
-from framework.files.atomic_write import MOST_TEXT
+from framework.files.atomic_write import MAX_TEXT
 from framework.files.json_file import read_json
 
 CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")  # of camera.json
@@ -27,10 +27,10 @@ class StoredCamera(NamedTuple):
 
     camera: Camera
     depth_scale: float  # units per meter
-    distortion: Distortion | None  # of the lens, in color and depth alike; None = a pinhole
+    distortion: Distortion | None  # lens distortion of color and depth; None = pinhole camera
 
 
-def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
+def read_json_object(path: Path, most: int = MAX_TEXT) -> dict[str, Any]:
     """Return the JSON object in a file of at most `most` bytes. Raises DataError that names the file."""
     found = read_json(path, most)
     if not isinstance(found, dict):
@@ -73,7 +73,7 @@ def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> 
     for key in unread:
         close = get_close_matches(key.lower(), known, n=1, cutoff=0.8)
         if close:
-            raise DataError(f"{path}: unknown key {key!r}; did you mean {close[0]!r}?")
+            raise DataError(f"{path}: expected known keys, got {key!r}; did you mean {close[0]!r}?")
     if unread:
         log.warning("%s: ignored unknown keys: %s; known keys: %s", path, ", ".join(unread), ", ".join(known))
 

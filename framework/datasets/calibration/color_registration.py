@@ -8,7 +8,7 @@ from functools import partial
 import cv2
 import numpy as np
 
-from framework.data import MOST_PIXELS, Camera, UInt8
+from framework.data import MAX_PIXELS, Camera, UInt8
 from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, FrameError
 
@@ -24,7 +24,7 @@ class ColorRegistration:
 
     def __post_init__(self) -> None:
         width, height = self._fine * self.depth.width, self._fine * self.depth.height
-        if width * height > MOST_PIXELS or max(width, height, *self.color.shape) > LONGEST_SIDE:
+        if width * height > MAX_PIXELS or max(width, height, *self.color.shape) > LONGEST_SIDE:
             raise DataError(
                 f"expected color and depth cameras of similar resolution, got "
                 f"{self.color.width}x{self.color.height} px and fx = {self.color.fx:g} px for color, "
@@ -72,6 +72,6 @@ def _registered_color(images: StoredImages, registration: ColorRegistration) -> 
 
 
 def _line(f_color: float, c_color: float, f_depth: float, c_depth: float, fine: int) -> tuple[float, float]:
-    """Return the numbers a and b: the coordinate i of the fine image is a i + b in the color image."""
+    """Return a and b such that the coordinate i of the fine image is a i + b in the color image."""
     slope = f_color / f_depth
     return slope / fine, slope * (0.5 / fine - 0.5 - c_depth) + c_color

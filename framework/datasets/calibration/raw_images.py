@@ -34,8 +34,8 @@ class Calibration:
     source: Path | str  # file or parameter of the camera, for messages
     depth_scale: float  # units per meter
     max_depth: float  # m; farther depth readings are dropped; 0 = keep all
-    distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
-    lens: Undistortion | None = field(init=False, repr=False)  # None = a pinhole
+    distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
+    lens: Undistortion | None = field(init=False, repr=False)  # None = pinhole camera
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lens", Undistortion(self.camera, self.distortion) if self.distortion else None)

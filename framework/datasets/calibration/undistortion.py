@@ -25,7 +25,7 @@ FARTHEST_SHIFT = 0.5  # fraction of the image width; a larger shift indicates an
 
 @dataclass(frozen=True)
 class Distortion:
-    """Distortion coefficients of a lens; all 0 = a pinhole."""
+    """Distortion coefficients of a lens; all 0 = pinhole camera."""
 
     k1: float = 0.0
     k2: float = 0.0

@@ -88,7 +88,10 @@ class DepthCamera(LiveVideo):
         except self.errors as error:
             which = f"device {self.serial}" if self.serial else "device"
             mode = f"{self.width}x{self.height} at {self.fps} Hz"
-            raise DataError(f"{self.brand}: {which} with {mode} cannot be started: {in_one_line(error)}") from error
+            raise DataError(
+                f"{self.brand}: expected {which} with {mode}, got an error ({in_one_line(error)}); check the "
+                "connection and dataset.serial, and set a size and rate that the device supports"
+            ) from error
         number = count()
         calibration: Calibration | None = None
         try:
@@ -100,7 +103,9 @@ class DepthCamera(LiveVideo):
                 else:
                     yield partial(self._frame, images, next(number), time.time(), calibration)
         except self.errors as error:
-            raise DataError(f"{self.brand}: {in_one_line(error)}") from error
+            raise DataError(
+                f"{self.brand}: expected a running camera, got an error ({in_one_line(error)}); check its connection"
+            ) from error
         finally:
             self.stop()
 
@@ -109,7 +114,9 @@ class DepthCamera(LiveVideo):
         try:
             color, depth = self.read(images)
         except self.errors as error:
-            raise FrameError(f"frame {number}: {in_one_line(error)}") from error
+            raise FrameError(
+                f"frame {number}: expected color and depth, got an error ({in_one_line(error)})"
+            ) from error
         if color is None or depth is None:
             raise FrameError(
                 f"frame {number}: expected color and depth, got no {'color' if color is None else 'depth'}"
@@ -130,5 +137,7 @@ def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images 
         if images is not None:
             last_time = time.monotonic()
         elif time.monotonic() - last_time > LONGEST_SILENCE:
-            raise DataError(f"{name}: no frame received for {LONGEST_SILENCE:g} s; check the camera's connection")
+            raise DataError(
+                f"{name}: expected a frame within {LONGEST_SILENCE:g} s, got none; check the camera's connection"
+            )
         yield images

@@ -35,7 +35,7 @@ from framework.interfaces import FrameReader, LiveVideo
 COLOR, DEPTH = (".jpg", ".jpeg", ".png"), (".png",)
 LONGEST_WAIT = 86_400.0  # s
 LARGEST_NUMBER = 2**53  # of a frame; smaller numbers are exact in double precision
-LEAST_REST = 3.0  # minimum pause between polls, as a multiple of the last poll's duration; listing a folder can be slow
+MIN_REST = 3.0  # minimum pause between polls, as a multiple of the last poll's duration; listing a folder can be slow
 CLOCK_TICK = 1e-6  # s, minimum difference between the timestamps of two frames of the same poll
 
 log = logging.getLogger(__name__)
@@ -74,7 +74,7 @@ class FolderWatch(LiveVideo):
             if over:
                 return
             yield None
-            time.sleep(min(max(self.poll_interval, LEAST_REST * (time.monotonic() - began)), 0.1))
+            time.sleep(min(max(self.poll_interval, MIN_REST * (time.monotonic() - began)), 0.1))
 
     def _calibration(self) -> Generator[None, None, Calibration]:
         """Wait for a complete camera.json and return the calibration."""
@@ -85,7 +85,9 @@ class FolderWatch(LiveVideo):
                 break
             except DataError as error:
                 if time.monotonic() > deadline:
-                    raise DataError(f"{error}; waited {self.camera_timeout:g} s for this file") from error
+                    raise DataError(
+                        f"{error}; write it within dataset.camera_timeout={self.camera_timeout:g} s"
+                    ) from error
             yield None
             time.sleep(self.poll_interval)
         camera, depth_scale, distortion = read_camera(path)

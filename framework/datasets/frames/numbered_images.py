@@ -25,7 +25,9 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
             continue
         number = number_of(path)
         if number is None:
-            raise DataError(f"{path}: expected a name that ends in a frame number, such as 000000{path.suffix}")
+            raise DataError(
+                f"{folder}: expected names that end in a frame number, such as 000000{path.suffix}, got {path.name}"
+            )
         if number in files:
             raise DataError(f"{path}: expected unique frame numbers, got {number} for {files[number].name} too")
         files[number] = path
@@ -60,7 +62,7 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[in
             errors.append(str(error))
             continue
         return width, height
-    raise DataError(f"no image can be read; first error: {errors[0]}")
+    raise DataError(f"expected a readable image, got none of {len(errors)}; first error: {errors[0]}")
 
 
 def number_of(path: Path) -> int | None:

@@ -73,14 +73,14 @@ class RecordedFrame:
     images: StoredImages
     timestamp: float  # s
     T_world_camera: Float64 | None = None  # (4, 4), None = unknown
-    error: str = ""  # reason of an unusable frame; "" = usable
+    error: str = ""  # reason why the frame is unusable; "" = usable
     up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = unknown
     color_timestamp: float | None = None  # s, of the color image; None = timestamp
     depth_timestamp: float | None = None  # s, of the depth image; None = timestamp
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
-        """Return the frame with the result of `pose`, or with the error message if `pose` raises DataError."""
+        """Return a frame with the pose that `pose` returns, or with the error message if `pose` raises DataError."""
         try:
             return cls(images, timestamp, pose())
         except DataError as error:
@@ -95,7 +95,7 @@ class Contents:
     camera_source: Path | str  # file or parameter of the camera, for messages
     depth_scale: float  # units per meter
     frames: Sequence[RecordedFrame]
-    distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
+    distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
 
 
 @dataclass
@@ -314,7 +314,11 @@ def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[Re
     times = [recorded.timestamp for recorded in frames if not recorded.error]
     if all(a < b for a, b in pairwise(times)):
         return frames
-    log.warning("%s: expected increasing timestamps; using a frame rate of %g Hz", name, FRAME_RATE)
+    log.warning(
+        "%s: expected increasing timestamps, got repeated or decreasing ones; using a frame rate of %g Hz",
+        name,
+        FRAME_RATE,
+    )
     return [replace(without_image_times(recorded), timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
 
 

@@ -11,7 +11,7 @@ from framework.data import FrameTruth, SceneTruth
 from framework.datasets.frames.sequence_reader import Recording
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import DataError
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class LabeledRecording(Recording):
         """
         if self.named_truth is not None:
             return
-        missing = [path for path in files if not is_there(path)]
+        missing = [path for path in files if not path_exists(path)]
         if not missing:
             self.mesh = read(*files)
         elif self.frame_ground_truth:

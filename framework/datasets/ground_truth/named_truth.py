@@ -23,7 +23,7 @@ import numpy as np
 from framework.data import Float64, Int32, ReferenceTrajectory
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 from framework.files.json_file import read_json
 from framework.files.number_lines import SHOWN
 from framework.files.ply import PlyMesh, read_ply
@@ -35,7 +35,7 @@ KEY = "dataset.ground_truth"
 MESH, INSTANCES, TRAJECTORY, METRICS = "mesh.ply", "instances.json", "trajectory.txt", "metrics.json"  # of a run
 LABELS = "instance"  # the vertex property
 LARGEST_ID = np.iinfo(np.int32).max
-MOST_DIGITS = 10  # of an id, including leading zeros
+MAX_DIGITS = 10  # of an id, including leading zeros
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ def truth_files(path: Path) -> list[Path]:
     if found is None:
         raise ConfigError(f"{KEY}: expected a labeled mesh (PLY) or a run directory, got nonexistent {path}")
     mesh = found / MESH if found.is_dir() else found
-    if not is_there(mesh):
+    if not path_exists(mesh):
         raise DataError(f"{KEY}: expected {MESH} in the directory {found}, got none; set {KEY} to the labeled mesh")
     places = [mesh.with_name(INSTANCES), mesh.absolute().parents[1] / INSTANCES]
-    names = next((place for place in places if is_there(place)), None)
+    names = next((place for place in places if path_exists(place)), None)
     if names is None:
         raise DataError(f"{KEY}: expected {places[0]} with the class of each instance of {mesh.name}, got none")
     trajectory = mesh.with_name(TRAJECTORY)
-    return [mesh, names, trajectory] if is_there(trajectory) else [mesh, names]
+    return [mesh, names, trajectory] if path_exists(trajectory) else [mesh, names]
 
 
 def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
@@ -104,7 +104,7 @@ def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
         raise DataError(f"{path}: expected a JSON object, got {type(content).__name__}")
     class_names: dict[int, str | None] = {}
     for key, entry in content.items():
-        if not (key.isascii() and key.isdigit() and len(key) <= MOST_DIGITS and 0 < int(key) <= largest_id):
+        if not (key.isascii() and key.isdigit() and len(key) <= MAX_DIGITS and 0 < int(key) <= largest_id):
             raise DataError(f"{path}: expected instance ids from 1 to {largest_id}, got {key!r:.60}")
         if int(key) in class_names:
             raise DataError(f"{path}: expected unique instance ids, got {int(key)} twice, the second time as {key!r}")
@@ -156,6 +156,6 @@ def _classes_of_run(path: Path, entries: Sequence[Any]) -> dict[int, str | None]
 
 def _trajectory_of_run(directory: Path) -> ReferenceTrajectory:
     timestamps, poses = read_tum(directory / TRAJECTORY)
-    metrics = read_json(directory / METRICS) if is_there(directory / METRICS) else {}
+    metrics = read_json(directory / METRICS) if path_exists(directory / METRICS) else {}
     given = isinstance(metrics, dict) and metrics.get("pose_source") == "ground_truth"
     return ReferenceTrajectory(timestamps, poses, given)

@@ -36,7 +36,7 @@ from framework.datasets.scannet.scannet_annotation import (
 )
 from framework.datasets.scannet.sens_file import open_sens
 from framework.errors import DataError, errors_of
-from framework.files.atomic_write import is_there
+from framework.files.atomic_write import path_exists
 from framework.files.image_files import read_color, read_uint16
 from framework.files.number_lines import PrintedMatrix, read_matrix
 from framework.geometry import inverse, rotation_angle
@@ -62,7 +62,7 @@ class ScanNet(LabeledRecording):
     def open(self) -> Contents:
         above = self.folder.resolve().parents[:2]
         tables = [parent / name for name in (FIRST_LABEL_TABLE, LABEL_TABLE) for parent in reversed(above)]
-        self._label_tables = [table for table in tables if is_there(table)]
+        self._label_tables = [table for table in tables if path_exists(table)]
         self.load_mesh([self.folder / f"{self.name}{end}" for end in MESH_FILES], self._read_mesh)
         if self.mesh and not self._label_tables:
             message = "%s: expected a label table with the class of each name, got none; fewer objects are evaluated"
@@ -118,7 +118,7 @@ def _exported_contents(folder: Path) -> Contents:
     depth_camera = _camera(intrinsic / "intrinsic_depth.txt", *first_size(depths.values(), read_uint16))
     color_camera = _color_camera(intrinsic / "intrinsic_color.txt", *first_size(colors.values(), read_color))
     extrinsics = [intrinsic / f"extrinsic_{name}.txt" for name in ("color", "depth")]
-    if all(map(is_there, extrinsics)):
+    if all(map(path_exists, extrinsics)):
         _warn_of_parallax(intrinsic, read_matrix(extrinsics[0]), read_matrix(extrinsics[1]), depth_camera)
     with errors_of(intrinsic):
         registration = ColorRegistration(color_camera, depth_camera)
@@ -163,7 +163,9 @@ def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, 
     try:
         T_color_depth = inverse(color.pose()) @ depth.pose()
     except DataError:
-        log.warning("%s: expected rigid extrinsics; color and depth cameras are assumed to coincide", source)
+        log.warning(
+            "%s: expected rigid extrinsics, got another matrix; color and depth cameras are assumed to coincide", source
+        )
         return
     baseline, angle = float(np.linalg.norm(T_color_depth[:3, 3])), rotation_angle(T_color_depth[:3, :3])
     shift = camera.fx * (baseline / NEAR + angle)

@@ -21,7 +21,7 @@ from framework.files.ply import read_ply
 from framework.vocabulary.label_spaces import MEANINGS
 
 LARGEST_FILE = 2**24  # bytes; segments of the largest room take 5 MB; parsed JSON takes up to 30 times the memory
-MOST_OBJECT_ID = np.iinfo(np.int32).max - 2  # instance id = object id + 1; one more id is used for unlabeled vertices
+MAX_OBJECT_ID = np.iinfo(np.int32).max - 2  # instance id = object id + 1; one more id is used for unlabeled vertices
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
 FIRST_LABEL_TABLE = "scannet-labels.combined.tsv"  # of the first release (2017), with other names
 NAME_COLUMNS = ("raw_category", "category")  # annotated names; the first release has no raw_category
@@ -151,8 +151,8 @@ def _group(where: str, group: Any) -> SegGroup:
     if not isinstance(group, dict):
         raise DataError(f"{where}: expected an object, got {type(group).__name__}")
     object_id, label, segments = (group.get(key) for key in ("objectId", "label", "segments"))
-    if type(object_id) is not int or not 0 <= object_id <= MOST_OBJECT_ID:
-        raise DataError(f"{where}: objectId: expected an integer from 0 to {MOST_OBJECT_ID}, got {object_id!r:.60}")
+    if type(object_id) is not int or not 0 <= object_id <= MAX_OBJECT_ID:
+        raise DataError(f"{where}: objectId: expected an integer from 0 to {MAX_OBJECT_ID}, got {object_id!r:.60}")
     if not isinstance(label, str) or not isinstance(segments, list):
         found = f"{type(label).__name__} and {type(segments).__name__}"
         raise DataError(f"{where}: expected a label (text) and segments (list), got {found}")

@@ -24,7 +24,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from framework.data import MOST_PIXELS, Camera, Float64, UInt8, UInt16
+from framework.data import MAX_PIXELS, Camera, Float64, UInt8, UInt16
 from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
 from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, FrameError
@@ -36,7 +36,7 @@ VERSION = 4
 RAW, PNG, JPEG = 0, 1, 2  # compression of color
 ZLIB, OCCIPITAL = 1, 2  # compression of depth, in addition to RAW
 LONGEST_NAME = 1024  # bytes of the sensor name; "StructureSensor" has 15
-MOST_FRAMES = 2**18  # two and a half hours at 30 Hz; the longest ScanNet video has about 6,000 frames
+MAX_FRAMES = 2**18  # two and a half hours at 30 Hz; the longest ScanNet video has about 6,000 frames
 START = struct.Struct("<IQ")
 MATRIX_BYTES = 64
 IMAGES = struct.Struct("<iiIIIIfQ")
@@ -110,7 +110,7 @@ class SensFrame:
                 file.seek(byte)
                 data = file.read(length)
         except OSError as error:
-            raise FrameError(f"{name}: cannot be read: {error.strerror or error}") from error
+            raise FrameError(f"{name}: expected a readable file, got {error.strerror or error}") from error
         _check_length(name, len(data), length)
         return data
 
@@ -134,7 +134,7 @@ def open_sens(path: Path) -> SensFile:
             header = _read_header(path, file, length)
             frames, cut = _find_frames(path, file, length, header)
     except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise DataError(f"{path}: expected a readable file, got {error.strerror or error}") from error
     if not frames:
         raise DataError(f"{path}: expected frames, got none: {cut or '0 according to its header'}")
     return SensFile(header, tuple(frames), cut)
@@ -160,14 +160,14 @@ def _read_header(path: Path, file: BinaryIO, length: int) -> SensHeader:
     at = file.tell()
     color_code, depth_code, *sizes, depth_scale, frames = IMAGES.unpack(take(IMAGES.size))
     for name, width, height in (("color", *sizes[:2]), ("depth", *sizes[2:])):
-        if not 0 < width * height <= MOST_PIXELS:
-            expected = f"expected {name} images of 1 to {MOST_PIXELS} px"
+        if not 0 < width * height <= MAX_PIXELS:
+            expected = f"expected {name} images of 1 to {MAX_PIXELS} px"
             raise DataError(f"{path}, byte {at + 8}: {expected}, got {width}x{height} px")
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
         expected = f"expected depth units per meter in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}]"
         raise DataError(f"{path}, byte {at + 24}: {expected}, got {depth_scale:g}")
-    if frames > MOST_FRAMES or frames * FRAME.size > length:
-        most = min(MOST_FRAMES, length // FRAME.size)
+    if frames > MAX_FRAMES or frames * FRAME.size > length:
+        most = min(MAX_FRAMES, length // FRAME.size)
         raise DataError(f"{path}, byte {at + 28}: expected at most {most} frames in {length} bytes, got {frames}")
     if depth_code == OCCIPITAL:
         raise DataError(
@@ -218,7 +218,7 @@ def _inflate(name: str, data: bytes, length: int) -> bytes:
     try:
         unpacked = stream.decompress(data, length + 1)
     except zlib.error as error:
-        raise FrameError(f"{name}: cannot be decompressed: {error}") from error
+        raise FrameError(f"{name}: expected a valid zlib stream, got an error ({error})") from error
     if len(unpacked) > length:
         raise FrameError(f"{name}: expected {length} bytes after decompression, got at least {length + 1}")
     if not stream.eof:

@@ -126,7 +126,9 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
             yield received
     except (EOFError, OSError):
         player.join()
-        raise DataError(f"damaged recording: OpenNI 2 crashed with status {player.exitcode}") from None
+        raise DataError(
+            f"expected an intact recording, got a crash of OpenNI 2 with status {player.exitcode}; download it again"
+        ) from None
     finally:
         player.terminate()
         player.join()
@@ -154,23 +156,23 @@ def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
     if len(file) > LONGEST_PATH:
         raise DataError(f"expected a path of at most {LONGEST_PATH} bytes for OpenNI 2, got {len(file)}; move the file")
     with ExitStack() as stack:
-        _check(openni.oniInitialize(API_VERSION), openni, "OpenNI 2 cannot be initialized")
+        _check(openni.oniInitialize(API_VERSION), openni, "initialize")
         stack.callback(openni.oniShutdown)
         device = ctypes.c_void_p()
-        _check(openni.oniDeviceOpen(file, ctypes.byref(device)), openni, "OpenNI 2 cannot open the recording")
+        _check(openni.oniDeviceOpen(file, ctypes.byref(device)), openni, "open the recording")
         stack.callback(openni.oniDeviceClose, device)
         for name, value in ((PLAYBACK_REPEAT, ctypes.c_int(False)), (PLAYBACK_SPEED, ctypes.c_float(MANUAL))):
             status = openni.oniDeviceSetProperty(device, name, ctypes.byref(value), ctypes.sizeof(value))
-            _check(status, openni, "OpenNI 2 cannot set a playback property")
+            _check(status, openni, "set a playback property")
         handles = []
         for stream in Stream:
             handle = ctypes.c_void_p()
             status = openni.oniDeviceCreateStream(device, SENSORS[stream], ctypes.byref(handle))
-            _check(status, openni, f"OpenNI 2 cannot open the {stream.name.lower()} stream")
+            _check(status, openni, f"open the {stream.name.lower()} stream")
             stack.callback(openni.oniStreamDestroy, handle)
             handles.append(handle)
         for handle in handles:
-            _check(openni.oniStreamStart(handle), openni, "OpenNI 2 cannot play the recording")
+            _check(openni.oniStreamStart(handle), openni, "play the recording")
         yield from _images(openni, handles, streams)
 
 
@@ -183,12 +185,12 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
         status = openni.oniWaitForAnyStream(waited, len(handles), ctypes.byref(which), PATIENCE)
         if status == TIME_OUT:
             reached = ", ".join(f"{stream.name.lower()} {last[stream]} of {streams[stream].last}" for stream in Stream)
-            raise DataError(f"damaged recording: OpenNI 2 stalled at {reached}")
-        _check(status, openni, "OpenNI 2 cannot play the recording")
+            raise DataError(f"expected an intact recording, got a stall of OpenNI 2 at {reached}; download it again")
+        _check(status, openni, "play the recording")
         stream = list(Stream)[which.value]
         frame = ctypes.POINTER(_Frame)()
         status = openni.oniStreamReadFrame(handles[which.value], ctypes.byref(frame))
-        _check(status, openni, "OpenNI 2 cannot play the recording")
+        _check(status, openni, "play the recording")
         try:
             last[stream], time = frame.contents.index, frame.contents.timestamp
             pixels = _pixels(stream, frame.contents)
@@ -223,10 +225,10 @@ def _library() -> Any:
             continue
         openni.oniGetExtendedError.restype = ctypes.c_char_p
         return openni
-    raise ConfigError("OpenNI 2 is not installed; run apt-get install libopenni2-0")
+    raise ConfigError("OpenNI 2: expected an installed library, got none; run apt-get install libopenni2-0")
 
 
-def _check(status: int, openni: Any, failure: str) -> None:
+def _check(status: int, openni: Any, action: str) -> None:
     if status != OK:
         reason = " ".join((openni.oniGetExtendedError() or b"").decode(errors="replace").split())
-        raise DataError(f"{failure}: {reason or f'status {status}'}")
+        raise DataError(f"expected OpenNI 2 to {action}, got an error ({reason or f'status {status}'})")

@@ -78,7 +78,7 @@ def read_contents(path: Path) -> OniContents:
         with path.open("rb") as file:
             return _read_contents(path, file)
     except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise DataError(f"{path}: expected a readable file, got {error.strerror or error}") from error
 
 
 @contextmanager
@@ -160,7 +160,7 @@ def _read_version(path: Path, file: BinaryIO) -> tuple[int, ...]:
     _magic, *numbers, _time, largest_node = FILE_HEADER.unpack(header)
     version = tuple(numbers)
     if largest_node > LARGEST_NODE:
-        raise DataError(f"{path}: damaged header: expected at most {LARGEST_NODE} nodes, got {largest_node}")
+        raise DataError(f"{path}: header: expected at most {LARGEST_NODE} nodes, got {largest_node}; download it again")
     if not VERSIONS[0] <= version <= VERSIONS[1]:
         first, last, found = (".".join(map(str, one)) for one in (*VERSIONS, version))
         raise DataError(f"{path}: expected format version {first} to {last}, got {found}")
@@ -192,5 +192,7 @@ def _added_stream(path: Path, record: _Record) -> Stream | None:
         (name_size,) = struct.unpack_from("<I", record.fields)
         (node_type,) = struct.unpack_from("<I", record.fields, 4 + name_size)
     except struct.error as error:
-        raise DataError(f"{path}: damaged: the record before byte {record.fields_end} is too short") from error
+        raise DataError(
+            f"{path}: expected a complete record before byte {record.fields_end}, got a shorter one; download it again"
+        ) from error
     return Stream(node_type) if node_type in list(Stream) else None

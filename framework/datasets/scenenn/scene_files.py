@@ -19,7 +19,7 @@ import numpy as np
 
 from framework.data import Camera, Float64, check_rigid
 from framework.errors import DataError
-from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
+from framework.files.atomic_write import MAX_TEXT, atomic_write, read_bytes
 from framework.files.number_lines import SHOWN, number, read_lines
 from framework.geometry import nearest_rigid
 
@@ -53,10 +53,10 @@ class _Line(NamedTuple):
 def read_trajectory_log(path: Path) -> TrajectoryLog:
     """Return the poses of a trajectory.log.
 
-    A frame with two poses is unusable. A last frame that is truncated is unusable, too. Raises DataError that names the
-    file and the line for other invalid lines.
+    A frame with two poses is unusable, and so is a truncated last frame. Raises DataError that names the file and the
+    line for other invalid lines.
     """
-    content = read_bytes(path, MOST_TEXT).removeprefix(BOM_UTF8)
+    content = read_bytes(path, MAX_TEXT).removeprefix(BOM_UTF8)
     numbered = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
     lines = [line for line in numbered if line.words]
     poses: dict[int, Float64] = {}
@@ -104,7 +104,7 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
         lines.append(f"{frame} {frame} {frame + 1}")
         lines.extend(" ".join(repr(float(value)) for value in row) for row in T_world_camera[:3])
         lines.append(LAST_ROW)
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("".join(line + "\n" for line in lines), encoding="ascii")
 
 
@@ -159,7 +159,7 @@ def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mappin
 
     If `color_times` is None, the depth timestamps are also written for color.
     """
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for image, time in times.items():
             color_time = time if color_times is None else color_times[image]
             file.write(f"{image} {round(color_time * MICROSECONDS)} {round(time * MICROSECONDS)}\n")
@@ -202,5 +202,5 @@ def write_intrinsics(path: Path, camera: Camera) -> None:
     """Write the camera's intrinsics atomically, in full precision."""
     sizes = {"depth_width": camera.width, "depth_height": camera.height}
     values = sizes | {key: getattr(camera, key) for key in INTRINSICS}
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("".join(f"{key} {value!r}\n" for key, value in values.items()), encoding="ascii")

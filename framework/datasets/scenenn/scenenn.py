@@ -31,7 +31,7 @@ from framework.datasets.scenenn.scene_files import TrajectoryLog, read_intrinsic
 from framework.datasets.scenenn.scenenn_annotation import LARGEST_ID, Annotated, read_annotation
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import DataError
-from framework.files.atomic_write import is_there, read_text
+from framework.files.atomic_write import path_exists, read_text
 from framework.files.image_files import read_color
 from framework.files.ply import read_ply
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
@@ -68,7 +68,7 @@ class SceneNN(LabeledRecording):
         colors = numbered_images(self.folder / "image", (".png", ".jpg", ".jpeg"))
         images = paired_images(colors, numbered_images(self.folder / "depth", (".png",)))
         log_file = self.folder / "trajectory.log"
-        poses = read_trajectory_log(log_file) if is_there(log_file) else None
+        poses = read_trajectory_log(log_file) if path_exists(log_file) else None
         times = _optional_times(self.folder / "timestamp.txt", list(images))
         self.load_mesh([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
         self.annotation = self.release or _named_release(self.root) if self.mesh else ""
@@ -93,7 +93,7 @@ def _recorded(
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[float, float]]:
     """Return the timestamps (s) of all images, or no timestamps if some are missing, so that clocks are not mixed."""
-    if not is_there(path):
+    if not path_exists(path):
         return {}
     times = read_timestamps(path)
     without = [k for k in images if k not in times]
@@ -143,5 +143,5 @@ def _nyu_class(label: Annotated | None) -> str:
 
 def _named_release(root: Path) -> str:
     path = root / "release.txt"
-    text = read_text(path) if is_there(path) else ""
+    text = read_text(path) if path_exists(path) else ""
     return text.strip().partition("\n")[0].strip() or "not named"

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Box, Float64
 from framework.errors import DataError
-from framework.files.atomic_write import read_bytes, written_whole
+from framework.files.atomic_write import atomic_write, read_bytes
 
 LARGEST_FILE = 2**24  # bytes; annotations have about 100 KB; 16 MiB of crafted XML take 9 s and 0.5 GB
 LARGEST_ID = int(np.iinfo(np.int32).max)  # of a mesh label
@@ -56,7 +56,9 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
     except DefusedXmlException as error:
         raise labels.error("expected XML without a document type or entities, got a declaration; remove it") from error
     except ParseError as error:
-        raise DataError(f"{path}, line {error.position[0]}: expected valid XML: {ErrorString(error.code)}") from error
+        raise DataError(
+            f"{path}, line {error.position[0]}: expected valid XML, got {ErrorString(error.code)}"
+        ) from error
     except (ValueError, LookupError) as error:
         raise labels.error("expected UTF-8, got an unknown encoding") from error
     if not labels.found:
@@ -100,7 +102,7 @@ def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
             boxes = {name: attributes[name] for name in ("aabbox", "obbox") if name in attributes}
             raise DataError(f"{path}: label {label.id}: expected finite boxes with extent >= 0, got {boxes}")
         lines.append(f"  <label {' '.join(f'{name}={quoteattr(value)}' for name, value in attributes.items())}/>")
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("\n".join([*lines, "</annotation>\n"]), encoding="utf-8")
 
 

@@ -87,7 +87,7 @@ def _listed(index: Path) -> list[str]:
 
 
 def _weights(names: Collection[str]) -> list[str]:
-    """Select the weight files among `names` as transformers does; return an empty list if there are none."""
+    """Return the weight files among `names` that transformers would load; empty if there are none."""
     if WHOLE in names:
         return [WHOLE]
     if INDEX in names:
@@ -96,7 +96,7 @@ def _weights(names: Collection[str]) -> list[str]:
 
 
 def _published(more: Sequence[str], names: Collection[str]) -> Sequence[str]:
-    """Return `more`, with the older tokenizer files if the model has only these."""
+    """Return `more`, with the tokenizer files replaced by their older names if the model has only those."""
     older = more == TOKENIZER and TOKENIZER[0] not in names and {*OLDER_TOKENIZER} <= {*names}
     return OLDER_TOKENIZER if older else more
 

@@ -31,7 +31,7 @@ from framework.files.json_file import read_json
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 LONGEST_SIDE = 1024  # px, largest input of a model
 HASH_DIGITS = 16  # digits of a local folder's content hash in the name of its space
-MOST_TOKENS = 64  # maximum length of a text; the limit is 77 for CLIP and 64 for SigLIP
+MAX_TOKENS = 64  # maximum length of a text; the limit is 77 for CLIP and 64 for SigLIP
 GRAY = 128
 
 
@@ -100,7 +100,7 @@ class ImageTextModel:
     def embed_text(self, text: str) -> Float32:
         """Return the unit vector (D,) of a phrase such as "a red chair"."""
         prompt = self._family.prompt.format(text.lower() if self._family.lower else text)
-        length = min(MOST_TOKENS, int(self._network.config.text_config.max_position_embeddings))
+        length = min(MAX_TOKENS, int(self._network.config.text_config.max_position_embeddings))
         tokens = self._tokenizer(
             [prompt], padding=self._family.padding, max_length=length, truncation=True, return_tensors="pt"
         )
@@ -110,7 +110,7 @@ class ImageTextModel:
         return np.asarray(self._unit(self._network.get_text_features(**given))[0])
 
     def _unit(self, features: Any) -> Float32:
-        """Normalize features (N, D) to unit length. Raises DataError for zero or non-finite features."""
+        """Return features (N, D) normalized to unit length. Raises DataError for zero or non-finite features."""
         tensor: Tensor = features if isinstance(features, Tensor) else features.pooler_output
         vectors = tensor.float().cpu().numpy()
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -132,7 +132,8 @@ def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ..
     numbers = (*mean, *std, factor)
     if len(numbers) != 7 or not all(isinstance(x, int | float) and np.isfinite(x) for x in numbers) or 0 in std:
         raise DataError(
-            f"detector.model: {path}: expected numbers in image_mean, image_std and rescale_factor, got {numbers}"
+            f"detector.model: {path}: expected 3 numbers in image_mean, 3 nonzero numbers in image_std and 1 in "
+            f"rescale_factor, all finite, got {mean}, {std} and {factor}"
         )
     return mean, std, float(factor)
 
@@ -147,11 +148,11 @@ def _space(folder: Path, model: str) -> str:
 
 
 def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundings: float = 1.0) -> UInt8:
-    """Crop the image around each of the masks (N, H, W); return crops (N, side, side, 4) of RGB and mask (0 or 255).
+    """Return crops (N, side, side, 4) of the image around each of the masks (N, H, W): RGB and mask (0 or 255).
 
-    A crop is a square around the center of the mask's box. Its side is `context` times the longer side of the box.
-    Pixels outside of the image are black. The background keeps the fraction `surroundings` of its contrast. The crop of
-    an empty mask is black.
+    A crop is a square around the center of the mask's box. Its side is `context` times the longer side of the box. Its
+    part outside of the image is black. If `surroundings` < 1, all pixels outside the mask keep only this fraction of
+    their difference from gray, including the black part. The crop of an empty mask is black.
     """
     crops = np.zeros((len(masks), side, side, 4), np.uint8)
     for k, box in enumerate(tight_boxes(masks)):
@@ -162,7 +163,7 @@ def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundi
 
 
 def _square_crop(image: UInt8, box: Float32, side: int, context: float, surroundings: float) -> UInt8:
-    """Crop an image (H, W, 4) of RGB and mask around the mask's tight box."""
+    """Return the crop (side, side, 4) of an image (H, W, 4), RGB and mask, around the mask's tight box."""
     height, width = image.shape[:2]
     x1, y1, x2, y2 = (int(value) for value in box)
     wide = max(1, round(context * (max(x2 - x1, y2 - y1) + 1)))  # px

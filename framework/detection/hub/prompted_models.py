@@ -17,7 +17,7 @@ from framework.detection.runtimes.device import ready
 from framework.errors import ConfigError, DataError
 
 PROMPT = "a photo of a {}"  # Minderer et al. 2023
-MOST_TOKENS = 16  # maximum length of a text, as in the training of OWLv2
+MAX_TOKENS = 16  # maximum length of a text, as in the training of OWLv2
 PADDING = 128  # gray value right of or below the image in the square input of OWLv2
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 SAM_FAMILY = {
@@ -45,7 +45,7 @@ class TextPromptedBoxes:
         network = read_part("detector.model", self.folder, "the weights", transformers.Owlv2ForObjectDetection)
         tokens = tokenizer(
             [PROMPT.format(text) for text in texts],
-            padding="max_length", max_length=MOST_TOKENS, truncation=True, return_tensors="pt",
+            padding="max_length", max_length=MAX_TOKENS, truncation=True, return_tensors="pt",
         )  # fmt: skip
         self._network = ready(network, device, half_precision)
         self._tokens = {name: tokens[name].to(device) for name in ("input_ids", "attention_mask")}

@@ -40,9 +40,9 @@ def read_network(
 ) -> MaskRCNN:
     """Return the network in `path`, in float32 and inference mode.
 
-    A .safetensors file is in this project's format and contains its description. For .pkl and .pth files, `kind` None =
-    detected from the names of the weights. See `from_torchvision` and `from_detectron2` for the other arguments. Code
-    in the file is never run. Raises DataError if the file does not contain a Mask R-CNN.
+    A .safetensors file is in this project's format and contains its description. For .pkl and .pth files, `kind` is
+    detected from the names of the weights if it is None. See `from_torchvision` and `from_detectron2` for the other
+    arguments. Code in the file is never run. Raises DataError if the file does not contain a Mask R-CNN.
     """
     if path.suffix == ".safetensors":
         return load_network(path)
@@ -114,7 +114,7 @@ def _newer_name(name: str) -> str:
 
 
 def _without_gaps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Remove the rows of unused COCO ids from the predictors; keep the background and the 80 classes."""
+    """Return the tensors without the predictors' rows of unused COCO ids: the background and 80 classes remain."""
     rows = torch.tensor(COCO_ROWS)
     sliced = dict(tensors)
     for kind in ("weight", "bias"):
@@ -127,7 +127,7 @@ def _without_gaps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _backbone(tensors: Mapping[str, Tensor], norm_eps: float, where: str) -> ResNetShape:
-    """Identify the residual network by the number of blocks in each level."""
+    """Return the shape of the residual network, identified by the number of blocks in each level."""
     depths = tuple(
         len({match[1] for name in tensors if (match := re.match(rf"backbone\.body\.layer{level}\.(\d+)\.", name))})
         for level in (1, 2, 3, 4)

@@ -117,7 +117,7 @@ class ArraysOnly(pickle.Unpickler):
 
 
 def _encoded(text: str, encoding: str) -> bytes:
-    """Encode the text in which Python 3 stores bytes in older pickle protocols."""
+    """Return the bytes that older pickle protocols of Python 3 store as `text`."""
     if encoding != "latin1":
         raise pickle.UnpicklingError(f"the encoding {encoding}")
     return text.encode("latin1")
@@ -183,7 +183,7 @@ def _put_background_first(tensors: dict[str, Tensor], where: str) -> None:
 
 
 def _depth(tensors: Mapping[str, Tensor], where: str) -> str:
-    """Identify the residual network by the number of blocks in its third level."""
+    """Return the name of the residual network, identified by the number of blocks in its third level."""
     blocks = len({name.split(".")[3] for name in tensors if name.startswith("backbone.body.layer3.")})
     for name in WITH_BOTTLENECKS:
         if DEPTHS[name][2] == blocks:

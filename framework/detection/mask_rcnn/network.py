@@ -77,7 +77,7 @@ class MaskRCNN(nn.Module):
         return self.roi_heads.box_predictor.cls_score.weight.dtype
 
     def normalize(self, images: Tensor) -> Tensor:
-        """Normalize RGB images (N, 3, H, W), 0..255, and pad them at the end to multiples of 32 px."""
+        """Return RGB images (N, 3, H, W), 0..255, normalized, and padded on the right and below to multiples of 32."""
         mean, std = (
             torch.tensor(values, device=images.device)[:, None, None]
             for values in (self.architecture.pixel_mean, self.architecture.pixel_std)
@@ -126,7 +126,7 @@ class MaskRCNN(nn.Module):
         return logits
 
     def pool(self, pyramid: Sequence[Tensor], boxes: Tensor, bins: int) -> Tensor:
-        """Pool features (P, C, bins, bins) of each box from the level for its size (Lin et al. 2017, eq. 1)."""
+        """Return the features (P, C, bins, bins) of the boxes, each pooled from the level for its size (eq. 1)."""
         sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=0).prod(dim=1).sqrt()
         level = torch.floor(CANONICAL_LEVEL + torch.log2(sides / CANONICAL_SIDE) + 1e-6)
         level = level.clamp(0, POOLED_LEVELS - 1)

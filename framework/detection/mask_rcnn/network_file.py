@@ -23,7 +23,7 @@ from torch import Tensor
 
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.errors import DataError, in_one_line
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.files.json_file import parse_json
 
 Fact = str | int | float | bool | None
@@ -54,7 +54,7 @@ def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: 
         "card": json.dumps(dict(card)),
         "tensors_sha256": _digest(tensors),
     }
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         try:
             save_file(tensors, temporary, metadata)
         except safetensors.SafetensorError as error:
@@ -70,7 +70,7 @@ def load_network(path: Path) -> MaskRCNN:
         expected, found = file.metadata().get("tensors_sha256"), _digest(tensors)
         if expected != found:
             raise DataError(
-                f"{path}: expected tensors with sha256 {expected}, got {found}; the file is damaged, download it again"
+                f"{path}: expected tensors with sha256 {expected}, got {found}; restore or download the file again"
             )
     return filled(description.architecture, tensors, str(path))
 
@@ -116,10 +116,10 @@ def _stored(network: MaskRCNN) -> dict[str, Tensor]:
 
 
 def _check_names(expected: typing.AbstractSet[str], found: typing.AbstractSet[str], where: str) -> None:
-    for names, fault in ((expected - found, "missing"), (found - expected, "unknown")):
+    for names, problem in ((expected - found, "missing"), (found - expected, "unknown")):
         if names:
             more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            raise DataError(f"{where}: expected the weights of this network, got {fault} {min(names)}{more}")
+            raise DataError(f"{where}: expected the weights of this network, got {problem} {min(names)}{more}")
 
 
 def _check_finite(tensors: Mapping[str, Tensor], where: str) -> None:

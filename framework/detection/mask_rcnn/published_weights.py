@@ -15,7 +15,7 @@ import platformdirs
 from tqdm import tqdm
 
 from framework.errors import DataError, in_one_line
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.files.search_paths import candidates
 
 OFFLINE = "INSTANCEMAP_OFFLINE"
@@ -110,12 +110,13 @@ def download(published: PublishedNetwork) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{path.parent}: expected a writable folder, got {error.strerror}") from error
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         with temporary.open("wb") as file:
             file.writelines(_received(published, by_hand))
         found = published.digest_of(temporary)
         if found != published.digest:
-            raise DataError(f"{published.url}: expected {published.algorithm} {published.digest}, got {found}")
+            expected = f"{published.algorithm} {published.digest}"
+            raise DataError(f"{published.url}: expected {expected}, got {found}; try again, or {by_hand}")
 
 
 def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:

@@ -58,7 +58,7 @@ class Samples:
 
     @classmethod
     def along(cls, start: Tensor, end: Tensor, bins: int, cells: int, ratio: int, shortest: float) -> Samples:
-        """Create the samples between `start` and `end` (N,) in cells; boxes are extended to `shortest` cells."""
+        """Create the samples between `start` and `end` (N,), in cells; shorter boxes are extended to `shortest`."""
         size = (end - start).clamp(min=shortest)
         counts = torch.full_like(size, ratio) if ratio else (size / bins).ceil().clamp(min=1.0)
         spread = size / bins * (counts - 1) / counts  # distance between the first and last sample of a bin
@@ -99,7 +99,7 @@ def _products(cells: Tensor, x: Samples, y: Samples) -> Tensor:
 
 
 def _sums(cells: Tensor, x: Samples, y: Samples) -> Tensor:
-    """Compute sums over windows in chunks of similar windows, because the widest window determines a chunk's cost."""
+    """Return the sums over windows. Chunks have windows of similar width, because the widest determines the cost."""
     sizes = x.windows * y.windows
     largest = int(sizes.max()) if len(sizes) else 1
     at_once = max(1, CHUNK // (x.bins * y.bins * largest))

@@ -12,7 +12,7 @@ from framework.detection.masks.letterbox import Letterbox
 
 
 def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], threshold: float = 0.5) -> Bool:
-    """Resize grids of probabilities to boxes in an image of `shape`; return the masks (N, H, W).
+    """Return the masks (N, H, W) of grids of probabilities, resized to their boxes in an image of `shape`.
 
     Pixels above `threshold` after bilinear interpolation are inside a mask. `grids`: (N, G, G) probabilities over each
     box. `borders`: (N, 4) boxes x1 y1 x2 y2 px, pixel centers at integers. A ring of zero cells is added, as in
@@ -32,7 +32,7 @@ def masks_from_prototypes(
     shape: tuple[int, int],
     threshold: float = 0.5,
 ) -> Bool:
-    """Threshold weighted sums of prototypes (Bolya et al., "YOLACT"); return the masks (N, H, W).
+    """Return the masks (N, H, W): thresholded weighted sums of prototypes (Bolya et al., "YOLACT").
 
     `coefficients`: (N, M). `prototypes`: (M, h, w), whose cells cover the complete input of the network. `borders`:
     (N, 4) boxes x1 y1 x2 y2 px of the image, the limits of the masks. The sums are logits. They are interpolated

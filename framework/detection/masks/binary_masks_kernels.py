@@ -39,7 +39,7 @@ def mask_bounds(masks):
 
 @njit(cache=True, nogil=True)
 def shared_pixels(masks, bounds):
-    """Count the common pixels of each pair of masks, only where their bounds (N, 4) intersect."""
+    """Return the number of common pixels (N, N) of each pair of masks; `bounds` (N, 4) are their boxes."""
     n = len(masks)
     shared = np.zeros((n, n), np.int64)
     for i in range(n):
@@ -57,7 +57,7 @@ def shared_pixels(masks, bounds):
 
 @njit(cache=True, nogil=True)
 def _grid_cells(start, end, cells, pixels):
-    """Return the first pixel in reach of a grid along one axis, and each pixel's lower cell and upper weight.
+    """Return the first pixel in reach of a grid along one axis, and per pixel a cell and the weight of the next cell.
 
     `cells` excludes the ring of zeros. Pixels are in reach inside the box and up to half a cell outside of it.
     """
@@ -77,7 +77,7 @@ def _grid_cells(start, end, cells, pixels):
 
 @njit(cache=True, nogil=True)
 def paste(ringed, borders, threshold, masks):
-    """Write the masks of ringed grids in boxes. Interpolation along y comes first and is shared by a row of pixels."""
+    """Write the masks of grids with a zero ring. Interpolation along y comes first and is shared by a row of pixels."""
     n, height, width = masks.shape
     cells = ringed.shape[1] - 2
     row = np.empty(cells + 2, np.float32)
@@ -97,7 +97,7 @@ def paste(ringed, borders, threshold, masks):
 
 @njit(cache=True, nogil=True)
 def _prototype_cells(start, end, pixels, scale, shift, cells):
-    """Return the first pixel inside a box along one axis, and each pixel's lower cell and upper weight."""
+    """Return the first pixel inside a box along one axis, and per pixel a cell and the weight of the next cell."""
     first, stop = max(0, int(np.ceil(start))), min(pixels, int(np.ceil(end)))
     n = max(0, stop - first)
     lower = np.empty(n, np.int64)

@@ -16,7 +16,7 @@ LARGEST_LOG_SCALE = float(np.log(1000.0 / 16.0))
 
 
 def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple[float, float]) -> Float32:
-    """Repeat the anchors (A, 4) of cell (0, 0) in every cell; return the anchors (rows * columns * A, 4).
+    """Return the anchors (rows * columns * A, 4) of all cells from the anchors (A, 4) of cell (0, 0).
 
     The anchor index varies fastest. `stride`: px per cell, for both axes or as (y, x).
     """

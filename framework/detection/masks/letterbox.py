@@ -37,7 +37,7 @@ class Letterbox:
 
     @classmethod
     def fit(cls, image_shape: tuple[int, int], input_shape: tuple[int, int], placement: Placement) -> Letterbox:
-        """Fit an image into the input as large as possible; shapes are (height, width)."""
+        """Return the letterbox that fits an image into the input at maximum size; shapes are (height, width)."""
         height, width = image_shape
         resized = input_shape
         if placement is not Placement.stretch:

@@ -15,7 +15,7 @@ NOISE = 3.0  # standard deviations of the depth noise
 
 @njit(cache=True, nogil=True)
 def fill_masks(borders, windows, depth, significance, step, min_readings, masks):
-    """Write the mask of the object in each box, with its holes; `windows` (N, 4) are the boxes in whole pixels."""
+    """Write the mask of the object in each box, with holes; `windows` (N, 4) are the boxes in whole pixels."""
     found = np.zeros(len(masks), np.bool_)
     for i in range(len(masks)):
         u0, v0, u1, v1 = windows[i]

@@ -19,7 +19,7 @@ from framework.errors import DataError
 
 FIRST_CHARACTER = 48  # encodes 0; a character has five bits of a number, and a sixth bit if more characters follow
 MORE, SIGN, BITS = 0x20, 0x10, 5
-LONGEST = 7  # maximum number of characters per number; its range exceeds the pixels of any image
+MAX_CHARACTERS = 7  # maximum number of characters per number; its range exceeds the pixels of any image
 
 
 def encode(masks: Bool) -> list[bytes]:
@@ -63,9 +63,9 @@ def unpack(counts: bytes) -> Int64:
     ends = np.flatnonzero((codes & MORE) == 0)
     starts = np.concatenate([[0], ends[:-1] + 1])
     position = np.arange(len(codes)) - np.repeat(starts, ends - starts + 1)
-    if position.max() >= LONGEST:
+    if position.max() >= MAX_CHARACTERS:
         raise DataError(
-            f"run lengths: expected numbers of at most {LONGEST} characters, got {position.max() + 1} characters"
+            f"run lengths: expected numbers of at most {MAX_CHARACTERS} characters, got {position.max() + 1} characters"
         )
     numbers = np.add.reduceat((codes & (MORE - 1)) << (BITS * position), starts)
     numbers -= np.where(codes[ends] & SIGN, 1 << (BITS * (position[ends] + 1)), 0)

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.data import Array
-from framework.detection.runtimes.caffe2_network_kernels import MOST, round_to_bytes
+from framework.detection.runtimes.caffe2_network_kernels import MAX_UINT8, round_to_bytes
 from framework.errors import DataError
 
 Operator = Mapping[str, Any]  # type, inputs (blobs, then weights), outputs (one blob), args
@@ -27,7 +27,7 @@ Run = Callable[..., Tensor]  # computes an operator's output from its blobs (N, 
 Window = tuple[list[int], list[int], list[int], int]  # strides, pads, dilations, groups
 
 CONVOLUTIONS = ("Int8Conv", "Int8ConvRelu")
-MOST_OF_WEIGHTS = 127  # largest int8 weight; oneDNN requires weights symmetric about 0
+MAX_WEIGHT = 127  # largest int8 weight; oneDNN requires weights symmetric about 0
 
 
 class Step(NamedTuple):
@@ -86,16 +86,16 @@ def dequantized_weights(values: Array, scale_zero: tuple[float, int] | None) -> 
 
 @cache
 def has_int8_kernels() -> bool:
-    """Return True if torch computes integer convolutions correctly on this processor, also for the largest values."""
+    """Return True if torch computes integer convolutions correctly on this processor, even for the largest values."""
     has_mkldnn = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
     if not has_mkldnn or torch.backends.quantized.engine != "x86":
         return False
     channels = 16
-    kernel = torch.full((1, channels, 1, 1), float(MOST_OF_WEIGHTS))
+    kernel = torch.full((1, channels, 1, 1), float(MAX_WEIGHT))
     window = [1, 1], [0, 0], [1, 1], 1
     convolve = _int8_convolution(kernel, torch.zeros(1), 1.0, window, Quantization(1.0, 0), None, False)
-    found = convolve(torch.full((1, channels, 8, 8), MOST, dtype=torch.uint8))
-    return bool((found == channels * MOST_OF_WEIGHTS * MOST).all())
+    found = convolve(torch.full((1, channels, 8, 8), MAX_UINT8, dtype=torch.uint8))
+    return bool((found == channels * MAX_WEIGHT * MAX_UINT8).all())
 
 
 def network_between(
@@ -217,7 +217,7 @@ def _int8_convolution(
     The quantization step of the kernel is `spacing` in channels whose integers fit into int8. Other channels are
     rounded to a coarser step. In Mask R-CNN2Go, 30,194 of 30,381 channels fit.
     """
-    scales = torch.clamp(kernel.abs().amax(dim=(1, 2, 3)) / MOST_OF_WEIGHTS, min=spacing)
+    scales = torch.clamp(kernel.abs().amax(dim=(1, 2, 3)) / MAX_WEIGHT, min=spacing)
     integers = torch.round(kernel / scales[:, None, None, None]).to(torch.int8)
     packed = torch.ops.onednn.qconv_prepack(integers, scales, *source, *window, None)
     zeros = torch.zeros(len(scales), dtype=torch.int32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-MOST = 255  # largest uint8
+MAX_UINT8 = 255  # largest uint8
 
 
 @njit(cache=True, nogil=True)
@@ -13,4 +13,4 @@ def round_to_bytes(values, rounded, per_unit, zero_point):
     """Write values (N,) * per_unit + zero_point to rounded (N,) uint8, in one pass instead of five in torch."""
     for i in range(values.shape[0]):
         nearest = np.rint(values[i] * per_unit + zero_point)
-        rounded[i] = np.uint8(np.int32(min(max(nearest, np.float32(0)), np.float32(MOST))))
+        rounded[i] = np.uint8(np.int32(min(max(nearest, np.float32(0)), np.float32(MAX_UINT8))))

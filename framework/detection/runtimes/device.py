@@ -27,7 +27,7 @@ def torch_device(device: str, name: str = "detector.device") -> torch.device:
 
 
 def ready(network: Any, device: torch.device, half_precision: bool) -> Any:
-    """Move the network to the device in inference mode; half precision is used only on CUDA."""
+    """Return the network on the device, in inference mode; half precision is used only on CUDA."""
     dtype = torch.float16 if half_precision and device.type == "cuda" else torch.float32
     return network.to(device, dtype).eval()
 
@@ -41,8 +41,8 @@ def one_torch_thread() -> Iterator[None]:
     it on exit.
     """
     with _changing:
-        asked = torch.get_num_threads()
-        _before.append(_before[0] if _before else asked)
+        count = torch.get_num_threads()
+        _before.append(_before[0] if _before else count)
         torch.set_num_threads(1)
     try:
         yield

@@ -229,12 +229,12 @@ class ExportMetadata:
 
     @classmethod
     def parse(cls, texts: Mapping[str, str]) -> ExportMetadata:
-        """Parse key-value pairs with Python or JSON literals as values."""
+        """Return the metadata in key-value pairs with Python or JSON literals as values."""
         return cls(_names(texts.get("names", "")), _size(texts.get("imgsz", "")), texts.get("author", ""))
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """Parse class names such as {0: "person", ...}; keys are integers or strings of digits."""
+    """Return the class names in {0: "person", ...}; keys are integers or strings of digits."""
     names = _literal(text)
     if not isinstance(names, dict):
         return ()
@@ -243,7 +243,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Parse the (height, width) from [height, width] or from one number for both."""
+    """Return the (height, width) in [height, width], or in one number for both."""
     sides = _literal(text)
     height, width = sides if isinstance(sides, list) and len(sides) == 2 else (sides, sides)
     if isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0:

@@ -19,7 +19,7 @@ from framework.data import DeferredTruth, Detections, Frame, FrameTruth
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.detection.stored.fingerprint import fingerprint
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_write import is_there, read_bytes, written_whole
+from framework.files.atomic_write import atomic_write, path_exists, read_bytes
 from framework.files.hashing import add_array
 from framework.interfaces import Detector
 
@@ -54,7 +54,7 @@ class Fingerprinted(Protocol):
     """Interface of detectors with weights that parameters do not identify, such as a model name on a hub."""
 
     def fingerprint(self) -> str:
-        """Return a hash of all inputs of the detections except the frame, including `fingerprint(self)`."""
+        """Return a hash of all inputs of the detections except the frame. It must include `fingerprint(self)`."""
 
 
 @dataclass
@@ -105,7 +105,7 @@ class CachedDetector(Detector):
         return detections
 
     def _read(self, path: Path) -> Detections | None:
-        if not is_there(path):
+        if not path_exists(path):
             return None
         try:
             data = read_bytes(path, LARGEST_ENTRY)
@@ -126,7 +126,7 @@ class CachedDetector(Detector):
     def _write(self, path: Path, detections: Detections) -> None:
         content = pack(detections)
         try:
-            with written_whole(path) as temporary:
+            with atomic_write(path) as temporary:
                 temporary.write_bytes(_checksum(path, content) + content)
         except DataError as error:
             self._writes = False
@@ -134,7 +134,7 @@ class CachedDetector(Detector):
 
 
 def _checksum(path: Path, content: bytes) -> bytes:
-    """Compute the SHA-256 of an entry's name and content; the name detects entries moved to another key."""
+    """Return the SHA-256 of an entry's name and content. The name detects an entry moved to another key."""
     return hashlib.sha256(f"{path.parent.name}/{path.name}\n".encode() + content).digest()
 
 
@@ -151,17 +151,18 @@ def identity_of(detector: Detector) -> str:
         return detector.fingerprint()
     except AttributeError as error:  # older plugins call super().fingerprint(), which Detector no longer defines
         raise ConfigError(
-            f"{type(detector).__name__}.fingerprint: {error}; call fingerprint() of {fingerprint.__module__}"
+            f"{type(detector).__name__}.fingerprint: expected a hash, got an error ({error}); call fingerprint() of "
+            f"{fingerprint.__module__}"
         ) from error
 
 
 def with_cache(detector: Detector, config: DictConfig) -> Detector:
-    """Add the cache configured by `detection_cache` and `detection_cache_dir` to a detector."""
-    asked = config.detection_cache
-    named = "off" if asked is False else asked  # YAML parses an unquoted off as false
+    """Return the detector, wrapped in the cache configured by `detection_cache` and `detection_cache_dir`."""
+    mode = config.detection_cache
+    named = "off" if mode is False else mode  # YAML parses an unquoted off as false
     modes = {mode.value: mode for mode in CacheMode}
     if named not in modes:
-        raise ConfigError(f"detection_cache: expected one of {', '.join(modes)}, got {asked!r}")
+        raise ConfigError(f"detection_cache: expected one of {', '.join(modes)}, got {mode!r}")
     if modes[named] is CacheMode.OFF:
         return detector
     if config.detection_cache_dir is not None:

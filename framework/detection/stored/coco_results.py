@@ -15,7 +15,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from framework.data import MOST_PIXELS, Detections, Float32
+from framework.data import MAX_PIXELS, Detections, Float32
 from framework.detection.masks.run_length import check, encode, pack
 from framework.detection.stored.stored_detection import (
     Polygons,
@@ -27,11 +27,11 @@ from framework.detection.stored.stored_detection import (
     read_score,
 )
 from framework.errors import ConfigError, DataError, errors_of
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.files.json_file import read_json
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
-MOST_DIGITS = 18  # maximum length of a frame number
+MAX_DIGITS = 18  # maximum length of a frame number
 
 
 class CategoryIds(Enum):
@@ -112,7 +112,7 @@ def _read_image_id(found: Any) -> int:
         return found
     name = PurePosixPath(found if isinstance(found, str) else "")
     stem = "" if name.suffix[1:].isdigit() else name.stem  # 12.5 is not a file name
-    if not (stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS):
+    if not (stem.isascii() and stem.isdigit() and len(stem) <= MAX_DIGITS):
         raise DataError(f"image_id: expected a frame number, or a file name such as 000012.png, got {found!r}")
     return int(stem)
 
@@ -121,8 +121,8 @@ def _read_box(found: Any) -> Float32 | None:
     if found is None:
         return None
     whole = isinstance(found, list) and len(found) == 4
-    if not whole or not all(isinstance(x, int | float) and abs(x) <= MOST_PIXELS for x in found) or min(found[2:]) < 0:
-        raise DataError(f"bbox: expected [x, y, width, height] px, at most {MOST_PIXELS}, got {found!r:.200}")
+    if not whole or not all(isinstance(x, int | float) and abs(x) <= MAX_PIXELS for x in found) or min(found[2:]) < 0:
+        raise DataError(f"bbox: expected [x, y, width, height] px, at most {MAX_PIXELS}, got {found!r:.200}")
     x, y, width, height = found
     return np.array([x, y, x + width, y + height], np.float32)
 
@@ -136,8 +136,8 @@ def _read_segmentation(found: Any) -> Segmentation:
             f"segmentation: expected run lengths with size [height, width], or a list of polygons, got {found!r:.200}"
         )
     shape = (size[0], size[1])
-    if shape[0] * shape[1] > MOST_PIXELS:
-        raise DataError(f"segmentation.size: expected at most {MOST_PIXELS} px, got {shape[1]}x{shape[0]} px")
+    if shape[0] * shape[1] > MAX_PIXELS:
+        raise DataError(f"segmentation.size: expected at most {MAX_PIXELS} px, got {shape[1]}x{shape[0]} px")
     counts = found.get("counts")
     if isinstance(counts, list):
         return RunLengths(pack(counts, shape), shape)
@@ -193,12 +193,12 @@ class ResultWriter:
 @contextmanager
 def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]:
     """Open a result file for a detector with these classes; the file appears atomically at the end of the block."""
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write("[\n")
         yield ResultWriter(file, classes)
         file.write("\n]\n")
 
 
 def _shortest(values: Float32) -> list[float]:
-    """Round float32 values to the fewest digits that identify them, which halves the file size."""
+    """Return float32 values rounded to the fewest digits that identify them, which halves the file size."""
     return [float(text) for text in values.astype(str)]

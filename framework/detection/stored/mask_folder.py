@@ -28,7 +28,7 @@ LARGEST_ID = np.iinfo(np.uint16).max
 
 @dataclass(frozen=True)
 class InstanceOfImage(Segmentation):
-    """The pixels with an id in an image."""
+    """The pixels with one id in an image of instance ids."""
 
     path: Path
     id: int
@@ -54,7 +54,7 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
     images: dict[int, Path] = {}
     for path in sorted(folder.glob("*.png")):
         if not (path.stem.isascii() and path.stem.isdigit()):
-            raise DataError(f"{path}: expected a file name such as 000012.png (the frame number)")
+            raise DataError(f"{folder}: expected frame numbers as file names, such as 000012.png, got {path.name}")
         frame = int(path.stem)
         if images.setdefault(frame, path) != path:
             raise DataError(

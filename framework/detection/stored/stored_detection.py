@@ -15,7 +15,7 @@ from framework.detection.masks.run_length import decode
 from framework.errors import DataError
 
 ROUNDED_SUM = 0.05  # largest |sum - 1| of probabilities with rounded digits
-LARGEST = 1e6  # largest accepted probability before the check of the sum
+MAX_PROBABILITY = 1e6  # largest accepted probability before the check of the sum
 
 
 class Segmentation(ABC):
@@ -76,14 +76,14 @@ class StoredDetection:
 
 
 def read_score(found: Any) -> float:
-    """Validate a score in [0, 1]. Raises DataError for other values."""
+    """Return a score in [0, 1]. Raises DataError for other values."""
     if isinstance(found, bool) or not isinstance(found, int | float) or not 0 <= found <= 1:
         raise DataError(f"score: expected a number in [0, 1], got {found!r}")
     return float(found)
 
 
 def read_label(found: Any, index: Mapping[str, int]) -> str:
-    """Validate a name in the label space. Raises DataError for other values."""
+    """Return a name in the label space. Raises DataError for other values."""
     if not isinstance(found, str) or found not in index:
         raise DataError(
             f"label: expected one of the {len(index)} names in detector.label_space, got {found!r}; set "
@@ -93,7 +93,7 @@ def read_label(found: Any, index: Mapping[str, int]) -> str:
 
 
 def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
-    """Read a distribution (C,) over the label space from a list or a mapping; None = not given.
+    """Return the distribution (C,) over the label space in a list or a mapping; None = not given.
 
     A mapping has class names as keys; missing names have the probability 0. Only rounded distributions are normalized.
     Raises DataError for other values.
@@ -114,7 +114,7 @@ def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
         raise DataError(f"class_probabilities: expected a list or an object, got {found!r}")
     if len(given) != len(index):
         raise DataError(f"class_probabilities: expected {len(index)} values, one for each label, got {len(given)}")
-    if not all(isinstance(p, int | float) and 0 <= p <= LARGEST for p in given):  # rejects NaN
+    if not all(isinstance(p, int | float) and 0 <= p <= MAX_PROBABILITY for p in given):  # rejects NaN
         raise DataError(f"class_probabilities: expected numbers of at least 0 with a sum of 1, got {given!r:.200}")
     row = np.array(given, np.float32)
     total = float(row.sum(dtype=np.float64))

@@ -21,7 +21,7 @@ from framework.importing.bags.ros_transforms import REALSENSE, static_rotation, 
 
 NEAR = 0.05  # s, averaging window before and after a frame, which reduces the effect of hand tremor
 GRAVITY = 9.81  # m/s^2
-OFF = 0.2  # maximum deviation of the median from gravity, as a fraction; rejects data without gravity
+MAX_DEVIATION = 0.2  # maximum deviation of the median from gravity, as a fraction; rejects data without gravity
 GYROSCOPE = re.compile("gyro", re.IGNORECASE)  # matches names of topics without acceleration
 
 log = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
     if not len(times):
         return f"{topic}: expected readable messages, got none"
     length = float(np.median(np.linalg.norm(measured, axis=1)))
-    if abs(length - GRAVITY) > OFF * GRAVITY:
+    if abs(length - GRAVITY) > MAX_DEVIATION * GRAVITY:
         return f"{topic}: expected a median of {GRAVITY:g} m/s^2, got {length:.3g} m/s^2"
     try:
         R_camera_imu = _rotation(bag, topic, frame_id, color)

@@ -37,11 +37,11 @@ from framework.importing.bags.ros_transforms import REALSENSE, stream_motion
 from framework.importing.depth_resampling import DepthRegistration
 from framework.importing.source import DeviceFrame, Format, Source, StoredFrame
 
-APART = 0.02  # s, maximum time between a color image and its depth image
-POSE_APART = 0.1  # s, maximum time between a color image and the nearest pose
+MAX_PAIR_INTERVAL = 0.02  # s, maximum time between a color image and its depth image
+MAX_POSE_INTERVAL = 0.1  # s, maximum time between a color image and the nearest pose
 MILLIMETER = 0.001  # m
 SAME_CAMERA = 0.01  # fraction of the image width; intrinsics that differ less belong to the same camera
-MOST_WAITING = 64  # maximum number of unpaired images
+MAX_WAITING = 64  # maximum number of unpaired images
 BROWN = ("plumb_bob", "Brown Conrady", "")  # names of the lens model with k1, k2, p1, p2, k3
 DEPTH_STREAM = "/Depth_"  # in RealSense's topic names
 
@@ -130,16 +130,17 @@ def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
     if by_record:
         return by_record
     raise DataError(
-        f"{bag.path}: expected color and depth images within {APART:g} s, got none for "
-        f"{len(sensed[topics.color])} images of {topics.color} and {len(sensed[topics.depth])} of {topics.depth}"
+        f"{bag.path}: expected color and depth images within {MAX_PAIR_INTERVAL:g} s of each other, got none among "
+        f"{len(sensed[topics.color])} images on {topics.color} and {len(sensed[topics.depth])} on {topics.depth}; set "
+        "--color and --depth to topics of one camera"
     )
 
 
 def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> list[Pair]:
-    """Return pairs by time (s). Only the first image of each time is used: some recorders write only zeros."""
+    """Return pairs by time (s), with the first image of each time only, because some recorders write only zeros."""
     # the indices of first occurrences are sorted to restore the recording order
     colors, depths = (sorted(np.unique(times, return_index=True)[1].tolist()) for times in (color_times, depth_times))
-    pairs = associate([color_times[i] for i in colors], [depth_times[j] for j in depths], APART)
+    pairs = associate([color_times[i] for i in colors], [depth_times[j] for j in depths], MAX_PAIR_INTERVAL)
     return [Pair(colors[i], depths[j], color_times[colors[i]], depth_times[depths[j]]) for i, j in pairs]
 
 
@@ -160,7 +161,7 @@ def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:
                 color, depth = (message, other) if message.topic == topics.color else (other, message)
                 yield partial(device.frame, pair, color, depth)
                 continue
-            if len(waiting) == MOST_WAITING:
+            if len(waiting) == MAX_WAITING:
                 yield partial(_raise, _alone(device, waiting.pop(next(iter(waiting)))))
             waiting[pair] = message
     except DataError as error:
@@ -171,7 +172,7 @@ def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:
 
 def _alone(device: Device, message: Message) -> DataError:
     place = f"{device.bag.path}, {message.stored_at:.6f} s"
-    return FrameError(f"{place}: expected a match for the image of {message.topic}, got none; the bag may be damaged")
+    return FrameError(f"{place}: expected color and depth, got only the image on {message.topic}")
 
 
 def _raise(error: DataError) -> DeviceFrame:
@@ -200,7 +201,7 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
     axes = CameraAxes.OPENCV if "optical" in frame_id else CameraAxes.ROS
     if axes is CameraAxes.ROS:
         log.warning("%s: poses of frame %r are used as camera poses, with x forward and z up", topic, frame_id)
-    return Trajectory.of(bag.path, lines, POSE_APART), PoseReading(camera_axes=axes)
+    return Trajectory.of(bag.path, lines, MAX_POSE_INTERVAL), PoseReading(camera_axes=axes)
 
 
 def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistration | None:

@@ -68,8 +68,8 @@ class RosBag:
             self._reader = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
             self._reader.open()
             self.kinds: dict[str, str] = {found.topic: found.msgtype for found in self._reader.connections}
-        except Exception as error:  # of many kinds
-            raise DataError(f"{path}: cannot be read: {in_one_line(error)[:SHOWN]}") from error
+        except Exception as error:  # rosbags has no common base exception
+            raise DataError(f"{path}: expected a ROS bag, got an error ({in_one_line(error)[:SHOWN]})") from error
 
     def topics(self, *kinds: str) -> list[str]:
         """Return the topics with messages of these types."""
@@ -83,8 +83,9 @@ class RosBag:
         try:
             for connection, stored_at, raw in self._reader.messages(chosen):
                 yield Message(connection.topic, connection.msgtype, stored_at * NANOSECONDS, bytes(raw))
-        except Exception as error:  # of many kinds
-            raise DataError(f"{self.path}: damaged bag: {in_one_line(error)[:SHOWN]}") from error
+        except Exception as error:  # rosbags has no common base exception
+            reason = in_one_line(error)[:SHOWN]
+            raise DataError(f"{self.path}: expected readable messages, got an error ({reason})") from error
 
     def first(self, topic: str) -> Any:
         """Return the decoded first message of a topic, or None without messages. Raises DataError."""
@@ -96,9 +97,11 @@ class RosBag:
         decode = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
         try:
             return decode(message.raw, message.kind)
-        except Exception as error:  # of many kinds
+        except Exception as error:  # rosbags has no common base exception
             reason = in_one_line(error)[:SHOWN]
-            raise FrameError(f"{self.path}: damaged message of {message.topic}: {reason}") from error
+            raise FrameError(
+                f"{self.path}: {message.topic}: expected a valid message, got an error ({reason})"
+            ) from error
 
     def sensed_at(self, message: Message) -> float:
         """Return the measurement time in s from the header of a message. The header is the first field."""

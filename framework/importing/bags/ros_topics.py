@@ -41,7 +41,7 @@ class Topics:
 
 
 def found_topics(bag: RosBag, given: Topics) -> Topics:
-    """Return the given topics, and select the others by type and name.
+    """Return the given topics. Topics that are not given are selected by type and name.
 
     Raises DataError or ConfigError that names the option if no single topic matches.
     """
@@ -59,10 +59,10 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
     for name, kinds in KINDS.items():
         topic = getattr(topics, name)
         if topic and bag.kinds.get(topic) not in kinds:
-            found = f"{topic} of {bag.kinds[topic]}" if topic in bag.kinds else f"unknown topic {topic}"
+            found = f"{topic} of type {bag.kinds[topic]}" if topic in bag.kinds else f"unknown topic {topic}"
             existing = ", ".join(bag.topics(*kinds)) or "none"
-            expected = f"{OPTIONS[name]}: expected a topic of {' or '.join(kinds)}"
-            raise ConfigError(f"{expected}, got {found}; available topics: {existing}")
+            expected = f"{OPTIONS[name]}: expected a topic of type {' or '.join(kinds)}"
+            raise ConfigError(f"{expected}, got {found}; set one of these topics: {existing}")
     return topics
 
 

@@ -37,7 +37,7 @@ def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
 
 
 def static_rotation(bag: RosBag, to: str, of: str) -> Float64 | None:
-    """Return R_to_of (3, 3) of two frames in /tf_static, if necessary through other frames; None = not in the bag."""
+    """Return R_to_of (3, 3) between two frames in /tf_static, possibly through other frames; None = not in the bag."""
     neighbors: dict[str, dict[str, Float64]] = defaultdict(dict)
     for message in bag.messages([topic for topic in bag.topics(TRANSFORMS) if topic.endswith("tf_static")]):
         for stored in bag.decoded(message).transforms:

@@ -56,7 +56,7 @@ class Turn:
 
 
 def upright(ups_camera: Sequence[Float64 | None]) -> Turn | None:
-    """Return the rotation to upright images, or None if it is unknown.
+    """Return the rotation that makes the images upright, or None if it is unknown.
 
     `ups_camera` contains the up direction (3,) in the camera of each frame, None = unknown.
     """

@@ -27,10 +27,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from framework.data import MOST_PIXELS, Camera, Float32, Float64, UInt8
+from framework.data import MAX_PIXELS, Camera, Float32, Float64, UInt8
 from framework.datasets.calibration.camera_json import number_list, numbers_of, pinhole, read_json_object
 from framework.errors import DataError, FrameError, import_optional, in_one_line
-from framework.files.atomic_write import MOST_TEXT, read_bytes
+from framework.files.atomic_write import MAX_TEXT, read_bytes
 from framework.files.image_files import LARGEST_FILE, decode_color, read_color
 from framework.files.json_file import parse_json
 from framework.files.number_lines import SHOWN
@@ -41,7 +41,7 @@ CHANNEL = "R"  # of the EXR files
 LZFSE_BLOCK = b"bvx"  # first bytes of each block of compressed data
 BYTES_A_BLOCK = 20_000  # minimum block size of an image; blocks end after 40,000 bytes without repetitions
 UNTURNED = 1e-3  # sine of half the angle; a hand-held phone is never aligned this exactly with the world axes
-MOST_BLOCKS = 8  # additional blocks; the number is limited because a block may decompress to 27 MB
+MAX_BLOCKS = 8  # additional blocks; the number is limited because a block may decompress to 27 MB
 
 _load_openexr = partial(import_optional, "OpenEXR", "reads Record3D's depth", "phone")
 _load_lzfse = partial(import_optional, "lzfse", "unpacks Record3D's .r3d files", "phone")
@@ -58,7 +58,7 @@ def open_file(path: Path) -> Source:
     _load_lzfse()
     files = R3dFile(path)
     where = f"{path}: metadata"
-    content = parse_json(where, files.read("metadata", MOST_TEXT))
+    content = parse_json(where, files.read("metadata", MAX_TEXT))
     if not isinstance(content, dict):
         raise DataError(f"{where}: expected a JSON object, got {type(content).__name__}")
     return _source(where, content, files)
@@ -97,7 +97,7 @@ class R3dFile:
         try:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
-            raise DataError(f"{path}: cannot be read: {in_one_line(error)[:SHOWN]}") from error
+            raise DataError(f"{path}: expected a zip archive, got an error ({in_one_line(error)[:SHOWN]})") from error
         self._members = set(self._zip.namelist())
 
     def color(self, number: int) -> UInt8:
@@ -125,13 +125,14 @@ class R3dFile:
             raise FrameError(f"{self.path}: expected {name}, got no such member") from error
         except (OSError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, ValueError, RuntimeError) as error:
             if isinstance(error, NotImplementedError):
-                raise FrameError(f"{self.path}: {name}: unsupported compression: {error}") from error
-            raise FrameError(f"{self.path}: {name}: damaged: {in_one_line(error)[:SHOWN]}") from error
+                raise FrameError(f"{self.path}: {name}: expected a supported compression, got {error}") from error
+            reason = in_one_line(error)[:SHOWN]
+            raise FrameError(f"{self.path}: {name}: expected a readable member, got an error ({reason})") from error
 
     def _unpacked(self, name: str, dtype: str, shape: tuple[int, int]) -> np.typing.NDArray[np.generic]:
         size = math.prod(shape) * np.dtype(dtype).itemsize
         packed = self.read(name, 2 * size + 1000)
-        blocks, most = packed.count(LZFSE_BLOCK), MOST_BLOCKS + size // BYTES_A_BLOCK
+        blocks, most = packed.count(LZFSE_BLOCK), MAX_BLOCKS + size // BYTES_A_BLOCK
         if blocks > most:
             raise FrameError(
                 f"{self.path}: {name}: expected at most {most} LZFSE blocks for {size} bytes, got {blocks}"
@@ -140,7 +141,8 @@ class R3dFile:
         try:
             raw = lzfse.decompress(packed)
         except (lzfse.error, MemoryError) as error:
-            raise FrameError(f"{self.path}: {name}: cannot be decompressed; the file is damaged") from error
+            reason = in_one_line(error)[:SHOWN]
+            raise FrameError(f"{self.path}: {name}: expected LZFSE data, got an error ({reason})") from error
         if len(raw) != size:
             expected = f"expected {size} bytes for {shape[1]}x{shape[0]} px"
             raise FrameError(f"{self.path}: {name}: {expected}, got {len(raw)}")
@@ -228,15 +230,15 @@ def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDAr
         low, high = header["dataWindow"]
         found = tuple(int(n) for n in (high - low + 1)[::-1])
         names = [channel.name for channel in header["channels"]]
-    except Exception as error:  # of many kinds
-        raise FrameError(f"{path}: damaged: {in_one_line(error)[:SHOWN]}") from error
-    if found != shape or names != [CHANNEL] or math.prod(shape) > MOST_PIXELS:
+    except Exception as error:  # OpenEXR has no common base exception
+        raise FrameError(f"{path}: expected an EXR file, got an error ({in_one_line(error)[:SHOWN]})") from error
+    if found != shape or names != [CHANNEL] or math.prod(shape) > MAX_PIXELS:
         expected = f"expected {shape[1]}x{shape[0]} px of {CHANNEL}"
         raise FrameError(f"{path}: {expected}, got {found[1]}x{found[0]} px of {', '.join(names)[:60]}")
     try:
         image = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()[CHANNEL].pixels
     except Exception as error:
-        raise FrameError(f"{path}: damaged: {in_one_line(error)[:SHOWN]}") from error
+        raise FrameError(f"{path}: expected a decodable image, got an error ({in_one_line(error)[:SHOWN]})") from error
     if image.shape != shape or image.dtype not in (np.float16, np.float32):
         raise FrameError(f"{path}: expected float16 or float32, got {image.dtype}")
     return np.asarray(image, np.float32)

@@ -20,7 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from framework.data import MOST_PIXELS, Camera, UInt8
+from framework.data import MAX_PIXELS, Camera, UInt8
 from framework.datasets.calibration.camera_json import pinhole
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import check_regular
@@ -114,7 +114,7 @@ def _read_camera(path: Path, video: Video) -> Camera:
 
 
 class Video:
-    """Reader of video frames in sensor orientation, as for depth. The rotation in the metadata is ignored."""
+    """Reader of video frames in sensor orientation, like depth. The rotation in the metadata is ignored."""
 
     def __init__(self, path: Path) -> None:
         """Open a video. Raises DataError that names the file if it cannot be decoded."""
@@ -132,8 +132,10 @@ class Video:
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         self.width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))  # px
         self.height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))  # px
-        if not self._capture.isOpened() or not 0 < self.width * self.height <= MOST_PIXELS:
-            raise DataError(f"{path}: cannot be decoded; the file is damaged, or OpenCV does not support its codec")
+        if not self._capture.isOpened() or not 0 < self.width * self.height <= MAX_PIXELS:
+            raise DataError(
+                f"{path}: expected a video in a codec that OpenCV supports, got an undecodable file; export it again"
+            )
         self._next = 0
 
     def frame(self, number: int) -> UInt8:
@@ -142,11 +144,11 @@ class Video:
             raise FrameError(f"{self.path}: expected increasing frames, got {number} after {self._next - 1}")
         while self._next <= number:
             if not self._capture.grab():
-                raise FrameError(f"{self.path}: expected frame {number}, got the end of the video or a damaged part")
+                raise FrameError(f"{self.path}: expected frame {number}, got the end of the readable video")
             self._next += 1
         decoded, image = self._capture.retrieve()
         if not decoded:
-            raise FrameError(f"{self.path}: frame {number} cannot be decoded")
+            raise FrameError(f"{self.path}: frame {number}: expected a decodable image, got none")
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 

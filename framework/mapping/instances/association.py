@@ -65,7 +65,7 @@ class Overlaps:
         return self.over_smaller(min_pixels) if rule is OverlapRule.SMALLER else self.over_union(min_pixels)
 
     def over_union(self, min_pixels: int) -> npt.NDArray[np.float64]:
-        """Return the IoUs (N, M) in [0, 1] of clusters and visible instances; unions count at least `min_pixels`."""
+        """Return the IoUs (N, M) in [0, 1] of clusters and visible instances; a union has at least `min_pixels`."""
         union = self.sizes[:, None] + self.visible[None, :] - self.votes
         return np.asarray(self.votes / np.maximum(union, min_pixels))
 
@@ -121,7 +121,7 @@ def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int3
 
 
 def vote_stride(camera: Camera) -> int:
-    """Return the stride of the voting pixels and rows."""
+    """Return the stride of voting pixels along rows and columns, px."""
     return max(1, camera.width // VOTES_ACROSS)
 
 
@@ -225,7 +225,7 @@ class Association:
         return count_overlaps(points, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
 
     def associate(self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, frame_index: int) -> Matches:
-        """Match each cluster with an overlapping instance, or create an instance if score and size suffice."""
+        """Return the matches. Each cluster is matched with an instance, or creates one if score and size suffice."""
         frame_index = table.number_of(frame_index)
         allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
@@ -267,7 +267,7 @@ class Association:
                     return  # the overlaps are outdated now; later frames detect other pairs again
 
     def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
-        """Return True if the classes of two instances allow a merge. A book on a table is not the table."""
+        """Return True if the classes of two instances allow a merge; a book is not merged with its table."""
         known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
         return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
 

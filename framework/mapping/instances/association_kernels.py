@@ -50,7 +50,7 @@ def look_up_instances(
 
 @njit(cache=True, nogil=True)
 def find_seen(instance_ids, seen):
-    """Mark the instances of instance_ids (h, w) in seen (ids + 1,)."""
+    """Set seen (ids + 1,) to True for each instance in instance_ids (h, w)."""
     for instance in instance_ids.flat:
         if instance > 0:
             seen[instance] = True
@@ -58,7 +58,7 @@ def find_seen(instance_ids, seen):
 
 @device
 def _add_run(count, list_id, label, offsets, clusters, column, votes):
-    """Add `count` pixels of a list on an instance to the votes (N + 1, M + 1) of its clusters and of the last row."""
+    """Add `count` pixels of an instance to the votes (N + 1, M + 1) of a list's clusters and of the last row."""
     votes[votes.shape[0] - 1, column[label]] += count
     for entry in range(offsets[list_id], offsets[list_id + 1]):
         votes[clusters[entry], column[label]] += count

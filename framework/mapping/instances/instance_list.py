@@ -16,7 +16,7 @@ from framework.mapping.instances.association import agreed_classes
 from framework.mapping.instances.instance_table import InstanceRecord, InstanceTable
 from framework.mapping.storage.map_header import MapHeader
 
-LEAST_VERTICES = 4  # minimum number of vertices that span a box
+MIN_VERTICES = 4  # minimum number of vertices that span a box
 
 
 class InstanceClass(Enum):
@@ -47,18 +47,18 @@ class Confirmation:
         return cls(saved.whole("min_observations"), saved.number("min_confidence"), saved.number("min_area"))
 
     def is_met(self, record: InstanceRecord) -> bool:
-        """Return True if an instance meets the conditions, except the area."""
+        """Return True if an instance meets all conditions except the minimum area."""
         return record.observations >= self.min_observations and record.confidence >= self.min_confidence
 
     def counts(self, table: InstanceTable) -> Bool:
-        """Return an array (ids + 1,), True if an instance meets the conditions, except the area."""
+        """Return an array (ids + 1,), True if an instance meets all conditions except the minimum area."""
         counts = np.zeros(table.last_id + 1, np.bool_)
         for record in table.records.values():
             counts[record.id] = self.is_met(record)
         return counts
 
     def min_vertices(self, voxel_size: float) -> int:
-        """Return the number of vertices of an instance with `min_area`."""
+        """Return the number of mesh vertices of an instance with an area of `min_area`."""
         return vertices_of_area(self.min_area, voxel_size)
 
     def too_small(self, instance_ids: Int32, voxel_size: float) -> Bool:
@@ -97,7 +97,7 @@ class InstanceTableMap(SceneMap):
         self.classes = agreed_classes(self.classes, classes)
 
     def instances(self) -> Mapping[int, Instance]:
-        """Return the instances with vertices by id, ascending; boxes are upright if gravity is known."""
+        """Return the instances that have vertices, by ascending id; boxes are upright if gravity is known."""
         mesh, up, instances = self.mesh(), self.gravity().up, {}
         class_evidence = self.class_evidence()
         for k, vertices in vertices_by_id(mesh.instance_ids).items():
@@ -119,12 +119,12 @@ class InstanceTableMap(SceneMap):
 
 
 def vertices_of_area(area: float, voxel_size: float) -> int:
-    """Return the number of vertices of a surface of `area` m^2, at least LEAST_VERTICES.
+    """Return the number of vertices of a surface of `area` m^2, at least MIN_VERTICES.
 
     A vertex counts voxel_size^2. The area is exact if the surface is parallel to the grid. The mesh has one vertex for
     each voxel that the surface crosses, so other surfaces have up to sqrt(3) times as many vertices.
     """
-    return max(LEAST_VERTICES, round(area / voxel_size**2))
+    return max(MIN_VERTICES, round(area / voxel_size**2))
 
 
 def vertices_by_id(instance_ids: Int32) -> dict[int, Int32]:

@@ -63,12 +63,12 @@ class InstanceRecord:
 
     @property
     def visible(self) -> int:
-        """Number of frames in view."""
+        """Number of frames in which the instance is in view."""
         return len(self.in_view)
 
     @property
     def confidence(self) -> float:
-        """Mean score of its detections times the fraction of frames in view with a detection, in [0, 1]."""
+        """Mean detection score times the fraction of in-view frames with a detection, in [0, 1]."""
         mean_score = self.score_sum / max(self.detections, 1)
         return mean_score * self.observations / max(self.visible, self.observations, 1)
 
@@ -97,7 +97,7 @@ class InstanceTable:
         return record
 
     def begin_recording(self) -> None:
-        """Start another sequence. Its frame indices may repeat those of previous sequences."""
+        """Begin another sequence, whose frame indices may repeat those of previous sequences."""
         spans = [span[1] for record in self.records.values() for span in record.in_view.spans[-1:]]
         self._last_before = max([*spans, *(record.last_frame for record in self.records.values())], default=-1)
         self._offset = 0
@@ -126,7 +126,7 @@ class InstanceTable:
         record.embedding = added(record.embedding, embedding)
 
     def merge(self, kept: int, dropped: int) -> None:
-        """Add the history of `dropped` to `kept` and remove it."""
+        """Add the history of instance `dropped` to `kept`, and remove `dropped`."""
         a, b = self.records[kept], self.records.pop(dropped)
         earlier, later = (a, b) if a.last_frame <= b.last_frame else (b, a)
         a.class_evidence = _combined(earlier.class_evidence, later.class_evidence, self.combine)

@@ -16,7 +16,7 @@ ARRAYS = ("embedding_ids", "embedding_sums", "embedding_weights", "embedding_cou
 """Arrays of a map file with embeddings: (M,) int32, (M, D) float64, (M,) float64, (M,) int64."""
 
 SPACE = "embedding_space"  # key of the embedding space in a saved table
-MOST_WEIGHT = 1e12  # maximum weight of one object
+MAX_WEIGHT = 1e12  # maximum weight of one object
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,9 @@ def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, d
     check_array("embedding_counts", counts, (n,), np.int64)
     if len(np.unique(ids)) < n:
         raise DataError("embedding_ids: expected unique instances, got duplicates")
-    if n and not (weights.min() > 0 and weights.max() <= MOST_WEIGHT):
+    if n and not (weights.min() > 0 and weights.max() <= MAX_WEIGHT):
         raise DataError(
-            f"embedding_weights: expected values in (0, {MOST_WEIGHT:g}], got {weights.min()} to {weights.max()}"
+            f"embedding_weights: expected values in (0, {MAX_WEIGHT:g}], got {weights.min()} to {weights.max()}"
         )
     if n and not (counts.min() >= 1 and counts.max() <= LARGEST_COUNT):
         raise DataError(f"embedding_counts: expected at least 1, got {counts.min()}")

@@ -94,7 +94,7 @@ class EvidenceRows:
         return Evidence(self.evidence.labeled[: self.row_count], **slots)
 
     def fill(self, saved: Evidence) -> None:
-        """Copy the evidence of a saved map, or its own evidence with fewer instance slots."""
+        """Copy the evidence of a saved map, or its own evidence from before the instance slots were doubled."""
         self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
         self._free()
         self._reserve(len(saved.labeled), len(saved.instance_ids))
@@ -133,7 +133,7 @@ class EvidenceRows:
     def merge_instances(self, kept: int, dropped: int) -> None:
         """Combine the evidence for instance `dropped` with that for `kept` in every voxel.
 
-        Merging is rare. It visits the blocks that named the dropped instance, and one in 64 of the other blocks.
+        Merging is rare. It visits only the blocks whose instance set has the bit of the dropped instance.
         """
         row_bits = self._row_bits[: self.row_count]
         merge_instances(self.evidence, row_bits, np.int32(kept), np.int32(dropped), int(self.combine))

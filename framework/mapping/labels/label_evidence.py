@@ -66,7 +66,7 @@ class Measurement(NamedTuple):
 
 
 def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8, UInt8]:
-    """Return the evidence of clusters relative to their unnamed classes, the named classes and their bits.
+    """Return the clusters' evidence relative to their unnamed classes, and their named classes with bits.
 
     If the evidence is log-likelihoods, a cluster names its NEW_CLASSES best classes, and each unnamed class has the
     mean evidence of the others. Otherwise a cluster names its best class, and has no evidence for other classes.

@@ -72,7 +72,7 @@ def best_class(evidence, voxel):
 
 @device
 def add_evidence(labels, values, free, label, added, combine, limit):
-    """Combine evidence with the slot of a label, up to `limit`, or assign a free or the least likely slot to the label.
+    """Combine evidence with a label's slot, up to `limit`. A new label gets a free slot or the least likely slot.
 
     Returns 1 if a label was evicted.
     """
@@ -102,7 +102,7 @@ def add_evidence(labels, values, free, label, added, combine, limit):
 
 @device
 def best_first(labels, values, free):
-    """Move the most likely label to slot 0. Ties go to the smaller label, so that order does not matter."""
+    """Move the most likely label to slot 0. Ties go to the smaller label, so that the result ignores slot order."""
     best = 0
     for s in range(1, len(labels)):
         if labels[s] == free:  # slots are filled from the front

@@ -29,7 +29,7 @@ from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VoxelHashing
 
 OTHER_CLASS = 0.3  # largest Bhattacharyya coefficient of the class distributions of different objects
-EXACT_BITS = 16  # resolution of class scores in exact storage over compact storage
+EXACT_BITS = 16  # additional bits of class scores in exact storage
 
 
 class LabelRule(NamedTuple):
@@ -91,7 +91,7 @@ class LabeledVoxels:
         return InstanceMap(volume, labels, rule.logarithmic, self.confirmation, self.instance_class)
 
     def continued(self, scene: SceneMap, rule: LabelRule) -> InstanceMap:
-        """Prepare a stored map for new frames. Raises ConfigError if its parameters or its rule differ."""
+        """Return the stored map, prepared for new frames. Raises ConfigError if its parameters or its rule differ."""
         if not isinstance(scene, InstanceMap):
             raise ConfigError(
                 f"fuser: expected a stored InstanceMap, got {type(scene).__name__}; choose the fuser that made the map"
@@ -100,19 +100,22 @@ class LabeledVoxels:
         parameters: dict[str, tuple[object, object]] = {
             "fuser.voxel_size": (f"{scene.volume.voxel_size:g}", f"{own.volume.voxel_size:g}"),
             "fuser.storage": (scene.labels.storage.name, self.storage.name),
-            "label rule of the fuser": (
-                (scene.table.combine.name, scene.table.logarithmic, scene.labels.score_scale),
-                (rule.combine.name, rule.logarithmic, own.labels.score_scale),
-            ),
         }
         for name, was, now in zip(Sensor._fields, scene.volume.sensor, own.volume.sensor, strict=True):
             parameters[f"fuser.{name}"] = f"{was:g}", f"{now:g}"
         for name, (stored, given) in parameters.items():
             if stored != given:
                 raise ConfigError(
-                    f"{name}: expected {stored} (as in the stored map), got {given}; set it to {stored}, or start a "
-                    "new map"
+                    f"{name}: expected {stored} (as in the stored map), got {given}; set {name}={stored}, or map into "
+                    "an empty folder"
                 )
+        stored_rule = (scene.table.combine.name, scene.table.logarithmic, scene.labels.score_scale)
+        given_rule = (rule.combine.name, rule.logarithmic, own.labels.score_scale)
+        if stored_rule != given_rule:
+            raise ConfigError(
+                f"fuser: expected the label rule of the stored map {stored_rule}, got {given_rule}; choose the fuser "
+                "that made the map"
+            )
         scene.confirmation = self.confirmation
         scene.instance_class = self.instance_class
         scene.volume.voxels.max_blocks = self.hashing.max_blocks

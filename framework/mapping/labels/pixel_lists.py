@@ -41,7 +41,7 @@ class PixelLists(NamedTuple):
 
 
 class ListTree(NamedTuple):
-    """Tree of the lists during construction. A list is a cluster, its head, followed by its parent list."""
+    """Tree of the lists during construction. A list consists of its head, a cluster, and its parent list."""
 
     head: Int32  # (capacity,)
     parent: Int32  # (capacity,)
@@ -71,7 +71,7 @@ def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> Pix
 
 
 def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> PixelLists:
-    """Return the lists without clusters below much smaller clusters and without clusters that have no instance.
+    """Return the lists without clusters that have no instance or lie below much smaller clusters.
 
     Large masks are coarse and cover small objects, such as a book on a couch. So a pixel keeps only clusters that are
     at most 1 / `area_ratio` times as large as its smallest cluster. If `area_ratio` is 0, a pixel keeps all clusters.

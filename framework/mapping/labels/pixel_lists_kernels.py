@@ -12,7 +12,7 @@ CHUNKS = 16  # chunks of image rows
 
 @device
 def _are_inside(coordinates, width, height):
-    """Return True if all pixels (2 P,), alternating u and v, are in the image. Unsigned negative numbers are large."""
+    """Return True if all pixels (2 P,), alternating u and v, are in the image; unsigned, negative numbers are large."""
     right = bottom = np.uint32(0)
     for p in range(coordinates.shape[0] // 2):
         right = max(right, np.uint32(coordinates[2 * p]))
@@ -22,7 +22,7 @@ def _are_inside(coordinates, width, height):
 
 @njit(cache=True, nogil=True)
 def link_points(coordinates, cluster, list_ids, tree):
-    """Fill list_ids (H, W) and the ListTree, which has room for one more list than there are points.
+    """Fill list_ids (H, W) and the ListTree, which has a capacity of one list per point plus one.
 
     The coordinates (2 P,) of the points alternate u and v. Returns the number of lists, 0 if a point is outside.
     """
@@ -76,7 +76,7 @@ def write_lists(head, parent, offsets, clusters):
 
 @njit(cache=True, nogil=True)
 def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kept_offsets, kept):
-    """Fill kept_offsets (L + 1,) and the first kept_offsets[L] entries of `kept`, an array as long as `clusters`."""
+    """Fill kept_offsets (L + 1,) and the first kept_offsets[L] entries of `kept`, which is as long as `clusters`."""
     sizes = np.zeros(instance_ids.shape[0], np.float64)
     for i in range(pixel_counts.shape[0]):
         for entry in range(offsets[i], offsets[i + 1]):
@@ -119,7 +119,7 @@ def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
 
 @njit(cache=True, nogil=True)
 def lists_without(offsets, clusters, supported, instances, replacement, origin, ends, kept):
-    """Fill replacement (L, 1 + J) with the list that replaces each list without an instance and at `instances` (J,).
+    """Fill replacement (L, 1 + J): the list that replaces each list at no instance (column 0) and at `instances` (J,).
 
     `origin` gets the list that each new list replaces, and `ends` the end of its clusters in `kept`. Returns the
     numbers of new lists and of their clusters.

@@ -23,7 +23,7 @@ CHUNK = 1024  # number of vertices that share scratch arrays
 
 @device
 def corner_voxels(grid, vertex, blocks, voxels, weights):
-    """Fill the block (-1 = absent), index and trilinear weight, (8,) each, of the voxels around a vertex (3,) m.
+    """Fill `blocks` (-1 = absent), `voxels` and trilinear `weights`, (8,) each, of the voxels around a vertex (3,) m.
 
     Returns True if any voxel has label evidence.
     """
@@ -55,7 +55,7 @@ def keep_near(grid, blocks, voxels, weights):
 
 @device
 def majority(labels, weights):
-    """Return the voxel with the largest weight of the majority label; -1 without a majority.
+    """Return the voxel that has the largest weight among the voxels of the majority label; -1 without a majority.
 
     The majority label is the entry of `labels` (8,) > 0 with more than half of the total weight.
     """

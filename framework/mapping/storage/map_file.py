@@ -15,7 +15,7 @@ import numpy as np
 
 from framework.data import Array, check_array
 from framework.errors import DataError, InstanceMapError, in_one_line
-from framework.files.atomic_write import check_regular, written_whole
+from framework.files.atomic_write import atomic_write, check_regular
 from framework.files.json_file import parse_json
 from framework.mapping.instances.instance_table import FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.instances.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
@@ -28,18 +28,18 @@ DEFLATE_LEVEL = 1  # zlib level; files are at most a tenth larger than at level 
 HEADER = "header"
 LARGEST_HEADER = 2**28  # bytes; an hour with thousands of instances takes about 10 MB
 LARGEST_ID = 2**24  # largest instance id
-MOST_EVIDENCE = 1e12  # largest evidence for a class
-MOST_ARRAYS = 100  # maximum number of arrays that a file lists
-SHARE_OF_MEMORY = 0.5  # maximum fraction of the machine's memory for a loaded map
+MAX_EVIDENCE = 1e12  # largest evidence for a class
+MAX_ARRAYS = 100  # maximum number of arrays that a file lists
+MAX_MEMORY_FRACTION = 0.5  # maximum fraction of the machine's memory for a loaded map
 
 
 def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-    """Write an .npz for np.load, lightly compressed, without timestamps."""
+    """Write a lightly compressed .npz file without timestamps, readable by np.load."""
     if not isinstance(cast(object, path), str | Path):
         raise DataError(f"map file: expected a path, got {path!r:.60}")
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
     with (
-        written_whole(Path(path)) as temporary,
+        atomic_write(Path(path)) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=DEFLATE_LEVEL) as archive,
     ):
         for name, array in {HEADER: encoded, **arrays}.items():
@@ -53,14 +53,14 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
     Raises DataError for other files and formats, and for wrong checksums. Array sizes are checked against the file and
     the memory of the machine before allocation.
     """
-    with faults_of(path), _opened(path) as archive:
+    with map_file_errors(path), _opened(path) as archive:
         header = _header(archive)
         found = header.values.get("format")
         if found != expected_format:
             raise DataError(f"expected map format {expected_format}, got {found!r:.60}")
         damaged = archive.testzip()
         if damaged is not None:
-            raise DataError(f"{damaged}: expected a matching checksum, got a mismatch; the file is damaged")
+            raise DataError(f"{damaged}: expected the stored CRC-32 checksum, got another")
         there = set(archive.namelist())
         optional = [name for name in ARRAYS if f"{name}.npy" in there]
         return header, {name: _array(archive, name) for name in dict.fromkeys((*names, *optional))}
@@ -68,19 +68,19 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
 
 def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
     """Return the arrays listed as `names` in the header of a file. Raises DataError like read_map()."""
-    with faults_of(path), _opened(path) as archive:
+    with map_file_errors(path), _opened(path) as archive:
         names = _header(archive).items("names")
-    return read_map(path, expected_format, [str(name) for name in names[:MOST_ARRAYS]])[1]
+    return read_map(path, expected_format, [str(name) for name in names[:MAX_ARRAYS]])[1]
 
 
 def read_format(path: Path | str) -> str:
     """Return the format of a map file. Raises DataError for other files."""
-    with faults_of(path), _opened(path) as archive:
+    with map_file_errors(path), _opened(path) as archive:
         return str(_header(archive).values.get("format"))
 
 
 @contextmanager
-def faults_of(path: Path | str) -> Iterator[None]:
+def map_file_errors(path: Path | str) -> Iterator[None]:
     """Convert errors during reading of a map file into a DataError that names the file."""
     try:
         yield
@@ -97,7 +97,7 @@ def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
     check_regular(Path(path))
     with zipfile.ZipFile(path) as archive:
         unpacked = sum(info.file_size for info in archive.infolist())
-        if unpacked > SHARE_OF_MEMORY * machine_memory():
+        if unpacked > MAX_MEMORY_FRACTION * machine_memory():
             raise DataError(
                 f"expected at most half of this machine's {machine_memory()} bytes of memory, got {unpacked} "
                 "unpacked bytes"
@@ -113,15 +113,19 @@ def _header(archive: zipfile.ZipFile) -> MapHeader:
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> Array:
-    """Read an array if its size in the archive agrees with its shape."""
+    """Return an array of the archive. Raises DataError if its size disagrees with its shape."""
     info = archive.getinfo(f"{name}.npy")
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read(member)
         claimed = member.tell() + math.prod(shape) * dtype.itemsize
-    if claimed != info.file_size or min(shape, default=0) < 0:
-        raise DataError(f"{name}: expected {shape} of {dtype}, got {info.file_size} bytes")
+    if min(shape, default=0) < 0:
+        raise DataError(f"{name}: expected dimensions >= 0, got {shape}")
+    if claimed != info.file_size:
+        raise DataError(
+            f"{name}: expected {claimed} bytes for shape {shape} and dtype {dtype}, got {info.file_size} bytes"
+        )
     with archive.open(info) as member:
         return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
 
@@ -193,7 +197,7 @@ def _plain_record(record: InstanceRecord) -> dict[str, Any]:
 
 
 def table_arrays(table: InstanceTable) -> dict[str, Array]:
-    """Return the arrays of an instance table, that is, its embeddings; empty without embeddings."""
+    """Return the arrays of an instance table's embeddings; empty without embeddings."""
     embeddings = {k: record.embedding for k, record in table.records.items() if record.embedding is not None}
     return embedding_arrays(embeddings)
 
@@ -228,9 +232,9 @@ def _record(entry: MapHeader, last_id: int, classes: int) -> InstanceRecord:
         score_sum=entry.number("score_sum", (0.0, float(entry.whole("detections")))),
         detections=entry.whole("detections"),
     )
-    if not np.abs(record.class_evidence).max() <= MOST_EVIDENCE:
+    if not np.abs(record.class_evidence).max() <= MAX_EVIDENCE:
         raise DataError(
-            f"{entry.name}.class_evidence: expected values within {MOST_EVIDENCE:g} of 0, got {evidence!r:.60}"
+            f"{entry.name}.class_evidence: expected values within {MAX_EVIDENCE:g} of 0, got {evidence!r:.60}"
         )
     return record
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from framework.errors import DataError
 
-MOST_CLASSES = 10_000  # maximum number of classes of a map; LVIS has 1,200
+MAX_CLASSES = 10_000  # maximum number of classes of a map; LVIS has 1,200
 LONGEST_NAME = 200  # maximum length of a class name, characters
 LARGEST_COUNT = 2**53  # maximum number of frames and evictions; JSON readers represent integers up to it exactly
 
@@ -26,7 +26,7 @@ class MapHeader:
 
     @classmethod
     def of(cls, found: object, name: str = "header") -> MapHeader:
-        """Return the header object of a value. Raises DataError for other types."""
+        """Return a JSON object as a header. Raises DataError for other types."""
         if not isinstance(found, dict):
             raise DataError(f"{name}: expected an object, got {found!r:.60}")
         return cls(found, name)
@@ -44,7 +44,7 @@ class MapHeader:
         """Return a list of arbitrary values."""
         found = self._value(key)
         if not isinstance(found, list):
-            raise self._fault(key, "a list", found)
+            raise self._error(key, "a list", found)
         return found
 
     def number(self, key: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> float:
@@ -52,7 +52,7 @@ class MapHeader:
         found, (low, high) = self._value(key), bounds
         is_number = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
         if not is_number or not low - 1e-6 * abs(low) <= found <= high + 1e-6 * abs(high):
-            raise self._fault(key, f"a number in [{low:g}, {high:g}]", found)
+            raise self._error(key, f"a number in [{low:g}, {high:g}]", found)
         return float(found)
 
     def whole(self, key: str, low: int = 0, high: int = LARGEST_COUNT) -> int:
@@ -63,22 +63,22 @@ class MapHeader:
         """Return a Boolean."""
         found = self._value(key)
         if not isinstance(found, bool):
-            raise self._fault(key, "true or false", found)
+            raise self._error(key, "true or false", found)
         return found
 
     def option(self, key: str, options: type[Option]) -> Option:
         """Return a member of an enumeration by its name."""
         found = self._value(key)
         if not isinstance(found, str) or found not in options.__members__:
-            raise self._fault(key, f"one of {', '.join(options.__members__)}", found)
+            raise self._error(key, f"one of {', '.join(options.__members__)}", found)
         return options[found]
 
     def classes(self) -> tuple[str, ...]:
         """Return the names of the map's classes."""
         found = self.items("classes")
         names = [name for name in found if isinstance(name, str) and len(name) <= LONGEST_NAME]
-        if len(names) < len(found) or len(found) > MOST_CLASSES:
-            raise self._fault("classes", f"at most {MOST_CLASSES} names of {LONGEST_NAME} characters", found)
+        if len(names) < len(found) or len(found) > MAX_CLASSES:
+            raise self._error("classes", f"at most {MAX_CLASSES} names of {LONGEST_NAME} characters", found)
         return tuple(names)
 
     def _value(self, key: str) -> Any:
@@ -86,7 +86,7 @@ class MapHeader:
             raise DataError(f"{self.name}: expected the key {key!r}, got none")
         return self.values[key]
 
-    def _fault(self, key: str, expected: str, found: object) -> DataError:
+    def _error(self, key: str, expected: str, found: object) -> DataError:
         return DataError(f"{self.name}.{key}: expected {expected}, got {found!r:.60}")
 
 

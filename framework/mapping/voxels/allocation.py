@@ -18,9 +18,9 @@ from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, FARTHEST_BLOCK
 
-MOST_SAMPLES = 4096  # maximum samples along the band of a reading, half a block apart; 6 by default
+MAX_SAMPLES = 4096  # maximum samples along the band of a reading, half a block apart; 6 by default
 REPEATS = 8  # maximum mean number of reports of a block by a chunk, which remembers recent blocks
-FEWEST_KEYS = 2**20  # minimum key capacity for a frame, 8 MB; the block budget limits smaller requests
+MIN_KEYS = 2**20  # minimum key capacity for a frame, 8 MB; the block budget limits smaller requests
 
 
 class Allocator:
@@ -71,9 +71,9 @@ class Allocator:
         band = float(self.sensor.truncation) + float(self.sensor.truncation_slope) * farthest
         longest = _longest_ray(camera)
         samples = 1 + int(np.ceil(4 * band * longest / block_size))
-        if samples > MOST_SAMPLES:
+        if samples > MAX_SAMPLES:
             raise MapFullError(
-                f"fuser.truncation_slope: expected a truncation band of at most {MOST_SAMPLES // 2} blocks, got "
+                f"fuser.truncation_slope: expected a truncation band of at most {MAX_SAMPLES // 2} blocks, got "
                 f"{samples // 2}; raise fuser.voxel_size or lower fuser.truncation_slope"
             )
         reach = float(np.abs(T_world_camera[:3, 3]).max()) + (farthest + band) * longest
@@ -87,7 +87,7 @@ class Allocator:
             surface_blocks(depth, view, self.sensor, size, stride, samples, self._found, counts)
             if counts.max() <= self._found.shape[1]:
                 break
-            if counts.sum() > max(REPEATS * self.voxels.max_blocks, FEWEST_KEYS):
+            if counts.sum() > max(REPEATS * self.voxels.max_blocks, MIN_KEYS):
                 raise MapFullError(
                     f"the map is full: expected at most {self.voxels.max_blocks} blocks, got "
                     f"{counts.sum() // REPEATS} or more for one frame; raise fuser.voxel_size or fuser.max_blocks, "
@@ -101,7 +101,7 @@ class Allocator:
 
 
 def _longest_ray(camera: Camera) -> float:
-    """Return the length of the ray to depth 1 through the corner farthest from the principal point."""
+    """Return the length, per m of depth, of the ray through the corner farthest from the principal point."""
     x = max(camera.cx, camera.width - camera.cx) / camera.fx
     y = max(camera.cy, camera.height - camera.cy) / camera.fy
     return float(np.sqrt(1 + x * x + y * y))

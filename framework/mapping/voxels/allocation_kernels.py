@@ -94,7 +94,7 @@ def unpack(keys, coords):
 
 @device
 def _extent(camera, size, margin):
-    """Return the half sides, m, along the camera axes of the bounding box of a cube in the world frame."""
+    """Return half the sides, m, of the box along the camera axes around a cube along the world axes."""
     half = np.float32(0.5) * size
     return (
         half * (abs(camera.R[0, 0]) + abs(camera.R[0, 1]) + abs(camera.R[0, 2])) + margin,

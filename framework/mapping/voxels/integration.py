@@ -62,7 +62,9 @@ class Integrator:
         return self._update(frame, T_world_camera, near_band, self._allocator.active_blocks(frame, T_world_camera))
 
     def integrate_object(self, frame: Frame, T_world_camera: Float64, near_band: float, mask: Bool) -> SeenBlocks:
-        """Integrate into the grid of one object. The grid grows only within the object's `mask` (H, W).
+        """Integrate one frame into the grid of one object, and return the voxels as `integrate` does.
+
+        The grid grows only within the object's `mask` (H, W).
 
         All existing blocks are updated, including by depth readings outside the mask.
         """

@@ -22,12 +22,14 @@ from framework.mapping.voxels.voxel_walk import prefetch_row
 LAYER_VOXELS = BLOCK_SIDE**2
 GROUP = 16  # number of successive blocks of one thread, with contiguous near voxels
 FAR = 1e9  # m
-LEAST_BEHIND = 0.02  # fraction of the full weight at the far end of the truncation band; above 0 to mark voxels as seen
+MIN_WEIGHT_BEHIND = (
+    0.02  # weight at the far end of the truncation band, fraction of the full weight; > 0 marks voxels as seen
+)
 
 
 @device
 def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
-    """Project the voxels of a block, eq. [6]: pixel indices into pixel (512,), depths (m) into scratch[:512].
+    """Project the voxels of a block (eq. [6]). Write pixel indices to pixel (512,) and depths (m) to scratch[:512].
 
     Voxels outside the image get pixel 0 and a depth larger than any reading.
     """
@@ -76,7 +78,7 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
     full2 = sensor.full_weight_depth * sensor.full_weight_depth
     weight_one = np.float32(WEIGHT_ONE)
     max_weight = sensor.max_weight * weight_one
-    most, least = np.float32(TSDF_MAX), np.float32(LEAST_BEHIND)
+    most, least = np.float32(TSDF_MAX), np.float32(MIN_WEIGHT_BEHIND)
     ramp = one / max(sensor.truncation - voxel, np.float32(0.5) * voxel)
     colored = near = np.int32(0)
     for n in range(BLOCK_VOXELS):
@@ -135,7 +137,7 @@ def _average_colors(packed, color, pixel, start, rounding, scratch, seen):
 
 @device
 def _is_colored(scratch, start):
-    """Return True if a voxel of the layer from `start` on gets a color by the weights scratch[512:]."""
+    """Return True if a voxel of the layer from `start` on has a nonzero color weight in scratch[512:]."""
     largest = np.float32(0.0)
     for n in range(LAYER_VOXELS):
         largest = max(largest, scratch[start + n + BLOCK_VOXELS])
@@ -144,7 +146,7 @@ def _is_colored(scratch, start):
 
 @device
 def _list_near(pixel, near_band, near_voxel, near_pixel, entry, scratch):
-    """List the voxels within near_band of the measured surface by the distances scratch[:512], and their pixels.
+    """List the voxels with a distance scratch[:512] within near_band of the measured surface, and their pixels.
 
     The list begins at `entry`. The comparisons of a layer are bits of a word, so that the compiler vectorizes them.
     """

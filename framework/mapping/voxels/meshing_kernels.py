@@ -48,7 +48,7 @@ def mark_stale(grid, changed, stale):
 
 @device
 def _any_and_all(words, around, z):
-    """Return two words for the cells of slice z: any, and all, of a cell's four corners in the slice are set."""
+    """Return two words for the cells of slice z: cells with any, and with all, of their four corners in z set."""
     up = 4 * (z >> 3)
     z &= 7
     here, block_x = words[around[up], z], words[around[up + 1], z]
@@ -107,7 +107,7 @@ def number_slices(cells, starts):
 
 @device
 def _crossing(a, b):
-    """Return (1, fraction) of the zero crossing between distances a and b of different signs, otherwise (0, 0)."""
+    """Return (1, position of the zero crossing as a fraction from a to b), or (0, 0) if a and b have the same sign."""
     crosses = (a ^ b) < 0
     where = np.float32(a) / np.float32(a - b if crosses else 1)
     return (np.float32(1.0), where) if crosses else (np.float32(0.0), np.float32(0.0))

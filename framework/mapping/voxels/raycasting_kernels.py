@@ -79,7 +79,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
     inverse_d = inverses(d)
     # the nearest voxel to a point is the cell of the point shifted by half a voxel
     shifted = (o[0] + half, o[1] + half, o[2] + half)
-    # a step beyond a border of more than the rounding of z, because otherwise the ray would not advance
+    # step past the border by more than the rounding of z, because otherwise the ray would not advance
     margin = max(np.float32(1e-3) * step, np.float32(2.5e-7) * far)
     z = near
     from_front = False  # the previous voxel was in front of a surface
@@ -121,7 +121,7 @@ def bound_tiles(depths, pixels, tile_near, tile_far):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
-    """Fill the depth (m) of every stride-th pixel and of the last row and column of an image by a full search.
+    """Fill `depth` (m) at every stride-th pixel, and in the last row and column of an image, by a full search.
 
     The image is (H, W), `depth` is (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1), 0 = no surface. `view`
     holds T_world_camera.
@@ -294,7 +294,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def paint(grid, view, depth, color):
-    """Fill color (H, W, 3) with the map's color at the surface of `depth` (H, W) m seen from `view`."""
+    """Fill color (H, W, 3) with the map's color at the surface at `depth` (H, W) m from `view`."""
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
     for v in prange(height):

@@ -18,7 +18,7 @@ from framework.mapping.voxels.integration import Integrator, SeenBlocks
 from framework.mapping.voxels.integration_parameters import BOUNDS, Sensor
 from framework.mapping.voxels.meshing import SurfaceNets, UnlabeledMesh
 from framework.mapping.voxels.raycasting import render_surface
-from framework.mapping.voxels.voxel_grid import MOST_BLOCKS, VoxelGrid
+from framework.mapping.voxels.voxel_grid import MAX_BLOCKS, VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, find_solid_blocks
 
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # saved arrays of the grid
@@ -109,7 +109,7 @@ class TsdfVolume:
         """Return the volume of a map file with `rows` label rows. Raises DataError if the file is invalid."""
         saved = header.part("sensor")
         sensor = Sensor(**{name: np.float32(saved.number(name, BOUNDS[name])) for name in Sensor._fields})
-        max_blocks = header.whole("max_blocks", 1, MOST_BLOCKS)
+        max_blocks = header.whole("max_blocks", 1, MAX_BLOCKS)
         volume = cls(header.number("voxel_size", BOUNDS["voxel_size"]), sensor, max_blocks)
         volume.integrator.frames = header.whole("frames")  # determines the rounding of the next frame
         volume.gravity_estimator = GravityEstimator.of(header)
@@ -119,7 +119,7 @@ class TsdfVolume:
         return volume
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Copy the voxels of a map file with checked types and shapes into an empty volume."""
+        """Copy the voxels of a map file, whose types and shapes are checked, into an empty volume."""
         coords = arrays["block_coords"]
         check_blocks(coords)
         self.voxels.allocate(coords)
@@ -166,7 +166,7 @@ class VoxelHashing:
             truncation_slope=BOUNDS["truncation_slope"],
             max_weight=BOUNDS["max_weight"],
             full_weight_depth=BOUNDS["full_weight_depth"],
-            max_blocks=(1, MOST_BLOCKS),
+            max_blocks=(1, MAX_BLOCKS),
         )
 
     def new_volume(self) -> TsdfVolume:

@@ -29,7 +29,7 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 Element = TypeVar("Element", bound=np.generic)
 Made = TypeVar("Made")
-MOST_BLOCKS = 2**31 // BLOCK_VOXELS  # maximum number of blocks of a map; voxel indices are 32-bit
+MAX_BLOCKS = 2**31 // BLOCK_VOXELS  # maximum number of blocks of a map; voxel indices are 32-bit
 REGION_SIDE = 8  # blocks
 REGION_BLOCKS = REGION_SIDE**3
 WEIGHT_ONE = 256  # stored weight of one observation
@@ -72,7 +72,7 @@ def _free_blocks(count: int) -> dict[str, Any]:
 
 
 def reserved(most: int, make: Callable[[int], Made]) -> Made:
-    """Return make(most): uninitialized arrays that take no memory until written, and never need to grow.
+    """Return the uninitialized arrays make(most), which take no memory until written and never need to grow.
 
     With limited address space (Windows, `ulimit -v`, no overcommit), return make(FIRST_RESERVED), which can grow.
     """

@@ -17,7 +17,7 @@ device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nr
 
 @device
 def one_more(count, condition):
-    """Return count + condition as int32. Numba would add in 64 bits, which fit half as often into a vector."""
+    """Return count + condition as int32. Numba would add 64-bit integers, of which half as many fit into a vector."""
     return np.int32(count + (np.int32(1) if condition else np.int32(0)))
 
 
@@ -158,7 +158,7 @@ COLORED = np.uint32(1 << 30)  # marker bit of a color
 
 @device
 def pack_color(red, green, blue):
-    """Return the packed color of quarters of a level, 0 to 1020. Ten bits per channel let averages converge."""
+    """Return a packed color from channels in quarters of a level, 0 to 1020. Ten bits let averages converge."""
     return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
 
 

@@ -42,7 +42,7 @@ def seen_point(view, u, v, z):
 
 @device
 def _leave_slab(z, start, d, inverse_d, size, inverse_size):
-    """Compute leave_cell() along one axis."""
+    """Return the exit parameter of leave_cell() along one axis."""
     cell = np.floor((start + z * d) * inverse_size)
     if inverse_d > np.float32(0.0):  # not d: a ray along the slab has a huge inverse_d and leaves the slab far ahead
         cell += np.float32(1.0)
@@ -51,7 +51,7 @@ def _leave_slab(z, start, d, inverse_d, size, inverse_size):
 
 @device
 def leave_cell(z, start, d, inverse_d, size, inverse_size):
-    """Return the parameter at the exit of the ray start + z * d from its grid cell at z, with side `size`.
+    """Return the parameter at which the ray start + z * d leaves the grid cell, of side `size`, that it is in at z.
 
     `start`, `d` and `inverse_d` are triples. `inverse_d` is 1 / d, a huge number if d is 0.
     """
@@ -79,7 +79,7 @@ def voxel_number(i, j, k):
 
 @device
 def _of_neighbor(grid, values, block, neighbor, n, missing):
-    """Return entry n of values (B, 512) of a block's neighbor, `missing` without such a neighbor."""
+    """Return entry n of values (B, 512) of a block's neighbor, or `missing` if the neighbor is absent."""
     there = grid.neighbors[np.uint32(block), np.uint32(neighbor)]
     return values[np.uint32(there), np.uint32(n)] if there >= 0 else missing
 
@@ -155,7 +155,7 @@ def trilinear(grid, block, x, y, z):
 
 @device
 def _add_color(red, green, blue, total, packed, weight):
-    """Add a packed color with its weight. A voxel without color adds nothing."""
+    """Return the sums with a packed color and its weight added. A voxel without color adds nothing."""
     weight = weight if packed & COLORED else np.float32(0.0)
     r, g, b = unpack_color(packed)
     return red + weight * r, green + weight * g, blue + weight * b, total + weight
@@ -219,7 +219,7 @@ def directions(view, scale, v):
 
 @device
 def points_of_row(view, scale, v, depth, points):
-    """Fill points (3, W), voxels, with the points of row v at `depth` (W,) m."""
+    """Fill `points` (3, W), in voxels, with the points of row v at `depth` (W,) m."""
     origin, change = directions(view, scale, v)
     tx, ty, tz = view.t[0] * scale, view.t[1] * scale, view.t[2] * scale
     for n in range(depth.shape[0]):

@@ -89,7 +89,7 @@ def grow(
 
 
 def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
-    """Return the initial children of M Gaussians, at one standard deviation in both directions of the longest axes.
+    """Return the initial children of M Gaussians, one standard deviation along the longest axes in both directions.
 
     2, 4 or 8 children lie along one, two or three axes. They have equal weights and a quarter of the covariance.
     """
@@ -110,7 +110,7 @@ def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
 
 
 def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) -> tuple[Level, Int64]:
-    """Return the level below nodes with weights `above`, and the components that became its nodes."""
+    """Return the level below nodes with weights `above`, and the indices of the components that became its nodes."""
     boxes = np.zeros((len(chosen), 2, 3))  # no uniform component
     level = level_below(fitted, boxes, chosen, above, min_support)
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)

@@ -156,7 +156,7 @@ def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: F
 
 @njit(cache=True, nogil=True)
 def add_point(moment: Float64, point: Float32, center: Float64, gamma: float) -> None:
-    """Add gamma * (1, x, x x^T) of the centered point, using the upper triangle of the symmetric matrix."""
+    """Add gamma * (1, x, x x^T) of the centered point x, with only the upper triangle of the symmetric matrix."""
     x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
     gx, gy, gz = gamma * x, gamma * y, gamma * z
     moment[0] += gamma

@@ -2,7 +2,7 @@
 
 Equations of docs/method.md: (1) the mixture, (2) the E-step, (3, 4) the M-step. The uniform component follows
 Eckart et al., "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016. scikit-learn's mixture has no uniform
-component and no evidence for single points, and is slower (tests/benchmarks/test_refiners.py).
+component and no per-point evidence, and is slower (tests/benchmarks/test_refiners.py).
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def likely_members(
 
 
 def blocks_of(begins: Int64, ends: Int64, size: int) -> Blocks:
-    """Split each range of points into blocks of at most `size` points."""
+    """Return blocks of at most `size` points that cover each range of points."""
     counts = -(-(ends - begins) // size)
     owner = np.repeat(np.arange(len(counts)), counts)
     firsts = begins[owner] + size * (np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts))

@@ -246,7 +246,7 @@ def _claim_batch(
     points: Float32, odds: Float32, rows: Float32, log_outlier: np.float32, own_components: int, min_posterior: float,
     claimed: Bool,
 ) -> None:  # fmt: skip
-    """Decide most points without exponentials: a sum of n terms lies between its largest term and n times this term."""
+    """Claim points, mostly without exponentials: a sum of n terms is between its largest term and n times this term."""
     components = len(rows)
     log_bound = math.log(min_posterior / (1.0 - min_posterior))
     certain = np.float32(log_bound + math.log(components - own_components + 1.0) + MARGIN)

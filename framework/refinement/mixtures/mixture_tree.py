@@ -66,7 +66,7 @@ class MixtureTree:
     def shared(
         self, k: int, points: Float32, starts: Int64, ratios: Float32, outlier_ratios: Float32, log_odds: Float32
     ) -> tuple[Int64, Float32]:
-        """Return `passed`, and the object's posterior (S,) at each point by the densities of this level.
+        """Return the result of `passed`, and the object's posterior (S,) at each point by the densities of level `k`.
 
         `ratios` (M,) are the object's fractions of the nodes, and `outlier_ratios` (Q,) of the uniform components. The
         object's density is multiplied by exp(`log_odds`) (S,). The posterior of a point at a leaf is 0.
@@ -124,7 +124,7 @@ def cut(points: Float32, starts: Int64, groups: int) -> Int32:
 
 
 def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: float) -> Float32:
-    """Return the object's fraction (M,) of each node, from evidence `log_odds[starts[j]:starts[j + 1]]` of its points.
+    """Return the object's fraction (M,) of each node j from its points' evidence `log_odds[starts[j]:starts[j + 1]]`.
 
     The evidence o_i of a point is its log-likelihood ratio. The fraction rho maximizes sum_i log(rho exp(o_i) + 1 -
     rho), with `above_points` additional points at the parent's fraction `above` (M,). It is the fixed point of EM over

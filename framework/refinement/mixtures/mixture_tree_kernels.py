@@ -152,7 +152,7 @@ def _add_scaled(densities: Float32, scale: np.float32, values: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def set_own_ratios(log_odds: Float32, starts: Int64, above_points: float, ratios: Float32) -> None:
-    """Replace the parents' fractions (M,) by the nodes' own fractions."""
+    """Replace the parents' fractions in `ratios` (M,) with the nodes' own fractions."""
     for j in prange(len(starts) - 1):
         if starts[j + 1] > starts[j]:
             odds = np.exp(log_odds[starts[j] : starts[j + 1]])

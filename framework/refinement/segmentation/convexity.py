@@ -82,6 +82,6 @@ def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> 
 
 
 def _closed(edges: Bool, radius: int) -> Bool:
-    """Return the edges closed by a square of 2 `radius` + 1 cells."""
+    """Return the edges after morphological closing by a square of 2 `radius` + 1 cells."""
     square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     return np.asarray(cv2.morphologyEx(edges.view(np.uint8), cv2.MORPH_CLOSE, square), np.bool_)

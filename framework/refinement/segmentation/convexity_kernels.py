@@ -10,8 +10,8 @@ from framework.refinement.mixtures.gaussian import SIMD
 from framework.refinement.segmentation.union_find import root, unite
 from framework.sensors.noise_models import axial_sigma, axial_sigma_single
 
-FEWEST_CELLS = 6  # minimum number of cells of a plane fit; any three cells fit a plane exactly
-LEAST_SPREAD = 0.1  # minimum determinant of a window's second moments over its square, cells^4; 0 for a line
+MIN_CELLS = 6  # minimum number of cells of a plane fit; any three cells fit a plane exactly
+MIN_SPREAD = 0.1  # minimum determinant of a window's second moments over its square, cells^4; 0 for a line
 SWITCH = 1.5  # minimum factor by which an adjacent window must fit better than the cell's own window
 STRIP = 16  # number of rows of cells connected in parallel
 
@@ -123,7 +123,7 @@ def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
         xx, xy, yy = sxx[c] - k * sx[c] * sx[c], sxy[c] - k * sx[c] * sy[c], syy[c] - k * sy[c] * sy[c]
         xe, ye, ee = sxe[c] - k * sx[c] * se[c], sye[c] - k * sy[c] * se[c], see[c] - k * se[c] * se[c]
         determinant = xx * yy - xy * xy
-        fits = (own[c] > zero) & (n[c] >= FEWEST_CELLS) & (determinant > np.float32(LEAST_SPREAD) * n[c] * n[c])
+        fits = (own[c] > zero) & (n[c] >= MIN_CELLS) & (determinant > np.float32(MIN_SPREAD) * n[c] * n[c])
         s = one / (determinant if fits else one)
         a, b = (yy * xe - xy * ye) * s, (xx * ye - xy * xe) * s
         residual = k * (ee - a * xe - b * ye)
@@ -267,7 +267,7 @@ def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool
 def _unite_row(
     inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, r: int, upwards: bool, parents: Int32
 ) -> None:
-    """Unite the cells of row r with their left or upper neighbors unless depth jumps."""
+    """Unite the cells of row r with their left or upper neighbors, except across depth jumps."""
     columns = inverse.shape[1]
     step = columns if upwards else 1
     flat_inverse, flat_edges = inverse.ravel(), edges.ravel()
@@ -282,7 +282,7 @@ def _unite_row(
 
 @njit(cache=True, nogil=True, parallel=True)
 def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, min_cells: int) -> tuple[Int32, int]:
-    """Return the connected components (rows, columns) of cells in [0, count), -1 = edge or too small, and the count."""
+    """Return the component label of each cell (rows, columns), in [0, count), and the count; -1 = edge or too small."""
     rows, columns = inverse.shape
     parents = np.arange(rows * columns).astype(np.int32)
     strips = -(-rows // STRIP)
@@ -314,7 +314,7 @@ def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, mi
 
 @njit(cache=True, nogil=True)  # too little work for threads
 def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> tuple[Int32, Float32]:
-    """Grow segments by one cell. A free cell joins the neighbor with the best prediction of its depth."""
+    """Return the segments grown by one cell. A free cell joins the neighbor that best predicts its depth."""
     rows, columns = inverse.shape
     new_labels, new_planes = labels.copy(), planes.copy()
     for r in range(rows):
@@ -340,7 +340,7 @@ def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> 
 def pixel_labels(
     depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise: Noise, slope: np.float32
 ) -> Int32:
-    """Return the label (H, W) of the nearby cell with the best plane prediction of each pixel.
+    """Return, for each pixel (H, W), the label of the nearby cell whose plane best predicts its depth.
 
     Without a prediction, a pixel near the mean of its own cell gets the label of this cell.
     """
@@ -391,7 +391,7 @@ def pixel_labels(
 
 @njit(cache=True, nogil=True)
 def _plane_of_cell(planes: Float32, inverse: Float32, r: int, c: int, plane: Float32) -> None:
-    """Set a, b, c of a cell; without a fit, use the plane at its depth."""
+    """Set `plane` to a, b, c of a cell; without a fit, to the plane of constant depth."""
     if planes[2, r, c] > 0:
         plane[0], plane[1], plane[2] = planes[0, r, c], planes[1, r, c], planes[2, r, c]
     else:

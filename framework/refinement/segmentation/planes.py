@@ -40,7 +40,7 @@ class Planes:
     m: Float64  # (K, 3) 1/m, normal over distance: a point p in camera coordinates is on plane k if m . p = 1
     deviations: Float64  # (K,) 1/m, rms deviation of the readings' inverse depth, at most the allowed noise
     areas: Float64  # (K,) visible area, m^2
-    shares: Float64  # (K,) fraction of the frame's readings
+    fractions: Float64  # (K,) fraction of the frame's readings
     behind: Float64  # (K,) readings behind the plane over readings on the plane
 
     def __len__(self) -> int:
@@ -78,7 +78,7 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
 
 
 def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
-    """Return 1 + the nearest plane (H, W) of each depth reading, 0 = none.
+    """Return 1 + the index of the nearest plane (H, W) for each depth reading, 0 = none.
 
     A reading is on a plane within `distance` (m, along the normal) plus three standard deviations of the plane's noise.
     """

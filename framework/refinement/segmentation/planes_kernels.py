@@ -86,7 +86,7 @@ def _length(m: Float64) -> float:
 
 @njit(cache=True, nogil=True)
 def _lies_in(moment: Float64, m: Float64, distance: float, noise: float) -> bool:
-    """Return True if a cell is on the plane; a point at inverse depth q is |q - m . r| / (|m| q) m off the plane."""
+    """Return True if a cell is on the plane. A point at inverse depth q is |q - m . r| / (|m| q) m off the plane."""
     return bool(_deviation(moment, m) <= noise + distance * _length(m) * moment[6] / moment[0])
 
 
@@ -112,7 +112,7 @@ def find_plane_cells(
     cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, min_area: float,
     spacing: float, found: Float64,
 ) -> int:  # fmt: skip
-    """Set m, deviation, area, share and behind of each plane; return their number. Clears `free` at their cells."""
+    """Set m, deviation, area, fraction and behind of each plane, clear `free` at its cells; return the plane count."""
     m, total = np.zeros(3), np.zeros(10)
     tried = np.zeros(len(cells), np.bool_)
     readings = 0.0
@@ -199,7 +199,7 @@ def _collect(cells: Float64, free: Bool, m: Float64, distance: float, noise: flo
 
 @njit(cache=True, nogil=True)
 def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> None:
-    """Set m to the plane of its best cells, at least half of the cells, and `total` to the sum of their moments.
+    """Set m to the plane of the best-fitting cells, at least half of them, and `total` to the sum of their moments.
 
     The other cells are across the intersection of two planes and would tilt the planes towards each other.
     """
@@ -224,7 +224,7 @@ def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> N
 
 @njit(cache=True, nogil=True)
 def _order(values: Float64, k: int) -> float:
-    """Return the k-th smallest value and reorder the values (Hoare 1961, "Find"). np.median compiles more slowly."""
+    """Return the k-th smallest value, and reorder the values (Hoare 1961, "Find"); np.median compiles more slowly."""
     low, high = 0, len(values) - 1
     while low < high:
         pivot = values[(low + high) // 2]
@@ -265,7 +265,7 @@ def label_points(
     depth: Float32, pinhole: Float32, m: Float32, lengths: Float32, reach: Float32, sigmas: Float32,
     image: UInt8,
 ) -> None:  # fmt: skip
-    """Set image (H, W) to 1 + the nearest plane within reach of each depth reading."""
+    """Set image (H, W) to 1 + the index of the nearest plane within reach of each depth reading."""
     fx, fy, cx, cy = pinhole
     for v in prange(depth.shape[0]):
         y = np.float32(v - cy) / fy
@@ -299,7 +299,7 @@ def find_off_planes(
 
 @njit(cache=True, nogil=True)
 def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
-    """Set `stays` by cluster (except the last row) and plane (except column 0 for no plane)."""
+    """Set `stays` for each cluster (the last row is no cluster) and plane (column 0 is no plane)."""
     parts, rows, columns = counts.shape
     for label in range(1, columns):
         most = max_own * _count(on_plane.ravel(), label)

@@ -15,9 +15,7 @@ from framework.geometry import nearest_rotation, transform
 from framework.refinement.refine import keep_points
 from framework.refinement.segmentation.segment_owners_kernels import find_owners, judged
 
-LEAST_SPREAD = (
-    0.02  # m, minimum root of the scatter's second eigenvalue; single precision then moves 5 m by under 0.1 mm
-)
+MIN_SPREAD = 0.02  # m, minimum root of the scatter's second eigenvalue; single precision then moves 5 m by under 0.1 mm
 SAMPLE = 4096  # number of evenly spaced points; more points change the pose by less than single precision
 TOLERANCE = 1e-3  # maximum distance of a point from its depth reading, m
 
@@ -47,7 +45,7 @@ def owned_segments(
 
 
 def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
-    """Return T_world_camera (4, 4) from the readings of `frame` at the clusters' pixels to the clusters' points.
+    """Return the T_world_camera (4, 4) that maps the depth readings at the clusters' pixels to the clusters' points.
 
     The pose is the least-squares rigid motion (Arun, Huang and Blostein, "Least-Squares Fitting of Two 3-D Point Sets",
     PAMI 1987). Returns None if there are too few points or if all points are on one line. SciPy's align_vectors would
@@ -59,7 +57,7 @@ def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
     if len(points_camera) < 3:
         return None
     offsets = points_camera - points_camera.mean(axis=0)
-    if np.sqrt(max(np.linalg.eigvalsh(offsets.T @ offsets)[1], 0.0)) < LEAST_SPREAD:
+    if np.sqrt(max(np.linalg.eigvalsh(offsets.T @ offsets)[1], 0.0)) < MIN_SPREAD:
         return None
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = nearest_rotation((points_world - points_world.mean(axis=0)).T @ offsets)

@@ -10,7 +10,7 @@ from framework.data import Bool, Int32
 
 @njit(cache=True, nogil=True)
 def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, count: int, min_overlap: float) -> Int32:
-    """Return the cluster (count,) with the most pixels in each segment, -1 = too few; ties go to the first."""
+    """Return the cluster (count,) with the most pixels in each segment; -1 = too few pixels. Ties go to the first."""
     sizes, covered = np.zeros(count, np.int64), np.zeros((count, clusters), np.int64)
     for label in labels.ravel():
         if label >= 0:
@@ -29,7 +29,7 @@ def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, cou
 
 @njit(cache=True, nogil=True)
 def judged(pixels: Int32, cluster: Int32, labels: Int32, owners: Int32) -> tuple[Bool, Int32, Int32]:
-    """Return the kept points (P,), the pixels (A, 2) of segments missing in their owner, and the owners (A,)."""
+    """Return the mask (P,) of kept points, the segment pixels (A, 2) that their owner lacks, and their owner (A,)."""
     height, width = labels.shape
     kept, covered = np.ones(len(cluster), np.bool_), np.zeros(labels.shape, np.bool_)
     for i in range(len(cluster)):

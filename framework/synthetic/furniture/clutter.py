@@ -308,7 +308,7 @@ def clothes(rng: Rng) -> Furniture:
 
 
 def _crumpled(sheet: Solid, rng: Rng, height: float, fringe: float) -> Solid:
-    """Add creases up to `height` m and an uneven border of up to `fringe` m to a sheet."""
+    """Return a sheet with creases up to `height` m and an uneven border of up to `fringe` m."""
     a, b, c, d = rng.uniform(0, 2 * np.pi, 4)
 
     def crumple(p: Float64) -> Float64:

@@ -7,7 +7,7 @@ import numpy as np
 from framework.data import Float64
 from framework.synthetic import paints
 from framework.synthetic.furniture import clutter, fixtures, seating, small_things, tabletops
-from framework.synthetic.furniture.groups import Group, against_wall, bed_group, beside, on_top, single, size
+from framework.synthetic.furniture.groups import Group, against_wall, bed_group, next_to, on_top, single, size
 from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import SPACING
 from framework.synthetic.paints import Texture
@@ -32,7 +32,7 @@ def cluttered_bed_group(rng: Rng) -> Group:
     bed, stand = group.pieces[:2]
     side = 1 if stand.bounds()[0][0] > 0 else -1
     bag = fixtures.backpack(rng).placed(0, 0, 0, -side * np.pi / 2)
-    group.add(bag, beside(bag, bed, -side, _touch(rng)), float(bed.bounds()[1][1]) - rng.uniform(0.3, 0.9))
+    group.add(bag, next_to(bag, bed, -side, _touch(rng)), float(bed.bounds()[1][1]) - rng.uniform(0.3, 0.9))
     low, high = bed.bounds()
     things = [
         clutter.blanket(rng, rng.uniform(0.75, 0.95) * min(size(bed)[0], 1.2), rng.uniform(0.55, 0.7)),
@@ -71,7 +71,7 @@ def cluttered_couch(rng: Rng) -> Group:
 
 
 def _in_leather(couch: Furniture, rng: Rng) -> Furniture:
-    """Replace the fabric of a couch with black leather."""
+    """Return a couch with black leather in place of its fabric."""
     hide = paints.leather(rng)
     parts = [(solid, hide if material.texture is Texture.FABRIC else material) for solid, material in couch.parts]
     return Furniture(couch.kind, couch.class_name, parts)
@@ -120,7 +120,7 @@ def _scatter(
 
 
 def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
-    """Place `thing` lengthwise or across at a random position between the corners; center a large object."""
+    """Return `thing` at a random position between the corners, lengthwise or across; a large object is centered."""
     turned = thing.placed(0.0, 0.0, 0.0, np.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.3, 0.3))
     turned_low, turned_high = turned.bounds()
     middle = (turned_low + turned_high)[:2] / 2
@@ -166,7 +166,7 @@ def _lay_on_seat(group: Group, chair: Furniture, thing: Furniture) -> None:
 
 
 def desk_row(rng: Rng, count: int) -> Group:
-    """Return identical, touching desks with identical office chairs and different objects."""
+    """Return a row of identical, touching desks with identical office chairs and different objects."""
     group = Group("desk row")
     desk, chair = tabletops.desk(rng), seating.office_chair(rng)
     pitch = size(desk)[0] + _touch(rng)
@@ -190,14 +190,14 @@ def laid_table_group(rng: Rng) -> Group:
         push_under(group, table, chair, side * pitch / 2)
     for side in (-1, 1)[: int(rng.integers(1, 3))]:
         turned = chair.placed(0, 0, 0, side * np.pi / 2)
-        group.add(turned, beside(turned, table, side, _touch(rng)), float(low[1] + high[1]) / 2)
+        group.add(turned, next_to(turned, table, side, _touch(rng)), float(low[1] + high[1]) / 2)
     things = [fixtures.backpack(rng), tabletops.book_pile(rng), clutter.bowl(rng), tabletops.book(rng)]
     strew_on(group, table, rng, [*things, *small_things.some(rng, small_things.ON_TABLES, 5)])
     return group
 
 
 def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Furniture:
-    """Push a chair under a table until its back or arms touch.
+    """Add a chair to the group, pushed under a table until its back or arms touch, and return it.
 
     The table faces +y, and the chair is `x` m from its middle.
     """
@@ -245,7 +245,7 @@ def board_group(rng: Rng) -> Group:
     things += [tabletops.book(rng), small_things.book_row(rng), *small_things.some(rng, small_things.ON_TABLES, 2)]
     strew_on(group, board, rng, things)
     bag = fixtures.backpack(rng)
-    group.add(bag, beside(bag, board, 1, _touch(rng)), against_wall(bag))
+    group.add(bag, next_to(bag, board, 1, _touch(rng)), against_wall(bag))
     return group
 
 

@@ -51,7 +51,7 @@ def against_wall(piece: Furniture) -> float:
 
 
 def on_top(piece: Furniture) -> float:
-    """Return the height of the object's uppermost point, m."""
+    """Return the height 1 mm above the object's highest point, m."""
     return float(piece.bounds()[1][2]) + 0.001
 
 
@@ -61,7 +61,7 @@ def size(piece: Furniture) -> Float64:
     return high - low
 
 
-def beside(piece: Furniture, other: Furniture, side: int, gap: float) -> float:
+def next_to(piece: Furniture, other: Furniture, side: int, gap: float) -> float:
     """Return the x offset of `piece`, `gap` m to the right (side 1) or left (side -1) of `other`."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(other_high[0] + gap - low[0] if side > 0 else other_low[0] - gap - high[0])
@@ -74,7 +74,7 @@ def bed_group(rng: Rng) -> Group:
     bed = group.add(bed, y=against_wall(bed))
     side = 1 if rng.uniform() < 0.5 else -1
     stand = clutter.nightstand(rng)
-    stand = group.add(stand, beside(stand, bed, side, 0.06), against_wall(stand))
+    stand = group.add(stand, next_to(stand, bed, side, 0.06), against_wall(stand))
     put_on(group, stand, rng, [clutter.table_lamp(rng), tabletops.book(rng)][::side])
     return group
 
@@ -117,7 +117,7 @@ def tv_group(rng: Rng) -> Group:
     group.add(fixtures.tv(rng), 0.0, float(board.bounds()[:2][0][1] + board.bounds()[1][1]) / 2 - 0.03, on_top(board))
     if rng.uniform() < 0.6:
         plant = clutter.plant(rng)
-        group.add(plant, beside(plant, board, 1, 0.05), against_wall(plant))
+        group.add(plant, next_to(plant, board, 1, 0.05), against_wall(plant))
     return group
 
 
@@ -164,7 +164,7 @@ def kitchen_group(rng: Rng) -> Group:
     fridge, row = fixtures.refrigerator(rng), clutter.counter(rng)
     side = 1 if rng.uniform() < 0.5 else -1
     row = group.add(row, y=against_wall(row))
-    group.add(fridge, beside(fridge, row, side, 0.02), against_wall(fridge))
+    group.add(fridge, next_to(fridge, row, side, 0.02), against_wall(fridge))
     return group
 
 

@@ -42,12 +42,12 @@ class Furniture:
         return lows.min(axis=0), highs.max(axis=0)
 
     def placed(self, x: float, y: float, z: float = 0.0, angle: float = 0.0) -> Furniture:
-        """Rotate the object by `angle` (rad, counter-clockwise from above), then translate it."""
+        """Return a copy rotated by `angle` (rad, counter-clockwise from above), then translated by x, y, z m."""
         parts = [(solid.turned("z", angle).moved(x, y, z), material) for solid, material in self.parts]
         return Furniture(self.kind, self.class_name, parts)
 
     def tilted(self, angle: float) -> Furniture:
-        """Rotate the object by `angle` rad about x, with its front upwards, and place it on z = 0."""
+        """Return a copy rotated by `angle` rad about x, with its front upwards, and placed on z = 0."""
         parts = [(solid.turned("x", angle), material) for solid, material in self.parts]
         tilted = Furniture(self.kind, self.class_name, parts)
         return tilted.placed(0.0, 0.0, -float(tilted.bounds()[0][2]))

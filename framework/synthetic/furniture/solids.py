@@ -31,17 +31,17 @@ class Solid:
         return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
     def turned(self, axis: str, angle: float) -> Solid:
-        """Rotate the solid by `angle` rad about the axis x, y or z through the origin."""
+        """Return a copy rotated by `angle` rad about the axis x, y or z through the origin."""
         R = axis_rotation(axis, angle)
         return replace(self, vertices=_turn(R, self.vertices), normals=_turn(R, self.normals))
 
     def deformed(self, shape: Callable[[Float64], Float64]) -> Solid:
-        """Apply `shape` to the vertices (V, 3), and recompute the normals."""
+        """Return a copy with `shape` applied to the vertices (V, 3) and recomputed normals."""
         vertices = shape(self.vertices.copy())
         return replace(self, vertices=vertices, normals=smooth_normals(vertices, self.triangles))
 
     def flat(self, along: int, up: int) -> Solid:
-        """Replace the texture coordinates with (s, t, 0) in meters from the corner, for image textures.
+        """Return a copy with texture coordinates (s, t, 0) in meters from the corner, for image textures.
 
         s and t run along the coordinate axes `along` and `up` of the vertices.
         """
@@ -61,7 +61,7 @@ def axis_rotation(axis: str, angle: float) -> Float64:
 
 
 def _turn(R: Float64, vectors: Float64) -> Float64:
-    """Rotate vectors (V, 3) without BLAS, because its rounding may depend on the number of threads."""
+    """Return the vectors (V, 3) rotated without BLAS, whose rounding may depend on the number of threads."""
     return np.asarray(np.einsum("ck,vk->vc", R, vectors))
 
 

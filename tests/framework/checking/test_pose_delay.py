@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from framework.checking.matched_pairs import MatchedPair
-from framework.checking.pose_delay import LONGEST_DELAY, PoseDelay, delayed, find_delay
+from framework.checking.pose_delay import MAX_DELAY, PoseDelay, delayed, find_delay
 from framework.checking.pose_fit import PoseFit, motion_of
 from framework.data import Camera, Float64, Frame
 from framework.datasets.frames.conventions import CameraAxes, PoseReading
@@ -60,7 +60,7 @@ def found(poses: Sequence[Float64], frames: int, noise: float = 0.0) -> PoseDela
     return find_delay(pairs_of(poses, stored, noise), stored, AS_IT_IS)
 
 
-@pytest.mark.parametrize("frames", [-LONGEST_DELAY, -3, -1, 1, 2, 5, LONGEST_DELAY])
+@pytest.mark.parametrize("frames", [-MAX_DELAY, -3, -1, 1, 2, 5, MAX_DELAY])
 def test_pose_delay_is_found_without_residual_error(frames: int) -> None:
     delay = found(trembling_walk(), frames)
     assert delay is not None
@@ -81,7 +81,7 @@ def test_pose_delay_in_uniform_motion_is_undetectable(frames: int) -> None:
 
 
 def test_pose_delay_beyond_search_range_is_not_reported() -> None:
-    for frames in (LONGEST_DELAY + 1, LONGEST_DELAY + 2):
+    for frames in (MAX_DELAY + 1, MAX_DELAY + 2):
         assert found(trembling_walk(), frames) is None
 
 

@@ -73,7 +73,7 @@ def test_pose_fit_identifies_reading_from_moving_camera(reading: PoseReading) ->
     judged = judge(pairs_of(walk(1), stored), PoseReading(), 1000.0, 2.0)
     assert judged.best is not None
     assert judged.best.reading == reading
-    assert judged.findings[0].verdict is (Verdict.FINE if reading == PoseReading() else Verdict.FAULT)
+    assert judged.findings[0].verdict is (Verdict.FINE if reading == PoseReading() else Verdict.ERROR)
     assert "equally well" not in judged.findings[0].text
 
 
@@ -81,7 +81,7 @@ def test_pose_fit_reports_ambiguous_axes_of_pan() -> None:
     """For a rotation about the vertical image axis, an inverted pose and an OpenGL pose rotate equally."""
     judged = judge(pairs_of(walk(2, pan_only=True), inverse), PoseReading(), 1000.0, 2.0)
     [fault] = judged.findings
-    assert fault.verdict is Verdict.FAULT
+    assert fault.verdict is Verdict.ERROR
     assert fault.setting in ("dataset.pose_kind=T_CAMERA_WORLD", "dataset.camera_axes=OPENGL")
     other = {"dataset.pose_kind=T_CAMERA_WORLD", "dataset.camera_axes=OPENGL"} - {fault.setting}
     assert f"{other.pop()}" in fault.text

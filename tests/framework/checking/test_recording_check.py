@@ -89,7 +89,7 @@ def shared_recording(shared_data: Path, name: str) -> Recording:
 
 
 def settings(findings: tuple[Finding, ...]) -> list[str]:
-    return [finding.setting for finding in findings if finding.verdict is Verdict.FAULT]
+    return [finding.setting for finding in findings if finding.verdict is Verdict.ERROR]
 
 
 @pytest.mark.acceptance
@@ -133,7 +133,7 @@ def test_recording_check_of_originals_reports_no_error(shared_data: Path) -> Non
     ]
     for recording in recordings:
         found = check(recording, FARTHEST)
-        assert not found.faults, recording.name
+        assert not found.errors, recording.name
         assert found.findings[0].subject == "depth"
 
 
@@ -142,11 +142,11 @@ def test_recording_check_applies_configured_conventions(tmp_path: Path) -> None:
     place = write_damaged(tmp_path / "damaged", DESK, pose=both, scale=2.0, depth_late=1, poses_late=-2)
     reading = PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL, pose_delay=-2)
     depth = DepthReading(depth_scale=5000, depth_delay=1)
-    assert not check(RgbdFolder(place, pose_reading=reading, depth_reading=depth), FARTHEST).faults
+    assert not check(RgbdFolder(place, pose_reading=reading, depth_reading=depth), FARTHEST).errors
     wrong = replace(reading, quaternion_order=QuaternionOrder.WXYZ, pose_delay=1)
     found = check(RgbdFolder(place, pose_reading=wrong, depth_reading=replace(depth, depth_delay=3)), FARTHEST)
     assert settings(found.findings) == [POSES + "-2", "dataset.quaternion_order=XYZW", DELAY + "1"]
-    assert "3 frames early (0.0" in found.faults[0].text
+    assert "3 frames early (0.0" in found.errors[0].text
 
 
 def test_recording_check_reports_clock_delay_in_two_units(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_recording_check_reports_clock_delay_in_two_units(tmp_path: Path) -> Non
     path = tmp_path / DESK.name / "groundtruth.txt"
     words = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
     path.write_text("".join(f"{float(time) + 0.1:.4f} {' '.join(pose)}\n" for time, *pose in words))
-    [fault] = check(TumRgbd(tmp_path, scene=DESK.name), FARTHEST).faults
+    [fault] = check(TumRgbd(tmp_path, scene=DESK.name), FARTHEST).errors
     assert fault.setting == POSES + "3"
     assert "3 frames late (0.096 s)" in fault.text
 
@@ -168,7 +168,7 @@ def test_recording_check_unrelated_poses_fit_in_no_axes(tmp_path: Path) -> None:
         T[:3, :3] = Rotation.from_rotvec((0, 0, 0.5 * next(turned))).as_matrix()
         return T
 
-    [fault] = check(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=another)), FARTHEST).faults
+    [fault] = check(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=another)), FARTHEST).errors
     assert fault.subject == "poses"
     assert "in any axes" in fault.text
     assert "tracker=voxel_hashing_icp" in fault.setting
@@ -196,7 +196,7 @@ class MovedDepth(RGBDSequence):
 def test_recording_check_reports_unregistered_depth(zoom: float, x: float, y: float) -> None:
     moved = cv2.getRotationMatrix2D((319.5, 239.5), 0, zoom)
     moved[:, 2] += (x, y)
-    [fault] = [fault for fault in check(MovedDepth(moved), FARTHEST).faults if fault.subject == "color and depth"]
+    [fault] = [fault for fault in check(MovedDepth(moved), FARTHEST).errors if fault.subject == "color and depth"]
     assert "not registered" in fault.text
     if zoom == 1:
         found_x, found_y = (float(number) for number in re.findall(r"([+-][0-9.]+) %", fault.text))
@@ -261,7 +261,7 @@ def test_recording_check_reports_defects_of_single_frame() -> None:
     assert verdicts(Part(8, blurred))["sharpness"] is Verdict.NOTE
     assert verdicts(Part(8, gray))["motion"] is Verdict.NOTE
     assert verdicts(Part(8, gray))["color and depth"] is Verdict.UNKNOWN
-    assert verdicts(Part(8, nothing))["depth"] is Verdict.FAULT
+    assert verdicts(Part(8, nothing))["depth"] is Verdict.ERROR
     assert verdicts(Part(8, sparse))["depth"] is Verdict.NOTE
 
 

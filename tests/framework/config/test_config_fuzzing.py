@@ -81,7 +81,7 @@ def line_of(option: Path, content: bytes) -> str:
 
 
 def test_config_option_undamaged_is_composed(option: Path) -> None:
-    assert "/nowhere/results.json: cannot be read" in line_of(option, OPTION)
+    assert "/nowhere/results.json: expected a readable file" in line_of(option, OPTION)
 
 
 @settings(max_examples=EXAMPLES // 2, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))

@@ -91,7 +91,7 @@ def test_replica_invalid_pose_raises_for_its_frame(root: Path) -> None:
 @pytest.mark.parametrize("name", ["frame000001.jpg", "depth000001.png"])
 def test_replica_missing_image_raises_for_its_frame(root: Path, name: str) -> None:
     (root / "room0/results" / name).unlink()
-    assert f"{name}: cannot be read" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+    assert f"{name}: expected a readable file" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
 
 
 @pytest.mark.parametrize("name", ["results", "traj.txt"])

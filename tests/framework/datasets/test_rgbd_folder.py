@@ -262,7 +262,7 @@ def test_rgbd_folder_names_differing_in_two_numbers_raise(folder, names):
 
 def test_rgbd_folder_file_name_without_number_raises(folder):
     shutil.copy(folder / "color/000001.png", folder / "color/cover.png")
-    with pytest.raises(DataError, match="expected a name that ends in a frame number"):
+    with pytest.raises(DataError, match="expected names that end in a frame number"):
         RgbdFolder(folder)
 
 
@@ -284,7 +284,7 @@ def test_rgbd_folder_unreadable_file_is_not_missing(folder, name, kind):
 @pytest.mark.parametrize("key", ["Distortion", "distorsion", "depthscale", "Width"])
 def test_rgbd_folder_misspelled_camera_key_has_suggestion(folder, key):
     change_camera(folder, **{key: 1})
-    with pytest.raises(DataError, match=f"unknown key '{key}'; did you mean"):
+    with pytest.raises(DataError, match=f"expected known keys, got '{key}'; did you mean"):
         RgbdFolder(folder)
 
 

@@ -142,7 +142,7 @@ def test_seven_scenes_invalid_pose_raises_for_its_frame(folder: Path, text: str 
 @pytest.mark.parametrize("name", ["color", "depth"])
 def test_seven_scenes_missing_image_raises_for_its_frame(folder: Path, name: str) -> None:
     (folder / f"frame-000002.{name}.png").unlink()
-    assert f"frame-000002.{name}.png: cannot be read" in fault_of(SevenScenes(folder), 2)
+    assert f"frame-000002.{name}.png: expected a readable file" in fault_of(SevenScenes(folder), 2)
 
 
 def test_seven_scenes_empty_folder_error_gives_scene_example(folder: Path) -> None:

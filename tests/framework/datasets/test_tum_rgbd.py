@@ -180,8 +180,8 @@ def test_tum_rgbd_duplicate_image_timestamps_keep_first(folder: Path, caplog: py
         path.write_text(path.read_text() + path.read_text().replace(".png", "_again.png") * 1000)
     sequence = TumRgbd(folder)  # 3 million pairs of these lines are within max_difference
     assert [frame.timestamp for frame in sequence] == [color_time(k) for k in range(FRAMES)]
-    assert caplog.text.count("rgb.txt: expected unique timestamps; skipped 3000 images") == 1
-    assert caplog.text.count("depth.txt: expected unique timestamps; skipped 3000 images") == 1
+    assert caplog.text.count("rgb.txt: expected unique timestamps, got repeated ones; skipped 3000 images") == 1
+    assert caplog.text.count("depth.txt: expected unique timestamps, got repeated ones; skipped 3000 images") == 1
 
 
 def test_tum_rgbd_recording_without_image_pairs_raises(folder: Path) -> None:
@@ -234,7 +234,7 @@ def test_tum_rgbd_duplicate_pose_timestamps_keep_first(folder: Path, caplog: pyt
     pose = TumRgbd(folder)[1].T_world_camera
     assert pose is not None
     assert pose[0, 3] == 1
-    assert f"groundtruth.txt: expected unique timestamps; skipped {FRAMES} poses" in caplog.text
+    assert f"groundtruth.txt: expected unique timestamps, got repeated ones; skipped {FRAMES} poses" in caplog.text
 
 
 def test_tum_rgbd_invalid_pose_raises_for_its_frame(folder: Path) -> None:
@@ -289,7 +289,7 @@ def test_tum_rgbd_binary_image_list_raises(folder: Path) -> None:
 def test_tum_rgbd_missing_listed_image_raises_for_its_frame(folder: Path) -> None:
     path = folder / f"depth/{color_time(1) + DEPTH_DELAY:.6f}.png"
     path.unlink()
-    assert f"{path}: cannot be read" in fault_of(TumRgbd(folder), 1)
+    assert f"{path}: expected a readable file" in fault_of(TumRgbd(folder), 1)
 
 
 def test_tum_rgbd_image_size_mismatch_raises(folder: Path) -> None:

@@ -377,6 +377,6 @@ def test_plan_parameters_out_of_range_raise(room: UprightRoom, monkeypatch: pyte
     for wrong in ({"resolution": 0.0}, {"robot_height": 9.0}, {"min_confidence": float("nan")}):
         with pytest.raises(Exception, match=f"{next(iter(wrong))}"):
             Chosen(**wrong)
-    monkeypatch.setattr(occupancy, "MOST_CELLS", 100)
+    monkeypatch.setattr(occupancy, "MAX_CELLS", 100)
     with pytest.raises(DataError, match=r"plan: expected at most .* cells, got 43 x 33 cells"):
         plan(room, RESOLUTION, 1.0)

@@ -20,7 +20,7 @@ from framework.detection.mask_rcnn.checkpoint import read_network
 from framework.detection.mask_rcnn.detectron2_checkpoint import read_pickle
 from framework.detection.stored.coco_results import CategoryIds, read_results
 from framework.errors import ConfigError, DataError, FrameError
-from framework.files.atomic_write import read_bytes, read_text, written_whole
+from framework.files.atomic_write import atomic_write, read_bytes, read_text
 from framework.files.hashing import path_hash
 from framework.files.image_files import read_color, read_uint16
 from framework.files.json_file import read_json
@@ -121,7 +121,7 @@ def test_atomic_write_to_non_regular_file_raises(tmp_path: Path, kind: str) -> N
     else:
         path.symlink_to(kind)
     before = path.stat().st_mode
-    with pytest.raises(DataError, match=": expected a regular file, got a"), written_whole(path) as temporary:
+    with pytest.raises(DataError, match=": expected a regular file, got a"), atomic_write(path) as temporary:
         temporary.write_text("{}")
     assert path.stat().st_mode == before
     assert list(tmp_path.iterdir()) == [path]
@@ -132,7 +132,7 @@ def test_atomic_write_follows_symbolic_link(tmp_path: Path) -> None:
     for target in (tmp_path / "real" / "there.txt", tmp_path / "real" / "not_yet.txt"):
         link = tmp_path / f"to_{target.name}"
         link.symlink_to(target)
-        with written_whole(link) as temporary:
+        with atomic_write(link) as temporary:
             assert temporary.parent == target.parent
             temporary.write_text("new")
         assert link.is_symlink()
@@ -148,7 +148,7 @@ def test_atomic_write_failure_names_requested_file(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(Path, "unlink", refused)
     with (
-        pytest.raises(DataError, match=r"page\.html: cannot be written: Read-only"),
-        written_whole(tmp_path / "page.html"),
+        pytest.raises(DataError, match=r"page\.html: expected a writable file, got Read-only"),
+        atomic_write(tmp_path / "page.html"),
     ):
         refused()

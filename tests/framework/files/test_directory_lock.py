@@ -21,7 +21,13 @@ pytestmark = pytest.mark.integration
 
 def test_directory_lock_second_lock_error_names_holder(tmp_path: Path) -> None:
     place = tmp_path / "new" / "sweep"
-    with locked(place), pytest.raises(DataError, match=rf"sweep: in use by process {os.getpid()} on "), locked(place):
+    with (
+        locked(place),
+        pytest.raises(
+            DataError, match=rf"sweep: expected an unlocked directory, got one in use by process {os.getpid()} on "
+        ),
+        locked(place),
+    ):
         pytest.fail("two processes hold the lock")
     with locked(place):
         pass
@@ -70,7 +76,7 @@ with locked(Path({str(tmp_path)!r})):
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"locked\n"
-        with pytest.raises(DataError, match=f": in use by process {holder.pid} on "), locked(tmp_path):
+        with pytest.raises(DataError, match=f"in use by process {holder.pid} on "), locked(tmp_path):
             pytest.fail("two processes hold the lock")
         holder.kill()
     with locked(tmp_path):
@@ -86,7 +92,7 @@ def test_directory_lock_unsupported_file_system_logs_warning(
     monkeypatch.setattr(fcntl, "flock", refuse)
     with locked(tmp_path):
         pass
-    assert "cannot be locked (No locks available)" in caplog.text
+    assert "expected a file system with locks, got No locks available" in caplog.text
 
 
 def test_directory_lock_named_pipe_as_file_raises(tmp_path: Path) -> None:
@@ -118,5 +124,5 @@ def test_new_directory_concurrent_calls_are_distinct(tmp_path: Path) -> None:
 
 def test_new_directory_creation_failure_raises(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(DataError, match=r"run: directory cannot be created: "):
+    with pytest.raises(DataError, match=r"run: expected a writable parent folder, got "):
         new_directory(str(tmp_path / "file" / "run"))

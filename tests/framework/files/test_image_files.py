@@ -47,7 +47,7 @@ def test_jpeg_truncated_with_end_marker_raises(share: float) -> None:
     """OpenCV would return an image that is gray after the truncation."""
     data = JPEG[: int(share * len(JPEG))] + END
     assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
-    assert message(data).startswith("picture.jpg: damaged image: ")
+    assert message(data).startswith("picture.jpg: expected a ")
 
 
 def test_jpeg_with_corrupt_block_raises() -> None:

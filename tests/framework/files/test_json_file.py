@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from framework.errors import DataError
-from framework.files.json_file import DEEPEST, parse_json, read_json, write_json
+from framework.files.json_file import MAX_DEPTH, parse_json, read_json, write_json
 
 
 def test_json_round_trip_is_exact(tmp_path: Path) -> None:
@@ -29,11 +29,11 @@ def test_json_byte_order_mark_is_ignored(marked: bytes) -> None:
         (b"\xff", "decode"),
         (b"[" * 10**6, "expected JSON with at most 50 nested lists"),
         (b'{"a":' * 10**5, "expected JSON with at most 50 nested lists"),
-        (b"[" * (DEEPEST + 1) + b"]" * (DEEPEST + 1), "expected JSON with at most 50 nested lists"),
+        (b"[" * (MAX_DEPTH + 1) + b"]" * (MAX_DEPTH + 1), "expected JSON with at most 50 nested lists"),
         (b'{"a":' * 51 + b"1" + b"}" * 51, "expected JSON with at most 50 nested lists"),
         (b"[" + b"9" * 100_000 + b"]", "expected integers of at most 63 bits, got 9{20}... of 100000 digits"),
         (b"[9223372036854775808]", "expected integers of at most 63 bits"),
-        (b'[{"fx": 1, "fy": 2, "fx": 3}]', "duplicate key 'fx' in an object"),
+        (b'[{"fx": 1, "fy": 2, "fx": 3}]', "expected unique keys, got 'fx' twice"),
     ],
 )
 def test_json_invalid_raises_one_line_error_with_source(content: bytes, message: str) -> None:
@@ -46,8 +46,8 @@ def test_json_invalid_raises_one_line_error_with_source(content: bytes, message:
 
 
 def test_json_maximum_nesting_depth_is_read(tmp_path: Path) -> None:
-    (tmp_path / "deep.json").write_text("[" * DEEPEST + "]" * DEEPEST)
+    (tmp_path / "deep.json").write_text("[" * MAX_DEPTH + "]" * MAX_DEPTH)
     found = read_json(tmp_path / "deep.json")
-    for _ in range(DEEPEST - 1):
+    for _ in range(MAX_DEPTH - 1):
         [found] = found
     assert found == []

@@ -182,8 +182,8 @@ def test_ply_written_file_is_read_by_open3d(tmp_path):
         (b"vertex 3", b"point 3", "line 10: expected an element 'vertex' in the header, got none"),
         (b"float x", b"half x", "line 4: expected a type in char, uchar, .*, got 'half'"),
         (b"float x", b"float", "line 4: .*'property TYPE NAME'.*'property float'"),
-        (b"float y", b"float x", "line 5: .*'vertex'.*duplicate.*'x'"),
-        (b"element face", b"element vertex", "line 8: duplicate.*'vertex'"),
+        (b"float y", b"float x", "line 5: .*'vertex'.*unique.*'x'"),
+        (b"element face", b"element vertex", "line 8: .*unique.*'vertex'"),
         (b"list uchar int", b"list float int", "line 9: .*'vertex_indices'.*integer"),
         (b"uchar int vertex", b"uchar float vertex", "vertex_indices: .*integers.*float32"),
         (b"vertex_indices", b"corners", "'face'.*vertex_indices or vertex_index"),
@@ -277,7 +277,7 @@ def test_ply_line_end_after_last_row_is_accepted(tmp_path):
 
 
 def test_ply_missing_file_raises(tmp_path):
-    with pytest.raises(DataError, match=r"a.ply: cannot be read: No such file"):
+    with pytest.raises(DataError, match=r"a.ply: expected a readable file, got No such file"):
         read_ply(tmp_path / "a.ply")
 
 

@@ -34,14 +34,14 @@ class Notebook:
     threads: set[str] = field(default_factory=set)
     closed: bool = False
 
-    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: FrameUpdate | None) -> None:
+    def draw_frames(self, notes: Sequence[FrameNote], skipped: Sequence[str], picture: FrameUpdate | None) -> None:
         self.threads.add(threading.current_thread().name)
         if self.fails:
             raise OSError(28, "No space left on device")
         if self.waits_for is not None:
             assert self.waits_for.wait(30)
         self.notes += notes
-        self.faults += faults
+        self.faults += skipped
         self.pictures += [picture] if picture else []
 
     def draw_map(self, snapshot: MapSnapshot) -> None:

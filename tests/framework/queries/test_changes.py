@@ -18,7 +18,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import DataError
 from framework.files.tum_trajectory import write_tum
 from framework.interfaces import RGBDSequence
-from framework.queries.changes import STAYS, Kind, Visit, changes, look_for, probability_gone
+from framework.queries.changes import STAY_PROBABILITY, Kind, Visit, changes, look_for, probability_gone
 from framework.synthetic.renderer import Renderer
 from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic
@@ -128,7 +128,7 @@ def test_probability_gone_follows_evidence() -> None:
     def gone(there: int, through: int, matched: bool, confidence: float = 0.8) -> float:
         return probability_gone(confidence, *bits(there, through), matched)
 
-    assert gone(0, 2, False) == pytest.approx(1 - STAYS), "too little was visible to decide"
+    assert gone(0, 2, False) == pytest.approx(1 - STAY_PROBABILITY), "too little was visible to decide"
     assert gone(10, 0, True) < 0.01
     assert gone(0, 10, False) > 0.8
     assert gone(0, 10, False) > gone(5, 5, False) > gone(10, 0, False)

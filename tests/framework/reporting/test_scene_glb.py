@@ -12,7 +12,7 @@ import trimesh
 
 from framework.data import InstanceMesh
 from framework.exporting.decimation import with_finer_objects
-from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
+from framework.reporting.scene_glb import MAX_BYTES, MAX_TRIANGLES, light_enough, scene_glb
 
 
 def two_squares() -> InstanceMesh:
@@ -89,6 +89,6 @@ def test_scene_glb_size_of_large_map_is_limited(shared_vertices: bool) -> None:
     mesh = InstanceMesh(
         vertices, triangles.astype(np.int32), np.full((len(vertices), 3), 90, np.uint8), zeros, zeros - 1, ()
     )
-    light = light_enough(with_finer_objects(mesh, MOST_TRIANGLES))
+    light = light_enough(with_finer_objects(mesh, MAX_TRIANGLES))
     content = scene_glb(light, np.zeros(len(light.vertices), np.float32), {}, UP)
-    assert 1_000_000 < len(content) <= MOST_BYTES
+    assert 1_000_000 < len(content) <= MAX_BYTES

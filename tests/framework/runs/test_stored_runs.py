@@ -68,7 +68,7 @@ def test_read_record_returns_config_and_metrics(directory: Path) -> None:
         ("metrics.json", "{}", "expected the config_hash of config.yaml, "),
         ("config.yaml", "seed: 4", "expected the config_hash of config.yaml, "),
         ("config.yaml", "", "expected the config_hash of config.yaml, "),
-        ("config.yaml", "seed: [", "config.yaml: cannot be read"),
+        ("config.yaml", "seed: [", "config.yaml: expected valid YAML"),
         ("config.yaml", "word", "expected the config_hash of config.yaml, "),
         ("config.yaml", "- 1", r"config\.yaml: expected keys and values, got a list"),
         (

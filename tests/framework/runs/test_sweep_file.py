@@ -7,17 +7,17 @@ from typing import Any
 import pytest
 
 from framework.errors import ConfigError
-from framework.runs.sweep_file import asked_runs, sweep_rows
+from framework.runs.sweep_file import requested_runs, sweep_rows
 
 
 def sweep(params: Any, task: Any) -> dict[str, Any]:
     return {"hydra": {"sweeper": {"params": params}, "overrides": {"task": task}}}
 
 
-def test_asked_runs_command_line_overrides_experiment() -> None:
+def test_requested_runs_command_line_overrides_experiment() -> None:
     asked = sweep({"row": "${all_of:${rows}}", "dataset.scene": "011,016", "seed": 0}, ["seed=0,1", "launcher=joblib"])
     expected = [("0", "011"), ("0", "016"), ("1", "011"), ("1", "016")]
-    assert asked_runs(asked, ["seed", "dataset.scene"]) == expected
+    assert requested_runs(asked, ["seed", "dataset.scene"]) == expected
 
 
 def test_sweep_rows_resolves_interpolations() -> None:
@@ -34,12 +34,12 @@ def test_sweep_file_does_not_resolve_environment_variables(monkeypatch: pytest.M
     config = {"rows": {"a": ["x=${oc.env:SECRET}"], "b": ["x=${c}"]}, "c": "${oc.env:SECRET}"}
     assert "hunter2" not in repr(sweep_rows(config))
     asked = config | sweep({"seed": "${oc.env:SECRET}", "other": "${c}"}, [])
-    assert asked_runs(asked, ["seed"]) == asked_runs(asked, ["other"]) == []
+    assert requested_runs(asked, ["seed"]) == requested_runs(asked, ["other"]) == []
 
 
-def test_asked_runs_resolves_sequence_interpolation() -> None:
+def test_requested_runs_resolves_sequence_interpolation() -> None:
     asked = {"sequences": {"all": "a,b"}} | sweep({"dataset.scene": "${sequences.all}", "seed": 0, "x": "${y}"}, [])
-    assert asked_runs(asked, ["seed", "dataset.scene"]) == [("0", "a"), ("0", "b")]
+    assert requested_runs(asked, ["seed", "dataset.scene"]) == [("0", "a"), ("0", "b")]
 
 
 @pytest.mark.parametrize(
@@ -52,14 +52,14 @@ def test_asked_runs_resolves_sequence_interpolation() -> None:
         ("seed=0.01,1e-3", ["0.01", "0.001"]),
     ],
 )
-def test_asked_runs_expands_hydra_override_values(override: str, values: list[str]) -> None:
-    assert asked_runs(sweep({}, [override]), ["seed"]) == [(value,) for value in values]
+def test_requested_runs_expands_hydra_override_values(override: str, values: list[str]) -> None:
+    assert requested_runs(sweep({}, [override]), ["seed"]) == [(value,) for value in values]
 
 
-def test_asked_runs_limits_large_ranges() -> None:
-    assert len(asked_runs(sweep({}, ["seed=range(0,100000000)"]), ["seed"])) == 1000
+def test_requested_runs_limits_large_ranges() -> None:
+    assert len(requested_runs(sweep({}, ["seed=range(0,100000000)"]), ["seed"])) == 1000
     both = sweep({}, ["seed=range(0,100000000)", "frames=range(0,100000000)"])
-    assert len(asked_runs(both, ["seed", "frames"])) == 100_000
+    assert len(requested_runs(both, ["seed", "frames"])) == 100_000
 
 
 @pytest.mark.parametrize(
@@ -75,5 +75,5 @@ def test_asked_runs_limits_large_ranges() -> None:
         sweep({}, ["other=1,2"]),
     ],
 )
-def test_asked_runs_unresolvable_sweep_is_empty(config: dict[str, Any]) -> None:
-    assert asked_runs(config, ["seed"]) == []
+def test_requested_runs_unresolvable_sweep_is_empty(config: dict[str, Any]) -> None:
+    assert requested_runs(config, ["seed"]) == []

@@ -64,6 +64,6 @@ def test_read_timings_invalid_line_raises_with_line_number(tmp_path: Path, conte
 
 def test_read_timings_unreadable_file_raises(tmp_path: Path) -> None:
     (tmp_path / "timings.csv").write_bytes(b"\xff\xfe")
-    for name, output in (("timings.csv", "expected UTF-8 text"), ("none.csv", "cannot be read")):
+    for name, output in (("timings.csv", "expected UTF-8 text"), ("none.csv", "expected a readable file")):
         with pytest.raises(DataError, match=f"{name}: {output}"):
             read_timings(tmp_path / name)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import numba
 import pytest
 
-from framework.runtime.cpu_budget import RECENT, CoreSharing
+from framework.runtime.cpu_budget import RECENT, CpuBudget
 
 
 @pytest.fixture
@@ -25,75 +25,73 @@ def thread_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], N
 
 
 @pytest.fixture(params=[1, 2, 4])
-def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> CoreSharing:
+def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> CpuBudget:
     """Return a budget of several cores; numba's own limit is replaced by a variable."""
     threads = [request.param]
     monkeypatch.setattr(numba, "get_num_threads", lambda: threads[0])
     monkeypatch.setattr(numba, "set_num_threads", lambda number: threads.__setitem__(0, number))
-    return CoreSharing()
+    return CpuBudget()
 
 
-def pass_frames(sharing: CoreSharing, passes: Callable[[float], None], ahead: float, mapping: float) -> None:
+def pass_frames(sharing: CpuBudget, passes: Callable[[float], None], ahead: float, mapping: float) -> None:
     """Process some frames with this load; the mapping's loops scale perfectly."""
     for _ in range(RECENT):
-        with sharing.ahead():
+        with sharing.prefetching():
             passes(ahead)
         with sharing.mapping():
             passes(mapping / numba.get_num_threads())
 
 
-def test_cpu_budget_splits_equal_load_evenly(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
-    assert sharing.cores_ahead() == sharing.cores // 2  # no measurements yet
+def test_cpu_budget_splits_equal_load_evenly(sharing: CpuBudget, thread_time: Callable[[float], None]) -> None:
+    assert sharing.prefetch_cores() == sharing.cores // 2  # no measurements yet
     pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
-    assert sharing.cores_ahead() == sharing.cores // 2
+    assert sharing.prefetch_cores() == sharing.cores // 2
 
 
-def test_cpu_budget_assigns_all_cores_to_loaded_side(
-    sharing: CoreSharing, thread_time: Callable[[float], None]
-) -> None:
+def test_cpu_budget_assigns_all_cores_to_loaded_side(sharing: CpuBudget, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=0.1, mapping=1.0)  # without a network, prefetching only reads a frame
-    assert sharing.cores_ahead() == 0
+    assert sharing.prefetch_cores() == 0
     with sharing.mapping():
         assert numba.get_num_threads() == sharing.cores
-    with sharing.ahead():
+    with sharing.prefetching():
         assert numba.get_num_threads() == 1
     assert numba.get_num_threads() == sharing.cores
     pass_frames(sharing, thread_time, ahead=20.0, mapping=1.0)
-    assert sharing.cores_ahead() == sharing.cores
+    assert sharing.prefetch_cores() == sharing.cores
     with sharing.mapping():
         assert numba.get_num_threads() == 1
 
 
-def test_cpu_budget_is_divided_among_workers(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+def test_cpu_budget_is_divided_among_workers(sharing: CpuBudget, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=20.0, mapping=1.0)
-    with sharing.ahead(workers=2):
+    with sharing.prefetching(workers=2):
         assert numba.get_num_threads() == max(sharing.cores // 2, 1)
 
 
-def test_cpu_budget_ignores_single_slow_frame(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+def test_cpu_budget_ignores_single_slow_frame(sharing: CpuBudget, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
     with sharing.mapping():
         thread_time(100.0)  # kernels are compiled
-    assert sharing.cores_ahead() == sharing.cores // 2
+    assert sharing.prefetch_cores() == sharing.cores // 2
 
 
-def test_cpu_budget_restores_thread_count_after_exception(sharing: CoreSharing) -> None:
+def test_cpu_budget_restores_thread_count_after_exception(sharing: CpuBudget) -> None:
     with pytest.raises(RuntimeError, match="lost"), sharing.mapping():
         raise RuntimeError("lost")
     assert numba.get_num_threads() == sharing.cores
 
 
 def test_cpu_budget_is_thread_safe() -> None:
-    sharing = CoreSharing()
+    sharing = CpuBudget()
 
     def side(around: Callable[[], object]) -> None:
         for _ in range(2000):
             with around():  # type: ignore[attr-defined]
-                sharing.cores_ahead()
+                sharing.prefetch_cores()
 
-    threads = [threading.Thread(target=side, args=(around,)) for around in (sharing.ahead, sharing.mapping)]
+    threads = [threading.Thread(target=side, args=(around,)) for around in (sharing.prefetching, sharing.mapping)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert 0 <= sharing.cores_ahead() <= sharing.cores
+    assert 0 <= sharing.prefetch_cores() <= sharing.cores

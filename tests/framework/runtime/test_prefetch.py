@@ -9,7 +9,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from framework.runtime.frame_stream import Turns, map_ahead
+from framework.runtime.frame_stream import Turns, prefetched_map
 
 
 def test_map_ahead_is_bounded_and_ordered() -> None:
@@ -19,7 +19,7 @@ def test_map_ahead_is_bounded_and_ordered() -> None:
         begun.append(k)
         return k * k
 
-    outcomes = map_ahead(square, range(10), ahead=2)
+    outcomes = prefetched_map(square, range(10), prefetch=2)
     assert next(outcomes) == 0
     assert max(begun, default=0) <= 2
     assert list(outcomes) == [k * k for k in range(1, 10)]
@@ -36,7 +36,7 @@ def test_map_ahead_overlaps_with_consumer() -> None:
             detected.set()
         return k
 
-    for k in map_ahead(detect, range(2), ahead=1):
+    for k in prefetched_map(detect, range(2), prefetch=1):
         if k == 0:
             fusing.set()
             assert detected.wait(10)
@@ -48,7 +48,7 @@ def test_map_ahead_results_keep_order(workers: int) -> None:
         time.sleep(0.002 * (k % 3))
         return k
 
-    assert list(map_ahead(sleep, range(20), ahead=3, workers=workers)) == list(range(20))
+    assert list(prefetched_map(sleep, range(20), prefetch=3, workers=workers)) == list(range(20))
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -58,11 +58,11 @@ def test_map_ahead_worker_exception_is_raised_in_order(workers: int) -> None:
             raise OSError("the disk is gone")
         return k
 
-    outcomes = map_ahead(fail, range(100), ahead=2, workers=workers)
+    outcomes = prefetched_map(fail, range(100), prefetch=2, workers=workers)
     assert [next(outcomes) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(OSError, match="the disk is gone"):
         next(outcomes)
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("detect-ahead")]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("prefetch")]
 
 
 def test_turns_run_in_order_despite_exceptions() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from framework.runtime import progress
-from framework.runtime.progress import LONGEST, SIGN_OF_LIFE, Progress
+from framework.runtime.progress import MAX_INTERVAL, MIN_INTERVAL, Progress
 from framework.runtime.run_log import Journal
 from tests.support.scenes.corner_room import GridFuser
 from tests.support.terminals import terminal_stderr
@@ -40,10 +40,10 @@ def test_progress_line_interval_grows_with_time(clock: Clock, monkeypatch: pytes
             clock.now = 100 + float(second)
             if bar.line_is_due():
                 lines.append(second)
-    assert lines[:4] == [SIGN_OF_LIFE * k for k in (1, 2, 3, 4)]
-    assert np.diff([line for line in lines if line < 30]).max() == SIGN_OF_LIFE
-    assert np.diff(lines)[-1] == LONGEST
-    assert len(lines) == pytest.approx(10 + 10 * np.log(600 / 30) + 3000 / LONGEST, abs=5)
+    assert lines[:4] == [MIN_INTERVAL * k for k in (1, 2, 3, 4)]
+    assert np.diff([line for line in lines if line < 30]).max() == MIN_INTERVAL
+    assert np.diff(lines)[-1] == MAX_INTERVAL
+    assert len(lines) == pytest.approx(10 + 10 * np.log(600 / 30) + 3000 / MAX_INTERVAL, abs=5)
 
 
 @pytest.mark.parametrize("columns", [80, 0])

@@ -30,8 +30,8 @@ def test_signals_deferred_first_waits_and_second_raises(
         interruption.check()
         with interruption.second_ends_at_once("after this frame"):
             signal.raise_signal(number)
-        assert interruption.asked is not None
-        assert interruption.asked.number == number
+        assert interruption.received is not None
+        assert interruption.received.number == number
         signal.raise_signal(number)  # between two steps: the result of the first must reach the second
         with pytest.raises(Interrupted) as second, interruption.second_ends_at_once("after the outputs are written"):
             signal.raise_signal(number)
@@ -59,9 +59,9 @@ def test_signals_deferred_nested_returns_outer_context() -> None:
         with signals_deferred(signal.SIGINT) as inner:
             assert inner is outer
         signal.raise_signal(signal.SIGTERM)
-        assert outer.asked is not None
+        assert outer.received is not None
     with signals_deferred(signal.SIGINT) as later:
-        assert later.asked is None
+        assert later.received is None
 
 
 def test_signals_deferred_keeps_existing_handlers() -> None:
@@ -73,7 +73,7 @@ def test_signals_deferred_keeps_existing_handlers() -> None:
     with signals_deferred(*ENDING) as interruption:
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGTERM)
-    assert (interruption.asked, received) == (None, [signal.SIGTERM])
+    assert (interruption.received, received) == (None, [signal.SIGTERM])
 
 
 def test_raise_on_signals_raises_for_each_signal() -> None:

@@ -311,7 +311,7 @@ def test_table_notes_count_older_records(sweep: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("table: [", "cannot be read"),
+        ("table: [", "expected valid YAML"),
         ("table: {columns: [], average_over: [seed]}", r"table\.columns: expected at least one key, got none"),
     ],
 )

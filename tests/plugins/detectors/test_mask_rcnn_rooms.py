@@ -10,7 +10,7 @@ import pytest
 from framework.data import Camera, Frame
 from framework.detection.mask_rcnn.network_file import describe_network
 from framework.evaluation.mask_ap import mask_ap
-from framework.training.augmentation import SMALLEST
+from framework.training.augmentation import MIN_PIXELS
 from framework.training.room_pictures import RoomPictures, render_rooms
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 from plugins.detectors.mask_rcnn import MaskRCNNDetector
@@ -19,7 +19,7 @@ from tests.support import registered
 pytestmark = pytest.mark.integration
 
 ROOMS = 2_000_000  # neither trained on nor held out in training
-MOST_BYTES = 20 << 20
+MAX_BYTES = 20 << 20
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def detector() -> MaskRCNNDetector:
 
 
 def test_bundled_network_is_small_and_has_model_card(detector: MaskRCNNDetector) -> None:
-    assert Path(detector.weights).stat().st_size < MOST_BYTES
+    assert Path(detector.weights).stat().st_size < MAX_BYTES
     assert set(detector.classes) == set(SCENENN_TO_COCO.values())
     card = describe_network(Path(detector.weights)).card
     assert {"data", "steps", "seed", "mask_ap50", "limits"} <= set(card)
@@ -50,6 +50,6 @@ def test_bundled_network_detects_objects_in_unseen_rooms(detector: MaskRCNNDetec
         camera = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
         frame = Frame(k, float(k), example.color, np.zeros((height, width), np.float32), camera)
         found.append((example.masks, example.class_names, detector.detect(frame)))
-    precision = mask_ap(found, detector.classes, SMALLEST)
+    precision = mask_ap(found, detector.classes, MIN_PIXELS)
     assert precision.objects >= 30
     assert precision.ap50 >= 0.4

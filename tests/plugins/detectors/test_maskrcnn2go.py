@@ -210,7 +210,7 @@ def test_maskrcnn2go_missing_weights_error_has_path(tmp_path, monkeypatch):
     assert str(tmp_path / "no/such/folder") in message
     assert all(name in message for name in SHA256)
     assert "\n" not in message
-    with pytest.raises(DataError, match=r"graph\.json: cannot be read"):
+    with pytest.raises(DataError, match=r"graph\.json: expected a readable file"):
         MaskRCNN2Go(weights=tmp_path, device="cpu")
 
 

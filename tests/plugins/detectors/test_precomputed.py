@@ -224,7 +224,7 @@ def test_precomputed_invalid_mask_folder_entry_raises(tmp_path: Path, listed: An
 
 def test_precomputed_mask_folder_with_unpaired_file_raises(tmp_path: Path) -> None:
     (write_folder(tmp_path) / "000003.json").rename(tmp_path / "000004.json")
-    with pytest.raises(DataError, match=r"000003\.json: cannot be read"):
+    with pytest.raises(DataError, match=r"000003\.json: expected a readable file"):
         Precomputed(tmp_path)
     (tmp_path / "000003.png").rename(tmp_path / "000005.png")
     (tmp_path / "000005.json").write_text("[]")
@@ -302,7 +302,7 @@ def test_precomputed_invalid_or_missing_result_file_raises(tmp_path: Path, conte
     (tmp_path / "results.json").write_text(content)
     with pytest.raises(DataError, match=message):
         Precomputed(tmp_path / "results.json")
-    with pytest.raises(DataError, match=r"absent\.json: cannot be read"):
+    with pytest.raises(DataError, match=r"absent\.json: expected a readable file"):
         Precomputed(tmp_path / "absent.json")
 
 

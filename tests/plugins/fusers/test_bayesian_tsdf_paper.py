@@ -13,7 +13,7 @@ from framework.mapping.instances.association import InstanceSource, Matches, Ove
 from framework.mapping.labels.evidence_rows import Storage
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.refinement.lifting import lift
-from plugins.fusers.bayesian_tsdf import LEAST_LIKELIHOOD, RULE, BayesianTsdf
+from plugins.fusers.bayesian_tsdf import MIN_LIKELIHOOD, RULE, BayesianTsdf
 from tests.support.registered import built
 from tests.support.scenes.analytic_scene import Scene, pose, room, walk
 from tests.support.true_masks import detections_of, fuse_masks, masks_of
@@ -203,7 +203,7 @@ def test_paper_fuser_instance_floor_0_divides_rest_of_score(frames: list[Frame])
     at = Pose(pose())
     clusters = lift(detections_of(frames[0], masks_of(frames[0]), (1.0, 0.5, 0.2)), frames[0], at)
     ratios = np.exp(fuser.evidence(clusters, 4).instances.astype(np.float64))
-    expected = [(1 - LEAST_LIKELIHOOD) * 4 / LEAST_LIKELIHOOD, 4.0, 0.2 * 4 / 0.8]
+    expected = [(1 - MIN_LIKELIHOOD) * 4 / MIN_LIKELIHOOD, 4.0, 0.2 * 4 / 0.8]
     np.testing.assert_allclose(ratios, expected, rtol=1e-4)
 
 

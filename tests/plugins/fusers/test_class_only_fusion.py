@@ -12,7 +12,7 @@ from framework.baselines.semantic_map import SemanticMap, connected_components
 from framework.data import Detections, Frame, Int32, Pose
 from framework.errors import ConfigError, DataError
 from framework.mapping.instance_map import FORMAT
-from framework.mapping.instances.instance_list import LEAST_VERTICES
+from framework.mapping.instances.instance_list import MIN_VERTICES
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
@@ -315,7 +315,7 @@ def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
             if max(values) > values[class_ids[v]] + 1e-5:
                 class_ids[v] = (0, 1, -1)[int(np.argmax(values))]
     result = np.array(class_ids, np.int32)
-    return np.where(connected_components(surface.triangles, result, LEAST_VERTICES) > 0, result, -1)
+    return np.where(connected_components(surface.triangles, result, MIN_VERTICES) > 0, result, -1)
 
 
 @pytest.mark.parametrize("smoothness", [0.5, 3.0])

@@ -273,7 +273,7 @@ def begun(viewer: RerunViewer, directory: Path) -> None:
 def test_rerun_unwritable_recording_raises(tmp_path: Path) -> None:
     (tmp_path / "recording.rrd").mkdir()
     with pytest.raises(
-        ConfigError, match=r"viewer\.file: expected a writable file, got .*recording\.rrd: .*Is a directory"
+        ConfigError, match=r"viewer\.file: expected a writable file, got .*recording\.rrd \(.*Is a directory"
     ):
         begun(RerunViewer(), tmp_path)
     (tmp_path / "file").touch()

@@ -23,7 +23,7 @@ from framework.data import (
     View,
 )
 from framework.errors import DataError, FrameError, MapFullError
-from framework.files.atomic_write import written_whole
+from framework.files.atomic_write import atomic_write
 from framework.geometry import back_project, transform
 from framework.interfaces import (
     ClusterRefiner,
@@ -201,7 +201,7 @@ class GridMap(SceneMap):
 
     def save(self, path: Path | str) -> None:
         mesh = self.mesh()
-        with written_whole(path) as temporary:
+        with atomic_write(path) as temporary:
             np.savez(
                 temporary,
                 vertices=mesh.vertices,

@@ -132,7 +132,7 @@ def test_plugins_lists_options_of_installed_package(environment: dict[str, str],
         "      score: float = 1.0  # in [0, 1], of the one object",
         "",
     ]
-    assert "unusable: detector acme.missing.Detector: unknown module acme.missing" in done.stdout
+    assert "unusable: detector acme.missing.Detector: expected an existing module, got acme.missing" in done.stdout
     at = lines.index("  acme_orphan  [from acme-detectors]")
     assert lines[at + 1].startswith("      unusable:")
     assert "acme_nobody" in lines[at + 1]
@@ -175,12 +175,12 @@ def test_describe_option_formats_parameters_like_yaml() -> None:
 
 
 FAULTY_OPTIONS = {
-    "no_yaml": ("a: [1,\n", "no_yaml.yaml: cannot be read: "),
+    "no_yaml": ("a: [1,\n", "no_yaml.yaml: expected valid YAML, got "),
     "list": ("- 1\n", "list.yaml: expected keys and values, got a list"),
     "no_text": ("\udcff", "no_text.yaml: expected UTF-8 text: "),
     "no_class": ("_target_: plugins.detectors.none.NoDetection\n", "got NoDetection; did you mean 'NoDetections'?"),
     "a_refiner": ("_target_: plugins.refiners.identity.Identity\n", "expected a class that implements Detector"),
-    "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "unknown parameter"),
+    "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "expected one of score_threshold"),
     "no_number": (
         "_target_: plugins.detectors.simulated.SimulatedDetector\nmin_pixels: many\nseed: ${seed}\n",
         "min_pixels: Value 'many' of type 'str' could not be converted to Integer",

@@ -84,7 +84,7 @@ def test_import_of_phone_recording_is_mappable(
     config = composed("dataset=rgbd_folder", f"dataset.root={tmp_path / 'out'}", "detector=none")
     sequence = build(RGBDSequence, config.dataset)
     found = check(sequence, 5.0)
-    assert not found.faults, found.faults
+    assert not found.errors, found.errors
     result = begin(config).run(sequence)
     assert not any(tracked.pose.lost for tracked in result.tracked)
     assert len(result.tracked) == 60

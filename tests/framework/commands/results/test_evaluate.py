@@ -193,12 +193,12 @@ def _truncated_mesh(directory: Path) -> None:
         (_another_size, "vertices of instance"),
         (_truncated_mesh, "mesh.ply, byte"),
         (lambda directory: (directory / "mesh.ply").unlink(), "mesh.ply"),
-        (lambda directory: (directory / "instances.json").unlink(), "instances.json: cannot be read"),
+        (lambda directory: (directory / "instances.json").unlink(), "instances.json: expected a readable file"),
         (
             lambda directory: _with_dataset(directory, truth=False),
             "expected the ground truth of its metrics, got a dataset without instances",
         ),
-        (lambda directory: _with_dataset(directory, colour=1), "unknown parameter"),
+        (lambda directory: _with_dataset(directory, colour=1), "got 'colour'"),
     ],
 )
 def test_evaluate_unusable_run_is_refused_and_others_continue(
@@ -280,7 +280,7 @@ def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
     with locked(stored):
         status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert f"refused: {stored}: in use by process {os.getpid()}" in err
+    assert f"refused: {stored}: expected an unlocked directory, got one in use by process {os.getpid()}" in err
     assert (stored / "metrics.json").read_bytes() == before
     assert command(stored)[0] == 0
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from framework.commands.running.choices import MANY, checked_sweep, single_run
+from framework.commands.running.choices import GLOB_COUNT, checked_sweep, single_run
 from framework.errors import ConfigError
 
 pytestmark = pytest.mark.integration
@@ -18,7 +18,7 @@ ROWS = ("ours", "voxblox_pp", "label_count")
         (["row=ours,label_count", "seed=0,1", "~detector", "+new=1"], 4),
         (["row=ours,label_count", "seed=0,1,2", "row=ours"], 3),
         (["seed=range(0,3)", "sequences='a,b'", "row=choice(ours,voxblox_pp)"], 6),
-        (["seed=range(0,3)", "dataset=glob(*)"], 3 * MANY),
+        (["seed=range(0,3)", "dataset=glob(*)"], 3 * GLOB_COUNT),
     ],
 )
 def test_checked_sweep_counts_runs(overrides: list[str], runs: int) -> None:

@@ -116,7 +116,7 @@ def test_resume_lost_camera_relocalizes_in_known_view(tmp_path: Path) -> None:
     [
         (("fuser.voxel_size=0.05",), r"fuser.voxel_size: expected 0.04 \(as in the stored map\), got 0.05"),
         (("fuser.max_depth=4",), "fuser.max_depth"),
-        (("fuser=label_count",), "label rule of the fuser: expected"),
+        (("fuser=label_count",), "fuser: expected the label rule of the stored map"),
         (("fuser=object_volumes",), "expected a fuser with support for stored maps, got ObjectVolumes"),
         (
             ("tracker=voxel_hashing_icp",),

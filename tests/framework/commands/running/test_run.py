@@ -142,7 +142,7 @@ def test_run_on_full_disk_writes_small_files(tmp_path: Path) -> None:
     assert left.isdisjoint({"mesh.ply", "map.npz", "metrics.json"})
     assert not list(place.glob(".*partial*"))
     fault = str(figures(place)["partial"])
-    assert fault.startswith(f"{place / 'mesh.ply'}: cannot be written: ")
+    assert fault.startswith(f"{place / 'mesh.ply'}: expected a writable file, got ")
     assert fault.endswith("the disk may be full")
     assert figures(place)["instances.ap50"] == 1.0
 
@@ -252,7 +252,7 @@ def test_run_in_locked_folder_changes_nothing(tmp_path: Path) -> None:
     with locked(place):
         status, stderr = end(begin(tmp_path, "seed=2", f"hydra.run.dir={place}"))
     assert (status, len(stderr.splitlines())) == (1, 1)
-    assert f"error: {place}: in use by process {os.getpid()} on " in stderr
+    assert f"error: {place}: expected an unlocked directory, got one in use by process {os.getpid()} on " in stderr
     assert {path: path.read_bytes() for path in before} == before
     assert {path for path in place.rglob("*") if path.is_file()} - set(before) == {place / ".lock_holder"}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from framework.commands.running.show_refinement import TRIED, called, detected
+from framework.commands.running.show_refinement import CANDIDATES, called, detected
 from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError, FrameError
 from tests.support.forked_commands import FAKE_CONF, completed
@@ -102,7 +102,7 @@ def test_show_refinement_tries_few_frames_of_long_video() -> None:
             return super().detect(frame)
 
     detected(CornerRoom(frames=1000), Counted(), None)
-    assert Counted.calls == TRIED
+    assert Counted.calls == CANDIDATES
 
 
 def test_show_refinement_called_has_refiner_overrides() -> None:

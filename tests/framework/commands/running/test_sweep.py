@@ -308,7 +308,10 @@ def test_sweep_in_locked_folder_is_refused(tmp_path: Path) -> None:
         done = end(begin(tmp_path))
     assert (done.returncode, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
-    assert f"error: {tmp_path / PLACE}: in use by process {os.getpid()} on " in done.stderr
+    assert (
+        f"error: {tmp_path / PLACE}: expected an unlocked directory, got one in use by process {os.getpid()} on "
+        in done.stderr
+    )
     assert not (tmp_path / PLACE / "multirun.yaml").exists()
 
 

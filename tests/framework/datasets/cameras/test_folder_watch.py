@@ -128,7 +128,7 @@ def test_folder_watch_reports_overtaken_incomplete_frame_once(folder: Path) -> N
     assert watched.look() == []
     write(folder, 4)
     assert watched.look() == [
-        f"{folder}/depth/000003.png: truncated image: no end marker in its 99 bytes",
+        f"{folder}/depth/000003.png: expected an image with an end marker, got none in 99 bytes (truncated file)",
         4,
     ]
 
@@ -155,7 +155,7 @@ def test_folder_watch_continues_after_files_are_removed(folder: Path) -> None:
     first, second = watched.readers()
     assert outcome(first) == 0
     (folder / "color/000001.jpg").unlink()
-    assert "color/000001.jpg: cannot be read: No such file" in str(outcome(second))
+    assert "color/000001.jpg: expected a readable file, got No such file" in str(outcome(second))
     for path in (folder / "depth").iterdir():
         path.unlink()
     write(folder, 2)

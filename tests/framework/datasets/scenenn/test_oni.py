@@ -23,7 +23,9 @@ def is_installed():
     return True
 
 
-played = pytest.mark.skipif(not is_installed(), reason="OpenNI 2 is not installed; run apt-get install libopenni2-0")
+played = pytest.mark.skipif(
+    not is_installed(), reason="OpenNI 2: expected an installed library, got none; run apt-get install libopenni2-0"
+)
 
 
 def depths(shape=(6, 8), dtype=np.uint16):
@@ -92,7 +94,7 @@ def test_oni_stalled_player_raises_after_timeout(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "PATIENCE", 200)
     path = OniFile(recording()).write(tmp_path / "a.oni")
     streams = {stream: Images(node=1, count=9, last=9) for stream in Stream}
-    with pytest.raises(DataError, match="damaged recording: OpenNI 2 stalled at depth 4 of 9, color 4 of 9"):
+    with pytest.raises(DataError, match="got a stall of OpenNI 2 at depth 4 of 9, color 4 of 9"):
         list(oni.play(path, streams))
 
 
@@ -101,12 +103,14 @@ def test_oni_player_crash_raises_one_line_error(tmp_path, monkeypatch):
     path = OniFile(recording()).write(tmp_path / "a.oni")
     with pytest.raises(DataError) as caught:
         frames_of(path)
-    assert str(caught.value) == f"{path}: damaged recording: OpenNI 2 crashed with status {-signal.SIGKILL}"
+    assert f"got a crash of OpenNI 2 with status {-signal.SIGKILL}" in str(caught.value)
 
 
 def test_oni_missing_openni_error_names_package(tmp_path, monkeypatch):
     monkeypatch.setattr(oni, "LIBRARIES", ("libNotThere.so",))
-    with pytest.raises(ConfigError, match="OpenNI 2 is not installed; run apt-get install libopenni2-0"):
+    with pytest.raises(
+        ConfigError, match="OpenNI 2: expected an installed library, got none; run apt-get install libopenni2-0"
+    ):
         next(oni.play(tmp_path / "a.oni", {}))
 
 

@@ -159,7 +159,7 @@ def test_trajectory_log_malformed_error_gives_file_and_line(path, line, new, mes
 
 
 def test_trajectory_log_missing_file_raises(path):
-    with pytest.raises(DataError, match=r"trajectory.log: cannot be read: No such file"):
+    with pytest.raises(DataError, match=r"trajectory.log: expected a readable file, got No such file"):
         read_trajectory_log(path)
 
 

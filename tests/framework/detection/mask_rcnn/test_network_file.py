@@ -88,7 +88,7 @@ def test_network_file_with_flipped_bit_raises(tmp_path):
     content = bytearray(path.read_bytes())
     content[-1000] ^= 1
     path.write_bytes(content)
-    assert_one_line(path, "damaged")
+    assert_one_line(path, "expected tensors with sha256")
 
 
 def test_network_file_without_architecture_raises(tmp_path):

@@ -343,7 +343,7 @@ def test_cache_full_disk_stops_storing_but_not_run(
     def full(path: Path) -> Any:
         raise DataError(f"{path} could not be written: No space left on device")
 
-    monkeypatch.setattr(cache, "written_whole", full)
+    monkeypatch.setattr(cache, "atomic_write", full)
     detector = CachedDetector(Noise(), tmp_path)
     for frame in room:
         detector.detect(frame)

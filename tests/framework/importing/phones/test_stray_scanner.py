@@ -72,7 +72,10 @@ def spoil_row(folder: Path, number: int, change) -> None:
             r"odometry.csv, line 3: expected a quaternion .* of length 1, got 7",
         ),
         (lambda words: [words[0], " 1.5", *words[2:]], r"odometry.csv, line 3: frame: expected 0 to 999999, got '1.5'"),
-        (lambda words: [words[0], " 000077", *words[2:]], r"rgb.mp4: expected frame 77, got the end of the video"),
+        (
+            lambda words: [words[0], " 000077", *words[2:]],
+            r"rgb.mp4: expected frame 77, got the end of the readable video",
+        ),
         (lambda words: ["99.0", *words[1:]], r"000001.png: expected a timestamp > .* s, got 99.000000 s"),
         (
             lambda words: [*words[:9], " -5.0", *words[10:]],
@@ -104,15 +107,15 @@ def test_stray_scanner_short_video_keeps_decoded_frames(folder: Path, tmp_path: 
     write_video(folder / "rgb.mp4", [frame.color for frame in FRAMES[:2]])
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
     assert (len(written.timestamps), len(written.errors)) == (2, 2)
-    assert "rgb.mp4: expected frame 2, got the end of the video" in written.errors[0]
+    assert "rgb.mp4: expected frame 2, got the end of the readable video" in written.errors[0]
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("rgb.mp4", None, r"rgb\.mp4: cannot be read"),
+        ("rgb.mp4", None, r"rgb\.mp4: expected a readable file"),
         ("rgb.mp4", b"#EXTM3U\nhttp://localhost/1.ts\n", r"rgb\.mp4: expected an MP4 or QuickTime file"),
-        ("rgb.mp4", b"\0\0\0\x18ftypmp42" + bytes(200), r"rgb\.mp4: cannot be decoded"),
+        ("rgb.mp4", b"\0\0\0\x18ftypmp42" + bytes(200), r"rgb\.mp4: expected a video in a codec"),
         ("odometry.csv", b"", r"odometry\.csv, line 1: expected timestamp, frame"),
         ("odometry.csv", b"1, 2, 3, 4\n", r"odometry\.csv, line 1: expected"),
         ("odometry.csv", b"timestamp, frame, x, y, z, qx, qy, qz, qw\n", "the recording has no frames"),

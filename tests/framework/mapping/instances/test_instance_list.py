@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from framework.mapping.instances.instance_list import LEAST_VERTICES, Confirmation
+from framework.mapping.instances.instance_list import MIN_VERTICES, Confirmation
 from framework.mapping.instances.instance_table import FrameSet, InstanceTable
 
 
@@ -25,8 +25,8 @@ def test_confirmation_requires_observations_and_confidence() -> None:
         (0.003, 0.01, 30),
         (0.003, float(np.float32(0.01)), 30),  # as the grid keeps it
         (0.075, 0.05, 30),
-        (0.003, 0.05, LEAST_VERTICES),  # 1.2 would be enough
-        (0.0, 0.01, LEAST_VERTICES),
+        (0.003, 0.05, MIN_VERTICES),  # 1.2 would be enough
+        (0.0, 0.01, MIN_VERTICES),
     ],
 )
 def test_confirmation_area_converts_to_vertex_count(min_area: float, voxel_size: float, vertices: int) -> None:

@@ -11,7 +11,7 @@ from framework.errors import FrameError, MapFullError
 from framework.geometry import inverse
 from framework.mapping.voxels import integration
 from framework.mapping.voxels.integration import GOLDEN, Integrator, SeenBlocks
-from framework.mapping.voxels.integration_kernels import LEAST_BEHIND
+from framework.mapping.voxels.integration_kernels import MIN_WEIGHT_BEHIND
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import VoxelHashing
 from framework.mapping.voxels.voxel_grid import TSDF_MAX, WEIGHT_ONE, VoxelGrid
@@ -71,7 +71,7 @@ def test_integration_of_one_frame_matches_reference() -> None:
     near = np.where(seen & (np.abs(d - p[..., 2]) <= VOXEL), row * CAMERA.width + column, -1)
     clear_band = clear & (np.abs(np.abs(d - p[..., 2]) - VOXEL) > 1e-4)
     assert (near_pixel == near)[clear_band].all()
-    behind = np.clip((band + d - p[..., 2]) / (SENSOR.truncation - VOXEL), LEAST_BEHIND, 1)
+    behind = np.clip((band + d - p[..., 2]) / (SENSOR.truncation - VOXEL), MIN_WEIGHT_BEHIND, 1)
     expected_weight = behind * np.minimum(1, (SENSOR.full_weight_depth / np.maximum(d, 1e-9)) ** 2) * WEIGHT_ONE
     assert np.abs(grid.weight[active] - np.maximum(expected_weight, 1))[both].max() < 1.001
 

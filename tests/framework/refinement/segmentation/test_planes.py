@@ -52,7 +52,7 @@ def test_find_planes_recovers_exact_plane(camera):
     np.testing.assert_allclose(planes.m[0], WALL, atol=1e-6)
     np.testing.assert_allclose(planes.normals[0], -WALL / np.linalg.norm(WALL), atol=1e-6)
     assert planes.deviations[0] < 1e-6
-    assert planes.shares[0] > 0.95, "all but what is left of a cell at the border"
+    assert planes.fractions[0] > 0.95, "all but what is left of a cell at the border"
     assert planes.behind[0] == 0
 
 
@@ -85,7 +85,7 @@ def test_find_planes_in_noisy_room_matches_open3d():
     k = nearest(planes, np.array([a, b, c]) / -d)
     assert abs(planes.normals[k] @ [a, b, c]) > np.cos(np.deg2rad(2.0))
     assert 1 / np.linalg.norm(planes.m[k]) == pytest.approx(abs(d), abs=0.05)
-    assert k == planes.shares.argmax()
+    assert k == planes.fractions.argmax()
 
 
 def test_find_planes_merges_divided_wall():
@@ -93,7 +93,7 @@ def test_find_planes_merges_divided_wall():
     depth[:, 140:180] = 1.0 + 0.3 * np.sin(np.arange(40) / 3)
     planes = found(depth)
     k = nearest(planes, WALL)
-    assert planes.shares[k] == pytest.approx(7 / 8, abs=0.08)
+    assert planes.fractions[k] == pytest.approx(7 / 8, abs=0.08)
     image = plane_image(frame_of(depth), planes.chosen(np.arange(len(planes)) == k), 0.02)
     assert (image == (np.abs(np.arange(320) - 159.5) > 20)).all()
 

@@ -7,7 +7,7 @@ import pytest
 
 from framework.data import Detections, FrameTruth
 from framework.detection.masks.binary_masks import tight_boxes
-from framework.evaluation.detection_faults import DetectionFaults, overlaps
+from framework.evaluation.detection_errors import DetectionErrors, overlaps
 
 CLASSES = ("chair", "bed")
 SHAPE = (60, 80)
@@ -37,7 +37,7 @@ CHAIR, BED = block(0, 0, 20, 20), block(0, 30, 40, 30)
 
 
 def counted(*frames: Detections) -> dict[str, float]:
-    faults = DetectionFaults()
+    faults = DetectionErrors()
     for found in frames:
         faults.add(TRUTH, found)
     return faults.table()

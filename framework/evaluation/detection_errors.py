@@ -16,11 +16,11 @@ import numpy as np
 
 from framework.data import Bool, Detections, FrameTruth, Int64
 
-SMALLEST = 64  # px, minimum area of an evaluated appearance
+MIN_PIXELS = 64  # px, minimum area of an evaluated appearance
 FOUND_IOU = 0.3  # minimum IoU of a found appearance, regardless of class
 SIDES = (32.0, 96.0)  # px, square roots of areas: COCO's bounds between small, medium and large
-ENOUGH = 5  # minimum appearances of an object for its detection rate
-RARELY, MOSTLY = 0.25, 0.75  # fractions of an object's appearances
+MIN_APPEARANCES = 5  # minimum appearances of an object for its detection rate
+RARE_FRACTION, FREQUENT_FRACTION = 0.25, 0.75  # fractions of an object's appearances
 PART_INSIDE, PART_COVERS = 0.6, 0.05  # minimum fractions of the detection and of the object, for a part of an object
 ON_ONE = 0.6  # minimum fraction of a false detection on one unknown object
 
@@ -48,7 +48,7 @@ class FalseDetection(NamedTuple):
 
 
 @dataclass
-class DetectionFaults:
+class DetectionErrors:
     """The errors of all frames added so far."""
 
     frames: int = 0
@@ -64,7 +64,7 @@ class DetectionFaults:
         names = [truth.class_names.get(i) if i else None for i in ids.tolist()]
         known = np.array([name is not None for name in names], np.bool_)
         used: set[int] = set()
-        for column in np.flatnonzero(known & (areas >= SMALLEST)).tolist():
+        for column in np.flatnonzero(known & (areas >= MIN_PIXELS)).tolist():
             on, area = shared[:, column], float(areas[column])
             iou = on / (sizes + area - on)
             parts = int(np.count_nonzero((on > PART_INSIDE * sizes) & (on > PART_COVERS * area)))
@@ -95,7 +95,7 @@ class DetectionFaults:
         hits = [one for one in self.appearances if one.iou >= FOUND_IOU]
         scores = [one.score for one in hits]
         of_objects = _by_object(self.appearances)
-        objects = [_found(seen) for seen in of_objects if len(seen) >= ENOUGH]
+        objects = [_found(seen) for seen in of_objects if len(seen) >= MIN_APPEARANCES]
         small, medium, large = (
             _found(one for one in self.appearances if low <= one.side < high)
             for low, high in ((0.0, SIDES[0]), SIDES, (SIDES[1], np.inf))
@@ -107,8 +107,8 @@ class DetectionFaults:
             "found, small": small,
             "found, medium": medium,
             "found, large": large,
-            "objects found in < 1/4 of the frames": _mean(share < RARELY for share in objects),
-            "objects found in > 3/4 of the frames": _mean(share > MOSTLY for share in objects),
+            "objects found in < 1/4 of the frames": _mean(fraction < RARE_FRACTION for fraction in objects),
+            "objects found in > 3/4 of the frames": _mean(fraction > FREQUENT_FRACTION for fraction in objects),
             "mask IoU": _mean(one.iou for one in hits),
             "fraction of the mask on the object": _mean(one.inside for one in hits),
             "fraction of the object in the mask": _mean(one.covered for one in hits),
