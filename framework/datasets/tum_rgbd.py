@@ -81,7 +81,7 @@ class TumRgbd(Recording):
         super().__post_init__()
 
     def open(self) -> Contents:
-        (camera, depth_scale, distortion), source = self._stored_camera()
+        (camera, depth_scale, distortion, sensor), source = self._stored_camera()
         color, depth = _read_list(self.folder / "rgb.txt"), _read_list(self.folder / "depth.txt")
         color_times, depth_times = ([image.timestamp for image in images] for images in (color, depth))
         pairs = associate(color_times, depth_times, self.max_time_difference)
@@ -98,7 +98,7 @@ class TumRgbd(Recording):
         for i, j in pairs:
             images, time = StoredImages.of_files(color[i].path, depth[j].path), color[i].timestamp
             frames.append(RecordedFrame.posed(images, time, partial(truth.at, time)))
-        return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None)
+        return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None, sensor)
 
     def _stored_camera(self) -> tuple[StoredCamera, Path | str]:
         """Return the camera and its source (file or parameter)."""

@@ -17,6 +17,7 @@ from framework.datasets.calibration.raw_images import Calibration, check_max_dep
 from framework.datasets.calibration.undistortion import Distortion
 from framework.errors import DataError, FrameError, in_one_line
 from framework.interfaces import FrameReader, LiveVideo
+from framework.sensors.noise_models import SensorChoice, SensorKind, kind_of_device
 
 WAIT_MS = 100  # ms, maximum wait for a frame
 LONGEST_SILENCE = 5.0  # s, maximum time without a frame; the camera then counts as disconnected
@@ -30,11 +31,13 @@ class DepthCamera(LiveVideo):
     """A camera with factory calibration. The library registers depth to color."""
 
     brand: ClassVar[str]
+    usual_sensor: ClassVar[SensorKind]  # kind of devices with unknown names
     serial: str = ""  # serial number of the device; "" = the first device found
     width: int = 640  # width of the color image, px, in [64, 4096]
     height: int = 480  # height of the color image, px, in [64, 4096]
     fps: int = 30  # frame rate, Hz, in [1, 300]; size and rate must be a mode of the device
     max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
+    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = of the device, otherwise of its brand
 
     def __post_init__(self) -> None:
         check_bounds(self, width=(64, 4096), height=(64, 4096), fps=(1, 300))
@@ -62,6 +65,10 @@ class DepthCamera(LiveVideo):
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         """Return copies of color (H, W, 3), RGB, and the registered depth (H, W); None = missing."""
 
+    @abstractmethod
+    def device_name(self) -> str:
+        """Return the model name of the streaming device, such as "Intel RealSense D435"."""
+
     def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:
         """Return the lens distortion, or None without distortion. Unsupported models are logged and ignored."""
         if not any(coefficients):
@@ -82,19 +89,20 @@ class DepthCamera(LiveVideo):
         number = count()
         calibration: Calibration | None = None
         try:
+            sensor = self.sensor.kind(kind_of_device(self.device_name()) or self.usual_sensor)
             for images in images_of(self.brand, self.wait):
                 if images is not None and calibration is None:
                     calibration = self.calibrate(images)
                 if images is None or calibration is None:
                     yield None
                 else:
-                    yield partial(self._frame, images, next(number), time.time(), calibration)
+                    yield partial(self._frame, images, next(number), time.time(), calibration, sensor)
         except self.errors as error:
             raise DataError(f"{self.brand}: {in_one_line(error)}") from error
         finally:
             self.stop()
 
-    def _frame(self, images: Any, number: int, timestamp: float, calibration: Calibration) -> Frame:
+    def _frame(self, images: Any, number: int, timestamp: float, calibration: Calibration, sensor: SensorKind) -> Frame:
         """Return the registered frame. Raises FrameError if an image is missing or registration fails."""
         try:
             color, depth = self.read(images)
@@ -105,7 +113,8 @@ class DepthCamera(LiveVideo):
                 f"frame {number}: expected color and depth, got no {'color' if color is None else 'depth'}"
             )
         color = calibration.color(color, f"frame {number}: color")
-        return Frame(number, timestamp, color, calibration.depth(depth, f"frame {number}: depth"), calibration.camera)
+        metric = calibration.depth(depth, f"frame {number}: depth")
+        return Frame(number, timestamp, color, metric, calibration.camera, sensor=sensor)
 
 
 def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images | None]:
