@@ -29,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.errors import DataError
+from framework.sensors.noise_models import SensorKind
 
 Array = npt.NDArray[np.generic]
 Float32 = npt.NDArray[np.float32]
@@ -172,6 +173,7 @@ class Frame:
     up: Float64 | None = None  # (3,) unit vector opposite to measured gravity, camera frame; None = no sensor
     color_timestamp: float | None = None  # s, of the color image; None = timestamp
     depth_timestamp: float | None = None  # s, of the depth image; None = timestamp
+    sensor: SensorKind = SensorKind.KINECT_V1  # kind of the depth sensor, with its noise model
 
     def __post_init__(self) -> None:
         index, camera = cast(object, self.index), cast(object, self.camera)  # the caller may pass any type
@@ -194,6 +196,8 @@ class Frame:
             check_array(where + "up", self.up, (3,), np.float64)
             if abs(np.linalg.norm(self.up) - 1) > UNIT_TOLERANCE:
                 raise DataError(f"{where}up: expected a unit vector, got length {np.linalg.norm(self.up):.4g}")
+        if not isinstance(cast(object, self.sensor), SensorKind):
+            raise DataError(f"{where}sensor: expected a SensorKind, got {self.sensor!r}; pass SensorKind.KINECT_V1")
         # kernels require contiguous writable arrays; views such as bgr[..., ::-1] and read-only arrays are copied
         object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
         object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))

@@ -36,6 +36,7 @@ from framework.data import (
     View,
 )
 from framework.errors import ConfigError
+from framework.sensors.noise_models import SensorKind
 
 FrameReader = Callable[[], Frame]
 """Reads one available frame. Raises FrameError if the frame is unusable."""
@@ -275,11 +276,19 @@ class SceneMap(ABC):
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """Return the view of the map from a camera. Raises DataError if T_world_camera is not a pose."""
 
-    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
+    def render_near(
+        self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
+    ) -> SurfaceView:
         """Return the surface near the measured `depth` (H, W) m, for tracking.
 
         A map may start its search at the depth measurements. It may omit pixels without a measurement, and surfaces far
         behind a measurement.
+
+        Args:
+            camera: The camera.
+            T_world_camera: Its pose (4, 4).
+            depth: (H, W) float32, m along z; 0 = no measurement.
+            sensor: The kind of the depth sensor, with its noise model.
         """
         return self.render(camera, T_world_camera)
 

@@ -39,6 +39,7 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
+from framework.sensors.noise_models import SensorKind
 
 FORMAT = "object_volumes 4"  # format of the map file; increment it when the meaning of the contents changes
 OBJECT = "object_"  # prefix of the arrays with the concatenated volumes of all objects
@@ -146,8 +147,10 @@ class ObjectMap(InstanceTableMap):
         instance_ids = self.instances_seen(camera, T_world_camera, surface.depth, stride=1)
         return View(**vars(surface), instance_ids=instance_ids, class_ids=self.table.class_ids()[instance_ids])
 
-    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        return self.background.render_near(camera, T_world_camera, depth)
+    def render_near(
+        self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
+    ) -> SurfaceView:
+        return self.background.render_near(camera, T_world_camera, depth, sensor)
 
     def mesh(self) -> InstanceMesh:
         return self.background.mesh(self._labeled)
@@ -242,4 +245,6 @@ def _cropped(frame: Frame, u0: int, v0: int, u1: int, v1: int) -> Frame:
     """Return the part of a frame from pixel (u0, v0) to (u1, v1), exclusive."""
     camera = frame.camera
     part = replace(camera, width=u1 - u0, height=v1 - v0, cx=camera.cx - u0, cy=camera.cy - v0)
-    return Frame(frame.index, frame.timestamp, frame.color[v0:v1, u0:u1], frame.depth[v0:v1, u0:u1], part)
+    return Frame(
+        frame.index, frame.timestamp, frame.color[v0:v1, u0:u1], frame.depth[v0:v1, u0:u1], part, sensor=frame.sensor
+    )

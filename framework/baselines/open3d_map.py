@@ -24,6 +24,7 @@ from framework.mapping.storage.map_file import (
     table_of,
     write_map,
 )
+from framework.sensors.noise_models import SensorKind
 
 FORMAT = "open3d_vbg 5"  # format of the map file; increment it when the meaning of the contents changes
 
@@ -100,8 +101,10 @@ class Open3DMap(InstanceTableMap):
         instance_ids[seen] = self.instances_at(points_of(surface)[seen])
         return View(**vars(surface), instance_ids=instance_ids, class_ids=self.table.class_ids()[instance_ids])
 
-    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        """Return the surface without labels; Open3D cannot use `depth`."""
+    def render_near(
+        self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
+    ) -> SurfaceView:
+        """Return the surface without labels; Open3D cannot use `depth` and `sensor`."""
         return self.grid.ray_cast(camera, T_world_camera)
 
     def mesh(self) -> InstanceMesh:

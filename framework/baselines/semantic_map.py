@@ -25,6 +25,7 @@ from framework.mapping.storage.map_file import map_file_errors, read_map, write_
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
+from framework.sensors.noise_models import SensorKind
 
 MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the parameters; AREA in m^2
 SWEEPS = 20  # maximum sweeps of the regularization
@@ -90,8 +91,10 @@ class SemanticMap(SceneMap):
         label_view(self.volume.voxels.grid, self.labels.evidence, self._log_missed, view, surface.depth, class_ids)
         return View(**vars(surface), instance_ids=np.zeros(camera.shape, np.int32), class_ids=class_ids)
 
-    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        return self.volume.render_near(camera, T_world_camera, depth)
+    def render_near(
+        self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
+    ) -> SurfaceView:
+        return self.volume.render_near(camera, T_world_camera, depth, sensor)
 
     def mesh(self) -> InstanceMesh:
         return self.volume.mesh(self._labeled)

@@ -17,6 +17,7 @@ from framework.datasets.frames.numbered_images import numbered_images, paired_im
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording
 from framework.errors import DataError
 from framework.files.number_lines import read_matrix_lines
+from framework.sensors.noise_models import SensorKind
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 
@@ -44,4 +45,4 @@ class ReplicaNiceSlam(Recording):
             else:
                 error = f"{pair.color_name}: expected a pose in traj.txt, got none among its {len(poses)} poses"
                 frames.append(RecordedFrame(pair, k / FRAME_RATE, error=error))
-        return Contents(camera, path, depth_scale, frames)
+        return Contents(camera, path, depth_scale, frames, sensor=SensorKind.EXACT)

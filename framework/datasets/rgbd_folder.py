@@ -1,7 +1,8 @@
 """Folder of color and depth images: the format for your own data.
 
     camera.json         {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}; meters = value / depth_scale;
-                        optional "distortion": [k1, k2, p1, p2, k3] of all images, which are undistorted on reading
+                        optional "distortion": [k1, k2, p1, p2, k3] of all images, which are undistorted on reading;
+                        optional "sensor": kind of the depth sensor, such as "REALSENSE_D435"; default "KINECT_V1"
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw
@@ -58,7 +59,7 @@ class RgbdFolder(Recording):
         if not path.is_file():
             expected = "expected a camera next to color/ and depth/, got no such file"
             raise DataError(f"{path}: {expected}; see docs/tutorials/own_data.md")
-        camera, depth_scale, distortion = read_camera(path)
+        camera, depth_scale, distortion, sensor = read_camera(path)
         color = numbered_images(self.folder / "color", (".jpg", ".jpeg", ".png"))
         depth = numbered_images(self.folder / "depth", (".png",))
         _check_same_frames(color, depth)
@@ -72,7 +73,7 @@ class RgbdFolder(Recording):
             images = StoredImages.of_files(color[number], depth[number])
             frame = _recorded(images, k, lines[k] if lines else None, times[k] if times else None)
             frames.append(replace(frame, up=ups[k] if ups else None))
-        return Contents(camera, path, depth_scale, frames, distortion)
+        return Contents(camera, path, depth_scale, frames, distortion, sensor)
 
     def truth_in(self, index: int) -> FrameTruth | None:
         if not self._instances:

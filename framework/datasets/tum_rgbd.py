@@ -81,7 +81,7 @@ class TumRgbd(Recording):
         super().__post_init__()
 
     def open(self) -> Contents:
-        (camera, depth_scale, distortion), source = self._stored_camera()
+        (camera, depth_scale, distortion, sensor), source = self._stored_camera()
         color, depth = _read_list(self.folder / "rgb.txt"), _read_list(self.folder / "depth.txt")
         color_times, depth_times = ([image.timestamp for image in images] for images in (color, depth))
         pairs = associate(color_times, depth_times, self.max_time_difference)
@@ -99,7 +99,7 @@ class TumRgbd(Recording):
             images, time = StoredImages.of_files(color[i].path, depth[j].path), color[i].timestamp
             recorded = RecordedFrame.posed(images, time, partial(truth.at, time))
             frames.append(replace(recorded, color_timestamp=time, depth_timestamp=depth[j].timestamp))
-        return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None)
+        return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None, sensor)
 
     def _stored_camera(self) -> tuple[StoredCamera, Path | str]:
         """Return the camera and its source (file or parameter)."""

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from framework.config.validation import require
 from framework.data import MAX_PIXELS, Array, Camera, Float64
-from framework.datasets.calibration.camera_json import DISTORTION
+from framework.datasets.calibration.camera_json import DISTORTION, SENSOR
 from framework.datasets.calibration.color_registration import ColorRegistration
 from framework.errors import DataError
 from framework.files.atomic_write import atomic_write
@@ -120,7 +120,8 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
         ups = [None if up is None else turn.R_turned_camera @ up for up in written.ups]
         write_gravity(directory / "gravity.txt", ups)
     lens = {DISTORTION: list(astuple(turn.lens(source.distortion)))} if source.distortion else {}
-    write_json(directory / "camera.json", asdict(turn.camera(camera)) | {"depth_scale": DEPTH_SCALE} | lens)
+    sensor = {SENSOR: source.sensor.name} if source.sensor else {}
+    write_json(directory / "camera.json", asdict(turn.camera(camera)) | {"depth_scale": DEPTH_SCALE} | lens | sensor)
     return written
 
 

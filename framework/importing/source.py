@@ -14,6 +14,7 @@ from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import CameraAxes, PoseReading
 from framework.errors import FrameError, errors_of
 from framework.geometry import nearest_rigid
+from framework.sensors.noise_models import SensorKind
 
 SMALLEST_SIDE = 2  # px, minimum side of a depth image for resampling
 UNSURE, FAIRLY_SURE, SURE = 0, 1, 2  # ARKit's low, medium and high confidence
@@ -61,6 +62,7 @@ class Source:
     count: int  # number of frames
     posed: bool  # True if the recording has poses; frames without a pose are then skipped
     distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
+    sensor: SensorKind | None = None  # kind of the depth sensor; None = unknown
 
 
 @dataclass(frozen=True)

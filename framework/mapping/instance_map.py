@@ -32,6 +32,7 @@ from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.raycasting import render
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
+from framework.sensors.noise_models import SensorKind
 
 FORMAT = 8  # format of the map file; increment it when the meaning of the contents changes
 LARGEST_SCALE = 2**40  # largest scale of quantized class scores
@@ -94,8 +95,10 @@ class InstanceMap(InstanceTableMap):
         volume = self.volume
         return render(volume.voxels, self.labels.evidence, volume.sensor, camera, T_world_camera)
 
-    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        return self.volume.render_near(camera, T_world_camera, depth)
+    def render_near(
+        self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
+    ) -> SurfaceView:
+        return self.volume.render_near(camera, T_world_camera, depth, sensor)
 
     def mesh(self) -> InstanceMesh:
         return self.volume.mesh(self._labeled)

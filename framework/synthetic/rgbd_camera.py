@@ -1,11 +1,13 @@
-"""Error model of an RGB-D camera similar to the Kinect v1.
+"""Error model of RGB-D cameras, by default similar to the Kinect v1.
 
-- Axial depth noise grows with the square of depth and towards grazing angles: see `framework.sensors.noise_models`.
-- Disparity is quantized to 1/8 px, so the step of depth is 2.9e-3 z^2: Khoshelham and Oude Elberink, "Accuracy and
-  Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012.
+- Axial depth noise follows the model of the sensor (`framework.sensors.noise_models`).
+- Disparity of a Kinect v1 is quantized to 1/8 px, so the step of depth is 2.9e-3 z^2: Khoshelham and Oude Elberink,
+  "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012. A RealSense D400
+  has steps of 1/32 px. Other sensors have steps of 1 mm.
 - Lateral noise moves readings across edges by about a pixel (Nguyen et al.), applied as by Handa et al., "A Benchmark
   for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
-- Readings are missing in the projector's shadow, at many pixels along depth edges, and at grazing angles.
+- Readings are missing in the shadow of the projector or second camera, at many pixels along depth edges, and at
+  grazing angles.
 - Dark and shiny surfaces lose readings in patches, because the correlation window is wider than a pixel.
 - Color has noise and motion blur.
 """
@@ -16,13 +18,14 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 
 from framework.data import Camera, Float32, Float64, UInt8, UInt16
 from framework.geometry import inverse
+from framework.sensors.noise_models import SensorKind
 from framework.synthetic.rgbd_camera_kernels import (
-    BASELINE,
     QUANTILE_BITS,
     SPARE_BITS,
     add_noise,
@@ -36,12 +39,26 @@ PATCH = 14.0  # px at 640 px width, spacing of the random numbers for patches wi
 COLOR_SIGMA = 1.5  # gray levels, 0..255
 
 
+class Triangulation(NamedTuple):
+    """Geometry of a sensor that measures disparity."""
+
+    baseline: float  # m, to the projector or the second camera; 0 = no triangulation
+    steps_depth: float  # m, depth times steps of disparity; 0 = steps of depth
+
+
+TRIANGULATION = {  # of depth cameras with 580 px (Kinect v1, at 640 px width) and 424 px (D435, at 848 px width)
+    SensorKind.KINECT_V1: Triangulation(0.075, 8 * 580 * 0.075),
+    SensorKind.REALSENSE_D435: Triangulation(0.05, 32 * 424 * 0.05),
+}
+
+
 @dataclass(frozen=True)
 class DepthSensor:
     """Model of depth readings from exact depth."""
 
     noise: float  # 0 = exact, 1 = as measured; scales standard deviations and probabilities
     max_range: float  # m
+    kind: SensorKind = SensorKind.KINECT_V1
 
     def measure(
         self,
@@ -56,17 +73,18 @@ class DepthSensor:
         `incidence`: (H, W), cosines of incidence. `unread`: (H, W), fraction of readings lost on materials, in patches;
         None = no loss.
         """
-        if self.noise == 0:
+        if self.noise == 0 or self.kind is SensorKind.EXACT:
             return np.where(depth <= self.max_range, depth, np.float32(0))
         noise, width, normal = self.noise, camera.width, normal_quantiles()
         theta = np.arccos(np.minimum(incidence, np.float32(1)))
         random = random_bits((*depth.shape, 4), rng)
-        lateral_sigma, disparity_scale = (
-            np.float32(noise * LATERAL_SIGMA * width / 640),
-            np.float32(camera.fx * BASELINE),
-        )
-        limit, reading = np.float32(self.max_range), np.zeros(depth.shape, np.float32)
-        read_depth(depth, theta, random, normal, np.float32(noise), lateral_sigma, disparity_scale, limit, reading)
+        baseline, steps_depth = TRIANGULATION.get(self.kind, Triangulation(0.0, 0.0))
+        reading = np.zeros(depth.shape, np.float32)
+        read_depth(
+            depth, theta, random, normal, np.float32(noise), np.float32(noise * LATERAL_SIGMA * width / 640),
+            np.float32(camera.fx * baseline), np.float32(steps_depth), self.kind.noise, np.float32(self.max_range),
+            reading,
+        )  # fmt: skip
         if unread is not None:
             cell = PATCH * width / 640
             nodes = (int(depth.shape[0] / cell) + 2, int(depth.shape[1] / cell) + 2)

@@ -6,11 +6,9 @@ import numpy as np
 from numba import njit
 
 from framework.data import Bool, Float32, UInt8, UInt16
-from framework.sensors.noise_models import axial_sigma_at_angle
+from framework.sensors.noise_models import FLOOR, DepthNoise
+from framework.sensors.noise_models_kernels import axial_sigma_at_angle
 
-BASELINE = 0.075  # m, between projector and camera
-DISPARITY_STEPS = 8.0  # per px
-FOCAL_KINECT = 580.0  # px at 640 px width, depth camera; the quantization is independent of the image size here
 MIN_RANGE = 0.4  # m
 EDGE_JUMP = 0.05  # relative step of depth at which the sensor's correlation window fails
 EDGE_DROP = 0.5  # probability of no reading next to such a step
@@ -20,13 +18,23 @@ SPARE_BITS = 16 - QUANTILE_BITS
 MAX_SAMPLES = 9  # blur samples along the path of a pixel; more samples make no visible difference
 SHARP = np.float32(0.5)  # px, minimum path length for blur
 
-_SCALE = np.float32(DISPARITY_STEPS * FOCAL_KINECT * BASELINE)  # m, depth times steps of disparity
+
+@njit(cache=True, nogil=True)
+def depth_step(z: np.float32, steps_depth: np.float32) -> np.float32:
+    """Return the quantization step (m) of depth at depth z (m).
+
+    `steps_depth` is the product of depth and steps of disparity, m; 0 = steps of depth.
+    """
+    return np.float32(z * z / steps_depth) if steps_depth > 0 else np.float32(FLOOR)
 
 
 @njit(cache=True, nogil=True)
-def depth_step(z: np.float32) -> np.float32:
-    """Return the quantization step (m) of depth at depth z (m)."""
-    return np.float32(z * z / _SCALE)
+def quantized(z: np.float32, steps_depth: np.float32) -> np.float32:
+    """Return depth z (m) rounded to a step of disparity, or of depth."""
+    if steps_depth > 0:
+        steps = np.rint(steps_depth / max(z, np.float32(0.1)))
+        return np.float32(steps_depth / max(steps, np.float32(1)))
+    return np.float32(np.rint(z / np.float32(FLOOR)) * np.float32(FLOOR))
 
 
 @njit(cache=True, nogil=True)
@@ -38,6 +46,8 @@ def read_depth(
     noise: np.float32,
     lateral_sigma: np.float32,
     disparity_scale: np.float32,
+    steps_depth: np.float32,
+    model: DepthNoise,
     max_range: np.float32,
     reading: Float32,
 ) -> None:
@@ -45,14 +55,14 @@ def read_depth(
 
     `depth`: (H, W) m. `theta`: (H, W) rad, angle of incidence. `random`: (H, W, 4) bits for the loss of a reading, the
     lateral error along y and x, and the axial error. `normal`: (N,) normal_quantiles. `lateral_sigma`: px.
-    `disparity_scale`: px m.
+    `disparity_scale`: px m. `steps_depth`: see `depth_step`. `model`: noise model, scaled by `noise`.
     """
     height, width = depth.shape
     near_edge = _near_edge(depth)
     largest_loss = min(noise, np.float32(1))
     for v in range(height):
-        # The projector is to the right of the camera. Pixel u is at u - f b / z in the projector. A pixel is in the
-        # shadow of a nearer surface unless it is to the left of all pixels on its right.
+        # The projector, or the other camera, is to the right of the camera. Pixel u is at u - f b / z in the projector.
+        # A pixel is in the shadow of a nearer surface unless it is to the left of all pixels on its right.
         leftmost = np.float32(np.inf)
         for u in range(width - 1, -1, -1):
             z = depth[v, u]
@@ -71,13 +81,12 @@ def read_depth(
             lateral_u = lateral_sigma * normal[random[v, u, 2] >> SPARE_BITS]
             noisy = _shifted(depth, v, u, lateral_v, lateral_u)
             # Gaussian noise; its deviation and the following quantization add up to the measured deviation
-            sigma, step = noise * axial_sigma_at_angle(noisy, theta[v, u]), depth_step(noisy)
+            sigma, step = noise * axial_sigma_at_angle(noisy, theta[v, u], model), depth_step(noisy, steps_depth)
             variance = sigma * sigma - step * step / np.float32(12)
             noisy += np.sqrt(max(variance, np.float32(0))) * normal[random[v, u, 3] >> SPARE_BITS]
-            steps = np.rint(_SCALE / max(noisy, np.float32(0.1)))
-            quantized = _SCALE / max(steps, np.float32(1))
-            if np.float32(MIN_RANGE) < quantized <= max_range:
-                reading[v, u] = quantized
+            value = quantized(noisy, steps_depth)
+            if np.float32(MIN_RANGE) < value <= max_range:
+                reading[v, u] = value
 
 
 @njit(cache=True, nogil=True)

@@ -16,6 +16,7 @@ from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_trut
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import ConfigError
 from framework.interfaces import RGBDSequence
+from framework.sensors.noise_models import SensorChoice, SensorKind
 from framework.synthetic.renderer import Renderer, cast_ids
 from framework.synthetic.rgbd_camera import DepthSensor, noisy_color
 from framework.synthetic.room import RoomKind, furnish
@@ -40,7 +41,8 @@ class Synthetic(RGBDSequence):
     frames: int = 240  # number of frames at 30 Hz
     width: int = 640  # width of the images, px
     height: int = 480  # height of the images, px
-    noise: float = 1.0  # scale of the sensor noise; 0 = none, 1 = Kinect v1
+    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = KINECT_V1, or EXACT without noise
+    noise: float = 1.0  # scale of the sensor noise; 0 = none, 1 = as in the noise model
     max_depth: float = 6.0  # maximum depth of the sensor, m
     simulated_color_delay: float = 0.0  # time from depth to color, with equal timestamps, s, in [-0.2, 0.2]
     color_delay: str = AUTO  # this time as known by the pipeline, s, in [-0.2, 0.2]; AUTO = estimated
@@ -76,7 +78,8 @@ class Synthetic(RGBDSequence):
         self.room = furnish(self.kind, rng)
         self.class_names = dict(self.room.surfaces.class_names)
         self._renderer = Renderer(self.room.surfaces, list(self.room.lamps))
-        self._sensor = DepthSensor(self.noise, self.max_depth)
+        self.sensor_kind = self.sensor.kind(SensorKind.KINECT_V1 if self.noise else SensorKind.EXACT)
+        self._sensor = DepthSensor(self.noise, self.max_depth, self.sensor_kind)
         wanted = {i for i, name in self.class_names.items() if name is not None}
         small = Camera(80, 60, FOCAL_LENGTH * 80, FOCAL_LENGTH * 80, 39.5, 29.5)
         self.path = plan_path(
@@ -109,6 +112,7 @@ class Synthetic(RGBDSequence):
             camera=self.camera,
             T_world_camera=T_world_camera,
             truth=FrameTruth(seen.instance_ids, self.class_names),
+            sensor=self.sensor_kind,
         )
 
     def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:

@@ -131,7 +131,8 @@ def linearize(
     accumulate(
         FrameView(level.depth, level.intensity, level.normals, *intrinsics(level.camera)), model, model_intensity,
         np.float32(1 / scale), np.ascontiguousarray(T_view_camera[:3, :3], np.float32),
-        np.ascontiguousarray(T_view_camera[:3, 3], np.float32), weights, linear, np.float32(brightness), sums,
+        np.ascontiguousarray(T_view_camera[:3, 3], np.float32), weights, linear, level.sensor.noise,
+        np.float32(brightness), sums,
     )  # fmt: skip
     total = sums.sum(axis=0)
     visible, matched, close, behind, matched_colors, compared = (int(count) for count in total[SUMS:])

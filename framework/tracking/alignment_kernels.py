@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 from framework.mapping.voxels.voxel_grid_kernels import device, one_more
-from framework.sensors.noise_models import axial_sigma_single
+from framework.sensors.noise_models_kernels import axial_sigma_single
 
 CHUNKS = 16  # chunks of image rows, summed in order, so that sums do not depend on the number of threads
 BATCH = 160  # points per batch; divides the usual image widths
@@ -140,7 +140,7 @@ def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
 
 
 @device
-def _add_geometry(model, R, weights, linear, points, J):
+def _add_geometry(model, R, weights, linear, noise_model, points, J):
     """Set the point-to-plane terms of a batch in J; return the counts (visible, matched, close, behind).
 
     points[NEAR] is set to 1 if a point is within max_distance of its model point, otherwise to 0. With linear weights,
@@ -173,7 +173,7 @@ def _add_geometry(model, R, weights, linear, points, J):
             + ny * (R10 * fx + R11 * fy + R12 * fz)
             + nz * (R20 * fx + R21 * fy + R22 * fz)
         )
-        noise = axial_sigma_single(points[DEPTH + n])
+        noise = axial_sigma_single(points[DEPTH + n], noise_model)
         sigma = noise * max(one, points[DEPTH + n] * inv_far)
         distance = nx * ex + ny * ey + nz * ez
         matches = near & (dot > min_dot)
@@ -296,11 +296,11 @@ def _add_brightness(J, lanes):
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, linear, brightness, sums):
+def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, linear, noise_model, brightness, sums):
     """Sum the normal equations over a FrameView by chunks of rows into sums (CHUNKS, TERMS).
 
     `R` and `t` are T_view_camera. `inverse_scale` is the width of model_intensity over the width of the view. `linear`
-    is a LinearWeights, or None for Tukey's weights.
+    is a LinearWeights, or None for Tukey's weights. `noise_model` is the DepthNoise of the frame's sensor.
     """
     height, width = frame.depth.shape
     shape, level_shape = model.depth.shape, model_intensity.shape
@@ -317,7 +317,7 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
                 _load(frame, v, u0, points)
                 _project(frame, v, u0, model, shape, R, t, points, pixel)
                 _gather_model(flat_depth, flat_normals, size, pixel, points)
-                visible, matched, close, behind = _add_geometry(model, R, weights, linear, points, J)
+                visible, matched, close, behind = _add_geometry(model, R, weights, linear, noise_model, points, J)
                 _add_products(J, lanes)
                 total[SUMS] += visible
                 total[SUMS + 1] += matched

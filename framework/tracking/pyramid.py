@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from framework.data import Camera, Float32, SurfaceView, UInt8
-from framework.sensors.noise_models import GROWTH, LEAST, NEAR
+from framework.sensors.noise_models import SensorKind
 from framework.tracking.pyramid_kernels import compute_normals, find_distinct, halve, halve_mapped
 
 SAMPLED = 4  # stride of the depth readings for the quantization estimate, px
 FEWEST_VALUES = 16  # minimum number of distinct depths for the quantization estimate
-COARSE = 2.5  # largest fine step between depth values, standard deviations of a structured-light camera's depth
+COARSE = 2.5  # largest fine step between depth values, standard deviations of the sensor's depth
 
 
 def intrinsics(camera: Camera) -> tuple[np.float32, np.float32, np.float32, np.float32]:
@@ -29,9 +29,13 @@ class PyramidLevel:
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
     normals: Float32  # (3, H, W) of the surface, towards the camera, in its frame; 0 at edges
+    sensor: SensorKind = SensorKind.KINECT_V1  # kind of the depth sensor
 
 
-def build_pyramid(camera: Camera, depth: Float32, color: UInt8, finest: float, levels: int) -> list[PyramidLevel]:
+def build_pyramid(
+    camera: Camera, depth: Float32, color: UInt8, finest: float, levels: int,
+    sensor: SensorKind = SensorKind.KINECT_V1,
+) -> list[PyramidLevel]:  # fmt: skip
     """Return the image at `finest` times its size and at levels - 1 further halvings, finest first.
 
     `finest` is 1 or a power of 1/2. Intensities average all pixels. Depths average the pixels of one surface.
@@ -43,7 +47,7 @@ def build_pyramid(camera: Camera, depth: Float32, color: UInt8, finest: float, l
         if camera.width <= least:
             normals = np.empty((3, *camera.shape), np.float32)
             compute_normals(depth, intrinsics(camera), normals)
-            pyramid.append(PyramidLevel(camera, depth, intensity, normals))
+            pyramid.append(PyramidLevel(camera, depth, intensity, normals, sensor))
             if len(pyramid) == levels:
                 return pyramid
         camera = _halved(camera)
@@ -52,16 +56,16 @@ def build_pyramid(camera: Camera, depth: Float32, color: UInt8, finest: float, l
         depth, intensity = half_depth, half_intensity
 
 
-def is_coarse(depth: Float32, otherwise: bool) -> bool:
+def is_coarse(depth: Float32, otherwise: bool, sensor: SensorKind = SensorKind.KINECT_V1) -> bool:
     """Return True if depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as with 8 bits.
 
-    Steps are gaps between the values in the nearer half, in standard deviations of a structured-light camera. A Kinect
-    has steps of 1.5 to 1.9 at any distance. Returns `otherwise` if too few values occur.
+    Steps are gaps between the values in the nearer half, in standard deviations of the sensor. A Kinect has steps of
+    1.5 to 1.9 at any distance. Returns `otherwise` if too few values occur.
     """
     values = _distinct(depth[::SAMPLED, ::SAMPLED])
     if len(values) < FEWEST_VALUES:
         return otherwise
-    steps = np.diff(values) / (LEAST + GROWTH * (values[:-1] - NEAR) ** 2)
+    steps = np.diff(values) / sensor.sigma(values[:-1])
     return bool(np.percentile(steps[: len(steps) // 2], 25) > COARSE)  # a gap may span several steps
 
 

@@ -49,7 +49,7 @@ class OnnxBoxes(Detector):
     max_slant: float = 85.0  # maximum angle between surface and image plane, degrees, in (0, 90); steeper = boundary
     min_readings: float = 0.1  # minimum fraction of the box's pixels with depth, in [0, 1]; other boxes are dropped
     device: str = "auto"  # device of the network: auto, cpu or cuda; auto = cuda if onnxruntime supports it
-    reads = ("color", "depth", "camera")
+    reads = ("color", "depth", "camera", "sensor")
 
     def __post_init__(self) -> None:
         check_intervals("detector", self, score_threshold="(0, 1)", nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
@@ -75,6 +75,7 @@ class OnnxBoxes(Detector):
             self.min_foreground_fraction,
             self.max_slant,
             self.min_readings,
+            frame.sensor,
         )
         if not found.all():
             self._report_dropped(frame, found)

@@ -43,7 +43,7 @@ class OpenVocabulary(Detector):
     max_detections: int = 50  # maximum number of detections per image, >= 1
     half_precision: bool = True  # True = half precision on CUDA; the CPU always uses single precision
     device: str = "auto"  # device of the networks: auto, cpu or cuda; auto = cuda if available
-    reads = ("color", "depth", "camera")
+    reads = ("color", "depth", "camera", "sensor")
 
     def __post_init__(self) -> None:
         check_intervals("detector", self, score_threshold="(0, 1)", nms_iou="(0, 1]", agnostic_nms_iou="(0, 1]")
@@ -71,7 +71,9 @@ class OpenVocabulary(Detector):
         if self._masks is not None:
             masks = self._masks(frame.color, boxes[kept])
         else:
-            masks, _ = masks_in_boxes(boxes[kept], frame.depth, frame.camera, SIGNIFICANCE, MAX_SLANT, MIN_READINGS)
+            masks, _ = masks_in_boxes(
+                boxes[kept], frame.depth, frame.camera, SIGNIFICANCE, MAX_SLANT, MIN_READINGS, frame.sensor
+            )
         distributions = word_distributions(probabilities[kept], self.score_threshold)
         return without_duplicates(masks, scores[kept], distributions, self.classes, self.agnostic_nms_iou)
 

@@ -25,7 +25,7 @@ class PlaneRemoval(ClusterRefiner):
     """
 
     plane_distance: float = 0.01  # maximum distance to a plane, m, >= 0, in addition to 3 standard deviations of noise
-    inverse_depth_noise: float = 0.003  # maximum RMS residual of a plane in inverse depth, 1/m, >= 0
+    inverse_depth_noise: float = 0.003  # maximum RMS residual of a plane in inverse depth, 1/m, >= 0, for KINECT_V1
     min_area: float = 0.8  # minimum visible area of a plane, m^2, >= 0
     min_frame_fraction: float = 0.04  # minimum fraction of the frame's readings on a plane, in [0, 1]
     max_behind_ratio: float = 0.1  # maximum ratio of readings behind a plane to readings on the plane, >= 0

@@ -161,8 +161,8 @@ class VoxelHashingIcp(PoseTracker):
         self._stored_scene = scene
 
     def _pyramid(self, frame: Frame) -> list[PyramidLevel]:
-        self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
-        return build_pyramid(frame.camera, frame.depth, frame.color, self.finest_scale, LEVELS)
+        self._coarse_depth = is_coarse(frame.depth, self._coarse_depth, frame.sensor)
+        return build_pyramid(frame.camera, frame.depth, frame.color, self.finest_scale, LEVELS, frame.sensor)
 
     def _relocalize_in_stored(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
         """Find the camera in a stored map by features, confirmed by alignment."""
@@ -298,7 +298,7 @@ class VoxelHashingIcp(PoseTracker):
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
     ) -> Alignment:
         """Align a frame to the view of the map at T_world_view, coarse to fine. The last pose is T_world_from."""
-        view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth)
+        view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth, levels[0].sensor)
         model, intensities = model_view(view), model_intensities(view, LEVELS)
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
         linear = self._linear_weights(scene)

@@ -150,6 +150,7 @@ def test_data_objects_accept_valid_values() -> None:
         ),
         (frame, {"timestamp": float("nan")}, "frame 7: timestamp: expected a finite number of seconds, got nan"),
         (frame, {"timestamp": "5"}, "timestamp: expected a finite number of seconds, got '5'"),
+        (frame, {"sensor": "EXACT"}, "frame 7: sensor: expected a SensorKind, got 'EXACT'"),
         (frame, {"T_world_camera": with_nan((4, 4), np.float64)}, "frame 7: T_world_camera: expected finite values"),
         (frame, {"T_world_camera": 2 * np.eye(4)}, r"expected a rigid transform, got \|R R\^T - I\| = .*, det R ="),
         (

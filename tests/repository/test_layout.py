@@ -14,10 +14,11 @@ import pytest
 CHECKOUT = Path(__file__).resolve().parents[2]
 LAYERS = [
     ["errors"],
+    ["sensors"],
     ["data"],
     ["geometry"],
     ["interfaces"],
-    ["files", "sensors"],
+    ["files"],
     ["config", "registry", "runtime", "vocabulary"],
     ["compilation"],
     ["rendering"],

@@ -15,9 +15,11 @@ from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError, errors_of
 from framework.files.atomic_write import MAX_TEXT
 from framework.files.json_file import read_json
+from framework.sensors.noise_models import SensorKind
 
 CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")  # of camera.json
 DISTORTION = "distortion"  # key of the lens distortion
+SENSOR = "sensor"  # key of the kind of the depth sensor
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +30,7 @@ class StoredCamera(NamedTuple):
     camera: Camera
     depth_scale: float  # units per meter
     distortion: Distortion | None  # lens distortion of color and depth; None = pinhole camera
+    sensor: SensorKind = SensorKind.KINECT_V1
 
 
 def read_json_object(path: Path, most: int = MAX_TEXT) -> dict[str, Any]:
@@ -41,8 +44,9 @@ def read_json_object(path: Path, most: int = MAX_TEXT) -> dict[str, Any]:
 def read_camera(path: Path) -> StoredCamera:
     """Return the calibration in a camera.json. Raises DataError that names the file and the key."""
     content = read_json_object(path)
-    check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
-    return StoredCamera(*camera_of(path, content, CAMERA_KEYS), distortion_of(path, content))
+    check_keys(path, content, (*CAMERA_KEYS, DISTORTION, SENSOR))
+    camera = camera_of(path, content, CAMERA_KEYS)
+    return StoredCamera(*camera, distortion_of(path, content), sensor_of(path, content))
 
 
 def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:
@@ -100,6 +104,17 @@ def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
     if DISTORTION not in content:
         return None
     return Distortion(*number_list(f"{path}: distortion [k1, k2, p1, p2, k3]", content[DISTORTION], 5))
+
+
+def sensor_of(path: Path, content: Mapping[str, Any]) -> SensorKind:
+    """Return the kind of the depth sensor in the content of a file; without the key, KINECT_V1. Raises DataError."""
+    name = content.get(SENSOR, SensorKind.KINECT_V1.name)
+    if not isinstance(name, str) or name not in SensorKind.__members__:
+        raise DataError(
+            f"{path}, {SENSOR}: expected one of {', '.join(SensorKind.__members__)}, got {str(name)[:40]}; set the "
+            "kind of the depth sensor, or remove the key for KINECT_V1"
+        )
+    return SensorKind[name]
 
 
 def _is_number(value: Any) -> bool:

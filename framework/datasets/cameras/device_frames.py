@@ -18,6 +18,7 @@ from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import AUTO, color_delay_of
 from framework.errors import DataError, FrameError, in_one_line
 from framework.interfaces import FrameReader, LiveVideo
+from framework.sensors.noise_models import SensorChoice, SensorKind, kind_of_device
 
 WAIT_MS = 100  # ms, maximum wait for a frame
 LONGEST_SILENCE = 5.0  # s, maximum time without a frame; the camera then counts as disconnected
@@ -31,12 +32,14 @@ class DepthCamera(LiveVideo):
     """A camera with factory calibration. The library registers depth to color."""
 
     brand: ClassVar[str]
+    usual_sensor: ClassVar[SensorKind]  # kind of devices with unknown names
     serial: str = ""  # serial number of the device; "" = the first device found
     width: int = 640  # width of the color image, px, in [64, 4096]
     height: int = 480  # height of the color image, px, in [64, 4096]
     fps: int = 30  # frame rate, Hz, in [1, 300]; size and rate must be a mode of the device
     max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
     color_delay: str = AUTO  # time from depth to color with equal timestamps, s, in [-0.2, 0.2]; AUTO = estimated
+    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = of the device, otherwise of its brand
 
     def __post_init__(self) -> None:
         check_bounds(self, width=(64, 4096), height=(64, 4096), fps=(1, 300))
@@ -68,6 +71,10 @@ class DepthCamera(LiveVideo):
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         """Return copies of color (H, W, 3), RGB, and the registered depth (H, W); None = missing."""
 
+    @abstractmethod
+    def device_name(self) -> str:
+        """Return the model name of the streaming device, such as "Intel RealSense D435"."""
+
     def depth_after_color(self, images: Any) -> float | None:
         """Return the time from the color to the depth image by the device's clock, s; None = unknown."""
         return None
@@ -95,13 +102,14 @@ class DepthCamera(LiveVideo):
         number = count()
         calibration: Calibration | None = None
         try:
+            sensor = self.sensor.kind(kind_of_device(self.device_name()) or self.usual_sensor)
             for images in images_of(self.brand, self.wait):
                 if images is not None and calibration is None:
                     calibration = self.calibrate(images)
                 if images is None or calibration is None:
                     yield None
                 else:
-                    yield partial(self._frame, images, next(number), time.time(), calibration)
+                    yield partial(self._frame, images, next(number), time.time(), calibration, sensor)
         except self.errors as error:
             raise DataError(
                 f"{self.brand}: expected a running camera, got an error ({in_one_line(error)}); check its connection"
@@ -109,7 +117,7 @@ class DepthCamera(LiveVideo):
         finally:
             self.stop()
 
-    def _frame(self, images: Any, number: int, timestamp: float, calibration: Calibration) -> Frame:
+    def _frame(self, images: Any, number: int, timestamp: float, calibration: Calibration, sensor: SensorKind) -> Frame:
         """Return the registered frame. Raises FrameError if an image is missing or registration fails."""
         try:
             color, depth = self.read(images)
@@ -122,11 +130,12 @@ class DepthCamera(LiveVideo):
                 f"frame {number}: expected color and depth, got no {'color' if color is None else 'depth'}"
             )
         color = calibration.color(color, f"frame {number}: color")
+        metric = calibration.depth(depth, f"frame {number}: depth")
         depth_after = self.depth_after_color(images)
+        depth_timestamp = None if depth_after is None else timestamp + depth_after
         return Frame(
-            number, timestamp, color, calibration.depth(depth, f"frame {number}: depth"), calibration.camera,
-            depth_timestamp=None if depth_after is None else timestamp + depth_after,
-        )  # fmt: skip
+            number, timestamp, color, metric, calibration.camera, depth_timestamp=depth_timestamp, sensor=sensor
+        )
 
 
 def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images | None]:

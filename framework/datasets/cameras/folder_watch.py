@@ -31,6 +31,7 @@ from framework.files.atomic_write import read_bytes
 from framework.files.image_files import LARGEST_FILE, check_image
 from framework.files.search_paths import folder_of
 from framework.interfaces import FrameReader, LiveVideo
+from framework.sensors.noise_models import SensorChoice, SensorKind
 
 COLOR, DEPTH = (".jpg", ".jpeg", ".png"), (".png",)
 LONGEST_WAIT = 86_400.0  # s
@@ -50,6 +51,7 @@ class FolderWatch(LiveVideo):
     camera_timeout: float = 30.0  # maximum wait for camera.json, s, in [0, 86400]
     poll_interval: float = 0.01  # interval between polls of the folder, s, in [0.001, 0.1]
     max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
+    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = of camera.json, otherwise KINECT_V1
 
     def __post_init__(self) -> None:
         waits = (0.0, LONGEST_WAIT)
@@ -61,7 +63,7 @@ class FolderWatch(LiveVideo):
         self.name = self.folder.resolve().name
 
     def frames(self) -> Generator[FrameReader | None]:
-        calibration = yield from self._calibration()
+        calibration, sensor = yield from self._calibration()
         arrivals = Arrivals(self.folder)
         last_time, last_arrival = 0.0, time.monotonic()
         while True:
@@ -70,14 +72,14 @@ class FolderWatch(LiveVideo):
             over = (self.folder / "end").exists() or 0 < self.idle_timeout < began - last_arrival
             for number, images in arrivals.look(to_the_end=over):
                 last_time, last_arrival = max(time.time(), last_time + CLOCK_TICK), began
-                yield partial(_read, number, images, last_time, calibration)
+                yield partial(_read, number, images, last_time, calibration, sensor)
             if over:
                 return
             yield None
             time.sleep(min(max(self.poll_interval, MIN_REST * (time.monotonic() - began)), 0.1))
 
-    def _calibration(self) -> Generator[None, None, Calibration]:
-        """Wait for a complete camera.json and return the calibration."""
+    def _calibration(self) -> Generator[None, None, tuple[Calibration, SensorKind]]:
+        """Wait for a complete camera.json and return the calibration and the kind of the depth sensor."""
         path, deadline = self.folder / "camera.json", time.monotonic() + self.camera_timeout
         while True:
             try:
@@ -90,17 +92,19 @@ class FolderWatch(LiveVideo):
                     ) from error
             yield None
             time.sleep(self.poll_interval)
-        camera, depth_scale, distortion = read_camera(path)
-        return Calibration(camera, path, depth_scale, self.max_depth, distortion)
+        camera, depth_scale, distortion, stored = read_camera(path)
+        return Calibration(camera, path, depth_scale, self.max_depth, distortion), self.sensor.kind(stored)
 
 
-def _read(number: int, images: StoredImages | str, timestamp: float, calibration: Calibration) -> Frame:
+def _read(
+    number: int, images: StoredImages | str, timestamp: float, calibration: Calibration, sensor: SensorKind
+) -> Frame:
     """Read a frame. Raises FrameError if it is unusable."""
     if isinstance(images, str):
         raise FrameError(images)
     color = calibration.color(images.color(), images.color_name)
     depth = calibration.depth(images.depth(), images.depth_name)
-    return Frame(number, timestamp, color, depth, calibration.camera)
+    return Frame(number, timestamp, color, depth, calibration.camera, sensor=sensor)
 
 
 class Arrivals:

@@ -11,6 +11,7 @@ from framework.data import Camera, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration
 from framework.datasets.cameras.device_frames import WAIT_MS, DepthCamera
 from framework.errors import import_optional
+from framework.sensors.noise_models import SensorKind
 
 MILLIMETERS = 1000.0  # per meter; the library's depth scale is in millimeters
 
@@ -20,6 +21,7 @@ class Orbbec(DepthCamera):
     """An Orbbec camera."""
 
     brand = "Orbbec"
+    usual_sensor = SensorKind.KINECT_V1
 
     def start(self) -> None:
         ob = import_optional("pyorbbecsdk", "reads Orbbec cameras", "orbbec")
@@ -29,6 +31,7 @@ class Orbbec(DepthCamera):
         if devices.get_count() == 0:
             raise RuntimeError("no device is connected")
         device = devices.get_device_by_serial_number(self.serial) if self.serial else devices.get_device_by_index(0)
+        self._device: Any = device
         self._pipeline: Any = ob.Pipeline(device)
         color_modes = self._pipeline.get_stream_profile_list(ob.OBSensorType.COLOR_SENSOR)
         depth_modes = self._pipeline.get_stream_profile_list(ob.OBSensorType.DEPTH_SENSOR)
@@ -62,6 +65,9 @@ class Orbbec(DepthCamera):
         if color is None or depth is None:
             return None
         return float(depth.get_timestamp_us() - color.get_timestamp_us()) / 1e6
+
+    def device_name(self) -> str:
+        return str(self._device.get_device_info().get_name())
 
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         registered = self._align.process(images)

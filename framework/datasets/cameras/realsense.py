@@ -11,6 +11,7 @@ from framework.data import Camera, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration
 from framework.datasets.cameras.device_frames import WAIT_MS, DepthCamera
 from framework.errors import import_optional
+from framework.sensors.noise_models import SensorKind
 
 
 @dataclass
@@ -18,6 +19,7 @@ class RealSense(DepthCamera):
     """An Intel RealSense camera."""
 
     brand = "RealSense"
+    usual_sensor = SensorKind.REALSENSE_D435
 
     def start(self) -> None:
         self._rs = rs = import_optional("pyrealsense2", "reads RealSense cameras", "realsense")
@@ -49,6 +51,9 @@ class RealSense(DepthCamera):
         if not color or not depth or color.get_frame_timestamp_domain() != depth.get_frame_timestamp_domain():
             return None
         return float(depth.get_timestamp() - color.get_timestamp()) / 1000  # from ms
+
+    def device_name(self) -> str:
+        return str(self._profile.get_device().get_info(self._rs.camera_info.name))
 
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         registered = self._align.process(images)

@@ -41,6 +41,7 @@ from framework.errors import ConfigError, DataError, FrameError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
+from framework.sensors.noise_models import SensorChoice, SensorKind
 
 FARTHEST = 1e4  # m, maximum distance of a pose from the origin; at this distance, float32 resolves 1 mm
 FRAME_RATE = 30.0  # Hz, for recordings without valid timestamps
@@ -96,6 +97,7 @@ class Contents:
     depth_scale: float  # units per meter
     frames: Sequence[RecordedFrame]
     distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
+    sensor: SensorKind = SensorKind.KINECT_V1  # kind of the depth sensor
 
 
 @dataclass
@@ -118,6 +120,7 @@ class Recording(RGBDSequence):
     seed: int = 0  # seed of the random frame selection
     max_depth: float = 10.0  # maximum depth, m; farther readings are dropped; 0 = unlimited
     ground_truth: Path | None = None  # labeled mesh or run directory for the evaluation; None = the recording's own
+    sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = of the recording, otherwise KINECT_V1
     pose_reading: PoseReading = field(default_factory=PoseReading)
     depth_reading: DepthReading = field(default_factory=DepthReading)
     color_delay: str = AUTO  # time from depth to color with equal timestamps, s, in [-0.2, 0.2]; AUTO = estimated
@@ -140,6 +143,7 @@ class Recording(RGBDSequence):
         frames = delay_depth(ordered, self.depth_reading.depth_delay)
         self.contents = replace(stored, frames=frames, depth_scale=depth_scale)
         self.camera = stored.camera
+        self.sensor_kind = self.sensor.kind(stored.sensor)
         self.calibration = Calibration(
             self.camera, stored.camera_source, depth_scale, self.max_depth, stored.distortion
         )
@@ -206,6 +210,7 @@ class Recording(RGBDSequence):
             up=recorded.up,
             color_timestamp=recorded.color_timestamp,
             depth_timestamp=recorded.depth_timestamp,
+            sensor=self.sensor_kind,
         )
 
     def metric_depth(self, index: int) -> Float32:

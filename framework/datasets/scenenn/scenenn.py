@@ -17,7 +17,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ from framework.errors import DataError
 from framework.files.atomic_write import path_exists, read_text
 from framework.files.image_files import read_color
 from framework.files.ply import read_ply
+from framework.sensors.noise_models import SensorKind
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 DEPTH_SCALE = 1000.0  # units per meter
@@ -42,11 +43,11 @@ MADE_BY = "synthesize.json"  # only in the root folder of synthetic scenes
 log = logging.getLogger(__name__)
 
 
-class SceneNNSensor(StrEnum):
-    """Depth sensors of the recordings. Each sensor has an intrinsics file."""
+class SceneNNIntrinsics(Enum):
+    """Intrinsics files of the recordings. The value is the kind of the depth sensor."""
 
-    ASUS = "asus"
-    KINECT2 = "kinect2"
+    ASUS = SensorKind.KINECT_V1
+    KINECT2 = SensorKind.TIME_OF_FLIGHT
 
 
 @dataclass
@@ -58,7 +59,7 @@ class SceneNN(LabeledRecording):
     """
 
     scene: str = "011"  # number of the sequence
-    sensor: SceneNNSensor = SceneNNSensor.ASUS  # selects the intrinsics file
+    intrinsics: SceneNNIntrinsics = SceneNNIntrinsics.ASUS  # intrinsics file
     release: str = ""  # annotation release for tables (two exist, with different results); "" = from release.txt
 
     def open(self) -> Contents:
@@ -73,9 +74,9 @@ class SceneNN(LabeledRecording):
         self.load_mesh([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
         self.annotation = self.release or _named_release(self.root) if self.mesh else ""
         frames = [_recorded(pair, k - 1, poses, times.get(k)) for k, pair in images.items()]
-        fx, fy, cx, cy = read_intrinsics(self.root / "intrinsic" / f"{self.sensor}.ini")
+        fx, fy, cx, cy = read_intrinsics(self.root / "intrinsic" / f"{self.intrinsics.name.lower()}.ini")
         camera = Camera(*first_size(colors.values(), read_color), fx, fy, cx, cy)
-        return Contents(camera, "the first color image", DEPTH_SCALE, frames)
+        return Contents(camera, "the first color image", DEPTH_SCALE, frames, sensor=self.intrinsics.value)
 
 
 def _recorded(

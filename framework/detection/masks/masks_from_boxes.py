@@ -22,13 +22,15 @@ import numpy as np
 
 from framework.data import Bool, Camera, Float32
 from framework.detection.masks.masks_from_boxes_kernels import fill_masks
+from framework.sensors.noise_models import SensorKind
 
 LARGEST_CLOSED_HOLE = 0.01  # fraction of the box; larger holes with readings show the background
 
 
 def masks_in_boxes(
-    borders: Float32, depth: Float32, camera: Camera, significance: float, max_slant: float, min_readings: float
-) -> tuple[Bool, Bool]:
+    borders: Float32, depth: Float32, camera: Camera, significance: float, max_slant: float, min_readings: float,
+    sensor: SensorKind = SensorKind.KINECT_V1,
+) -> tuple[Bool, Bool]:  # fmt: skip
     """Return the masks (N, H, W) of the objects in boxes, and a mask (N,) of the boxes with enough depth readings.
 
     The masks of other boxes are empty.
@@ -40,13 +42,14 @@ def masks_in_boxes(
         significance: Minimum fraction of the weighted readings in the foreground.
         max_slant: Maximum angle between the image plane and a surface, degrees.
         min_readings: Minimum fraction of the box's pixels with a reading.
+        sensor: The kind of the depth sensor.
     """
     height, width = depth.shape
     masks = np.zeros((len(borders), height, width), np.bool_)
     step = math.tan(math.radians(max_slant)) / min(camera.fx, camera.fy)
     borders = np.ascontiguousarray(borders, np.float64)
     windows = np.clip(np.ceil(borders), 0, [width, height, width, height]).astype(np.int64)
-    found = fill_masks(borders, windows, depth, significance, step, min_readings, masks)
+    found = fill_masks(borders, windows, depth, significance, step, sensor.noise, min_readings, masks)
     for i in np.flatnonzero(found):
         u1, v1, u2, v2 = windows[i]
         _close_holes(masks[i, v1:v2, u1:u2], depth[v1:v2, u1:u2] > 0)

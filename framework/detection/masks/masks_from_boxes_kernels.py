@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from framework.sensors.noise_models import axial_sigma
+from framework.sensors.noise_models_kernels import axial_sigma
 
 BIN = 0.02  # of log depth: 2% of the depth
 NEAREST, FARTHEST = 0.05, 100.0  # m, range of the histogram
 VALLEY = 0.15  # fraction of a mode's peak below which a bin ends the mode
-NOISE = 3.0  # standard deviations of the depth noise
+SIGMAS = 3.0  # standard deviations of the depth noise
 
 
 @njit(cache=True, nogil=True)
-def fill_masks(borders, windows, depth, significance, step, min_readings, masks):
+def fill_masks(borders, windows, depth, significance, step, noise, min_readings, masks):
     """Write the mask of the object in each box, with holes; `windows` (N, 4) are the boxes in whole pixels."""
     found = np.zeros(len(masks), np.bool_)
     for i in range(len(masks)):
@@ -28,7 +28,7 @@ def fill_masks(borders, windows, depth, significance, step, min_readings, masks)
         near, far = _foreground(window, weight_x, weight_y, significance)
         if far <= near:
             continue
-        _grow(window, weight_x, weight_y, near, far, step, masks[i, v0:v1, u0:u1])
+        _grow(window, weight_x, weight_y, near, far, step, noise, masks[i, v0:v1, u0:u1])
         found[i] = True
     return found
 
@@ -82,7 +82,7 @@ def _foreground(window, weight_x, weight_y, significance):
 
 
 @njit(cache=True, nogil=True)
-def _grow(window, weight_x, weight_y, near, far, step, mask):
+def _grow(window, weight_x, weight_y, near, far, step, noise, mask):
     """Write the connected component with most weight, of the pixels between near and far, to `mask`."""
     height, width = window.shape
     label = np.zeros((height, width), np.int32)
@@ -106,7 +106,7 @@ def _grow(window, weight_x, weight_y, near, far, step, mask):
                     if y < 0 or x < 0 or y >= height or x >= width or label[y, x]:
                         continue
                     other = window[y, x]
-                    if near <= other <= far and abs(other - z) <= _largest_step(min(other, z), step):
+                    if near <= other <= far and abs(other - z) <= _largest_step(min(other, z), step, noise):
                         label[y, x] = labels
                         stack[n] = y, x
                         n += 1
@@ -118,6 +118,6 @@ def _grow(window, weight_x, weight_y, near, far, step, mask):
 
 
 @njit(cache=True, nogil=True)
-def _largest_step(z, step):
+def _largest_step(z, step, noise):
     """Return the largest difference in depth, m, between neighboring pixels of one surface at depth z m."""
-    return step * z + NOISE * axial_sigma(z)
+    return step * z + SIGMAS * axial_sigma(z, noise)

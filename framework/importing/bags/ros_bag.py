@@ -9,6 +9,8 @@
                                             the rotation as in the recorder's player. .../option/Depth Units is m per
                                             unit. Depth is registered to color on import
 
+The kind of the depth sensor is known from the topics of RealSense, Azure Kinect and Orbbec's drivers.
+
 Color and depth images are associated by time, as in TUM RGB-D. Poses are interpolated at the time of the color image.
 """
 
@@ -36,6 +38,7 @@ from framework.importing.bags.ros_topics import Topics, camera_info_of, found_to
 from framework.importing.bags.ros_transforms import REALSENSE, stream_motion
 from framework.importing.depth_resampling import DepthRegistration
 from framework.importing.source import DeviceFrame, Format, Source, StoredFrame
+from framework.sensors.noise_models import kind_of_device
 
 MAX_PAIR_INTERVAL = 0.02  # s, maximum time between a color image and its depth image
 MAX_POSE_INTERVAL = 0.1  # s, maximum time between a color image and the nearest pose
@@ -66,7 +69,8 @@ def open_source(path: Path, given: Topics) -> Source:
     accelerometer = find_accelerometer(bag, topics.color, [pair.timestamp for pair in pairs])
     device = Device(bag, topics, camera, registration, unit, accelerometer, *_trajectory(bag, topics.poses))
     name = f"a ROS bag (color {topics.color}, depth {topics.depth}, poses {topics.poses or 'none'})"
-    return Source(name, _frames(device, pairs), len(pairs), bool(topics.poses), _distortion(topics, info))
+    sensor = kind_of_device(f"{topics.depth} {topics.color}")
+    return Source(name, _frames(device, pairs), len(pairs), bool(topics.poses), _distortion(topics, info), sensor)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from framework.datasets.calibration.camera_json import numbers_of, pinhole, read
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
 from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, meters
+from framework.sensors.noise_models import SensorKind
 
 MICROSECONDS = 1e6  # per second
 LEVELS = (1, 255)  # minimum values of medium and high confidence
@@ -51,7 +52,7 @@ def open_source(path: Path) -> Source:
         expected = "expected cameras and depth/, got none"
         raise DataError(f"{path}: {expected}; record with a LiDAR, and export with Polycam's developer mode on")
     frames = [partial(_read, folder, stem) for stem in stems]
-    return Source("Polycam", frames, len(frames), posed=True)
+    return Source("Polycam", frames, len(frames), posed=True, sensor=SensorKind.PHONE_LIDAR)
 
 
 def _read(folder: Path, stem: str) -> DeviceFrame:

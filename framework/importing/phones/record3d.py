@@ -36,6 +36,7 @@ from framework.files.json_file import parse_json
 from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import QUATERNION_TOLERANCE
 from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, readings
+from framework.sensors.noise_models import SensorKind
 
 CHANNEL = "R"  # of the EXR files
 LZFSE_BLOCK = b"bvx"  # first bytes of each block of compressed data
@@ -172,7 +173,9 @@ def _source(where: Path | str, content: Mapping[str, Any], files: ExrFolder | R3
             up=arkit_up(T_world_camera) if knows_up else None,
         )
 
-    return Source("Record3D", [partial(read, k) for k in range(len(poses))], len(poses), posed=True)
+    return Source(
+        "Record3D", [partial(read, k) for k in range(len(poses))], len(poses), posed=True, sensor=SensorKind.PHONE_LIDAR
+    )
 
 
 def _pose(where: str, values: Any) -> Float64:

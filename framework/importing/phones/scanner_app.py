@@ -20,6 +20,7 @@ from framework.datasets.frames.sequence_reader import FRAME_RATE
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
 from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, meters
+from framework.sensors.noise_models import SensorKind
 
 _FRAME = re.compile(r"frame_([0-9]{5,9})\.json")
 
@@ -39,7 +40,7 @@ def open_source(path: Path) -> Source:
             'resolution scan, which includes depth, and export "All Data"'
         )
     frames = [partial(_read, path, number) for number in complete]
-    return Source("3D Scanner App", frames, len(frames), posed=True)
+    return Source("3D Scanner App", frames, len(frames), posed=True, sensor=SensorKind.PHONE_LIDAR)
 
 
 def _read(folder: Path, number: str) -> DeviceFrame:

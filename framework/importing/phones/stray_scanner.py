@@ -28,6 +28,7 @@ from framework.files.image_files import read_uint8, read_uint16
 from framework.files.number_lines import SHOWN, numbers, read_lines
 from framework.files.tum_trajectory import TumLine
 from framework.importing.source import DeviceFrame, Format, Source, arkit_up, meters
+from framework.sensors.noise_models import SensorKind
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # first columns of odometry.csv
 INTRINSICS = ("fx", "fy", "cx", "cy")  # next columns, in newer versions
@@ -57,7 +58,7 @@ def open_source(path: Path) -> Source:
     rows = _read_odometry(path / "odometry.csv", _read_camera(path / "camera_matrix.csv", video))
     confident = (path / "confidence").is_dir()
     frames = [partial(_read, path, row, video, confident) for row in rows]
-    return Source("Stray Scanner", frames, len(frames), posed=True)
+    return Source("Stray Scanner", frames, len(frames), posed=True, sensor=SensorKind.PHONE_LIDAR)
 
 
 def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: bool) -> DeviceFrame:

@@ -1,7 +1,8 @@
 """Integration of depth images into the running averages of the visible voxels.
 
 The signed distance is projective, along z. Its running average is the TSDF of Curless and Levoy (1996). The truncation
-distance increases with depth like the sensor noise, and the weight of an observation falls with depth squared.
+distance increases with depth like the sensor noise. The weight of an observation falls with depth squared, beyond the
+depth up to which the noise of the sensor is nearly constant.
 """
 
 from __future__ import annotations
@@ -72,6 +73,11 @@ class Integrator:
         self._allocator.allocate(frame.camera, depth, T_world_camera)
         return self._update(frame, T_world_camera, near_band, np.arange(self.voxels.block_count, dtype=np.int32))
 
+    def _sensor_of(self, frame: Frame) -> Sensor:
+        """Return the parameters with the depth up to which the noise of the frame's sensor is nearly constant."""
+        full_weight_depth = max(self.sensor.full_weight_depth, np.float32(frame.sensor.noise.full_weight_depth))
+        return self.sensor._replace(full_weight_depth=full_weight_depth)
+
     def _update(self, frame: Frame, T_world_camera: Float64, near_band: float, active: Int32) -> SeenBlocks:
         self.frames += 1
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
@@ -83,5 +89,5 @@ class Integrator:
         seen = SeenBlocks(active, starts, counts, self._near_voxel[:n], self._near_pixel[:n])
         color = cv2.cvtColor(frame.color, cv2.COLOR_RGB2RGBA).view(np.uint32)
         grid, band = self.voxels.grid, np.float32(near_band)
-        integrate(grid, seen, frame.depth, color, view, self.sensor, rounding, band)
+        integrate(grid, seen, frame.depth, color, view, self._sensor_of(frame), rounding, band)
         return seen

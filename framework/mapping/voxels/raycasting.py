@@ -33,6 +33,7 @@ from framework.mapping.voxels.raycasting_kernels import (
     paint,
 )
 from framework.mapping.voxels.voxel_grid import VoxelGrid
+from framework.sensors.noise_models import SensorKind
 
 MAX_STRIDE = 8  # px between coarse rays
 
@@ -50,11 +51,13 @@ def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camer
 
 
 def cast_view(
-    voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None
-) -> tuple[Float32, Float32]:
+    voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None,
+    kind: SensorKind = SensorKind.KINECT_V1,
+) -> tuple[Float32, Float32]:  # fmt: skip
     """Return the depth (H, W) m and the world-frame normals (H, W, 3) of the visible surface; depth 0 = no surface.
 
-    With depth `readings` (H, W) m, only the surface near the readings or in front of them is searched.
+    With depth `readings` (H, W) m of a sensor `kind`, only the surface near the readings or in front of them is
+    searched.
     """
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
@@ -67,7 +70,7 @@ def cast_view(
     else:
         shift = np.float32(MAX_SHIFT) * voxels.grid.voxel_size
         limits = np.where((readings > 0) & (readings < sensor.max_depth), readings + shift, np.float32(0.0))
-        cast_near(voxels.grid, view, tile_near, tile_far, limits, stride, readings, coarse)
+        cast_near(voxels.grid, view, tile_near, tile_far, limits, stride, readings, kind.noise, coarse)
     depth = np.empty(camera.shape, np.float32)
     normals = np.empty((*camera.shape, 3), np.float32)
     cast_fine(voxels.grid, view, tile_near, tile_far, limits, stride, coarse, depth, normals)
@@ -90,16 +93,17 @@ def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera
 
 
 def render_surface(
-    voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None
-) -> SurfaceView:
-    """Return the view without labels; see `cast_view` for `readings` (H, W) m.
+    voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32 | None = None,
+    kind: SensorKind = SensorKind.KINECT_V1,
+) -> SurfaceView:  # fmt: skip
+    """Return the view without labels; see `cast_view` for `readings` (H, W) m and `kind`.
 
     Raises DataError if the camera, its pose or the readings are invalid.
     """
     check_view(camera, T_world_camera)
     if readings is not None:
         check_array("depth", readings, camera.shape, np.float32)
-    depth, normals = cast_view(voxels, sensor, camera, T_world_camera, readings)
+    depth, normals = cast_view(voxels, sensor, camera, T_world_camera, readings, kind)
     color = np.empty((*camera.shape, 3), np.uint8)
     paint(voxels.grid, pinhole(camera, T_world_camera), depth, color)
     return SurfaceView(camera, T_world_camera, depth, normals, color)

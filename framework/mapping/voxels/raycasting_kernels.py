@@ -20,7 +20,7 @@ from framework.mapping.voxels.voxel_walk import (
     trilinear,
     voxel_number,
 )
-from framework.sensors.noise_models import axial_sigma_single
+from framework.sensors.noise_models_kernels import axial_sigma_single
 
 TILE = 8  # px; the rays of a tile share blocks in the cache
 REFINEMENTS = 4  # maximum Newton steps of a ray; a plane needs one, a curved surface two or three
@@ -251,7 +251,7 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
+def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, depth):
     """Fill depth like cast_coarse(), starting at the camera's depth readings (H, W) m.
 
     No pixel is searched beyond its limit (H, W) m. At limit 0 the depth is -1, because neighbors may be searched.
@@ -276,7 +276,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
             if limits[v, u] > zero:
                 d, step = _ray(view, scale, u, v)
                 start = reading + shift
-                reach = np.float32(REACH) * voxel + np.float32(3.0) * axial_sigma_single(reading)
+                reach = np.float32(REACH) * voxel + np.float32(3.0) * axial_sigma_single(reading, noise)
                 if last_but_one > zero and last > zero:
                     extrapolated = one / max(last + last - last_but_one, np.float32(1e-3))
                     if abs(extrapolated - start) < reach:

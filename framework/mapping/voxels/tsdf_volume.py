@@ -20,6 +20,7 @@ from framework.mapping.voxels.meshing import SurfaceNets, UnlabeledMesh
 from framework.mapping.voxels.raycasting import render_surface
 from framework.mapping.voxels.voxel_grid import MAX_BLOCKS, VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, find_solid_blocks
+from framework.sensors.noise_models import SensorKind
 
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # saved arrays of the grid
 NO_BLOCKS = np.zeros(0, np.int32)
@@ -89,8 +90,10 @@ class TsdfVolume:
     def render(self, camera: Camera, T_world_camera: Float64) -> SurfaceView:
         return render_surface(self.voxels, self.sensor, camera, T_world_camera)
 
-    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        return render_surface(self.voxels, self.sensor, camera, T_world_camera, depth)
+    def render_near(
+        self, camera: Camera, T_world_camera: Float64, depth: Float32, sensor: SensorKind = SensorKind.KINECT_V1
+    ) -> SurfaceView:
+        return render_surface(self.voxels, self.sensor, camera, T_world_camera, depth, sensor)
 
     def saved(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Return the entries for the header of a map file, and the arrays."""

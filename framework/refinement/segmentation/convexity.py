@@ -23,6 +23,7 @@ import numpy as np
 
 from framework.data import Bool, Camera, Float32, Int32
 from framework.refinement.segmentation.convexity_kernels import (
+    Noise,
     absorbed,
     best_planes,
     connected,
@@ -31,6 +32,7 @@ from framework.refinement.segmentation.convexity_kernels import (
     pixel_labels,
     sum_cells,
 )
+from framework.sensors.noise_models import SensorKind
 
 
 @dataclass(frozen=True)
@@ -44,21 +46,23 @@ class Limits:
 
 
 def segments(
-    depth: Float32, camera: Camera, *, cell: int, window: int, limits: Limits, closing: int, min_pixels: int
-) -> tuple[Int32, int]:
+    depth: Float32, camera: Camera, *, cell: int, window: int, limits: Limits, closing: int, min_pixels: int,
+    sensor: SensorKind = SensorKind.KINECT_V1,
+) -> tuple[Int32, int]:  # fmt: skip
     """Return the segment (H, W) of each pixel in [0, count), -1 = none, and the count.
 
     Planes are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px. Gaps of up to 2 `closing` cells in
-    edges are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors.
+    edges are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors. Noise is that of
+    the kind of depth sensor, `sensor`.
     """
     slope = np.float32(limits.max_slope * cell * 2 / (camera.fx + camera.fy))  # relative change of depth per cell
     pinhole = np.array(
         [camera.fx / cell, camera.fy / cell, (camera.cx + 0.5) / cell - 0.5, (camera.cy + 0.5) / cell - 0.5], np.float32
     )
-    noise = (limits.noise_factor, limits.min_noise)
+    noise = Noise(limits.noise_factor, limits.min_noise, *sensor.noise[:3])
     inverse = sum_cells(depth, cell, noise, slope)
     fits = fit_planes(inverse, window, noise, slope)
-    planes = best_planes(inverse, fits, window, limits.min_noise)
+    planes = best_planes(inverse, fits, window, noise)
     edges = count_edges(planes, pinhole, noise, limits.max_angle, normal_sigma(1.0, window, cell, camera))
     min_cells = max(min_pixels // cell**2, 1)
     labels, count = connected(inverse, _closed(edges, closing), noise, slope, min_cells)

@@ -2,34 +2,45 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32
 from framework.refinement.mixtures.gaussian import SIMD
 from framework.refinement.segmentation.union_find import root, unite
-from framework.sensors.noise_models import axial_sigma, axial_sigma_single
+from framework.sensors.noise_models_kernels import axial_sigma, axial_sigma_single
 
 MIN_CELLS = 6  # minimum number of cells of a plane fit; any three cells fit a plane exactly
 MIN_SPREAD = 0.1  # minimum determinant of a window's second moments over its square, cells^4; 0 for a line
 SWITCH = 1.5  # minimum factor by which an adjacent window must fit better than the cell's own window
 STRIP = 16  # number of rows of cells connected in parallel
 
-Noise = tuple[float, float]  # (noise_factor, min_noise) of the limits
+
+class Noise(NamedTuple):
+    """Noise limits, flat because parallel kernels do not accept nested tuples."""
+
+    factor: float  # depth difference that counts as noise, standard deviations
+    min_noise: float  # minimum standard deviation of depth, m
+    least: float  # coefficients of the sensor's DepthNoise
+    near: float
+    growth: float
+
 
 _axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the caller's fast-math flags
 
 
 @njit(cache=True, nogil=True)
-def _sigma(z: float, min_noise: float) -> float:
+def _sigma(z: float, noise: Noise) -> float:
     """Return the standard deviation (m) of depth z (m)."""
-    return float(max(axial_sigma(z), min_noise))
+    return float(max(axial_sigma(z, noise), noise.min_noise))
 
 
 @njit(cache=True, nogil=True)
 def _noise_at(inverse: float, noise: Noise) -> np.float32:
     """Return the noise of inverse depth, 1 / m."""
-    return np.float32(noise[0] * _sigma(1.0 / inverse, noise[1]) * inverse * inverse)
+    return np.float32(noise.factor * _sigma(1.0 / inverse, noise) * inverse * inverse)
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -48,7 +59,7 @@ def sum_cells(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Flo
                         nearest = depth[v, u]
             if nearest == np.inf:
                 continue
-            farthest = nearest * (1 + slope) + 2 * noise[0] * _sigma(nearest, noise[1])
+            farthest = nearest * (1 + slope) + 2 * noise.factor * _sigma(nearest, noise)
             total, count = np.float32(0), 0
             for v in range(r * cell, min((r + 1) * cell, height)):
                 for u in range(c * cell, min((c + 1) * cell, width)):
@@ -134,7 +145,7 @@ def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def best_planes(inverse: Float32, fits: Float32, window: int, min_noise: float) -> Float32:
+def best_planes(inverse: Float32, fits: Float32, window: int, noise: Noise) -> Float32:
     """Return the plane a, b, c (3, rows, columns) of the best-fitting window around or adjacent to each cell.
 
     Within noise, the window around the cell is preferred. c = 0 if no window fits.
@@ -147,7 +158,7 @@ def best_planes(inverse: Float32, fits: Float32, window: int, min_noise: float) 
         for c in range(columns):
             d = inverse[r, c]
             if d > 0:
-                variance[c] = (_sigma(1.0 / d, min_noise) * d * d) ** 2
+                variance[c] = (_sigma(1.0 / d, noise) * d * d) ** 2
             score[c] = variance[c] + fits[3, r, c] + (d - fits[2, r, c]) ** 2
         for dy in (0, -window, window):
             if not 0 <= r + dy < rows:
@@ -222,7 +233,7 @@ def _set_surface(
     fx, fy, cx, _ = pinhole
     a, b, d = plane
     nx, ny, nz, distance, px, py, pz, gate, min_cosine = surface
-    k, floor = np.float32(noise[0]), np.float32(noise[1])
+    k, floor = np.float32(noise.factor), np.float32(noise.min_noise)
     angle, angle_sigma = np.float32(max_angle), np.float32(normal_sigma_1m)
     for c in range(len(d)):
         valid = d[c] > zero
@@ -232,7 +243,7 @@ def _set_surface(
         length = one / np.sqrt(mx * mx + my * my + mz * mz)
         nx[c], ny[c], nz[c], distance[c] = mx * length, my * length, mz * length, length
         px[c], py[c], pz[c] = x / fx * z, y / fy * z, z if valid else zero
-        sigma = _axial_sigma(z)
+        sigma = _axial_sigma(z, noise)
         gate[c] = k * (sigma if sigma > floor else floor)
         # cos t = 1 - t^2 / 2 + t^4 / 24, within 0.01 rad up to a right angle; a larger angle is no crease
         t = angle + gate[c] * angle_sigma / z

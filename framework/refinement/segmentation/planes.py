@@ -60,20 +60,24 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
     """Return the planes with a visible area of at least `min_area` m^2, a quarter of it connected.
 
     A cell of 16x16 px belongs to a plane if the rms of its readings is at most `distance` (m, along the normal) plus
-    `noise` (1/m, of inverse depth: `noise` * z^2 m at depth z). A plane begins at the flattest free cell and grows over
-    neighboring cells. Then it takes all cells of the frame that lie in the plane, including cells across an occluder.
+    `noise` (1/m, of inverse depth: `noise` * z^2 m at depth z; for KINECT_V1, more for sensors with more noise). A
+    plane begins at the flattest free cell and grows over neighboring cells. Then it takes all cells of the frame that
+    lie in the plane, including cells across an occluder.
     """
     height, width = frame.camera.shape
+    sensor = frame.sensor.noise
     moments = np.zeros(((height + CELL - 1) // CELL, (width + CELL - 1) // CELL, 10))
     sum_moments(frame.depth, pinhole(frame.camera), moments)
     cells = moments.reshape(-1, 10)
     flatness = np.full(len(cells), np.inf)
-    write_flatness(cells, distance, noise, flatness)
+    write_flatness(cells, distance, noise, sensor, flatness)
     free = flatness < np.inf
     seeds = np.argsort(flatness, kind="stable")[: free.sum()]
     pixel_size = 1.0 / math.sqrt(frame.camera.fx * frame.camera.fy)
     found = np.empty((MAX_PLANES, 7))
-    count = find_plane_cells(cells, moments.shape[1], seeds, free, distance, noise, min_area, STEP * pixel_size, found)
+    count = find_plane_cells(
+        cells, moments.shape[1], seeds, free, distance, noise, sensor, min_area, STEP * pixel_size, found
+    )
     return Planes(found[:count, :3].copy(), *found[:count, 3:].T.copy())
 
 

@@ -9,6 +9,8 @@ from numba import njit, prange
 
 from framework.data import Bool, Float32, Float64, Int32, Int64, UInt8
 from framework.refinement.refine_kernels import PART
+from framework.sensors.noise_models import DepthNoise
+from framework.sensors.noise_models_kernels import noise_ratio
 
 CELL = 16  # side of a cell, px: 9 cm at 3 m and 540 px focal length, smaller than a relevant plane
 STEP = 2  # stride of the readings used in a cell, px
@@ -85,9 +87,19 @@ def _length(m: Float64) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _lies_in(moment: Float64, m: Float64, distance: float, noise: float) -> bool:
+def _allowed(moment: Float64, noise: float, sensor: DepthNoise) -> float:
+    """Return the maximum rms of inverse depth at the mean depth of a cell, 1/m, for this sensor.
+
+    Less noise than that of KINECT_V1 does not lower it, because real floors and walls are not flat.
+    """
+    return float(noise * max(noise_ratio(moment[0] / moment[6], sensor), 1.0))
+
+
+@njit(cache=True, nogil=True)
+def _lies_in(moment: Float64, m: Float64, distance: float, noise: float, sensor: DepthNoise) -> bool:
     """Return True if a cell is on the plane. A point at inverse depth q is |q - m . r| / (|m| q) m off the plane."""
-    return bool(_deviation(moment, m) <= noise + distance * _length(m) * moment[6] / moment[0])
+    allowed = _allowed(moment, noise, sensor)
+    return bool(_deviation(moment, m) <= allowed + distance * _length(m) * moment[6] / moment[0])
 
 
 @njit(cache=True, nogil=True)
@@ -99,18 +111,18 @@ def _area(moment: Float64, m: Float64, spacing: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def write_flatness(cells: Float64, distance: float, noise: float, flatness: Float64) -> None:
+def write_flatness(cells: Float64, distance: float, noise: float, sensor: DepthNoise, flatness: Float64) -> None:
     """Set the deviation of each cell (C, 10) that is full and flat enough to seed a plane."""
     m = np.zeros(3)
     for i in range(len(cells)):
-        if 2 * cells[i, 0] >= FULL and _solve(cells[i], m) and _lies_in(cells[i], m, distance, noise):
+        if 2 * cells[i, 0] >= FULL and _solve(cells[i], m) and _lies_in(cells[i], m, distance, noise, sensor):
             flatness[i] = _deviation(cells[i], m)
 
 
 @njit(cache=True, nogil=True)
 def find_plane_cells(
-    cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, min_area: float,
-    spacing: float, found: Float64,
+    cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, sensor: DepthNoise,
+    min_area: float, spacing: float, found: Float64,
 ) -> int:  # fmt: skip
     """Set m, deviation, area, fraction and behind of each plane, clear `free` at its cells; return the plane count."""
     m, total = np.zeros(3), np.zeros(10)
@@ -123,7 +135,7 @@ def find_plane_cells(
     for seed in seeds:
         if not free[seed] or tried[seed] or k == MAX_PLANES:
             continue
-        size = _grow(cells, columns, seed, free, distance, noise, m, region)
+        size = _grow(cells, columns, seed, free, distance, noise, sensor, m, region)
         area = 0.0
         for j in range(size):
             i = region[j]
@@ -133,9 +145,9 @@ def find_plane_cells(
             continue
         total[:] = 0.0
         for _ in range(REFITS):
-            _collect(cells, free, m, distance, noise, deviations)
+            _collect(cells, free, m, distance, noise, sensor, deviations)
             _refit(cells, deviations, m, total)
-        _collect(cells, free, m, distance, noise, deviations)
+        _collect(cells, free, m, distance, noise, sensor, deviations)
         area, count = 0.0, 0.0
         for i in range(len(cells)):
             if deviations[i] < np.inf:
@@ -145,7 +157,8 @@ def find_plane_cells(
             continue
         for i in range(len(cells)):
             free[i] = free[i] and deviations[i] == np.inf
-        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = m[0], m[1], m[2], min(_deviation(total, m), noise)
+        found[k, 0], found[k, 1], found[k, 2] = m[0], m[1], m[2]
+        found[k, 3] = min(_deviation(total, m), _allowed(total, noise, sensor))
         found[k, 4], found[k, 5] = area, count / readings
         found[k, 6] = _readings_behind(cells, m, found[k, 3], distance) / count
         k += 1
@@ -154,8 +167,9 @@ def find_plane_cells(
 
 @njit(cache=True, nogil=True)
 def _grow(
-    cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, m: Float64, region: Int64
-) -> int:
+    cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, sensor: DepthNoise, m: Float64,
+    region: Int64,
+) -> int:  # fmt: skip
     """Set `region` to the connected cells of the seed in one plane and m to this plane; return the number of cells.
 
     The plane is fitted again with every new cell.
@@ -176,7 +190,7 @@ def _grow(
         ):
             if exists and free[j] and not seen[j]:
                 seen[j] = True
-                if _lies_in(cells[j], m, distance, noise):
+                if _lies_in(cells[j], m, distance, noise, sensor):
                     region[size] = j
                     size += 1
                     for a in range(10):
@@ -186,14 +200,16 @@ def _grow(
 
 
 @njit(cache=True, nogil=True)
-def _collect(cells: Float64, free: Bool, m: Float64, distance: float, noise: float, deviations: Float64) -> None:
+def _collect(
+    cells: Float64, free: Bool, m: Float64, distance: float, noise: float, sensor: DepthNoise, deviations: Float64
+) -> None:
     """Set the deviation of each free cell that lies in the plane, and infinity for all other cells."""
     slope = distance * _length(m)
     for i in range(len(cells)):
         deviations[i] = np.inf
         if free[i]:
             deviation = _deviation(cells[i], m)
-            if deviation <= noise + slope * cells[i, 6] / cells[i, 0]:
+            if deviation <= _allowed(cells[i], noise, sensor) + slope * cells[i, 6] / cells[i, 0]:
                 deviations[i] = deviation
 
 

@@ -287,3 +287,9 @@ def test_run_with_inverted_poses_logs_warning(tmp_path: Path, caplog: pytest.Log
     warn_of_poses(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=inverse)))
     assert "poses: stored as T_camera_world" in caplog.text
     assert "run `instancemap check`" in caplog.text
+
+
+def test_check_reports_depth_sensor() -> None:
+    [finding] = [finding for finding in check(DESK, FARTHEST).findings if finding.subject == "sensor"]
+    assert (finding.verdict, finding.setting) == (Verdict.FINE, "")
+    assert finding.text == "KINECT_V1, standard deviation of depth 1.9 mm at 1 m, 14.0 mm at 3 m"

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from framework.data import Camera
 from framework.datasets.replica_nice_slam import ReplicaNiceSlam
 from framework.errors import DataError
+from framework.sensors.noise_models import SensorKind
 from tests.support.recordings.recordings import fault_of, mapped, opened, write_color, write_depth
 
 CAMERA = {"w": 24, "h": 16, "fx": 12.0, "fy": 12.0, "cx": 11.5, "cy": 7.5, "scale": 6553.5}
@@ -45,6 +46,10 @@ def root(tmp_path: Path) -> Path:
     write_camera(root)
     write_poses(root / "room0", [pose_at(k) for k in range(FRAMES)])
     return root
+
+
+def test_replica_frame_of_rendered_recording_is_exact(root: Path) -> None:
+    assert ReplicaNiceSlam(root, "room0")[0].sensor is SensorKind.EXACT
 
 
 def test_replica_frame_matches_files(root: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 from framework.datasets.frames.conventions import DepthReading
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError, FrameError
+from framework.sensors.noise_models import SensorChoice, SensorKind
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
 WIDTH, HEIGHT, FRAMES = 24, 16, 4
@@ -565,3 +566,22 @@ def test_recording_color_delay_is_given_or_estimated(folder):
     for wrong in ("0.3", "soon", "nan"):
         with pytest.raises(ConfigError, match=r"dataset\.color_delay: expected AUTO or a value in \[-0\.2, 0\.2\] s"):
             RgbdFolder(folder, color_delay=wrong)
+
+
+def test_rgbd_folder_sensor_is_read_from_camera_json(folder):
+    assert {frame.sensor for frame in RgbdFolder(folder)} == {SensorKind.KINECT_V1}
+    change_camera(folder, sensor="PHONE_LIDAR")
+    assert {frame.sensor for frame in RgbdFolder(folder)} == {SensorKind.PHONE_LIDAR}
+
+
+def test_rgbd_folder_sensor_parameter_overrides_camera_json(folder):
+    change_camera(folder, sensor="PHONE_LIDAR")
+    assert RgbdFolder(folder, sensor=SensorChoice.TIME_OF_FLIGHT)[0].sensor is SensorKind.TIME_OF_FLIGHT
+
+
+@pytest.mark.parametrize("name", ["D435", "kinect_v1", "AUTO", 7, None])
+def test_rgbd_folder_unknown_sensor_in_camera_json_raises(folder, name):
+    change_camera(folder, sensor=name)
+    names = "EXACT, KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT, PHONE_LIDAR"
+    with pytest.raises(DataError, match=rf"camera\.json, sensor: expected one of {names}, got {name}; set the kind"):
+        RgbdFolder(folder)

@@ -16,6 +16,7 @@ from framework.data import Camera
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.tum_rgbd import PUBLISHED, Intrinsics, TumRgbd, associate
 from framework.errors import ConfigError, DataError
+from framework.sensors.noise_models import SensorKind
 from tests.support.recordings.recordings import fault_of, mapped, opened, write_color, write_depth
 
 START = 1305031102.175304  # s
@@ -111,9 +112,11 @@ OWN = {"width": 640, "height": 480, "fx": 600.0, "fy": 601.0, "cx": 310.0, "cy":
 
 
 def test_tum_rgbd_custom_recording_uses_camera_json(folder: Path) -> None:
+    assert TumRgbd(folder)[0].sensor is SensorKind.KINECT_V1
     mine = folder.rename(folder.parent / "my_desk")
-    (mine / "camera.json").write_text(json.dumps(OWN))
+    (mine / "camera.json").write_text(json.dumps(OWN | {"sensor": "REALSENSE_D435"}))
     sequence = TumRgbd(mine)
+    assert sequence[0].sensor is SensorKind.REALSENSE_D435
     assert sequence.camera == Camera(640, 480, 600.0, 601.0, 310.0, 250.0)
     assert sequence.calibration.lens is None
     assert (sequence[0].depth == 10).all()  # 10,000 units of 1 mm

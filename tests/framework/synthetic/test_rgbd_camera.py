@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.sensors.noise_models import axial_sigma_at_angle
+from framework.sensors.noise_models import SensorKind
+from framework.sensors.noise_models_kernels import axial_sigma_at_angle
 from framework.synthetic.rgbd_camera import (
     PATCH,
+    TRIANGULATION,
     DepthSensor,
     noisy_color,
     normal_quantiles,
@@ -16,28 +18,54 @@ from framework.synthetic.rgbd_camera_kernels import depth_step
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 FRONT = np.ones(CAMERA.shape, np.float32)
+KINECT = SensorKind.KINECT_V1
+STEPS = np.float32(TRIANGULATION[KINECT].steps_depth)
 
 
-def measure(depth, incidence=FRONT, noise=1.0, seed=0, max_range=8.0):
-    sensor = DepthSensor(noise, max_range)
+def measure(depth, incidence=FRONT, noise=1.0, seed=0, max_range=8.0, kind=KINECT):
+    sensor = DepthSensor(noise, max_range, kind)
     return sensor.measure(np.asarray(depth, np.float32), incidence, CAMERA, np.random.default_rng([seed]))
 
 
 @pytest.mark.parametrize("z", [0.8, 1.5, 2.5, 4.0])
 def test_depth_noise_deviation_matches_nguyen_model(z):
     # Spread over two depth steps, so that the wall's place among the steps does not matter.
-    depth = z + np.linspace(-1, 1, FRONT.size).reshape(FRONT.shape) * float(depth_step(np.float32(z)))
+    depth = z + np.linspace(-1, 1, FRONT.size).reshape(FRONT.shape) * float(depth_step(np.float32(z), STEPS))
     error = (measure(depth) - depth)[measure(depth) > 0]
     expected = 0.0012 + 0.0019 * (z - 0.4) ** 2
     assert error.std() == pytest.approx(expected, rel=0.05)
     assert abs(error.mean()) < 0.05 * expected
 
 
+@pytest.mark.parametrize("z", [0.8, 2.5])
+@pytest.mark.parametrize("kind", [SensorKind.REALSENSE_D435, SensorKind.TIME_OF_FLIGHT, SensorKind.PHONE_LIDAR])
+def test_depth_noise_deviation_matches_sensor_model(kind, z):
+    wall = np.full(FRONT.shape, z)
+    error = (measure(wall, kind=kind) - wall)[measure(wall, kind=kind) > 0]
+    assert error.size == FRONT.size
+    assert error.std() == pytest.approx(kind.sigma(z), rel=0.05)
+    assert abs(error.mean()) < 0.05 * kind.sigma(z)
+
+
+def test_depth_of_exact_sensor_has_no_noise():
+    depth = np.random.default_rng(0).uniform(0.1, 4, FRONT.shape).astype(np.float32)
+    np.testing.assert_array_equal(measure(depth, kind=SensorKind.EXACT), depth)
+
+
+def test_depth_of_time_of_flight_has_no_shadow():
+    depth = np.full(FRONT.shape, 3.0)
+    depth[:, 150:200] = 1.0
+    left = np.s_[:, 138:148]  # in the shadow of a Kinect's projector
+    assert not measure(depth)[left].any()
+    assert measure(depth, kind=SensorKind.TIME_OF_FLIGHT)[left].all()
+
+
 def test_depth_noise_increases_at_grazing_angles():
     wall = np.full(FRONT.shape, 2.0)
     slanted = measure(wall, np.full(FRONT.shape, np.cos(np.deg2rad(72)), np.float32))
     theta = np.float32(np.deg2rad(72))
-    assert axial_sigma_at_angle(np.float32(2), theta) > 1.05 * axial_sigma_at_angle(np.float32(2), np.float32(0))
+    upright, tilted = (axial_sigma_at_angle(np.float32(2), angle, KINECT.noise) for angle in (np.float32(0), theta))
+    assert tilted > 1.05 * upright
     assert slanted[slanted > 0].std() > 1.05 * measure(wall).std()
 
 
@@ -45,7 +73,7 @@ def test_depth_is_quantized_to_eighth_disparity_steps():
     reading = measure(np.full(FRONT.shape, 3.0))
     inverse = np.unique(1 / reading[reading > 0].astype(np.float64))
     np.testing.assert_allclose(np.diff(inverse) * 8 * 580 * 0.075, np.rint(np.diff(inverse) * 348), atol=0.02)
-    assert depth_step(np.float32(3.0)) == pytest.approx(9 / 348)
+    assert depth_step(np.float32(3.0), STEPS) == pytest.approx(9 / 348)
 
 
 def test_depth_sensor_box_casts_projector_shadow_on_left():

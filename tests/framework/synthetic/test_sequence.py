@@ -14,6 +14,7 @@ import pytest
 from framework.data import FrameTruth
 from framework.errors import ConfigError
 from framework.geometry import back_project, inverse, project, rotation_angle, transform
+from framework.sensors.noise_models import SensorChoice, SensorKind
 from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic
 
@@ -200,3 +201,21 @@ def test_synthetic_simulated_color_delay_moves_color_and_truth():
     np.testing.assert_array_equal(late[3].truth.instance_ids, plain[4].truth.instance_ids)
     assert late.constant_color_delay() is None
     assert Synthetic(seed=1, color_delay="0.01", **SMALL).constant_color_delay() == 0.01
+
+
+@pytest.mark.parametrize(
+    ("noise", "choice", "kind"),
+    [
+        (1.0, SensorChoice.AUTO, SensorKind.KINECT_V1),
+        (0.0, SensorChoice.AUTO, SensorKind.EXACT),
+        (1.0, SensorChoice.TIME_OF_FLIGHT, SensorKind.TIME_OF_FLIGHT),
+    ],
+)
+def test_synthetic_frames_have_noise_of_their_sensor(noise, choice, kind):
+    video = Synthetic(seed=1, noise=noise, sensor=choice, **SMALL)
+    frame = video[0]
+    exact, _ = video.exact_view(frame.T_world_camera)
+    error = np.median(np.abs(frame.depth - exact)[frame.depth > 0])
+    assert frame.sensor is kind
+    typical = np.median(kind.sigma(frame.depth[frame.depth > 0]))
+    assert error == 0 if kind is SensorKind.EXACT else 0.4 * typical < error < 1.2 * typical

@@ -8,6 +8,7 @@ import pytest
 
 from framework.data import Frame
 from framework.geometry import exp_se3, inverse
+from framework.sensors.noise_models import SensorKind
 from framework.tracking.alignment import LinearWeights, ModelView, NormalEquations, Weights, linearize, smoothed
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, intrinsics, model_intensities
 from plugins.trackers.voxel_hashing_icp import _solved
@@ -254,3 +255,15 @@ def test_linear_weights_require_matching_normals_for_color() -> None:
     ]
     assert by_color[0].matched > 100
     assert by_color[1].matched == 0
+
+
+@pytest.mark.parametrize("kind", SensorKind)
+def test_geometric_weight_is_inverse_variance_of_sensor(kind: SensorKind) -> None:
+    """At the true pose, each matched point adds (n / sigma)^2 to the information of a translation."""
+    frame = WALL.frame(T_VIEW)
+    model, intensities = model_of(WALL)
+    level = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3, kind)[0]
+    A = linearize(level, model, intensities[0], np.eye(4), DEPTH, 0.0).A
+    matched = level.normals.any(axis=0) & (model.depth > 0)
+    information = (model.normals[2, matched].astype(float) / kind.sigma(level.depth[matched].astype(float))) ** 2
+    assert A[2, 2] == pytest.approx(information.sum(), rel=1e-3)

@@ -7,6 +7,7 @@ import pytest
 
 from framework.data import Camera
 from framework.geometry import back_project
+from framework.sensors.noise_models import SensorKind
 from framework.tracking.pyramid import build_pyramid, is_coarse, model_intensities
 
 
@@ -67,3 +68,10 @@ def test_is_coarse_detects_eight_bit_depth(nearest: float) -> None:
 def test_is_coarse_of_constant_depth_returns_default(otherwise: bool) -> None:
     assert is_coarse(np.full((120, 160), 1.0, np.float32), otherwise) == otherwise
     assert is_coarse(np.zeros((120, 160), np.float32), otherwise) == otherwise
+
+
+def test_is_coarse_compares_steps_with_sensor_noise() -> None:
+    steps = slope(0.0392, 0.6)
+    assert is_coarse(steps, otherwise=False)
+    assert not is_coarse(steps / np.float32(2), otherwise=True, sensor=SensorKind.PHONE_LIDAR)
+    assert is_coarse(steps / np.float32(2), otherwise=False, sensor=SensorKind.TIME_OF_FLIGHT)

@@ -12,6 +12,7 @@ from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError
 from framework.geometry import exp_se3
 from framework.refinement.lifting import lift
+from framework.sensors.noise_models import SensorKind
 from plugins.refiners.plane_removal import PlaneRemoval
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -87,6 +88,19 @@ def test_plane_removal_sensor_noise_widens_plane_distance():
     [left] = masks_of(PlaneRemoval().refine(lifted(frame, bled), frame))
     assert left[bled & (ids == 0)].mean() < 0.01
     assert left[(ids == 1) & (heights(frame) > 0.06)].all()
+
+
+@pytest.mark.parametrize(("sensor", "found"), [(SensorKind.KINECT_V1, False), (SensorKind.REALSENSE_D435, True)])
+def test_plane_removal_limit_follows_sensor_noise(sensor, found):
+    """The noise is that of a RealSense D435, about twice that of a Kinect."""
+    frame = replace(scene(BOX, noise=0.0038)[0], sensor=sensor)
+    planes = PlaneRemoval(plane_distance=0.0).structure(frame)
+    assert (planes.fractions.sum() > 0.8) == found
+
+
+def test_plane_removal_limit_of_exact_sensor_allows_uneven_walls():
+    frame = replace(scene(BOX, noise=0.002)[0], sensor=SensorKind.EXACT)
+    assert PlaneRemoval(plane_distance=0.0).structure(frame).fractions.sum() > 0.8
 
 
 def test_plane_removal_keeps_table_top():

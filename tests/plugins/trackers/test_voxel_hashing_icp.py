@@ -14,6 +14,7 @@ from framework.errors import ConfigError, DataError
 from framework.geometry import exp_se3, inverse, rotation_angle
 from framework.interfaces import SceneMap
 from framework.registry import assemble
+from framework.sensors.noise_models import SensorKind
 from framework.tracking.absolute_pose import AbsolutePose
 from framework.tracking.features import Features
 from framework.tracking.keyframes import Keyframe
@@ -187,6 +188,21 @@ def test_voxel_hashing_icp_renders_map_from_predicted_pose(monkeypatch: pytest.M
     tracker.track(frames[5], scene)
     last, before = poses[4].T_world_camera, poses[3].T_world_camera
     np.testing.assert_allclose(seen_from, [last @ inverse(before) @ last], atol=1e-9)
+
+
+def test_tracker_uses_sensor_of_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(3))]
+    tracker = VoxelHashingIcp(finest_scale=1.0)
+    _, scene = run(tracker, frames[:2])
+    sensors = []
+    render, aligned = scene.render_near, voxel_hashing_icp.linearize
+    monkeypatch.setattr(scene, "render_near", lambda *view: sensors.append(view[3]) or render(*view))
+    monkeypatch.setattr(
+        voxel_hashing_icp, "linearize", lambda level, *rest: sensors.append(level.sensor) or aligned(level, *rest)
+    )
+    tracker.track(dataclasses.replace(frames[2], sensor=SensorKind.TIME_OF_FLIGHT), scene)
+    assert len(sensors) > 3
+    assert set(sensors) == {SensorKind.TIME_OF_FLIGHT}
 
 
 @pytest.mark.parametrize("bound", [{"max_translation": 0.002}, {"max_rotation": 0.001}])

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Camera, Float64, Frame, UInt8, UInt16
 from framework.datasets.rgbd_folder import RgbdFolder
+from framework.sensors.noise_models import SensorKind
 from tests.support.scenes.corner_room import look, pose_at
 
 LIDAR = (192, 256)  # (h, w) px of ARKit's depth
@@ -130,6 +131,7 @@ def check_imported(
     assert sequence.camera == frames[0].camera.scaled(scale)
     assert len(sequence) == len(frames)
     for frame, seen in zip(frames, sequence, strict=True):
+        assert seen.sensor is SensorKind.PHONE_LIDAR
         assert seen.timestamp == pytest.approx(frame.timestamp, abs=1e-6)
         np.testing.assert_allclose(seen.T_world_camera, frame.T_world_camera, atol=1e-6)
         if tells_up:

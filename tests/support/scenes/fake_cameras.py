@@ -26,6 +26,7 @@ class FakeCamera:
     plugged_in: bool = True
     coeffs: tuple[float, ...] = (0.0,) * 5  # of its lens: k1, k2, p1, p2, k3
     model: str = "inverse"  # of the lens; brown = ours
+    name: str = "a camera"  # name of the device
     frames: int = 4  # number of frames before it stops sending
     unplugged_at: int = -1  # frame at which the library raises; -1 = never
     without_depth: int = -1  # this frame has no depth; -1 = none
@@ -122,7 +123,9 @@ def realsense_module(camera: FakeCamera) -> ModuleType:
             sensor = SimpleNamespace(get_depth_scale=lambda: UNIT)
             return SimpleNamespace(
                 get_stream={"color": color}.__getitem__,
-                get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
+                get_device=lambda: SimpleNamespace(
+                    first_depth_sensor=lambda: sensor, get_info={"name": camera.name}.__getitem__
+                ),
             )
 
         def try_wait_for_frames(self, timeout_ms: int = 5000) -> tuple[bool, _Images | None]:
@@ -142,6 +145,7 @@ def realsense_module(camera: FakeCamera) -> ModuleType:
         "pyrealsense2",
         stream=SimpleNamespace(depth="depth", color="color"),
         format=SimpleNamespace(z16="depth", rgb8="rgb"),
+        camera_info=SimpleNamespace(name="name"),
         distortion=SimpleNamespace(brown_conrady="brown", inverse_brown_conrady="inverse"),
         config=Config,
         pipeline=Pipeline,
@@ -155,14 +159,16 @@ def orbbec_module(camera: FakeCamera) -> ModuleType:
     class OBError(Exception):
         pass
 
-    def device_of(serial: str) -> str:
+    device = SimpleNamespace(get_device_info=lambda: SimpleNamespace(get_name=lambda: camera.name))
+
+    def device_of(serial: str) -> SimpleNamespace:
         if serial != SERIAL:
             raise OBError(f"Device not found by serial number: {serial}")
-        return serial
+        return device
 
     devices = SimpleNamespace(
         get_count=lambda: int(camera.plugged_in),
-        get_device_by_index=lambda index: SERIAL,
+        get_device_by_index=lambda index: device,
         get_device_by_serial_number=device_of,
     )
 
@@ -177,8 +183,8 @@ def orbbec_module(camera: FakeCamera) -> ModuleType:
             assert mode == "both"
 
     class Pipeline:
-        def __init__(self, device: str) -> None:
-            assert device == SERIAL
+        def __init__(self, given: SimpleNamespace) -> None:
+            assert given is device
 
         def get_stream_profile_list(self, sensor: str) -> SimpleNamespace:
             def profile(width: int, height: int, format: str, fps: int) -> SimpleNamespace:

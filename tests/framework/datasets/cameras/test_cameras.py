@@ -19,6 +19,7 @@ from framework.datasets.cameras.orbbec import Orbbec
 from framework.datasets.cameras.realsense import RealSense
 from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import LiveVideo
+from framework.sensors.noise_models import SensorChoice, SensorKind
 from tests.support.scenes.corner_room import CAMERA, CornerRoom
 from tests.support.scenes.fake_cameras import (
     DEPTH_AFTER_COLOR_US,
@@ -202,3 +203,27 @@ def test_camera_frame_has_time_of_depth_image(brand: Brand, device: FakeCamera) 
     [frame] = sent(brand.video(), 1)
     assert frame.color_time == frame.timestamp
     assert frame.depth_time - frame.color_time == pytest.approx(1e-6 * DEPTH_AFTER_COLOR_US, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("module", "reader", "library", "name", "kind"),
+    [
+        (realsense_module, RealSense, "pyrealsense2", "Intel RealSense D455", SensorKind.REALSENSE_D435),
+        (realsense_module, RealSense, "pyrealsense2", "Intel RealSense L515", SensorKind.TIME_OF_FLIGHT),
+        (realsense_module, RealSense, "pyrealsense2", "a camera", SensorKind.REALSENSE_D435),
+        (orbbec_module, Orbbec, "pyorbbecsdk", "Orbbec Femto Mega", SensorKind.TIME_OF_FLIGHT),
+        (orbbec_module, Orbbec, "pyorbbecsdk", "Orbbec Gemini 2", SensorKind.REALSENSE_D435),
+        (orbbec_module, Orbbec, "pyorbbecsdk", "a camera", SensorKind.KINECT_V1),
+    ],
+)
+def test_camera_device_name_determines_sensor(
+    module, reader, library, name, kind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, library, module(FakeCamera(name=name)))
+    [frame] = sent(reader(width=CAMERA.width, height=CAMERA.height), 1)
+    assert frame.sensor is kind
+
+
+def test_camera_sensor_parameter_overrides_device(brand: Brand, device: FakeCamera) -> None:
+    [frame] = sent(brand.video(sensor=SensorChoice.EXACT), 1)
+    assert frame.sensor is SensorKind.EXACT

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from framework.datasets.cameras.folder_watch import FolderWatch
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import FrameReader, PoseTracker, SceneMap
+from framework.sensors.noise_models import SensorChoice, SensorKind
 from plugins.detectors.none import NoDetections
 from tests.framework.test_pipeline import mapped, pipeline
 from tests.support.scenes.corner_room import CAMERA, CornerRoom, pose_at
@@ -56,7 +58,7 @@ def folder(tmp_path: Path) -> Path:
 class Watched:
     """A watched folder with the messages since the last call."""
 
-    def __init__(self, folder: Path, **parameters: float) -> None:
+    def __init__(self, folder: Path, **parameters: Any) -> None:
         self.over = False
         self._frames = FolderWatch(folder, poll_interval=0.001, **parameters).frames()
 
@@ -94,6 +96,16 @@ def test_folder_watch_frames_match_recorded_folder(folder: Path) -> None:
         np.testing.assert_array_equal(live.depth, recorded.depth)
     times = [before, *(frame.timestamp for frame in found), time.time()]
     assert times == sorted(set(times))
+
+
+@pytest.mark.parametrize(
+    ("choice", "kind"), [(SensorChoice.AUTO, SensorKind.PHONE_LIDAR), (SensorChoice.EXACT, SensorKind.EXACT)]
+)
+def test_watched_frames_have_chosen_sensor(folder: Path, choice: SensorChoice, kind: SensorKind) -> None:
+    (folder / "camera.json").write_text(json.dumps(CALIBRATION | {"depth_scale": 1000, "sensor": "PHONE_LIDAR"}))
+    write(folder, 0)
+    [reader] = Watched(folder, sensor=choice).readers()
+    assert reader().sensor is kind
 
 
 @pytest.mark.parametrize("share", [0, 0.3, 0.999])

@@ -10,10 +10,11 @@ import pytest
 
 from framework.data import Camera
 from framework.datasets.scenenn.scene_files import write_intrinsics, write_timestamps, write_trajectory_log
-from framework.datasets.scenenn.scenenn import SceneNN, SceneNNSensor
+from framework.datasets.scenenn.scenenn import SceneNN, SceneNNIntrinsics
 from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
 from framework.errors import DataError, FrameError
 from framework.files.ply import write_ply
+from framework.sensors.noise_models import SensorKind
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 15.0, 11.0)
 FRAMES = 4
@@ -213,11 +214,14 @@ def test_scenenn_annotation_release_is_reported(root: Path) -> None:
     assert SceneNN(root, "016").annotation == "not named"
 
 
-def test_scenenn_sensor_selects_intrinsics_file(root: Path) -> None:
+def test_scenenn_intrinsics_select_file_and_sensor(root: Path) -> None:
+    assert SceneNN(root, "016")[0].sensor is SensorKind.KINECT_V1
     with pytest.raises(DataError, match=r"kinect2\.ini"):
-        SceneNN(root, "016", sensor=SceneNNSensor.KINECT2)
+        SceneNN(root, "016", intrinsics=SceneNNIntrinsics.KINECT2)
     write_intrinsics(root / "intrinsic" / "kinect2.ini", Camera(32, 24, 29.0, 28.0, 16.0, 12.0))
-    assert SceneNN(root, "016", sensor=SceneNNSensor.KINECT2).camera.fx == 29.0
+    sequence = SceneNN(root, "016", intrinsics=SceneNNIntrinsics.KINECT2)
+    assert sequence.camera.fx == 29.0
+    assert sequence[0].sensor is SensorKind.TIME_OF_FLIGHT
 
 
 def test_scenenn_timestamp_file_gives_times_of_both_images(root: Path) -> None:

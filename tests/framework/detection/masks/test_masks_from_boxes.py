@@ -7,9 +7,11 @@ from scipy import ndimage
 from framework.data import Camera
 from framework.detection.masks import masks_from_boxes, masks_from_boxes_kernels
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
+from framework.sensors.noise_models import SensorKind
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 SIGNIFICANCE, SLANT, READINGS = 0.4, 85.0, 0.1
+NOISE = SensorKind.KINECT_V1.noise
 BOX = np.array([[39.5, 19.5, 99.5, 79.5]], np.float32)  # the pixels 40..99 x 20..79
 V, U = np.indices((120, 160))
 
@@ -76,14 +78,15 @@ def test_masks_in_boxes_slanted_plane_is_whole_below_limit(slant, whole):
 
 def test_masks_in_boxes_grow_joins_pixels_below_largest_step():
     for z in (0.5, 1.0, 4.0):
-        limit = masks_from_boxes_kernels._largest_step(z, np.tan(np.radians(80)) / 150)
+        limit = masks_from_boxes_kernels._largest_step(z, np.tan(np.radians(80)) / 150, NOISE)
         assert limit == pytest.approx(z * np.tan(np.radians(80)) / 150 + 3 * (0.0012 + 0.0019 * (z - 0.4) ** 2))
         for step, joined in ((0.95 * limit, True), (1.05 * limit, False)):
             depth = np.where(U < 70, np.float32(z), np.float32(z + step))
             # over the whole range, so that only the connection decides
             mask = np.zeros((120, 160), np.bool_)
             ones = np.ones(160)
-            masks_from_boxes_kernels._grow(depth, ones, np.ones(120), 0.1, 10.0, np.tan(np.radians(80)) / 150, mask)
+            step_limit = np.tan(np.radians(80)) / 150
+            masks_from_boxes_kernels._grow(depth, ones, np.ones(120), 0.1, 10.0, step_limit, NOISE, mask)
             assert mask.all() == joined
 
 
@@ -105,7 +108,7 @@ def test_masks_in_boxes_grow_and_hole_closing_match_labeling():
             ):
                 expected = expected | hole
         mask = np.zeros((30, 40), np.bool_)
-        masks_from_boxes_kernels._grow(depth, weight_x, weight_y, 0.5, 1.5, 0.01, mask)
+        masks_from_boxes_kernels._grow(depth, weight_x, weight_y, 0.5, 1.5, 0.01, NOISE, mask)
         masks_from_boxes._close_holes(mask, depth > 0)
         np.testing.assert_array_equal(mask, expected)
 
@@ -144,3 +147,10 @@ def test_masks_in_boxes_noise_keeps_surface_whole():
     depth = (depth + rng.normal(0, 0.0012 + 0.0019 * (depth - 0.4) ** 2)).astype(np.float32)
     mask = mask_of(depth)
     assert (mask & disk(28)).sum() / (mask | disk(28)).sum() > 0.99
+
+
+@pytest.mark.parametrize(("sensor", "whole"), [(SensorKind.KINECT_V1, False), (SensorKind.PHONE_LIDAR, True)])
+def test_masks_in_boxes_step_limit_follows_sensor_noise(sensor, whole):
+    depth = np.where(U < 70, np.float32(1.5), np.float32(1.53))
+    masks, _ = masks_in_boxes(BOX, depth, CAMERA, SIGNIFICANCE, 45.0, READINGS, sensor)
+    assert (masks.sum() == 60 * 60) == whole

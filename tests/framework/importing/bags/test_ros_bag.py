@@ -190,6 +190,14 @@ def test_ros_bag_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
     add_realsense(bag, DEPTH_CAMERA)
     assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
     check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # readings are moved to the nearest pixel
+    assert json.loads((tmp_path / "out/camera.json").read_text())["sensor"] == "REALSENSE_D435"
+
+
+def test_topics_without_known_driver_write_no_sensor(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag, "depth_registered")
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    assert "sensor" not in json.loads((tmp_path / "out/camera.json").read_text())
 
 
 def test_ros_bag_unregistered_depth_raises(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from framework.mapping.voxels.tsdf_volume import VoxelHashing
 from framework.mapping.voxels.voxel_grid import TSDF_MAX, WEIGHT_ONE, VoxelGrid
 from framework.mapping.voxels.voxel_grid_kernels import UNSEEN
 from framework.registry import assemble
+from framework.sensors.noise_models import SensorKind
 from tests.support.scenes.analytic_scene import CAMERA, pose, room, walk
 from tests.support.thread_counts import by_one_thread_and_two
 
@@ -282,3 +283,21 @@ def test_integration_is_independent_of_thread_count() -> None:
 
     by_one, by_two = by_one_thread_and_two(integrated)
     assert by_one == by_two
+
+
+@pytest.mark.parametrize(
+    ("kind", "weight"),
+    [
+        (SensorKind.KINECT_V1, (1.5 / 3) ** 2),
+        (SensorKind.REALSENSE_D435, (1.5 / 3) ** 2),
+        (SensorKind.TIME_OF_FLIGHT, (2.2 / 3) ** 2),
+        (SensorKind.PHONE_LIDAR, 1.0),
+        (SensorKind.EXACT, 1.0),
+    ],
+)
+def test_integration_weight_follows_sensor_noise(kind: SensorKind, weight: float) -> None:
+    integrator = new_integrator()
+    color, depth = np.zeros((*CAMERA.shape, 3), np.uint8), np.full(CAMERA.shape, 3.0, np.float32)
+    integrator.integrate(Frame(0, 0.0, color, depth, CAMERA, sensor=kind), np.eye(4), VOXEL)
+    assert integrator.voxels.grid.weight.max() == int(WEIGHT_ONE * weight)
+    assert integrator.sensor == SENSOR

@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 
+from framework.config.composition import composed
 from framework.data import Camera, Frame
+from framework.interfaces import MapFuser
 from framework.mapping.labels.evidence_rows import EvidenceRows
+from framework.mapping.voxels import raycasting
 from framework.mapping.voxels.integration import Integrator
 from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.raycasting import cast_view, render, render_surface, tile_bounds
 from framework.mapping.voxels.raycasting_kernels import TILE, cast_coarse
 from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_walk import inverses, leave_cell
-from framework.sensors.noise_models import axial_sigma_single
+from framework.registry import build
+from framework.sensors.noise_models import SensorKind
 from tests.support.scenes.analytic_scene import Scene, pose, room, walk
 
 VOXEL = 0.02
@@ -51,7 +55,7 @@ def test_raycast_noisy_distant_wall_is_unbiased() -> None:
     rng = np.random.default_rng(0)
     camera = Camera(80, 60, 65.5, 65.5, 39.5, 29.5)
     for _ in range(60):
-        wall = rng.normal(depth, axial_sigma_single(np.float32(depth)), camera.shape).astype(np.float32)
+        wall = rng.normal(depth, SensorKind.KINECT_V1.sigma(depth), camera.shape).astype(np.float32)
         frame = Frame(0, 0.0, np.zeros((*camera.shape, 3), np.uint8), wall, camera)
         integrator.integrate(frame, np.eye(4), voxel)
     seen, _ = cast_view(integrator.voxels, sensor, camera, np.eye(4))
@@ -169,3 +173,14 @@ def test_tile_bounds_ignore_block_next_to_camera() -> None:
     voxels.grid.solid[voxels.block_count - 1] = True
     tile_near, _ = tile_bounds(voxels, SENSOR, CAMERA, pose())
     assert np.quantile(tile_near[:20], 0.1) > 0.5
+
+
+@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "object_volumes", "class_only_fusion"])
+def test_render_near_searches_by_noise_of_sensor(fuser: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    noises = []
+    monkeypatch.setattr(raycasting, "cast_near", lambda *given: noises.append(given[-2]) or given[-1].fill(0))
+    scene = build(MapFuser, composed(f"fuser={fuser}").fuser).scene
+    depth = np.full(CAMERA.shape, 2.0, np.float32)
+    scene.render_near(CAMERA, np.eye(4), depth)
+    scene.render_near(CAMERA, np.eye(4), depth, SensorKind.PHONE_LIDAR)
+    assert noises == [SensorKind.KINECT_V1.noise, SensorKind.PHONE_LIDAR.noise]

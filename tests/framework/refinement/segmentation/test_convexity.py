@@ -9,11 +9,12 @@ from scipy import ndimage
 from framework.data import Camera
 from framework.refinement.segmentation import convexity, convexity_kernels
 from framework.refinement.segmentation.convexity import Limits, normal_sigma, segments
+from framework.sensors.noise_models import SensorKind
 from tests.support.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(160, 120, 135.0, 135.0, 79.5, 59.5)
 LIMITS = Limits(noise_factor=3.0, min_noise=0.0, max_slope=4.0, max_angle=np.deg2rad(15.0))
-NOISE = (3.0, 0.0)
+NOISE = convexity_kernels.Noise(3.0, 0.0, *SensorKind.KINECT_V1.noise[:3])
 
 
 def cut(depth: np.ndarray, camera: Camera = CAMERA, **changed: int) -> tuple[np.ndarray, int]:
@@ -167,7 +168,7 @@ def test_best_planes_at_crease_use_own_side():
     u = np.arange(31)
     inverse = np.tile(np.where(u < 15, 0.5, 0.5 + 0.02 * (u - 14.5)), (15, 1)).astype(np.float32)
     planes = convexity_kernels.best_planes(
-        inverse, convexity_kernels.fit_planes(inverse, 3, NOISE, np.float32(1.0)), 3, 0.0
+        inverse, convexity_kernels.fit_planes(inverse, 3, NOISE, np.float32(1.0)), 3, NOISE
     )
     np.testing.assert_allclose(planes[0, 5, :15], 0, atol=1e-4)
     np.testing.assert_allclose(planes[0, 5, 15:], 0.02, atol=1e-4)
@@ -179,7 +180,9 @@ def test_normal_sigma_matches_spread_of_fitted_normals():
     cell, window, sigma = 1, 3, 0.002
     depth = 1 + rng.normal(0, sigma, (7 * 30, 7 * 40))
     camera = Camera(280, 210, 135.0, 135.0, 139.5, 104.5)
-    fits = convexity_kernels.fit_planes((1 / depth).astype(np.float32), window, (10.0, 0.0), np.float32(1.0))
+    fits = convexity_kernels.fit_planes(
+        (1 / depth).astype(np.float32), window, NOISE._replace(factor=10.0), np.float32(1.0)
+    )
     slopes = fits[0, 3::7, 3::7] * camera.fx  # along x, of windows that do not overlap; 1 m away, of the depth
     assert np.sqrt(2) * slopes.std() == pytest.approx(normal_sigma(sigma, window, cell, camera), rel=0.1)
 
@@ -243,3 +246,10 @@ def test_segments_are_independent_of_thread_count():
     boxes = np.array([[0.15, 0.3, 1.1, 0.55, 0.6, 1.5], [-0.5, 0.4, 1.0, -0.2, 0.6, 1.2]])
     depth = noisy(rendered(boxes, 0.6, 0.5)[0], 1.0)
     np.testing.assert_array_equal(*by_one_thread_and_two(lambda: cut(depth)[0]))
+
+
+@pytest.mark.parametrize(("sensor", "count"), [(SensorKind.KINECT_V1, 1), (SensorKind.EXACT, 2)])
+def test_segments_split_at_steps_above_sensor_noise(sensor, count):
+    depth = np.full(CAMERA.shape, 3.0)
+    depth[:, 80:] = 3.03  # 2 standard deviations of a Kinect
+    assert cut(depth, sensor=sensor)[1] == count

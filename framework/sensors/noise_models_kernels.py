@@ -1,0 +1,51 @@
+"""Kernels of noise_models.py.
+
+They take the `DepthNoise` as an argument, or another named tuple with the fields `least`, `near` and `growth`. Do not
+change the order of multiplications: results would differ in the last digit, and maps would no longer be byte-identical.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from framework.sensors.noise_models import FLOOR, DepthNoise, SensorKind
+
+LARGEST_THETA = np.float32(np.deg2rad(80))  # limit of the fits; the models diverge at larger angles
+
+_KINECT_V1 = SensorKind.KINECT_V1.noise
+
+# explicit fastmath: without it, numba caches the function with the flags of its first caller
+device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fastmath=False, _nrt=False)
+
+
+@device
+def axial_sigma(z: float, noise: DepthNoise) -> float:
+    """Return sigma(z, 0) in m, in double precision."""
+    return max(FLOOR, noise.least + noise.growth * (z - noise.near) ** 2)
+
+
+@device
+def axial_sigma_single(z: np.float32, noise: DepthNoise) -> np.float32:
+    """Return sigma(z, 0) in m, in single precision."""
+    beyond = z - np.float32(noise.near)
+    return max(np.float32(FLOOR), np.float32(noise.least) + np.float32(noise.growth) * beyond * beyond)
+
+
+@device
+def axial_sigma_at_angle(z: np.float32, theta: np.float32, noise: DepthNoise) -> np.float32:
+    """Return sigma(z, theta) in m, in single precision, with theta in rad."""
+    theta = min(theta, LARGEST_THETA)
+    beyond = z - np.float32(noise.near)
+    upright = np.float32(np.pi / 2) - theta
+    root = np.sqrt(max(z, np.float32(0.1)))
+    scale = np.float32(noise.slant) / root + np.float32(noise.far_slant) * z * root
+    slant = scale * (theta * theta) / (upright * upright)
+    facing = np.float32(noise.least) + np.float32(noise.growth) * (beyond * beyond)
+    return np.float32(max(np.float32(FLOOR), facing) + slant)
+
+
+@device
+def noise_ratio(z: float, noise: DepthNoise) -> float:
+    """Return sigma(z, 0) over that of KINECT_V1, for limits that were tuned for KINECT_V1."""
+    return float(axial_sigma(z, noise) / axial_sigma(z, _KINECT_V1))
