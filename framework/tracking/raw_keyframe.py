@@ -20,8 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.data import Float32, Float64
-from framework.geometry import adjoint, inverse, pose_distance
+from framework.geometry import adjoint, inverse
 from framework.tracking.alignment import LinearWeights, ModelView, NormalEquations, Weights, linearize, smoothed
+from framework.tracking.depth_scale import DepthScale
 from framework.tracking.pyramid import PyramidLevel, intrinsics
 
 NEW_DISTANCE = 0.1  # m and rad from the keyframe, beyond which a frame replaces it
@@ -56,11 +57,11 @@ class KeyframeTerm(NamedTuple):
     weight: float  # in [0, 1]
 
     @classmethod
-    def at(cls, keyframe: RawKeyframe | None, T_world_view: Float64) -> KeyframeTerm | None:
+    def at(cls, keyframe: RawKeyframe | None, T_world_view: Float64, scale: DepthScale) -> KeyframeTerm | None:
         """Return the term of an alignment that starts at a view; None if the keyframe is too far away."""
         if keyframe is None:
             return None
-        distance = pose_distance(keyframe.T_world_camera, T_world_view)
+        distance = scale.distance(keyframe.T_world_camera, T_world_view)
         if distance >= USED_DISTANCE:
             return None
         T_key_view = inverse(keyframe.T_world_camera) @ T_world_view

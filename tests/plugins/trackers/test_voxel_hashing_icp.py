@@ -75,6 +75,36 @@ def test_color_determines_motion_along_wall() -> None:
     assert any(pose.lost for pose in alone), "and alone it says that the motion is not determined"
 
 
+def enlarged(frame: Frame, scale: float) -> Frame:
+    """Return the frame of the scene enlarged by `scale`."""
+    assert frame.T_world_camera is not None
+    T = frame.T_world_camera.copy()
+    T[:3, 3] *= scale
+    return dataclasses.replace(frame, depth=np.float32(scale) * frame.depth, T_world_camera=T)
+
+
+@pytest.mark.parametrize("scale", [1, 8])
+def test_hall_is_tracked_as_accurately_as_room(scale: float) -> None:
+    """At scale 8, depths are 10 to 25 m and steps 8 cm."""
+    frames = [enlarged(room().frame(T, k), scale) for k, T in enumerate(walk(20))]
+    fuser = assemble(BayesianTsdf, voxel_size=0.02 * scale, max_depth=4.0 * scale)
+    tracker = VoxelHashingIcp(finest_scale=1.0)
+    for frame in frames:
+        pose = tracker.track(frame, fuser.scene)
+        assert not pose.lost, pose.reason
+        fuser.fuse(frame, pose, NOTHING)
+    assert drift(pose, frames[-1])[0] < 0.004 * scale
+
+
+@pytest.mark.parametrize(
+    ("size", "scale"), [((640, 480), 0.5), ((1280, 720), 0.5), ((1920, 1440), 0.25), ((1440, 1920), 0.25)]
+)
+def test_finest_level_side_is_bounded(size: tuple[int, int], scale: float) -> None:
+    camera = Camera(*size, 500.0, 500.0, 0.5 * size[0], 0.5 * size[1])
+    assert VoxelHashingIcp()._finest_scale(camera) == scale
+    assert VoxelHashingIcp(finest_side=0)._finest_scale(camera) == 0.5
+
+
 def test_covered_frames_are_lost_and_tracking_resumes() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(30))]
     covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[10:14]]
