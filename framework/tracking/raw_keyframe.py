@@ -39,11 +39,11 @@ class RawKeyframe:
     intensities: Sequence[Float32]  # by level from FINEST on, -1 = no depth
 
     @classmethod
-    def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64) -> RawKeyframe:
-        """Return the keyframe of an image pyramid, finest level first."""
+    def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64, scattered: bool = False) -> RawKeyframe:
+        """Return the keyframe of an image pyramid, finest level first. Normals of scattered depth are averaged more."""
         used = levels[FINEST:]
         model = ModelView(used[0].depth, used[0].normals, *intrinsics(used[0].camera))
-        models = [smoothed(model, halvings) for halvings in range(len(used))]
+        models = [smoothed(model, halvings + scattered) for halvings in range(len(used))]
         intensities = [np.where(level.depth > 0, level.intensity, np.float32(-1)) for level in used]
         return cls(T_world_camera, models, intensities)
 

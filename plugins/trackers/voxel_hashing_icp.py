@@ -20,8 +20,8 @@ from framework.tracking.alignment import LinearWeights, NormalEquations, Weights
 from framework.tracking.depth_scale import DepthScale
 from framework.tracking.features import FrameFeatures
 from framework.tracking.keyframes import Keyframes
-from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, model_intensities
-from framework.tracking.raw_keyframe import NEW_DISTANCE, KeyframeTerm, RawKeyframe
+from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, is_scattered, model_intensities
+from framework.tracking.raw_keyframe import FINEST, NEW_DISTANCE, KeyframeTerm, RawKeyframe
 
 LEVELS = 3
 CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; four times as long at each coarser level
@@ -129,6 +129,7 @@ class VoxelHashingIcp(PoseTracker):
         self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
         self._raw_keyframe: RawKeyframe | None = None
         self._scale = DepthScale()  # of the current frame
+        self._scattered_depth = False  # True if neighbors of many readings have no depth
         self._coarse_depth = False  # True if depth is too coarse for normals from neighboring readings
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
@@ -152,7 +153,7 @@ class VoxelHashingIcp(PoseTracker):
             self._steady_frames = 0
             self._T_last_next = np.eye(4)
             self._T_world_doubted = None if alignment.reason else alignment.T_world_camera
-            return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
+            return Pose(self._T_world_last, lost=True, reason=self._loss(alignment, frame))
         T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
         if self.raw_keyframe:
@@ -168,6 +169,7 @@ class VoxelHashingIcp(PoseTracker):
 
     def _pyramid(self, frame: Frame) -> list[PyramidLevel]:
         self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
+        self._scattered_depth = self.raw_keyframe and is_scattered(frame.depth)
         finest = self._finest_scale(frame.camera)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, finest, LEVELS)
         if self.residual_weights is ResidualWeights.TUKEY:
@@ -183,6 +185,13 @@ class VoxelHashingIcp(PoseTracker):
         while self.finest_side and max(camera.shape) * scale > self.finest_side:
             scale /= 2
         return scale
+
+    def _loss(self, alignment: Alignment, frame: Frame) -> str:
+        """Return the reason of a loss, with the cause if depth is missing in many single pixels."""
+        reason = alignment.reason or alignment.doubt
+        if not is_scattered(frame.depth):
+            return reason
+        return f"{reason}; only {np.mean(frame.depth > 0):.0%} of the pixels have depth, most without neighbors"
 
     def _relocalize_in_stored(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
         """Find the camera in a stored map by features, confirmed by alignment."""
@@ -241,7 +250,7 @@ class VoxelHashingIcp(PoseTracker):
         """Replace the raw keyframe if it is missing or too far from a trusted pose."""
         key = self._raw_keyframe
         if key is None or not self._scale.near(key.T_world_camera, T_world_camera, NEW_DISTANCE):
-            self._raw_keyframe = RawKeyframe.of(levels, T_world_camera)
+            self._raw_keyframe = RawKeyframe.of(levels, T_world_camera, self._scattered_depth)
 
     def _is_jump(self, T_last_next: Float64) -> bool:
         step, turn = np.linalg.norm(T_last_next[:3, 3]), rotation_angle(T_last_next[:3, :3])
@@ -343,6 +352,12 @@ class VoxelHashingIcp(PoseTracker):
                     break
         if self._scale.length(xi) >= CONVERGED:  # the counts before a long step do not describe its result
             equations = linearize(levels[0], smooth, intensities[0], T_view_camera, weights, brightness, linear)
+            if term is not None:
+                own = term.linearized(levels, 0, T_view_camera, weights, key_brightness, linear)
+        compared = levels[0]
+        # until many frames are mapped, the view of the map is empty where depth is scattered
+        if self._scattered_depth and term is not None and own.visible > equations.visible:
+            equations, compared = own, levels[FINEST]
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially
         T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
@@ -350,7 +365,7 @@ class VoxelHashingIcp(PoseTracker):
             count / max(equations.visible, 1) for count in (equations.matched, equations.close, equations.behind)
         )
         agreement_in_front = equations.close / max(equations.visible - equations.behind, 1)
-        reason = self._rejection(levels[0], equations, inverse(T_world_from) @ T_world_camera)
+        reason = self._rejection(compared, equations, inverse(T_world_from) @ T_world_camera)
         doubt = ""
         if agreement < self.min_agreement or behind > self.max_occluded:
             doubt = f"{agreement:.0%} of the visible points agree with the map, {behind:.1%} lie behind it"
@@ -370,7 +385,9 @@ class VoxelHashingIcp(PoseTracker):
         Coarse levels start from less accurate poses, and Tukey's weights tolerate larger residuals there.
         """
         weights = self._weights._replace(
-            min_normal_dot=np.float32(-1) if self._coarse_depth else self._weights.min_normal_dot,
+            min_normal_dot=np.float32(-1)
+            if self._coarse_depth or self._scattered_depth
+            else self._weights.min_normal_dot,
             color_weight=self._weights.color_weight if level >= LEVELS - self.color_levels else np.float32(0),
         )
         if self.residual_weights is ResidualWeights.LINEAR:

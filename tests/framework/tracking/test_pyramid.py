@@ -7,7 +7,7 @@ import pytest
 
 from framework.data import Camera
 from framework.geometry import back_project
-from framework.tracking.pyramid import build_pyramid, is_coarse, model_intensities
+from framework.tracking.pyramid import build_pyramid, is_coarse, is_scattered, model_intensities
 
 
 def test_pyramid_depth_does_not_mix_surfaces_or_holes() -> None:
@@ -67,3 +67,13 @@ def test_is_coarse_detects_eight_bit_depth(nearest: float) -> None:
 def test_is_coarse_of_constant_depth_returns_default(otherwise: bool) -> None:
     assert is_coarse(np.full((120, 160), 1.0, np.float32), otherwise) == otherwise
     assert is_coarse(np.zeros((120, 160), np.float32), otherwise) == otherwise
+
+
+@pytest.mark.parametrize(("missing", "expected"), [(0.05, False), (0.3, True), (0.9, True)])
+def test_is_scattered_detects_single_missing_pixels(missing: float, expected: bool) -> None:
+    depth = np.ones((120, 160), np.float32)
+    depth[:, :60] = 0  # a hole is not scattered
+    assert not is_scattered(depth)
+    depth[np.random.default_rng(0).random(depth.shape) < missing] = 0
+    assert is_scattered(depth) == expected
+    assert not is_scattered(np.zeros_like(depth))

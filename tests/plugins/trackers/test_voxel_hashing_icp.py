@@ -378,6 +378,26 @@ def test_tracking_resumes_without_relocalization(moving: bool) -> None:
     assert drift(poses[-1], last[-1])[0] < 0.006
 
 
+def scattered(frame: Frame, missing: float) -> Frame:
+    """Return the frame without depth in randomly selected pixels."""
+    rng = np.random.default_rng(frame.index)
+    return dataclasses.replace(frame, depth=np.where(rng.random(frame.depth.shape) < missing, 0, frame.depth))
+
+
+def test_scattered_depth_is_tracked() -> None:
+    frames = [scattered(room().frame(T, k), 0.7) for k, T in enumerate(walk(30))]
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
+    assert not any(pose.lost for pose in poses)
+    assert drift(poses[-1], frames[-1])[0] < 0.006
+
+
+def test_loss_names_scattered_depth() -> None:
+    frames = [scattered(room().frame(T, k), 0.7) for k, T in enumerate(walk(3))]
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0, raw_keyframe=False), frames)
+    assert poses[-1].lost
+    assert "only 30% of the pixels have depth, most without neighbors" in poses[-1].reason
+
+
 def coarse(frame: Frame) -> Frame:
     """As if depth had been stored in 8 bits."""
     steps = (np.floor(frame.depth / 0.0392) + 0.5) * 0.0392
