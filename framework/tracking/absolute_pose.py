@@ -11,6 +11,7 @@ from framework.data import Bool, Camera, Float32, Float64
 from framework.geometry import inverse, nearest_rotation, transform
 
 COLMAP_PIXEL_CENTER = 0.5  # center of the first pixel in COLMAP; it is 0 here
+REFERENCE_SIDE = 640  # side of images for which max_error holds, px; it grows with the side of larger images
 CONFIDENCE = 0.9999  # confidence of RANSAC
 MAX_DEPTH_ERROR = 0.05  # maximum depth error of an inlier, fraction of its depth
 
@@ -27,7 +28,7 @@ class AbsolutePose:
 class AbsolutePoseEstimator:
     """Estimator of an `AbsolutePose` from matches; equal matches give equal poses."""
 
-    max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
+    max_error: float = 4.0  # maximum reprojection error of an inlier, px of an image 640 px wide or smaller, > 0
     min_inliers: int = 15  # minimum number of inliers, >= 4; wrong matches reach 4 to 8
     min_inlier_ratio: float = 0.25  # minimum fraction of inliers among the matches, in (0, 1]
     seed: int = 0  # random seed, >= 0
@@ -39,7 +40,6 @@ class AbsolutePoseEstimator:
             self, max_error=(1e-3, 1e3), min_inliers=(4, 100_000), min_inlier_ratio=(1e-3, 1.0), seed=(0, 2**31 - 1)
         )
         self._estimation = pycolmap.AbsolutePoseEstimationOptions()
-        self._estimation.ransac.max_error = self.max_error
         self._estimation.ransac.min_inlier_ratio = self.min_inlier_ratio  # limits the number of trials
         self._estimation.ransac.confidence = CONFIDENCE
         self._estimation.ransac.random_seed = self.seed
@@ -59,6 +59,8 @@ class AbsolutePoseEstimator:
         needed = max(self.min_inliers, self.min_inlier_ratio * len(pixels))
         if np.count_nonzero(finite) < needed:
             return None
+        max_error = self.max_error * max(1.0, max(camera.shape) / REFERENCE_SIDE)
+        self._estimation.ransac.max_error = max_error
         found = pycolmap.estimate_and_refine_absolute_pose(
             pixels[finite].astype(np.float64) + COLMAP_PIXEL_CENTER,
             points_world[finite].astype(np.float64),
@@ -79,18 +81,24 @@ class AbsolutePoseEstimator:
             return None
         T_camera_world[:3, :3] = nearest_rotation(T_camera_world[:3, :3])
         readings = np.zeros(len(pixels), np.float32) if depth is None else depth
-        inliers = finite & self._inliers(camera, pixels, points_world, readings, T_camera_world)
+        inliers = finite & self._inliers(camera, pixels, points_world, readings, T_camera_world, max_error)
         if np.count_nonzero(inliers) < needed:
             return None
         return AbsolutePose(inverse(T_camera_world), inliers)
 
     def _inliers(
-        self, camera: Camera, pixels: Float32, points_world: Float32, depth: Float32, T_camera_world: Float64
+        self,
+        camera: Camera,
+        pixels: Float32,
+        points_world: Float32,
+        depth: Float32,
+        T_camera_world: Float64,
+        max_error: float,
     ) -> Bool:
         """Return an array (M,), True for matches that agree with the pose; non-finite matches are False."""
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             x, y, z = transform(T_camera_world, points_world.astype(np.float64)).T
             u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            near = np.hypot(u - pixels[:, 0], v - pixels[:, 1]) <= self.max_error
+            near = np.hypot(u - pixels[:, 0], v - pixels[:, 1]) <= max_error
             confirmed = (depth == 0) | (np.abs(z - depth) <= MAX_DEPTH_ERROR * depth)
         return np.asarray(near & (z > 0) & confirmed, np.bool_)

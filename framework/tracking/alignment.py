@@ -5,8 +5,9 @@
 T = T_view_camera moves the frame's points p_i into the view. The view gives each point its model point q_i with normal
 n_i, and its model intensity. w_i and v_i are Tukey's biweights. Residuals are divided by their expected noise, so both
 terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its noise times depth / FAR. Errors
-of structured-light cameras at this range cover whole image regions and do not average out. Gauss-Newton steps are
-twists in the view's frame: T <- exp(xi) T.
+of structured-light cameras at this range cover whole image regions and do not average out. Beyond `RANGE`, sensors are
+of another kind: standard deviations and gates are those at `RANGE` times depth / RANGE. The balance of the two terms
+then does not depend on depth. Gauss-Newton steps are twists in the view's frame: T <- exp(xi) T.
 
 `LinearWeights` replaces Tukey's weights by the weights in VoxelHashing's published code, for residuals in m and in
 [0, 1]. With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
@@ -28,7 +29,18 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.data import Float32, Float64, SurfaceView
-from framework.tracking.alignment_kernels import CHUNKS, ROW, SUMS, TERMS, accumulate, smooth_normals, turn_normals
+from framework.tracking.alignment_kernels import (
+    BRIGHTNESS,
+    CHUNKS,
+    COLOR,
+    ENERGY,
+    ROW,
+    SUMS,
+    TERMS,
+    accumulate,
+    smooth_normals,
+    turn_normals,
+)
 from framework.tracking.pyramid import PyramidLevel, intrinsics
 
 
@@ -89,7 +101,7 @@ def smoothed(model: ModelView, level: int) -> ModelView:
 class Weights(NamedTuple):
     """Weights of residuals and gates of correspondences."""
 
-    max_distance: np.float32  # maximum distance of a point from its model point, m
+    max_distance: np.float32  # maximum distance of a point up to RANGE from its model point, m
     close_distance: np.float32  # m; maximum depth difference for agreement with the model, or 3 standard deviations
     min_normal_dot: np.float32  # minimum cosine between the frame's and the model's normal
     geometric_scale: np.float32  # zero of Tukey's weight for geometric residuals, standard deviations
@@ -115,6 +127,10 @@ class NormalEquations(NamedTuple):
     matched: int  # visible points with a weight
     close: int  # visible points at a depth that agrees with the model
     behind: int  # visible points clearly behind the model, which should hide them
+    A_color: Float64  # (6, 6) the part of the photometric term; 0 for LinearWeights
+    energy: float  # sum of w r^2 of the geometric term
+    color_energy: float  # ... of the photometric term
+    matched_colors: int  # visible points with a photometric weight
     brightness: float  # mean of frame minus model intensity: the change of exposure
 
 
@@ -136,12 +152,17 @@ def linearize(
     )  # fmt: skip
     total = sums.sum(axis=0)
     visible, matched, close, behind, matched_colors, compared = (int(count) for count in total[SUMS:])
+    geometry, color = total[:COLOR], total[COLOR:BRIGHTNESS]
     return NormalEquations(
-        A=total[MATRIX_SUMS],
-        b=total[ROW - 1 : 6 * ROW : ROW].copy(),
+        A=geometry[MATRIX_SUMS] + color[MATRIX_SUMS],
+        b=geometry[ROW - 1 : ENERGY : ROW] + color[ROW - 1 : ENERGY : ROW],
         visible=visible,
         matched=matched if weights.depth_weight > 0 else matched_colors,
         close=close,
         behind=behind,
-        brightness=float(total[SUMS - 1] / max(compared, 1)),
+        A_color=color[MATRIX_SUMS],
+        energy=float(geometry[ENERGY]),
+        color_energy=float(color[ENERGY]),
+        matched_colors=matched_colors,
+        brightness=float(total[BRIGHTNESS] / max(compared, 1)),
     )

@@ -12,7 +12,10 @@ CHUNKS = 16  # chunks of image rows, summed in order, so that sums do not depend
 BATCH = 160  # points per batch; divides the usual image widths
 LANES = 16  # lanes of a sum; point n of a batch is added to lane n % LANES
 ROW = 5  # sums per derivative of the error: products with itself, the next three derivatives and the error
-SUMS = 6 * ROW + 1  # sums over points, in lanes: the normal equations, then the change of brightness
+ENERGY = 6 * ROW  # index of the weighted squared error among the sums of one term of the energy
+COLOR = ENERGY + 1  # index of the first sum of the photometric term, after those of the geometric term
+BRIGHTNESS = 2 * COLOR  # index of the change of brightness
+SUMS = BRIGHTNESS + 1  # sums over points, in lanes
 TERMS = SUMS + 6  # terms of a chunk: its sums, then its six counts
 # offsets of a batch's point fields: in the frame, in the view, and in the model ...
 DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00, I10, I01, I11 = (
@@ -21,8 +24,9 @@ DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00,
 POINT_FIELDS = 21
 # ... and of its residual terms
 J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in range(10))
-TERM_SIZE = ADDED + SUMS * LANES  # after the fields, the batch's sums by lane
+TERM_SIZE = ADDED + COLOR * LANES  # after the fields, the batch's sums of one term by lane
 FAR = 2.0  # depth above which depth errors are correlated, m
+RANGE = 5.0  # largest depth of structured-light cameras, m; errors and gates are proportional to depth beyond it
 NEAREST = 0.05  # minimum depth of projected points in the view, m
 
 
@@ -151,7 +155,7 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
     cx, cy = model.cx + half, model.cy + half
     R00, R01, R02, R10, R11, R12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
     R20, R21, R22 = R[2, 0], R[2, 1], R[2, 2]
-    inv_far = one / np.float32(FAR)
+    inv_far, far_range, inv_range = one / np.float32(FAR), np.float32(RANGE), one / np.float32(RANGE)
     max_distance2 = weights.max_distance * weights.max_distance
     close_distance = weights.close_distance
     min_dot, scale, strength = weights.min_normal_dot, weights.geometric_scale, weights.depth_weight
@@ -165,7 +169,12 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
         ex, ey, ez = px - qx, py - qy, pz - q
         mapped = q > zero
         distance2 = ex * ex + ey * ey + ez * ez
-        near = mapped & (distance2 <= max_distance2)
+        z = points[DEPTH + n]
+        growth = max(one, z * inv_range)
+        if linear is None:  # numba compiles only the branch of the type of `linear`
+            near = mapped & (distance2 <= max_distance2 * growth * growth)
+        else:
+            near = mapped & (distance2 <= max_distance2)
         nx, ny, nz = points[MX + n], points[MY + n], points[MZ + n]
         fx, fy, fz = points[NX + n], points[NY + n], points[NZ + n]
         dot = (
@@ -173,14 +182,15 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
             + ny * (R10 * fx + R11 * fy + R12 * fz)
             + nz * (R20 * fx + R21 * fy + R22 * fz)
         )
-        noise = axial_sigma_single(points[DEPTH + n], noise_model)
-        sigma = noise * max(one, points[DEPTH + n] * inv_far)
+        in_range = min(z, far_range)
+        noise = axial_sigma_single(in_range, noise_model) * growth
+        sigma = noise * max(one, in_range * inv_far)
         distance = nx * ex + ny * ey + nz * ez
         matches = near & (dot > min_dot)
-        if linear is None:  # numba compiles only the branch of the type of `linear`
+        if linear is None:
             weight = _tukey(distance / sigma, scale) * strength / (sigma * sigma)
         else:
-            nearness = (one - np.sqrt(distance2) / weights.max_distance) + (one - points[DEPTH + n] / linear.max_depth)
+            nearness = (one - np.sqrt(distance2) / weights.max_distance) + (one - z / linear.max_depth)
             weight = max(half * nearness, zero) * strength
             near = matches
         weight = weight if matches else zero
@@ -272,16 +282,25 @@ def _multiply(J, a, b, c, d, row):
 
 
 @device
-def _add_products(J, lanes):
-    """Add a batch's w J^T r and w J^T J (upper triangle and three more elements) to the lanes."""
+def _add_products(J, lanes, first):
+    """Add a batch's sums of one term to the lanes from `first` on.
+
+    The sums are w J^T J (upper triangle and three more elements), w J^T r and w r^2.
+    """
     _multiply(J, J0, J1, J2, J3, 0)
     _multiply(J, J1, J2, J3, J4, 1)
     _multiply(J, J2, J3, J4, J5, 2)
     _multiply(J, J3, J4, J5, J0, 3)
     _multiply(J, J4, J5, J0, J1, 4)
     _multiply(J, J5, J0, J1, J2, 5)
-    for n in range(6 * ROW * LANES):
-        lanes[n] += np.float64(J[ADDED + n])
+    for lane in range(LANES):
+        energy = np.float32(0.0)
+        for step in range(BATCH // LANES):
+            n = step * LANES + lane
+            energy += J[W + n] * J[ERROR + n] * J[ERROR + n]
+        J[ADDED + ENERGY * LANES + lane] = energy
+    for n in range(COLOR * LANES):
+        lanes[first + n] += np.float64(J[ADDED + n])
 
 
 @device
@@ -292,7 +311,7 @@ def _add_brightness(J, lanes):
         for step in range(BATCH // LANES):
             n = step * LANES + lane
             change += J[DARKER + n]
-        lanes[6 * ROW * LANES + lane] += np.float64(change)
+        lanes[BRIGHTNESS * LANES + lane] += np.float64(change)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -306,6 +325,7 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
     shape, level_shape = model.depth.shape, model_intensity.shape
     size = np.int32(model.depth.size)
     flat_depth, flat_normals, flat_intensity = model.depth.ravel(), model.normals.ravel(), model_intensity.ravel()
+    color = COLOR * LANES if linear is None else 0  # equal rounding as one sum, for LinearWeights
     for chunk in prange(CHUNKS):
         total = np.zeros(TERMS, np.float64)
         lanes = np.zeros(SUMS * LANES, np.float64)
@@ -318,7 +338,7 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
                 _project(frame, v, u0, model, shape, R, t, points, pixel)
                 _gather_model(flat_depth, flat_normals, size, pixel, points)
                 visible, matched, close, behind = _add_geometry(model, R, weights, linear, noise_model, points, J)
-                _add_products(J, lanes)
+                _add_products(J, lanes, 0)
                 total[SUMS] += visible
                 total[SUMS + 1] += matched
                 total[SUMS + 2] += close
@@ -326,7 +346,7 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
                 if weights.color_weight > np.float32(0.0):
                     _gather_intensities(flat_intensity, level_shape, inverse_scale, points, pixel)
                     matched, compared = _add_photometry(model, inverse_scale, weights, linear, brightness, points, J)
-                    _add_products(J, lanes)
+                    _add_products(J, lanes, color)
                     _add_brightness(J, lanes)
                     total[SUMS + 4] += matched
                     total[SUMS + 5] += compared

@@ -13,6 +13,7 @@ from framework.tracking.pyramid_kernels import compute_normals, find_distinct, h
 
 SAMPLED = 4  # stride of the depth readings for the quantization estimate, px
 FEWEST_VALUES = 16  # minimum number of distinct depths for the quantization estimate
+SCATTERED = 0.15  # fraction of neighbors of readings without depth; a Kinect's images have at most 0.02
 COARSE = 2.5  # largest fine step between depth values, standard deviations of the sensor's depth
 
 
@@ -67,6 +68,13 @@ def is_coarse(depth: Float32, otherwise: bool, sensor: SensorKind = SensorKind.K
         return otherwise
     steps = np.diff(values) / sensor.sigma(values[:-1])
     return bool(np.percentile(steps[: len(steps) // 2], 25) > COARSE)  # a gap may span several steps
+
+
+def is_scattered(depth: Float32) -> bool:
+    """Return True if neighbors of many readings in depth (H, W) m have no depth, as with single missing pixels."""
+    known = depth[::SAMPLED] > 0
+    pairs = np.count_nonzero(known[:, :-1]) + np.count_nonzero(known[:, 1:])
+    return bool(np.count_nonzero(known[:, :-1] ^ known[:, 1:]) > SCATTERED * pairs)
 
 
 def _distinct(depth: Float32) -> Float32:

@@ -20,8 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.data import Float32, Float64
-from framework.geometry import adjoint, inverse, pose_distance
+from framework.geometry import adjoint, inverse
 from framework.tracking.alignment import LinearWeights, ModelView, NormalEquations, Weights, linearize, smoothed
+from framework.tracking.depth_scale import DepthScale
 from framework.tracking.pyramid import PyramidLevel, intrinsics
 
 NEW_DISTANCE = 0.1  # m and rad from the keyframe, beyond which a frame replaces it
@@ -38,11 +39,11 @@ class RawKeyframe:
     intensities: Sequence[Float32]  # by level from FINEST on, -1 = no depth
 
     @classmethod
-    def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64) -> RawKeyframe:
-        """Return the keyframe of an image pyramid, finest level first."""
+    def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64, scattered: bool = False) -> RawKeyframe:
+        """Return the keyframe of an image pyramid, finest level first. Normals of scattered depth are averaged more."""
         used = levels[FINEST:]
         model = ModelView(used[0].depth, used[0].normals, *intrinsics(used[0].camera))
-        models = [smoothed(model, halvings) for halvings in range(len(used))]
+        models = [smoothed(model, halvings + scattered) for halvings in range(len(used))]
         intensities = [np.where(level.depth > 0, level.intensity, np.float32(-1)) for level in used]
         return cls(T_world_camera, models, intensities)
 
@@ -56,11 +57,11 @@ class KeyframeTerm(NamedTuple):
     weight: float  # in [0, 1]
 
     @classmethod
-    def at(cls, keyframe: RawKeyframe | None, T_world_view: Float64) -> KeyframeTerm | None:
+    def at(cls, keyframe: RawKeyframe | None, T_world_view: Float64, scale: DepthScale) -> KeyframeTerm | None:
         """Return the term of an alignment that starts at a view; None if the keyframe is too far away."""
         if keyframe is None:
             return None
-        distance = pose_distance(keyframe.T_world_camera, T_world_view)
+        distance = scale.distance(keyframe.T_world_camera, T_world_view)
         if distance >= USED_DISTANCE:
             return None
         T_key_view = inverse(keyframe.T_world_camera) @ T_world_view

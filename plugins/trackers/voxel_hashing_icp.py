@@ -11,16 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.config.validation import check_bounds, require
-from framework.data import Array, Float64, Frame, Pose
+from framework.data import Array, Camera, Float64, Frame, Pose
 from framework.errors import DataError
-from framework.geometry import exp_se3, inverse, nearest_rotation, pose_distance, rotation_angle
+from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.tracking.absolute_pose import AbsolutePose
 from framework.tracking.alignment import LinearWeights, NormalEquations, Weights, linearize, model_view, smoothed
+from framework.tracking.depth_scale import DepthScale
 from framework.tracking.features import FrameFeatures
 from framework.tracking.keyframes import Keyframes
-from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, model_intensities
-from framework.tracking.raw_keyframe import NEW_DISTANCE, KeyframeTerm, RawKeyframe
+from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, is_scattered, model_intensities
+from framework.tracking.raw_keyframe import FINEST, NEW_DISTANCE, KeyframeTerm, RawKeyframe
 
 LEVELS = 3
 CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; four times as long at each coarser level
@@ -73,10 +74,11 @@ class VoxelHashingIcp(PoseTracker):
 
     residual_weights: ResidualWeights = ResidualWeights.TUKEY  # weights of residuals
     finest_scale: float = 0.5  # scale of the finest level and of the map's view relative to the image, a power of 1/2
+    finest_side: int = 640  # maximum side of the finest level, px, >= 0; larger levels are halved; 0 = unlimited
     iterations_coarse: int = 8  # number of iterations at 1/4 of the finest resolution, >= 0
     iterations_middle: int = 6  # number of iterations at 1/2 of the finest resolution, >= 0
     iterations_fine: int = 4  # number of iterations at the finest resolution, >= 1
-    max_distance: float = 0.1  # maximum distance of corresponding points, m, > 0
+    max_distance: float = 0.1  # maximum distance of corresponding points, m, > 0; proportional to depth beyond 5 m
     close_distance: float = 0.05  # maximum distance for agreement with the map, m, > 0; at least 3 sigma of depth noise
     min_normal_dot: float = 0.7  # minimum cosine between corresponding normals, in [-1, 1]
     geometric_scale: float = 4.0  # cut-off of distances, in standard deviations, > 0 (TUKEY)
@@ -86,11 +88,11 @@ class VoxelHashingIcp(PoseTracker):
     color_weight: float = 0.1  # weight lambda of the photometric term, >= 0; 0 = ICP only
     color_levels: int = 3  # number of levels with color, from the coarsest, in [1, 3]
     depth_weight: float = 1.0  # weight of the point-to-plane term, in [0, 1]; 0 = color only
-    max_translation: float = 0.3  # maximum translation between frames, m, > 0; lost above it
+    max_translation: float = 0.3  # maximum translation between frames, m, > 0; lost above it; more beyond 5 m (TUKEY)
     max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
     min_visible: float = 0.05  # minimum fraction of visible points (in mapped parts of the view), in [0, 1]
     min_matched: float = 0.4  # minimum fraction of the visible points with a weight, in [0, 1]
-    min_information: float = 1e-3  # minimum ratio of smallest to mean eigenvalue of the normal matrix, in [0, 1]
+    min_information: float = 1e-3  # minimum ratio of smallest to mean eigenvalue without units, in [0, 1]
     min_agreement: float = 0.92  # minimum fraction of visible points that agree with the map, in [0, 1]; 0 = off
     max_occluded: float = 0.015  # maximum fraction of visible points behind the map's surface, in [0, 1]; 1 = off
     raw_keyframe: bool = True  # True = align to a raw keyframe in addition to the map; False = map only
@@ -99,8 +101,9 @@ class VoxelHashingIcp(PoseTracker):
 
     def __post_init__(self) -> None:
         check_bounds(
-            self, finest_scale=(1 / 64, 1.0), iterations_coarse=(0, 1000), iterations_middle=(0, 1000),
-            iterations_fine=(1, 1000), max_distance=(1e-4, 10.0), close_distance=(1e-4, 10.0),
+            self, finest_scale=(1 / 64, 1.0), finest_side=(0, 1_000_000), iterations_coarse=(0, 1000),
+            iterations_middle=(0, 1000), iterations_fine=(1, 1000),
+            max_distance=(1e-4, 10.0), close_distance=(1e-4, 10.0),
             min_normal_dot=(-1.0, 1.0), geometric_scale=(1e-3, 1e3), photometric_scale=(1e-3, 1e3),
             intensity_noise=(1e-3, 1.0), max_intensity_difference=(1e-3, 1.0), color_weight=(0.0, 1e3),
             color_levels=(1, LEVELS), depth_weight=(0.0, 1.0),
@@ -123,6 +126,8 @@ class VoxelHashingIcp(PoseTracker):
         self._last: FrameFeatures | None = None  # features of the last trusted frame
         self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
         self._raw_keyframe: RawKeyframe | None = None
+        self._scale = DepthScale()  # of the current frame
+        self._scattered_depth = False  # True if neighbors of many readings have no depth
         self._coarse_depth = False  # True if depth is too coarse for normals from neighboring readings
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
@@ -139,14 +144,14 @@ class VoxelHashingIcp(PoseTracker):
             alignment = self._align_predicted(levels, scene, T_world_predicted)
         if not (alignment.trusted and self._steady_frames >= STEADY) and levels[0].depth.any():
             alignment = self._relocalized(alignment, seen, levels, scene)
-            if not _near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
+            if not self._scale.near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
                 self._steady_frames = 0
         if not alignment.trusted:
             self._lost_frames += 1
             self._steady_frames = 0
             self._T_last_next = np.eye(4)
             self._T_world_doubted = None if alignment.reason else alignment.T_world_camera
-            return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
+            return Pose(self._T_world_last, lost=True, reason=self._loss(alignment, frame))
         T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
         if self.raw_keyframe:
@@ -162,7 +167,29 @@ class VoxelHashingIcp(PoseTracker):
 
     def _pyramid(self, frame: Frame) -> list[PyramidLevel]:
         self._coarse_depth = is_coarse(frame.depth, self._coarse_depth, frame.sensor)
-        return build_pyramid(frame.camera, frame.depth, frame.color, self.finest_scale, LEVELS, frame.sensor)
+        self._scattered_depth = self.raw_keyframe and is_scattered(frame.depth)
+        finest = self._finest_scale(frame.camera)
+        levels = build_pyramid(frame.camera, frame.depth, frame.color, finest, LEVELS, frame.sensor)
+        if self.residual_weights is ResidualWeights.TUKEY:
+            self._scale = DepthScale.of(levels[-1].depth)
+        return levels
+
+    def _finest_scale(self, camera: Camera) -> float:
+        """Return the scale of the finest level, at most `finest_side` px large.
+
+        Coarse levels of larger images would be too fine for large motions.
+        """
+        scale = self.finest_scale
+        while self.finest_side and max(camera.shape) * scale > self.finest_side:
+            scale /= 2
+        return scale
+
+    def _loss(self, alignment: Alignment, frame: Frame) -> str:
+        """Return the reason of a loss, with the cause if depth is missing in many single pixels."""
+        reason = alignment.reason or alignment.doubt
+        if not is_scattered(frame.depth):
+            return reason
+        return f"{reason}; only {np.mean(frame.depth > 0):.0%} of the pixels have depth, most without neighbors"
 
     def _relocalize_in_stored(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
         """Find the camera in a stored map by features, confirmed by alignment."""
@@ -179,7 +206,7 @@ class VoxelHashingIcp(PoseTracker):
         """Align from the predicted pose. A result near the prediction needs less agreement."""
         assert self._T_world_last is not None
         alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
-        if not _near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
+        if not self._scale.near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
             self._steady_frames = 0
             return alignment
         self._steady_frames += 1
@@ -202,7 +229,7 @@ class VoxelHashingIcp(PoseTracker):
     def _initialize(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
         """Define the world frame by the first frame with enough depth."""
         frame = seen.frame
-        if min(frame.camera.shape) * self.finest_scale < SMALLEST * 2 ** (LEVELS - 1):
+        if min(frame.camera.shape) * self._finest_scale(frame.camera) < SMALLEST * 2 ** (LEVELS - 1):
             raise DataError(
                 f"tracker.finest_scale: expected at least {SMALLEST} px at the coarsest of {LEVELS} levels, got "
                 f"{self.finest_scale:g} for images of {frame.camera.width}x{frame.camera.height} px"
@@ -220,12 +247,12 @@ class VoxelHashingIcp(PoseTracker):
     def _update_raw_keyframe(self, levels: list[PyramidLevel], T_world_camera: Float64) -> None:
         """Replace the raw keyframe if it is missing or too far from a trusted pose."""
         key = self._raw_keyframe
-        if key is None or pose_distance(key.T_world_camera, T_world_camera) > NEW_DISTANCE:
-            self._raw_keyframe = RawKeyframe.of(levels, T_world_camera)
+        if key is None or not self._scale.near(key.T_world_camera, T_world_camera, NEW_DISTANCE):
+            self._raw_keyframe = RawKeyframe.of(levels, T_world_camera, self._scattered_depth)
 
     def _is_jump(self, T_last_next: Float64) -> bool:
         step, turn = np.linalg.norm(T_last_next[:3, 3]), rotation_angle(T_last_next[:3, :3])
-        return bool(step > self.max_translation or turn > self.max_rotation)
+        return bool(step > self.max_translation * self._scale.growth or turn > self.max_rotation)
 
     def _trust(self, seen: FrameFeatures, T_world_camera: Float64) -> Pose:
         self._T_world_last = T_world_camera
@@ -237,7 +264,7 @@ class VoxelHashingIcp(PoseTracker):
                 self._keyframes.add_with(seen.frame, seen.found, T_world_camera)
             else:
                 self._keyframes.add(seen.frame, T_world_camera)
-            if not any(_near(T, T_world_camera, VISITED_SEPARATION) for T in reversed(self._visited)):
+            if not any(self._scale.near(T, T_world_camera, VISITED_SEPARATION) for T in reversed(self._visited)):
                 self._visited.append(T_world_camera)
         return Pose(T_world_camera)
 
@@ -261,15 +288,15 @@ class VoxelHashingIcp(PoseTracker):
         self, alignment: Alignment, T_world_found: Float64, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
         """Return the alignment confirmed by a pose from features. A pose with two independent sources is trusted."""
-        if alignment.trusted and _near(alignment.T_world_camera, T_world_found, self.max_distance):
+        if alignment.trusted and self._scale.near(alignment.T_world_camera, T_world_found, self.max_distance):
             return alignment
         again = self._align(levels, scene, T_world_found, T_world_found)
-        agrees = not again.reason and _near(again.T_world_camera, T_world_found, self.max_distance)
+        agrees = not again.reason and self._scale.near(again.T_world_camera, T_world_found, self.max_distance)
         if agrees and (alignment.reason or again.trusted or again.agreement > alignment.agreement):
             return again._replace(doubt="")
         if alignment.reason:
             return alignment
-        if _near(alignment.T_world_camera, T_world_found, self.max_distance):
+        if self._scale.near(alignment.T_world_camera, T_world_found, self.max_distance):
             return alignment._replace(doubt="")
         return alignment._replace(doubt=alignment.doubt or "features and alignment with the map disagree")
 
@@ -290,7 +317,7 @@ class VoxelHashingIcp(PoseTracker):
         if not alignment.trusted or self.min_agreement == 0:
             return alignment
         again = self._align(levels, scene, alignment.T_world_camera, T_world_from)
-        if not _near(alignment.T_world_camera, again.T_world_camera, SAME_POSE / 2):
+        if not self._scale.near(alignment.T_world_camera, again.T_world_camera, SAME_POSE / 2):
             return again._replace(doubt="a second alignment from the result of the first disagrees")
         return again
 
@@ -303,7 +330,7 @@ class VoxelHashingIcp(PoseTracker):
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
         linear = self._linear_weights(scene)
         T_view_camera = np.eye(4)
-        term = KeyframeTerm.at(self._raw_keyframe, T_world_view)
+        term = KeyframeTerm.at(self._raw_keyframe, T_world_view, self._scale)
         brightness = key_brightness = 0.0
         for level in reversed(range(LEVELS)):
             weights, smooth = self._weights_at(level), smoothed(model, level)
@@ -319,10 +346,16 @@ class VoxelHashingIcp(PoseTracker):
                     A, b = A + own.A, b + own.b
                 xi = _solved(A, b)
                 T_view_camera = exp_se3(xi) @ T_view_camera
-                if np.abs(xi).max() < CONVERGED * 4**level:
+                if self._scale.length(xi) < CONVERGED * 4**level:
                     break
-        if np.abs(xi).max() >= CONVERGED:  # the counts before a long step do not describe its result
+        if self._scale.length(xi) >= CONVERGED:  # the counts before a long step do not describe its result
             equations = linearize(levels[0], smooth, intensities[0], T_view_camera, weights, brightness, linear)
+            if term is not None:
+                own = term.linearized(levels, 0, T_view_camera, weights, key_brightness, linear)
+        compared = levels[0]
+        # until many frames are mapped, the view of the map is empty where depth is scattered
+        if self._scattered_depth and term is not None and own.visible > equations.visible:
+            equations, compared = own, levels[FINEST]
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially
         T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
@@ -330,7 +363,7 @@ class VoxelHashingIcp(PoseTracker):
             count / max(equations.visible, 1) for count in (equations.matched, equations.close, equations.behind)
         )
         agreement_in_front = equations.close / max(equations.visible - equations.behind, 1)
-        reason = self._rejection(levels[0], equations, inverse(T_world_from) @ T_world_camera)
+        reason = self._rejection(compared, equations, inverse(T_world_from) @ T_world_camera)
         doubt = ""
         if agreement < self.min_agreement or behind > self.max_occluded:
             doubt = f"{agreement:.0%} of the visible points agree with the map, {behind:.1%} lie behind it"
@@ -350,7 +383,9 @@ class VoxelHashingIcp(PoseTracker):
         Coarse levels start from less accurate poses, and Tukey's weights tolerate larger residuals there.
         """
         weights = self._weights._replace(
-            min_normal_dot=np.float32(-1) if self._coarse_depth else self._weights.min_normal_dot,
+            min_normal_dot=np.float32(-1)
+            if self._coarse_depth or self._scattered_depth
+            else self._weights.min_normal_dot,
             color_weight=self._weights.color_weight if level >= LEVELS - self.color_levels else np.float32(0),
         )
         if self.residual_weights is ResidualWeights.LINEAR:
@@ -374,16 +409,19 @@ class VoxelHashingIcp(PoseTracker):
         if self._is_jump(T_from_camera):
             step, turn = np.linalg.norm(T_from_camera[:3, 3]), rotation_angle(T_from_camera[:3, :3])
             return f"implausible step of {step:.2f} m and {np.degrees(turn):.0f} deg"
-        information = np.linalg.eigvalsh(equations.A)
-        least = self.min_information * (RECOVERY_INFORMATION if self._lost_frames else 1.0)
-        if information[0] < least * information.mean():
+        if not self._is_determined(equations):
             return "the visible surface does not determine the motion"
         return ""
 
+    def _is_determined(self, equations: NormalEquations) -> bool:
+        """Return True if all motions are determined, by eigenvalues of A for lengths in units of the typical depth.
 
-def _near(T_a: Float64, T_b: Float64, limit: float) -> bool:
-    """Return True if two poses are within `limit` m and rad of each other."""
-    return pose_distance(T_a, T_b) < limit
+        Color counts in full, without lambda, because only geometric information is faked by noise of normals.
+        """
+        color = (1 / self.color_weight - 1) * equations.A_color if self.color_weight > 0 else 0.0
+        information = np.linalg.eigvalsh(self._scale.without_units(equations.A + color))
+        least = self.min_information * (RECOVERY_INFORMATION if self._lost_frames else 1.0)
+        return bool(information[0] >= least * information.mean())
 
 
 def _solved(A: Float64, b: Float64) -> Float64:

@@ -45,6 +45,21 @@ def test_absolute_pose_rejects_outliers() -> None:
     assert rotation_angle(error[:3, :3]) < 0.002
 
 
+@pytest.mark.parametrize("factor", [1, 3])
+def test_absolute_pose_error_limit_follows_resolution(factor: int) -> None:
+    """Pixels of the same images, 3 times larger, are 3 times less accurate."""
+    pixels, points_world, _ = matches(100)
+    camera = Camera(
+        factor * CAMERA.width, factor * CAMERA.height, factor * CAMERA.fx, factor * CAMERA.fy,
+        factor * (CAMERA.cx + 0.5) - 0.5, factor * (CAMERA.cy + 0.5) - 0.5,
+    )  # fmt: skip
+    angles = np.linspace(0, 20 * np.pi, 100)
+    pixels += 1.5 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    found = AbsolutePoseEstimator().estimate(camera, factor * (pixels + 0.5) - 0.5, points_world)
+    assert found is not None
+    assert found.inliers.sum() > 95
+
+
 def test_absolute_pose_is_deterministic_for_given_seed() -> None:
     """The matches are so noisy that other random samples give other inliers."""
     rng = np.random.default_rng(2)

@@ -10,6 +10,7 @@ from framework.data import Frame
 from framework.geometry import exp_se3, inverse
 from framework.sensors.noise_models import SensorKind
 from framework.tracking.alignment import LinearWeights, ModelView, NormalEquations, Weights, linearize, smoothed
+from framework.tracking.depth_scale import DepthScale
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, intrinsics, model_intensities
 from plugins.trackers.voxel_hashing_icp import _solved
 from tests.support.scenes.analytic_scene import CAMERA, Scene, pose
@@ -153,6 +154,56 @@ def test_smoothed_normals_are_box_means_without_unmapped_pixels() -> None:
                 np.testing.assert_allclose(found.normals[:, v, u], total / np.linalg.norm(total), atol=1e-4)
 
 
+BOTH = COLOR._replace(depth_weight=np.float32(1), color_weight=np.float32(0.1))
+
+
+def enlarged(
+    scale: float, offset: np.ndarray, weights: Weights, linear: LinearWeights | None = None
+) -> NormalEquations:
+    """Return the equations of the corner, enlarged by `scale`, at `offset` (6,) from the true pose."""
+    frame = CORNER.frame(T_VIEW)
+    model, intensities = model_of(CORNER)
+    large = model._replace(depth=np.float32(scale) * model.depth)
+    level = build_pyramid(CAMERA, np.float32(scale) * frame.depth, frame.color, 1.0, 3)[0]
+    return linearize(level, large, intensities[0], exp_se3(offset), weights, 0.0, linear)
+
+
+@pytest.mark.parametrize("weights", [DEPTH, COLOR, BOTH], ids=["depth", "color", "both"])
+def test_alignment_beyond_range_is_scale_invariant(weights: Weights) -> None:
+    """All depths are beyond 5 m. Powers of two scale floating-point numbers without rounding."""
+    motion = np.array([0.4, -0.3, 0.5, 0.002, -0.003, 0.001])
+    units = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    near, far = (enlarged(scale, motion * np.where(units, scale / 16, 1), weights) for scale in (16, 64))
+    assert near.matched > 1000
+    assert (far.visible, far.matched, far.close, far.behind) == (near.visible, near.matched, near.close, near.behind)
+    for A, A_far in ((near.A, far.A), (near.A_color, far.A_color)):
+        A = DepthScale(16.0).without_units(A)
+        np.testing.assert_allclose(
+            DepthScale(64.0).without_units(A_far), A, rtol=1e-4, atol=1e-4 * np.abs(near.A).max()
+        )
+    assert far.energy == pytest.approx(near.energy, rel=1e-3)
+
+
+def test_distance_gate_beyond_range_grows_with_depth() -> None:
+    """At 17 to 23 m, Tukey's gate of 0.1 m allows more than 0.3 m. VoxelHashing's gate of 0.15 m is fixed."""
+    backward = np.array([0, 0, 0.3, 0, 0, 0])
+    assert enlarged(16, backward, DEPTH).matched > 1000
+    assert enlarged(16, backward, DEPTH, LinearWeights(np.float32(60), np.float32(0.1))).matched == 0
+    assert enlarged(1, backward, DEPTH).matched == 0
+
+
+def test_equations_sum_terms_and_separate_color() -> None:
+    offset = np.array([0.004, -0.003, 0.002, 0.002, 0.001, -0.002])
+    both, depth, color = (
+        enlarged(1, offset, weights) for weights in (BOTH, DEPTH, COLOR._replace(color_weight=np.float32(0.1)))
+    )
+    np.testing.assert_allclose(both.A, depth.A + color.A)
+    np.testing.assert_allclose(both.b, depth.b + color.b)
+    np.testing.assert_allclose(both.A_color, color.A)
+    assert (both.energy, both.color_energy) == pytest.approx((depth.energy, color.color_energy))
+    assert both.matched_colors == color.matched
+
+
 CORNER = Scene(
     planes=[(np.array([0, 0, -1.0]), -1.8), (np.array([0, -0.8, -0.6]), -1.2), (np.array([0.8, 0, -0.6]), -1.4)],
     contrast=1.0,
@@ -204,8 +255,9 @@ def slow_equations(
     weight = np.stack([w * weights.depth_weight, x * weights.color_weight])
     A = np.einsum("iep,jep,ep->ij", J, J, weight)
     return NormalEquations(
-        A, np.einsum("iep,ep->i", J, weight * r), int((depth > 0).sum()), int((w > 0).sum()), 0, 0, 0
-    )
+        A, np.einsum("iep,ep->i", J, weight * r), int((depth > 0).sum()), int((w > 0).sum()), 0, 0,
+        np.zeros((6, 6)), 0.0, 0.0, 0, 0.0,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])

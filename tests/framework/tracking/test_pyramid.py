@@ -8,7 +8,7 @@ import pytest
 from framework.data import Camera
 from framework.geometry import back_project
 from framework.sensors.noise_models import SensorKind
-from framework.tracking.pyramid import build_pyramid, is_coarse, model_intensities
+from framework.tracking.pyramid import build_pyramid, is_coarse, is_scattered, model_intensities
 
 
 def test_pyramid_depth_does_not_mix_surfaces_or_holes() -> None:
@@ -75,3 +75,13 @@ def test_is_coarse_compares_steps_with_sensor_noise() -> None:
     assert is_coarse(steps, otherwise=False)
     assert not is_coarse(steps / np.float32(2), otherwise=True, sensor=SensorKind.PHONE_LIDAR)
     assert is_coarse(steps / np.float32(2), otherwise=False, sensor=SensorKind.TIME_OF_FLIGHT)
+
+
+@pytest.mark.parametrize(("missing", "expected"), [(0.05, False), (0.3, True), (0.9, True)])
+def test_is_scattered_detects_single_missing_pixels(missing: float, expected: bool) -> None:
+    depth = np.ones((120, 160), np.float32)
+    depth[:, :60] = 0  # a hole is not scattered
+    assert not is_scattered(depth)
+    depth[np.random.default_rng(0).random(depth.shape) < missing] = 0
+    assert is_scattered(depth) == expected
+    assert not is_scattered(np.zeros_like(depth))

@@ -7,6 +7,7 @@ import pytest
 
 from framework.geometry import exp_se3, inverse
 from framework.tracking.alignment import Weights
+from framework.tracking.depth_scale import DepthScale
 from framework.tracking.pyramid import PyramidLevel, build_pyramid
 from framework.tracking.raw_keyframe import NEW_DISTANCE, USED_DISTANCE, KeyframeTerm, RawKeyframe
 from plugins.trackers.voxel_hashing_icp import _solved
@@ -27,7 +28,7 @@ def test_keyframe_term_step_recovers_pose_from_any_view(level: int) -> None:
         pose(0.02, -0.03, 0.01, (0.02, -0.01, 0.03)),
         pose(0.03, -0.02, 0.0, (0.01, 0.02, 0.0)),
     )
-    term = KeyframeTerm.at(RawKeyframe.of(pyramid(T_KEY), T_KEY), T_world_view)
+    term = KeyframeTerm.at(RawKeyframe.of(pyramid(T_KEY), T_KEY), T_world_view, DepthScale())
     assert term is not None
     truth = inverse(T_world_view) @ T_world_camera
     T_view_camera = exp_se3(np.array([0.004, -0.003, 0.002, 0.002, 0.001, -0.002])) @ truth
@@ -39,7 +40,7 @@ def test_keyframe_term_step_recovers_pose_from_any_view(level: int) -> None:
 
 
 def test_keyframe_term_at_finest_level_has_weight_of_its_points() -> None:
-    term = KeyframeTerm.at(RawKeyframe.of(pyramid(T_KEY), T_KEY), T_KEY)
+    term = KeyframeTerm.at(RawKeyframe.of(pyramid(T_KEY), T_KEY), T_KEY, DepthScale())
     assert term is not None
     levels = pyramid(T_KEY)
     finest, half = (term.linearized(levels, level, np.eye(4), WEIGHTS, 0.0, None) for level in (0, 1))
@@ -54,6 +55,6 @@ def test_keyframe_term_at_finest_level_has_weight_of_its_points() -> None:
 def test_keyframe_term_weight_falls_with_distance(offset: float, weight: float | None) -> None:
     keyframe = RawKeyframe.of(pyramid(T_KEY), T_KEY)
     for xi in ([offset, 0, 0, 0, 0, 0], [0, 0, 0, 0, offset, 0]):
-        term = KeyframeTerm.at(keyframe, T_KEY @ exp_se3(np.array(xi, np.float64)))
+        term = KeyframeTerm.at(keyframe, T_KEY @ exp_se3(np.array(xi, np.float64)), DepthScale())
         assert (term and term.weight) == (None if weight is None else pytest.approx(weight))
-    assert KeyframeTerm.at(None, T_KEY) is None
+    assert KeyframeTerm.at(None, T_KEY, DepthScale()) is None

@@ -76,6 +76,36 @@ def test_voxel_hashing_icp_color_determines_motion_along_wall() -> None:
     assert any(pose.lost for pose in alone), "alone it reports that the motion is undetermined"
 
 
+def enlarged(frame: Frame, scale: float) -> Frame:
+    """Return the frame of the scene enlarged by `scale`."""
+    assert frame.T_world_camera is not None
+    T = frame.T_world_camera.copy()
+    T[:3, 3] *= scale
+    return dataclasses.replace(frame, depth=np.float32(scale) * frame.depth, T_world_camera=T)
+
+
+@pytest.mark.parametrize("scale", [1, 8])
+def test_voxel_hashing_icp_hall_is_tracked_as_accurately_as_room(scale: float) -> None:
+    """At scale 8, depths are 10 to 25 m and steps 8 cm."""
+    frames = [enlarged(room().frame(T, k), scale) for k, T in enumerate(walk(20))]
+    fuser = assemble(BayesianTsdf, voxel_size=0.02 * scale, max_depth=4.0 * scale)
+    tracker = VoxelHashingIcp(finest_scale=1.0)
+    for frame in frames:
+        pose = tracker.track(frame, fuser.scene)
+        assert not pose.lost, pose.reason
+        fuser.fuse(frame, pose, NOTHING)
+    assert drift(pose, frames[-1])[0] < 0.004 * scale
+
+
+@pytest.mark.parametrize(
+    ("size", "scale"), [((640, 480), 0.5), ((1280, 720), 0.5), ((1920, 1440), 0.25), ((1440, 1920), 0.25)]
+)
+def test_voxel_hashing_icp_finest_side_is_bounded(size: tuple[int, int], scale: float) -> None:
+    camera = Camera(*size, 500.0, 500.0, 0.5 * size[0], 0.5 * size[1])
+    assert VoxelHashingIcp()._finest_scale(camera) == scale
+    assert VoxelHashingIcp(finest_side=0)._finest_scale(camera) == 0.5
+
+
 def test_voxel_hashing_icp_resumes_after_covered_frames() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(30))]
     covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[10:14]]
@@ -190,7 +220,7 @@ def test_voxel_hashing_icp_renders_map_from_predicted_pose(monkeypatch: pytest.M
     np.testing.assert_allclose(seen_from, [last @ inverse(before) @ last], atol=1e-9)
 
 
-def test_tracker_uses_sensor_of_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxel_hashing_icp_uses_sensor_of_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(3))]
     tracker = VoxelHashingIcp(finest_scale=1.0)
     _, scene = run(tracker, frames[:2])
@@ -362,6 +392,26 @@ def test_voxel_hashing_icp_resumes_without_relocalization(moving: bool) -> None:
     assert all(pose.lost for pose in poses[7:11])
     assert not any(pose.lost for pose in poses[11:])
     assert drift(poses[-1], last[-1])[0] < 0.006
+
+
+def scattered(frame: Frame, missing: float) -> Frame:
+    """Return the frame without depth in randomly selected pixels."""
+    rng = np.random.default_rng(frame.index)
+    return dataclasses.replace(frame, depth=np.where(rng.random(frame.depth.shape) < missing, 0, frame.depth))
+
+
+def test_scattered_depth_is_tracked() -> None:
+    frames = [scattered(room().frame(T, k), 0.7) for k, T in enumerate(walk(30))]
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
+    assert not any(pose.lost for pose in poses)
+    assert drift(poses[-1], frames[-1])[0] < 0.006
+
+
+def test_voxel_hashing_icp_loss_names_scattered_depth() -> None:
+    frames = [scattered(room().frame(T, k), 0.7) for k, T in enumerate(walk(3))]
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0, raw_keyframe=False), frames)
+    assert poses[-1].lost
+    assert "only 30% of the pixels have depth, most without neighbors" in poses[-1].reason
 
 
 def coarse(frame: Frame) -> Frame:

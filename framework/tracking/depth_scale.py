@@ -1,0 +1,51 @@
+"""Scale of lengths in a frame: limits in meters that grow with depth, and measures without units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Float32, Float64
+from framework.geometry import inverse, rotation_angle
+from framework.tracking.alignment_kernels import RANGE
+
+
+@dataclass(frozen=True)
+class DepthScale:
+    """The typical depth of a frame.
+
+    A translation t and a rotation t / depth move points at this depth by the same angle in the image. Limits in m hold
+    up to RANGE and grow in proportion to depth beyond it, as the errors of readings do.
+    """
+
+    depth: float = 1.0  # m, > 0
+
+    @classmethod
+    def of(cls, depth: Float32) -> DepthScale:
+        """Return the scale of depth readings (H, W) m, 0 = no reading."""
+        readings = depth[depth > 0]
+        return cls(float(np.median(readings))) if readings.size else cls()
+
+    @property
+    def growth(self) -> float:
+        """The factor of limits in m, >= 1."""
+        return max(1.0, self.depth / RANGE)
+
+    def length(self, xi: Float64) -> float:
+        """Return the largest entry of a twist (6,), m and rad; meters are divided by the growth."""
+        return float(max(np.abs(xi[:3]).max() / self.growth, np.abs(xi[3:]).max()))
+
+    def distance(self, T_world_a: Float64, T_world_b: Float64) -> float:
+        """Return the larger of translation, m, divided by the growth, and rotation, rad, between two poses."""
+        T_a_b = inverse(T_world_a) @ T_world_b
+        return max(float(np.linalg.norm(T_a_b[:3, 3])) / self.growth, rotation_angle(T_a_b[:3, :3]))
+
+    def near(self, T_world_a: Float64, T_world_b: Float64, limit: float) -> bool:
+        """Return True if two poses are within `limit` m and rad of each other."""
+        return self.distance(T_world_a, T_world_b) < limit
+
+    def without_units(self, A: Float64) -> Float64:
+        """Return the information matrix (6, 6) of translations in units of the depth and of rotations."""
+        units = np.array([self.depth] * 3 + [1.0] * 3)
+        return A * np.outer(units, units)
