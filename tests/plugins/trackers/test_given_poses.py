@@ -54,6 +54,7 @@ TRACKERS = pytest.mark.parametrize(
 def test_given_poses_skip_frames_without_pose_with_one_warning(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("WARNING")
     fuser = GridFuser()
     result = pipeline(tracker(tmp_path), fuser).run(CornerRoom(frames=FRAMES, unposed=GAP))
     metrics = run_metrics(result)
@@ -72,6 +73,7 @@ def test_given_poses_missing_do_not_hide_unreadable_frames(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Unreadable frames are logged one by one up to a limit, in which frames without poses do not count."""
+    caplog.set_level("WARNING")
     late = 30
     room = CornerRoom(frames=late + 2, unposed=tuple(range(late)), unreadable=late)
     given = tracker(tmp_path)
