@@ -52,6 +52,7 @@ from framework.runs.stored_runs import KEYFRAMES, MAP
 from framework.runtime.cpu_budget import limited_threads
 from framework.runtime.process_settings import Settings, configure_process
 from framework.runtime.run_log import Journal
+from framework.sensors.noise_models import SensorKind
 from framework.tracking.keyframes import read_keyframes
 
 __all__ = [
@@ -82,6 +83,7 @@ __all__ = [
     "QueryResult",
     "RGBDSequence",
     "SceneMap",
+    "SensorKind",
     "StageTimer",
     "View",
     "Viewer",
@@ -165,6 +167,7 @@ class Mapper(Map):
         viewer.begin(self.scene, "frames from Python", Path())
         finalize(self, viewer.end)  # when the mapper is deleted, or at exit
         self._camera: Camera | None = None  # camera of the last frame
+        self._sensor = SensorKind.KINECT_V1  # kind of the depth sensor of the last frame
         self._T_world_camera: Float64 | None = None  # pose of the last frame that is not lost
         self._frames = 0  # number of calls of `add`
 
@@ -176,6 +179,7 @@ class Mapper(Map):
         camera: Camera | None = None,
         timestamp: float | None = None,
         up: Float64 | None = None,
+        sensor: SensorKind | None = None,
     ) -> FrameResult:
         """Detect, track, refine and fuse the next frame of a video. A lost frame is not fused.
 
@@ -186,6 +190,7 @@ class Mapper(Map):
             camera: The camera; None = the camera of the last frame.
             timestamp: Time of the frame, s; None = 30 frames per second.
             up: (3,) unit vector opposite to gravity in the camera frame; None = unknown.
+            sensor: The kind of the depth sensor; None = that of the last frame, at first KINECT_V1.
 
         Returns:
             The pose of the frame, and the new and removed objects.
@@ -210,8 +215,8 @@ class Mapper(Map):
                         "fx, fy, cx, cy)"
                     )
                 time = self._frames / FRAME_RATE if timestamp is None else timestamp
-                frame = Frame(self._frames, time, color, depth, camera, pose, up=up)
-            self._camera = frame.camera
+                frame = Frame(self._frames, time, color, depth, camera, pose, up=up, sensor=sensor or self._sensor)
+            self._camera, self._sensor = frame.camera, frame.sensor
             self._frames += 1
             self._journal.timings.clear()  # unused here; would grow without limit for a live camera
             self._journal.tracked.clear()

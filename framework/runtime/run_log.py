@@ -18,6 +18,7 @@ from framework.data import Array, Float64, Frame, Pose
 from framework.errors import FrameError, NoPoseError
 from framework.interfaces import FusionStage, PoseTracker, SceneMap, StageTimer
 from framework.runtime.progress import Progress
+from framework.sensors.noise_models import SensorKind
 
 log = logging.getLogger(__name__)
 
@@ -107,6 +108,7 @@ class Journal:
     lost_for: int = 0  # number of consecutive lost frames
     frames_dropped: int = 0
     latencies: list[float] = field(default_factory=list)  # s
+    sensor: SensorKind | None = None  # of the last frame
 
     def __enter__(self) -> Journal:
         self._screen = ExitStack()
@@ -189,7 +191,10 @@ class Journal:
         return self.frames_skipped - self.without_pose
 
     def frame_tracked(self, frame: Frame, pose: Pose) -> None:
-        """Record a pose; log when tracking is lost and recovered."""
+        """Record a pose; log the depth sensor, and when tracking is lost and recovered."""
+        if frame.sensor is not self.sensor:
+            self.sensor = frame.sensor
+            log.info("depth sensor: %s", frame.sensor)
         self.tracked.append(TrackedFrame(frame.index, self.frames - 1, frame.timestamp, pose, frame.T_world_camera))
         if pose.lost:
             if not self.lost_for:

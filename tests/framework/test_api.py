@@ -25,6 +25,7 @@ from framework.pipeline import Pipeline
 from framework.refinement.lifting import lift
 from framework.registry import build
 from framework.runs.metrics import room_metrics
+from framework.sensors.noise_models import SensorKind
 from tests.support import registered
 from tests.support.scenes.analytic_scene import Scene
 from tests.support.scenes.corner_room import CornerRoom, pose_at
@@ -69,6 +70,18 @@ def test_mapper_add_unusable_frame_keeps_map_unchanged(room: CornerRoom) -> None
         mapper.add(replace(room[1], T_world_camera=None))
     np.testing.assert_array_equal(mapper.scene.mesh().vertices, before)
     assert not mapper.add(room[2]).lost
+
+
+def test_mapper_add_keeps_sensor_and_logs_it(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+    mapper = Mapper(*STAGES, "detector=none")
+    with caplog.at_level("INFO"):
+        for k, sensor in enumerate((None, SensorKind.PHONE_LIDAR, None)):
+            frame = room[k]
+            mapper.add(frame.color, frame.depth, frame.T_world_camera, frame.camera, sensor=sensor)
+    assert [record.message for record in caplog.records if "depth sensor" in record.message] == [
+        "depth sensor: KINECT_V1, standard deviation of depth 1.9 mm at 1 m, 14.0 mm at 3 m",
+        "depth sensor: PHONE_LIDAR, standard deviation of depth 10.0 mm at 1 m, 10.0 mm at 3 m",
+    ]
 
 
 @pytest.mark.parametrize("fuser", ["bayesian_tsdf", "open3d_vbg", "object_volumes", "class_only_fusion"])

@@ -111,6 +111,7 @@ def test_pipeline_keeps_sequence_frame_indices() -> None:
 
 @PREFETCH
 def test_pipeline_skips_unreadable_frame(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("WARNING")
     result = pipeline(prefetch).run(CornerRoom(unreadable=2))
     assert (result.frames, result.frames_skipped) == (6, 1)
     assert [frame.index for frame in result.tracked] == [0, 1, 3, 4, 5]
@@ -171,6 +172,8 @@ def test_pipeline_stage_returning_none_raises(
 
 
 def test_pipeline_limits_log_of_skipped_frames(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("WARNING")
+
     @dataclass
     class MostlyBroken(CornerRoom):
         def __getitem__(self, k: int) -> Frame:
@@ -192,6 +195,7 @@ def test_pipeline_without_usable_frame_raises() -> None:
 
 
 def test_pipeline_counts_lost_frames_without_fusion(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("WARNING")
     result = pipeline(tracker=GivenPose(lost_from=2, lost_to=5)).run(room)
     assert (result.frames, result.frames_lost, len(mapped(result).vertices)) == (6, 3, 3)
     assert [frame.pose.lost for frame in result.tracked] == [False, False, True, True, True, False]

@@ -240,7 +240,7 @@ def verdicts(sequence: RGBDSequence) -> dict[str, Verdict]:
 
 
 def test_single_frame_or_missing_poses_can_be_checked() -> None:
-    fine = dict.fromkeys(("depth", "poses", "sharpness"), Verdict.FINE)
+    fine = dict.fromkeys(("depth", "poses", "sharpness", "sensor"), Verdict.FINE)
     assert verdicts(Part(1)) == fine | dict.fromkeys(("motion", "color and depth"), Verdict.UNKNOWN)
     assert verdicts(Part(20)) == fine | dict.fromkeys(("motion", "color and depth"), Verdict.FINE)
 
@@ -289,3 +289,9 @@ def test_run_with_inverted_poses_logs_warning(tmp_path: Path, caplog: pytest.Log
     warn_of_poses(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=inverse)))
     assert "poses: stored as T_camera_world" in caplog.text
     assert "run `instancemap check`" in caplog.text
+
+
+def test_check_reports_depth_sensor() -> None:
+    [finding] = [finding for finding in check(DESK, FARTHEST).findings if finding.subject == "sensor"]
+    assert (finding.verdict, finding.setting) == (Verdict.FINE, "")
+    assert finding.text == "KINECT_V1, standard deviation of depth 1.9 mm at 1 m, 14.0 mm at 3 m"

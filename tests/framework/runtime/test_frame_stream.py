@@ -145,6 +145,7 @@ def test_live_video_detects_every_nth_mapped_frame(prefetch: int) -> None:
 
 @PREFETCH
 def test_fast_live_video_drops_and_counts_frames(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("WARNING")
     video = LiveRoom(frames_sent=60, period_s=SLOW_S / 6)
     result = pipeline(prefetch, fuser=GridFuser(slow_s=SLOW_S)).run(video)
     assert result.live is not None

@@ -54,6 +54,7 @@ TRACKERS = pytest.mark.parametrize(
 def test_frames_without_pose_are_skipped_with_one_warning(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("WARNING")
     fuser = GridFuser()
     result = pipeline(tracker(tmp_path), fuser).run(CornerRoom(frames=FRAMES, unposed=GAP))
     metrics = run_metrics(result)
@@ -72,6 +73,7 @@ def test_unposed_frames_do_not_hide_unreadable_frames(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Unreadable frames are told one by one up to a limit, which frames without poses do not count in."""
+    caplog.set_level("WARNING")
     late = 30
     room = CornerRoom(frames=late + 2, unposed=tuple(range(late)), unreadable=late)
     given = tracker(tmp_path)
