@@ -272,7 +272,8 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
         if key not in fields:
             hint = rename_hint(f"{where.split()[0]}.{key}")
             suggestion = f"; {hint}" if hint else _did_you_mean(key, list(fields))
-            expected = "a known parameter" if suggestion else f"one of {', '.join(fields) or 'none'}"
+            names = f"one of {', '.join(fields)}" if fields else "no parameters"
+            expected = "a known parameter" if suggestion else names
             raise ConfigError(f"{where}: expected {expected}, got {key!r}{suggestion}")
         if key in stages:
             plugins[key] = _inner(f"{where}: {key}", stages[key], node[key], holds_one(plugin_class, key))

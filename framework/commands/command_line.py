@@ -161,7 +161,7 @@ def _config_dirs(words: list[str]) -> list[Path]:
 
 
 def _in_worker() -> bool:
-    """Return True in a job of a launcher other than Hydra's basic launcher, which uses separate processes."""
+    """Return True in a job of a launcher with worker processes, i.e., any launcher but Hydra's basic one."""
     hydra_config = HydraConfig.get()
     return is_of_sweep(hydra_config) and not str(hydra_config.launcher._target_).endswith(".BasicLauncher")
 

@@ -86,7 +86,7 @@ class BenchmarkSettings:
         if not 0 < self.camera_speed <= MAX_CAMERA_SPEED:
             raise ConfigError(f"--camera-speed: expected a value in (0, {MAX_CAMERA_SPEED:g}], got {self.camera_speed}")
         if self.width % 4:
-            raise ConfigError(f"--width: expected a multiple of 4 px, for images of 4:3, got {self.width}")
+            raise ConfigError(f"--width: expected a multiple of 4 px (4:3 aspect ratio), got {self.width}")
 
     @property
     def camera(self) -> Camera:

@@ -5,9 +5,10 @@
 T = T_view_camera moves the frame's points p_i into the view. The view gives each point its model point q_i with normal
 n_i, and its model intensity. w_i and v_i are Tukey's biweights. Residuals are divided by their expected noise, so both
 terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its noise times depth / FAR. Errors
-of structured-light cameras at this range cover whole image regions and do not average out. Beyond `RANGE`, sensors are
-of another kind: standard deviations and gates are those at `RANGE` times depth / RANGE. The balance of the two terms
-then does not depend on depth. Gauss-Newton steps are twists in the view's frame: T <- exp(xi) T.
+of structured-light cameras at this range cover whole image regions and do not average out. `RANGE` is the
+maximum depth of these cameras. Beyond it, standard deviations and gates are those at `RANGE` times depth / RANGE, so
+that the balance of the two terms does not depend on depth. Gauss-Newton steps are twists in the view's frame:
+T <- exp(xi) T.
 
 `LinearWeights` replaces Tukey's weights by the weights in VoxelHashing's published code, for residuals in m and in
 [0, 1]. With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
@@ -17,7 +18,7 @@ then does not depend on depth. Gauss-Newton steps are twists in the view's frame
 
 The kernels process points in batches of a fixed size. Branch-free loops over fields of one array are vectorized by the
 compiler. Separate loops only fetch from images. Ignored points have weight 0. Sums are kept in lanes, so that vector
-code needs no reordered additions (fast math) and every compilation rounds equally.
+code needs no reordered additions (fast math) and every compilation rounds identically.
 """
 
 from __future__ import annotations

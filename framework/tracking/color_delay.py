@@ -7,9 +7,10 @@ Its error in px is constant. An inaccurate registration adds a constant offset o
 
     |v_k| d_k = |v_k| d + n_k . o + noise
 
-Robust regression (Tukey's biweight) over the compared frames gives the delay d. Its standard deviation is a jackknife
-over blocks of frames, because errors of nearby frames are correlated. Slow frames are not compared. A camera that turns
-to one side at a constant rate does not determine d, and the standard deviation is then large.
+Robust regression (Tukey's biweight) over the compared frames gives the delay d, with a normal prior of the offset. The
+standard deviation is the larger one of the regression and of a jackknife over blocks of frames, because errors of
+nearby frames are correlated. Slow frames are not compared. A camera that turns to one side at a constant rate does not
+separate d from o, and the standard deviation is then large.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ MIN_COMPARISONS = 16  # minimum number of compared frames for an estimate
 BLOCKS = 8  # number of blocks of the jackknife
 MAX_DEVIATION = 0.002  # s, maximum standard deviation of a usable estimate ...
 MAX_RELATIVE_DEVIATION = 0.2  # ... or, if larger, the maximum as a fraction of the estimate
+OFFSET_DEVIATION = 2.0  # px, standard deviation of the constant offset before the first comparison
 CUT_OFF = 4.685  # standard deviations with weight 0 in Tukey's biweight
 ITERATIONS = 10  # of the robust regression
 
@@ -166,17 +168,18 @@ def regress(comparisons: Float64, start: float) -> DelayEstimate:
         residuals = shifts - X @ solution
         scale = max(1.4826 * float(np.median(np.abs(residuals))), 0.1)
         weights = np.maximum(1 - (residuals / (CUT_OFF * scale)) ** 2, 0) ** 2
-        solution = _solution(X, shifts, weights)
+        covariance = scale**2 * np.linalg.inv(_information(X, weights, scale))
+        solution = covariance @ X.T @ (weights * shifts) / scale**2
     without = []  # delays without one of the blocks
     for block in np.array_split(np.arange(len(delays)), BLOCKS):
         rest = weights.copy()
         rest[block] = 0
-        without.append(_solution(X, shifts, rest)[0])
-    deviation = float(np.sqrt((BLOCKS - 1) * np.var(without)))
+        without.append(np.linalg.solve(_information(X, rest, scale), X.T @ (rest * shifts))[0])
+    deviation = max(float(np.sqrt((BLOCKS - 1) * np.var(without))), float(np.sqrt(covariance[0, 0])))
     return DelayEstimate(float(solution[0]), deviation, len(delays))
 
 
-def _solution(X: Float64, y: Float64, weights: Float64) -> Float64:
-    """Return the weighted least-squares solution, the smallest one if it is not unique."""
-    root = np.sqrt(weights)
-    return np.asarray(np.linalg.lstsq(X * root[:, None], y * root, rcond=None)[0])
+def _information(X: Float64, weights: Float64, scale: float) -> Float64:
+    """Return X^T W X (3, 3) with the prior of the offset, for residuals with a standard deviation of `scale` px."""
+    prior = np.array([0.0, 1.0, 1.0]) * (scale / OFFSET_DEVIATION) ** 2
+    return np.asarray((X * weights[:, None]).T @ X + np.diag(prior))

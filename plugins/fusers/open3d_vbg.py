@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 @dataclass
 class Open3DVoxelBlockGrid(MapFuser):
-    """Open3D's TSDF with a majority label per voxel. The classes of an instance are a product over detections."""
+    """Open3D's TSDF with a majority label per voxel.
+
+    The class distribution of an instance is the product of those of its detections.
+    """
 
     tsdf: Tsdf = field(default_factory=Tsdf)
     association: Association = field(default_factory=Association)

@@ -53,7 +53,10 @@ class Dbscan(ClusterRefiner):
         return keep_points(clusters, kept)
 
     def _sampled(self, pixels: Int32) -> tuple[Bool, int]:
-        """Return an array (P,), True for pixels in every step-th row and column, and the smallest sufficient step."""
+        """Return a mask (P,) of the pixels in every step-th row and column, and the step.
+
+        The step is the smallest one with at most `max_points` such pixels.
+        """
         for step in range(self.stride, 1 << 16):
             sampled = (pixels[:, 0] % step == 0) & (pixels[:, 1] % step == 0)
             if np.count_nonzero(sampled) <= self.max_points:

@@ -135,8 +135,8 @@ def check_name(stage: str, name: str) -> None:
         )
     if keyword.iskeyword(name) or name in FOLDERS:
         raise ConfigError(
-            f"NAME: expected a name without a meaning in Python packages, got {name}; choose another name such as "
-            f"my_{name}"
+            f"NAME: expected a name other than a Python keyword, {' or '.join(sorted(FOLDERS))}, got {name}; choose "
+            f"another name such as my_{name}"
         )
     if name in options_of(stage):
         raise ConfigError(

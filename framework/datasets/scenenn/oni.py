@@ -66,7 +66,7 @@ class OniImage:
 
 @dataclass(frozen=True)
 class OniFrame:
-    """A color and a depth image of about the same time, registered or mirrored as recorded."""
+    """A color image and a depth image taken at about the same time."""
 
     color: UInt8  # (H, W, 3) RGB
     depth_mm: UInt16  # (H, W) mm, 0 = no reading

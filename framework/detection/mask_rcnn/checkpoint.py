@@ -137,4 +137,5 @@ def _backbone(tensors: Mapping[str, Tensor], norm_eps: float, where: str) -> Res
         if expected == depths and (name in WITH_BOTTLENECKS) == bottlenecks:
             width = len(required(tensors, "backbone.body.conv1.weight", where))
             return ResNetShape(name, width, norm_eps=norm_eps)
-    raise DataError(f"{where}: expected a known residual network, got {depths} blocks")
+    found = f"{depths} blocks {'with' if bottlenecks else 'without'} bottlenecks"
+    raise DataError(f"{where}: expected the blocks of {', '.join(DEPTHS)}, got {found}")

@@ -192,7 +192,7 @@ class Association:
     min_class_agreement: float = 0.0  # minimum Bhattacharyya coefficient of the classes to match, in [0, 1]
     create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; updates have no minimum
     create_points: int = 50  # minimum cluster size to create an instance, px, >= 1; also minimum overlap denominator
-    split_instances: bool = True  # True = create an instance for the second of two clusters on one instance
+    split_instances: bool = True  # True = create an instance for the second cluster that matches an instance
     merge_overlap: float = 1.0  # minimum overlap with one cluster to merge two instances, in [0, 1]; 1 = no merging
     merge_frames: int = 3  # minimum number of frames with a joint cluster minus with separate clusters, to merge, >= 1
     merge_agreement: float = 0.1  # minimum Bhattacharyya coefficient of the classes to merge, in [0, 1]

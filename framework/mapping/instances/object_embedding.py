@@ -115,7 +115,7 @@ def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, d
     with np.errstate(over="ignore"):  # invalid values may overflow
         lengths = np.linalg.norm(sums / weights[:, None], axis=1)
     if n and lengths.max() > 1 + 1e-3:
-        raise DataError(f"embedding_sums: expected at most 1 per unit of weight, got {lengths.max():.4g}")
+        raise DataError(f"embedding_sums: expected vectors with norm / weight of at most 1, got {lengths.max():.4g}")
     return space, {
         int(k): ObjectEmbedding(sums[i], float(weights[i]), int(counts[i])) for i, k in enumerate(ids.tolist())
     }

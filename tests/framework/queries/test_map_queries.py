@@ -166,7 +166,7 @@ def test_mapper_accepts_keyword_parameters(value: str) -> None:
     )
     assert type(named.pipeline.detector).__name__ == "NoDetections"
     assert Mapper("detector=none", **{"fuser.voxel_size": 0.05}).scene.statistics.voxels == 0  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="detector: expected a name, a number, true, false or None"):
+    with pytest.raises(ConfigError, match="detector: expected a string, path, number, bool or None"):
         Mapper(detector=["none"])
 
 
@@ -180,7 +180,8 @@ def test_mapper_and_command_line_maps_are_identical(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     mapper = Mapper(*asked)
     for frame in TumRgbd(CHECKOUT / "data" / "desk", scene="rgbd_dataset_freiburg1_rpy", stop=6):
-        mapper.add(frame.color, frame.depth, pose=frame.T_world_camera, camera=frame.camera, timestamp=frame.timestamp)
+        times = {"timestamp": frame.timestamp, "depth_timestamp": frame.depth_time}
+        mapper.add(frame.color, frame.depth, pose=frame.T_world_camera, camera=frame.camera, **times)
     mapper.save(tmp_path / "map.npz")
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "run" / "map.npz").read_bytes()
     assert mapper.instances()

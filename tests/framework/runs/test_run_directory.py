@@ -232,7 +232,7 @@ def test_mesh_file_is_readable_by_open3d(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.asarray(read.vertex_colors) * 255, mesh.colors, atol=1e-3)
 
 
-def test_record_instances_contain_class_and_geometry(record: RunRecord, room: CornerRoom) -> None:
+def test_run_directory_instances_have_class_and_geometry(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room)
     record.write(room, result)
     first, second = json.loads((record.directory / "instances.json").read_text())

@@ -197,7 +197,7 @@ def test_paper_fuser_recursions_agree_with_slow_reference(
     assert several > 50
 
 
-def test_paper_fuser_instance_floor_0_divides_rest_of_score(frames: list[Frame]) -> None:
+def test_paper_fuser_zero_instance_floor_splits_remainder(frames: list[Frame]) -> None:
     fuser = paper_fuser()
     assert fuser.instance_floor == 0
     at = Pose(pose())

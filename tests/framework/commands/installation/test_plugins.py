@@ -177,10 +177,10 @@ def test_describe_option_formats_parameters_like_yaml() -> None:
 FAULTY_OPTIONS = {
     "no_yaml": ("a: [1,\n", "no_yaml.yaml: expected valid YAML, got "),
     "list": ("- 1\n", "list.yaml: expected keys and values, got a list"),
-    "no_text": ("\udcff", "no_text.yaml: expected UTF-8 text: "),
+    "no_text": ("\udcff", "no_text.yaml: expected UTF-8 text, got "),
     "no_class": ("_target_: plugins.detectors.none.NoDetection\n", "got NoDetection; did you mean 'NoDetections'?"),
     "a_refiner": ("_target_: plugins.refiners.identity.Identity\n", "expected a class that implements Detector"),
-    "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "expected one of score_threshold"),
+    "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "expected no parameters, got 'score'"),
     "no_number": (
         "_target_: plugins.detectors.simulated.SimulatedDetector\nmin_pixels: many\nseed: ${seed}\n",
         "min_pixels: Value 'many' of type 'str' could not be converted to Integer",

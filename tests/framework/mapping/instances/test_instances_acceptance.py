@@ -90,7 +90,7 @@ def test_instances_of_adjacent_chairs_stay_separate() -> None:
     assert_one_each(scene, mapped(frames, detections), 0.9)
 
 
-def test_instance_of_table_stays_one_from_two_sides() -> None:
+def test_table_seen_from_two_sides_is_one_instance() -> None:
     """The camera sees one side from low down and then, after a jump, the other side."""
     scene = BoxScene([table(0.0, 0.0)])
     sides = [(x, y, 1.2) for y in (-2.2, 1.8) for x in np.linspace(-0.8, 0.8, 12)]

@@ -155,7 +155,7 @@ def test_embeddings_of_other_space_raise() -> None:
         (
             "embedding_sums",
             np.float64([[900, 0], [0, 1]]),
-            "embedding_sums: expected at most 1 per unit of weight, got ",
+            "embedding_sums: expected vectors with norm / weight of at most 1, got ",
         ),
         ("embedding_weights", np.float64([0, 1]), r"embedding_weights: expected values in \(0, 1e\+12\], got .* to"),
         ("embedding_counts", np.int64([0, 1]), "embedding_counts: expected at least 1"),
