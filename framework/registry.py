@@ -156,6 +156,8 @@ def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
     files: Any = CachingConfigRepository(loader.repository)
     for name in sorted(loader.get_group_options(stage), key=lambda name: name not in sought):
         own = files.load_config(f"{stage}/{name}").config
+        if OmegaConf.is_interpolation(own, "_target_"):
+            continue  # its value depends on other configs, so it names no class
         if "_target_" in own:
             yield str(own["_target_"])
         else:

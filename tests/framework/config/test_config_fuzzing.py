@@ -110,6 +110,10 @@ def test_config_option_invalid_file_error_is_one_line_with_path(content: str, me
     assert line.startswith(str(option))
 
 
+def test_config_option_interpolated_target_raises_one_line_error(option: Path) -> None:
+    assert "expected the _target_ of a registered option" in line_of(option, b"_target_: ${seed}plugins.X\n")
+
+
 def test_config_option_linked_to_device_raises(option: Path) -> None:
     option.symlink_to("/dev/zero")
     with pytest.raises(InstanceMapError, match="detector: expected one of"):

@@ -24,7 +24,7 @@ def test_room_pictures_show_known_classes_in_varied_colors(seen: list) -> None:
     for color, ids, names in seen:
         assert color.shape == (*ids.shape, 3)
         assert set(names.values()) <= set(SCENENN_TO_COCO.values())
-        assert np.isin(ids, list(names)).sum() >= room_pictures.LEAST
+        assert np.isin(ids, list(names)).sum() >= room_pictures.MIN_PIXELS
     assert not np.array_equal(seen[0][0], seen[1][0])
 
 
