@@ -99,7 +99,7 @@ def _parse_header(path: Path, data: bytes) -> Header:
         except ValueError as error:
             raise DataError(f"{path}, line {number}: {error}") from error
     if not format_name:
-        expected = f"expected a header line 'format ENCODING 1.0' with the encoding {' or '.join(FORMATS)}"
+        expected = f"expected a header line 'format' with 1.0 and the encoding {' or '.join(FORMATS)}"
         raise DataError(f"{path}, line {len(lines)}: {expected}, got none")
     header = Header(format_name, tuple(elements), tuple(comments), len(lines), sum(map(len, lines)))
     _check_size(path, header, len(data) - header.size)
