@@ -56,7 +56,7 @@ def test_option_missing_required_parameter_or_file_raises(stage: str, name: str)
 def test_option_yaml_lists_all_parameters_with_comments(stage: str, name: str) -> None:
     option = registered.OPTION[stage, name]
     assert option.documentation
-    assert not option.documentation.startswith("cannot be used"), option.documentation
+    assert not option.documentation.startswith("unusable"), option.documentation
     node = registered.composed(stage, name)[stage]
     assert {parameter.name for parameter in option.parameters} == set(node) - {"_target_"}
     assert not [parameter.name for parameter in option.parameters if not parameter.comment]

@@ -212,7 +212,7 @@ def test_describe_option_accepts_every_registered_option() -> None:
     for option in options:
         assert option.name in describe(option)
         assert option.provider == "main"
-        assert not option.documentation.startswith("cannot be used")
+        assert not option.documentation.startswith("unusable")
 
 
 def test_plugins_listing_does_not_import_open3d(tmp_path: Path) -> None:
