@@ -98,7 +98,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     motion_finding = _check_motion(steps, len(neighbors), sequence.camera.width)
     findings += [*judgment.findings, registration_finding, motion_finding, _check_sharpness(frames)]
     findings += _check_times(sequence)
-    findings.append(check_color_delay(sequence, matcher))
+    findings.append(check_color_delay(matcher))
     findings.append(Finding(Verdict.FINE, "sensor", f"{frames[0].sensor}"))
     camera = sequence.camera
     summary = (

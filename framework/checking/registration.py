@@ -17,13 +17,13 @@ from framework.checking import Finding, Verdict
 from framework.data import Bool, Float32, Frame
 from framework.errors import FrameError
 from framework.interfaces import RGBDSequence
+from framework.tracking.color_delay import MAX_GRADIENT
+from framework.tracking.color_delay_kernels import DEPTH_STEP
 
 WIDTH = 320  # px, width of the compared images
 SEARCHED_SHIFT = 16  # px at WIDTH, in both directions
 MAX_DELAY = 6  # frames, in both directions
 ZOOMS = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.11, 1.18, 1.25)  # scale of the depth image about its center
-DEPTH_STEP = 0.05  # fraction of the depth; a larger step is an edge
-MAX_GRADIENT = 200.0  # Sobel units; stronger gradients are clipped, so that lamps do not dominate
 MIN_FRAMES = 3
 MIN_EDGES = 20.0  # px at WIDTH; frames with fewer edge pixels are ignored
 MIN_STRENGTH_RATIO = 1.2  # minimum strength of another alignment, as a ratio to the stored alignment

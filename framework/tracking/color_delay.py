@@ -34,15 +34,14 @@ WIDTH = 320  # px, width of the compared images
 MAX_GRADIENT = 200.0  # Sobel units; stronger gradients are clipped, so that lamps do not dominate
 MIN_EDGES, MAX_EDGES = 100, 1500  # number of edge points of a compared frame
 MIN_SPEED = 0.125  # minimum image motion of a compared frame, image widths per s
-EVERY, MANY, EVERY_LATER = 1, 60, 8  # every frame is compared, after 60 comparisons every 8th frame
-MIN_COMPARISONS = 16  # minimum number of compared frames for an estimate
+DENSE_COMPARISONS, LATER_STRIDE = 60, 8  # number of successive comparisons; after them, every 8th frame is compared
+MIN_COMPARISONS, MAX_COMPARISONS = 16, 512  # number of latest comparisons for an estimate
 BLOCKS = 8  # number of blocks of the jackknife
 MAX_DEVIATION = 0.002  # s, maximum standard deviation of a usable estimate ...
 MAX_RELATIVE_DEVIATION = 0.2  # ... or, if larger, the maximum as a fraction of the estimate
 OFFSET_DEVIATION = 2.0  # px, standard deviation of the constant offset before the first comparison
 CUT_OFF = 4.685  # standard deviations with weight 0 in Tukey's biweight
 ITERATIONS = 10  # of the robust regression
-
 
 UNKNOWN = DelayEstimate(0.0, np.inf, 0)
 
@@ -55,7 +54,6 @@ def is_usable(estimate: DelayEstimate) -> bool:
 class _Tracked(NamedTuple):
     frame: Frame
     T_world_camera: Float64
-    number: int  # of the tracked frame
 
 
 class DelayEstimator:
@@ -64,23 +62,23 @@ class DelayEstimator:
     def __init__(self) -> None:
         self.estimate = UNKNOWN
         self._recent: deque[_Tracked] = deque(maxlen=HISTORY)
-        self._number = 0
-        self._comparisons: list[tuple[float, float, float]] = []  # delay, s, and mean image motion, px / s
+        self._frames = 0  # number of added frames
+        # delay, s, and mean image motion (x, y), px / s
+        self._comparisons: deque[tuple[float, float, float]] = deque(maxlen=MAX_COMPARISONS)
         self._strengths = np.zeros(len(TESTED_DELAYS))  # sum over the compared frames
 
-    def add(self, frame: Frame, T_world_camera: Float64) -> bool:
-        """Add a frame that follows the previous one. Return True if the estimate has changed."""
+    def add(self, frame: Frame, T_world_camera: Float64) -> None:
+        """Add a frame that follows the previous one, and update the estimate."""
         if self._recent and not 0 < frame.depth_time - self._recent[-1].frame.depth_time <= MAX_STEP:
             self.interrupt()
-        self._recent.append(_Tracked(frame, T_world_camera, self._number))
-        self._number += 1
-        every = EVERY if len(self._comparisons) < MANY else EVERY_LATER
-        if len(self._recent) < HISTORY or self._recent[HISTORY // 2].number % every or not self._compare():
-            return False
+        self._recent.append(_Tracked(frame, T_world_camera))
+        self._frames += 1
+        skipped = len(self._comparisons) >= DENSE_COMPARISONS and self._frames % LATER_STRIDE
+        if skipped or len(self._recent) < HISTORY or not self._compare():
+            return
         if len(self._comparisons) >= MIN_COMPARISONS:
             start = float(TESTED_DELAYS[self._strengths.argmax()])
             self.estimate = regress(np.array(self._comparisons), start)
-        return True
 
     def interrupt(self) -> None:
         """Forget the recent frames, because the motion to the next frame is unknown."""
@@ -88,7 +86,7 @@ class DelayEstimator:
 
     def _compare(self) -> bool:
         """Compare color and depth of the frame in the middle. Return False if it is slow or has too few edges."""
-        before, (frame, T_world_camera, _), after = (self._recent[HISTORY // 2 + k] for k in (-1, 0, 1))
+        before, (frame, T_world_camera), after = (self._recent[HISTORY // 2 + k] for k in (-1, 0, 1))
         camera = frame.camera
         seconds = after.frame.depth_time - before.frame.depth_time
         least = MIN_SPEED * camera.width  # px / s

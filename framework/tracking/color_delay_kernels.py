@@ -7,6 +7,7 @@ from numba import njit, prange
 
 DEPTH_STEP = 0.05  # fraction of the depth; a larger step is an edge
 REACH = 4  # px, maximum width of the missing depth at an edge
+DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # (u, v) of the searched neighbors
 ROWS = 2  # step between the searched rows, px
 
 
@@ -22,10 +23,7 @@ def find_edges(depth, edges):
                 continue
             behind = z * np.float32(1.0 + DEPTH_STEP)
             found = False
-            for direction in range(4):
-                du, dv = (
-                    (1, 0) if direction == 0 else (-1, 0) if direction == 1 else (0, 1) if direction == 2 else (0, -1)
-                )
+            for du, dv in DIRECTIONS:
                 for k in range(1, REACH + 1):
                     neighbor = depth[v + k * dv, u + k * du]
                     if neighbor > np.float32(0.0):

@@ -19,11 +19,10 @@ import numpy as np
 
 from framework.data import DelayEstimate, Float64, Frame, Int32, Pose
 from framework.geometry import interpolate, inverse, rotation_angle
-from framework.tracking.color_delay import DelayEstimator, is_usable
+from framework.tracking.color_delay import MAX_STEP, DelayEstimator, is_usable
 from framework.tracking.color_delay_kernels import register
 from framework.tracking.pyramid import intrinsics
 
-MAX_STEP = 0.2  # s, maximum time between two poses for a velocity
 MIN_SHIFT = 0.5  # px, minimum image motion between color and depth for a registration
 NEAR = 1.0  # m, depth of the points for this image motion
 STRIDE = 8  # px, step between the depth readings for their median
@@ -36,9 +35,7 @@ class RegisteredFrame(NamedTuple):
 
     frame: Frame  # with the color at each depth pixel
     T_world_color: Float64  # (4, 4) pose of the color camera
-    color_pixels: Int32 | None = (
-        None  # (H, W) flat index of the color pixel at each depth reading, -1 = none; None = same
-    )
+    color_pixels: Int32 | None = None  # (H, W) flat index of the color pixel of each reading, -1 = none; None = same
 
 
 class ColorToDepth:

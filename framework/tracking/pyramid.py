@@ -13,7 +13,7 @@ from framework.tracking.pyramid_kernels import compute_normals, find_distinct, h
 
 SAMPLED = 4  # stride of the depth readings for the quantization estimate, px
 FEWEST_VALUES = 16  # minimum number of distinct depths for the quantization estimate
-SCATTERED = 0.15  # fraction of neighbors of readings without depth; a Kinect's images have at most 0.02
+SCATTERED = 0.15  # minimum fraction of missing neighbors of depth readings; Kinect images have at most 0.02
 COARSE = 2.5  # largest fine step between depth values, standard deviations of the sensor's depth
 
 

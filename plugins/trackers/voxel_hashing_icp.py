@@ -382,10 +382,9 @@ class VoxelHashingIcp(PoseTracker):
 
         Coarse levels start from less accurate poses, and Tukey's weights tolerate larger residuals there.
         """
+        normals_known = not (self._coarse_depth or self._scattered_depth)
         weights = self._weights._replace(
-            min_normal_dot=np.float32(-1)
-            if self._coarse_depth or self._scattered_depth
-            else self._weights.min_normal_dot,
+            min_normal_dot=self._weights.min_normal_dot if normals_known else np.float32(-1),
             color_weight=self._weights.color_weight if level >= LEVELS - self.color_levels else np.float32(0),
         )
         if self.residual_weights is ResidualWeights.LINEAR:
@@ -416,7 +415,7 @@ class VoxelHashingIcp(PoseTracker):
     def _is_determined(self, equations: NormalEquations) -> bool:
         """Return True if all motions are determined, by eigenvalues of A for lengths in units of the typical depth.
 
-        Color counts in full, without lambda, because only geometric information is faked by noise of normals.
+        Color counts in full, without lambda, because noise of normals adds false information to geometry only.
         """
         color = (1 / self.color_weight - 1) * equations.A_color if self.color_weight > 0 else 0.0
         information = np.linalg.eigvalsh(self._scale.without_units(equations.A + color))

@@ -63,7 +63,7 @@ def test_option_yaml_lists_all_parameters_with_comments(stage: str, name: str) -
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
-    """Return the default value, which OmegaConf calls "???" if there is none."""
+    """Return the default value; "???" is OmegaConf's marker of a missing one."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return "???" if field.default is dataclasses.MISSING else field.default

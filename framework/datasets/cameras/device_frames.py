@@ -32,7 +32,7 @@ class DepthCamera(LiveVideo):
     """A camera with factory calibration. The library registers depth to color."""
 
     brand: ClassVar[str]
-    usual_sensor: ClassVar[SensorKind]  # kind of devices with unknown names
+    default_sensor: ClassVar[SensorKind]  # kind of devices with unknown names
     serial: str = ""  # serial number of the device; "" = the first device found
     width: int = 640  # width of the color image, px, in [64, 4096]
     height: int = 480  # height of the color image, px, in [64, 4096]
@@ -102,7 +102,7 @@ class DepthCamera(LiveVideo):
         number = count()
         calibration: Calibration | None = None
         try:
-            sensor = self.sensor.kind(kind_of_device(self.device_name()) or self.usual_sensor)
+            sensor = self.sensor.kind(kind_of_device(self.device_name()) or self.default_sensor)
             for images in images_of(self.brand, self.wait):
                 if images is not None and calibration is None:
                     calibration = self.calibrate(images)

@@ -21,7 +21,7 @@ class Orbbec(DepthCamera):
     """An Orbbec camera."""
 
     brand = "Orbbec"
-    usual_sensor = SensorKind.KINECT_V1
+    default_sensor = SensorKind.KINECT_V1
 
     def start(self) -> None:
         ob = import_optional("pyorbbecsdk", "reads Orbbec cameras", "orbbec")

@@ -19,7 +19,7 @@ class RealSense(DepthCamera):
     """An Intel RealSense camera."""
 
     brand = "RealSense"
-    usual_sensor = SensorKind.REALSENSE_D435
+    default_sensor = SensorKind.REALSENSE_D435
 
     def start(self) -> None:
         self._rs = rs = import_optional("pyrealsense2", "reads RealSense cameras", "realsense")

@@ -269,14 +269,14 @@ def delay_depth(frames: Sequence[RecordedFrame], delay: int) -> Sequence[Recorde
     for frame, other in _with_later(frames, delay):
         if other:
             images = replace(frame.images, depth_name=other.images.depth_name, depth=other.images.depth)
-            moved.append(without_image_times(replace(frame, images=images)) if delay else frame)
+            moved.append(_without_image_times(replace(frame, images=images)) if delay else frame)
         else:
             error = frame.error or f"expected a depth image at an offset of {delay} frames, got none"
             moved.append(replace(frame, error=error))
     return moved
 
 
-def without_image_times(frame: RecordedFrame) -> RecordedFrame:
+def _without_image_times(frame: RecordedFrame) -> RecordedFrame:
     """Return the frame without separate timestamps of color and depth."""
     return replace(frame, color_timestamp=None, depth_timestamp=None)
 
@@ -293,7 +293,7 @@ def _with_plausible_image_times(name: str, frames: Sequence[RecordedFrame]) -> S
         return frames
     message = "%s: expected timestamps of color and depth within %g s of each other, got %.6g s; not used"
     log.warning(message, name, LONGEST_COLOR_DELAY, largest)
-    return [without_image_times(frame) for frame in frames]
+    return [_without_image_times(frame) for frame in frames]
 
 
 def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[RecordedFrame, RecordedFrame | None]]:
@@ -324,7 +324,7 @@ def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[Re
         name,
         FRAME_RATE,
     )
-    return [replace(without_image_times(recorded), timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
+    return [replace(_without_image_times(recorded), timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
 
 
 def check_selection(start: int, stop: int, stride: int, frame_fraction: float = 1.0) -> None:

@@ -36,7 +36,7 @@ class Delayed(RGBDSequence):
 @pytest.mark.parametrize(("delay", "corrected"), [(0.03, True), (0.0, False)])
 def test_color_delay_check_reports_estimate(delay: float, corrected: bool) -> None:
     sequence = Delayed(delay)
-    finding = check_color_delay(sequence, Matcher(sequence))
+    finding = check_color_delay(Matcher(sequence))
     assert finding.verdict is Verdict.FINE
     words = finding.text.split()
     assert float(words[2]) == pytest.approx(1e3 * delay, abs=2)
@@ -45,11 +45,11 @@ def test_color_delay_check_reports_estimate(delay: float, corrected: bool) -> No
 
 def test_color_delay_check_standing_camera_is_unknown() -> None:
     sequence = Delayed(0.03, speed=0)
-    assert check_color_delay(sequence, Matcher(sequence)).verdict is Verdict.UNKNOWN
+    assert check_color_delay(Matcher(sequence)).verdict is Verdict.UNKNOWN
 
 
 def test_color_delay_check_reports_given_delay() -> None:
     sequence = Delayed(0.03, speed=0, constant=0.02)
-    finding = check_color_delay(sequence, Matcher(sequence))
+    finding = check_color_delay(Matcher(sequence))
     assert finding.verdict is Verdict.FINE
     assert finding.text.startswith("20 ms, as set")
