@@ -26,6 +26,7 @@ from framework.tracking.uncertainty import is_significant, pose_covariance
 
 LEVELS = 3
 CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; four times as long at each coarser level
+STANDING = 1e-3  # maximum motion of a standing camera, m and rad; above it, an uncertain motion is better than none
 SAME_POSE = 0.05  # maximum difference between equal poses, m and rad
 SMALLEST = 8  # minimum side of the coarsest level, px
 CHANGED_SCENE = 0.95  # minimum agreement of the points not behind the map's surface, if an object was removed
@@ -164,12 +165,14 @@ class VoxelHashingIcp(PoseTracker):
         return self._trust(seen, alignment.T_world_camera, alignment.covariance)
 
     def _held(self, alignment: Alignment) -> Alignment:
-        """Return the alignment at the last pose if the motion from there does not exceed its uncertainty.
+        """Return the alignment at the last pose if the motion from there is small and does not exceed its uncertainty.
 
         The last pose is that of the last significant motion, so that slow motion adds up until it is significant.
         """
         assert self._T_world_last is not None
         if self._lost_frames or alignment.covariance is None:
+            return alignment
+        if not self._scale.near(self._T_world_last, alignment.T_world_camera, STANDING):
             return alignment
         if is_significant(inverse(self._T_world_last) @ alignment.T_world_camera, alignment.covariance):
             return alignment

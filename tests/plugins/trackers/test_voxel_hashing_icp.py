@@ -411,6 +411,17 @@ def test_slow_motion_is_tracked() -> None:
     assert drift(poses[-1], frames[-1])[0] < 0.0015
 
 
+@pytest.mark.parametrize(("step", "held"), [(0.0005, True), (0.002, False)])
+def test_only_small_uncertain_motion_is_held(step: float, held: bool) -> None:
+    """As along a wall with little texture: the uncertainty is larger than the motion of a moving camera."""
+    tracker = VoxelHashingIcp()
+    tracker._T_world_last = moved(1.0)
+    uncertain = aligned(moved(1.0 + step))._replace(covariance=np.eye(6))
+    found = tracker._held(uncertain).T_world_camera
+    np.testing.assert_array_equal(found, moved(1.0) if held else uncertain.T_world_camera)
+    assert tracker._held(uncertain._replace(covariance=1e-12 * np.eye(6))).T_world_camera is uncertain.T_world_camera
+
+
 def test_pose_covariance_predicts_errors() -> None:
     """Errors relative to the previous frame, in units of their covariance."""
     frames = noisy(0.004, 30)
