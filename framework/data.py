@@ -41,6 +41,7 @@ UInt16 = npt.NDArray[np.uint16]
 Bool = npt.NDArray[np.bool_]
 
 ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; published poses have 4 digits
+COVARIANCE_TOLERANCE = 1e-9  # rounding error of a covariance, fraction of its largest entry
 MAX_PIXELS = 2**25  # px of an image, such as 8K video
 WIDEST = 10.0  # maximum lateral distance per depth, m/m: a field of view of 168 degrees
 LONGEST_FOCAL_LENGTH = 1e6  # px
@@ -224,9 +225,16 @@ class Pose:
     T_world_camera: Float64  # (4, 4); if lost, the last reliable pose
     lost: bool = False
     reason: str = ""  # reason for the loss, for the log
+    covariance: Float64 | None = None  # (6, 6) m, rad, in the camera frame; None = unknown
+    """The covariance of xi = (translation, rotation), if T_world_camera exp(xi) is the true pose relative to the map.
+
+    It does not contain the drift of the map. It is 0 for the pose that defines the world frame.
+    """
 
     def __post_init__(self) -> None:
         check_rigid("Pose.T_world_camera", self.T_world_camera)
+        if self.covariance is not None:
+            _check_covariance("Pose.covariance", self.covariance)
 
 
 @dataclass(frozen=True)
@@ -465,6 +473,17 @@ def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: n
         raise DataError(f"{name}: expected shape {wanted}, got {array.shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise DataError(f"{name}: expected finite values, got NaN or infinity")
+
+
+def _check_covariance(name: str, C: Float64) -> None:
+    check_array(name, C, (6, 6), np.float64)
+    tolerance = COVARIANCE_TOLERANCE * float(np.abs(C).max())
+    asymmetry, least = float(np.abs(C - C.T).max()), float(np.linalg.eigvalsh(C)[0])
+    if asymmetry > tolerance or least < -tolerance:
+        raise DataError(
+            f"{name}: expected a symmetric, positive semidefinite matrix, got |C - C^T| = {asymmetry:.2g}, minimum "
+            f"eigenvalue {least:.2g}"
+        )
 
 
 def _check_objects(found: Detections | PointClusters, n: int, c: int) -> None:

@@ -79,4 +79,10 @@ class KeyframeTerm(NamedTuple):
             self.T_key_view @ T_view_camera, weights, brightness, linear,
         )  # fmt: skip
         weight = self.weight * 4 ** (compared - level)
-        return own._replace(A=weight * self.Ad.T @ own.A @ self.Ad, b=weight * self.Ad.T @ own.b)
+        return own._replace(
+            A=weight * self.Ad.T @ own.A @ self.Ad,
+            b=weight * self.Ad.T @ own.b,
+            A_color=weight * self.Ad.T @ own.A_color @ self.Ad,
+            energy=weight * own.energy,
+            color_energy=weight * own.color_energy,
+        )

@@ -22,9 +22,11 @@ from framework.tracking.features import FrameFeatures
 from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, is_scattered, model_intensities
 from framework.tracking.raw_keyframe import FINEST, NEW_DISTANCE, KeyframeTerm, RawKeyframe
+from framework.tracking.uncertainty import is_significant, pose_covariance
 
 LEVELS = 3
 CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; four times as long at each coarser level
+STANDING = 1e-3  # maximum motion of a standing camera, m and rad; above it, an uncertain motion is better than none
 SAME_POSE = 0.05  # maximum difference between equal poses, m and rad
 SMALLEST = 8  # minimum side of the coarsest level, px
 CHANGED_SCENE = 0.95  # minimum agreement of the points not behind the map's surface, if an object was removed
@@ -53,6 +55,7 @@ class Alignment(NamedTuple):
     agreement_in_front: float  # ratio of points that agree to points not behind the map's surface
     reason: str  # reason for rejection, empty if the pose is possible
     doubt: str  # reason for confirmation by a second source, empty without doubt
+    covariance: Float64 | None = None  # (6, 6) Pose.covariance; None = unknown
 
     @property
     def trusted(self) -> bool:
@@ -152,11 +155,26 @@ class VoxelHashingIcp(PoseTracker):
             self._T_last_next = np.eye(4)
             self._T_world_doubted = None if alignment.reason else alignment.T_world_camera
             return Pose(self._T_world_last, lost=True, reason=self._loss(alignment, frame))
+        alignment = self._held(alignment)
         T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
         if self.raw_keyframe:
             self._update_raw_keyframe(levels, alignment.T_world_camera)
-        return self._trust(seen, alignment.T_world_camera)
+        return self._trust(seen, alignment.T_world_camera, alignment.covariance)
+
+    def _held(self, alignment: Alignment) -> Alignment:
+        """Return the alignment at the last pose if the motion from there is small and does not exceed its uncertainty.
+
+        The last pose is that of the last significant motion, so that slow motion adds up until it is significant.
+        """
+        assert self._T_world_last is not None
+        if self._lost_frames or alignment.covariance is None:
+            return alignment
+        if not self._scale.near(self._T_world_last, alignment.T_world_camera, STANDING):
+            return alignment
+        if is_significant(inverse(self._T_world_last) @ alignment.T_world_camera, alignment.covariance):
+            return alignment
+        return alignment._replace(T_world_camera=self._T_world_last)
 
     def keyframes(self) -> Mapping[str, Array]:
         return self._keyframes.saved()
@@ -200,7 +218,7 @@ class VoxelHashingIcp(PoseTracker):
         if not alignment.trusted:
             return Pose(np.eye(4), lost=True, reason=alignment.reason)
         self._stored_scene = None
-        return self._trust(seen, alignment.T_world_camera)
+        return self._trust(seen, alignment.T_world_camera, alignment.covariance)
 
     def _align_predicted(self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64) -> Alignment:
         """Align from the predicted pose. A result near the prediction needs less agreement."""
@@ -242,7 +260,7 @@ class VoxelHashingIcp(PoseTracker):
             return Pose(T_world_camera, lost=True, reason=few if frame.depth.any() else "the frame has no depth")
         if self.raw_keyframe:
             self._update_raw_keyframe(self._pyramid(frame), T_world_camera)
-        return self._trust(seen, T_world_camera)
+        return self._trust(seen, T_world_camera, np.zeros((6, 6)))
 
     def _update_raw_keyframe(self, levels: list[PyramidLevel], T_world_camera: Float64) -> None:
         """Replace the raw keyframe if it is missing or too far from a trusted pose."""
@@ -254,7 +272,7 @@ class VoxelHashingIcp(PoseTracker):
         step, turn = np.linalg.norm(T_last_next[:3, 3]), rotation_angle(T_last_next[:3, :3])
         return bool(step > self.max_translation * self._scale.growth or turn > self.max_rotation)
 
-    def _trust(self, seen: FrameFeatures, T_world_camera: Float64) -> Pose:
+    def _trust(self, seen: FrameFeatures, T_world_camera: Float64, covariance: Float64 | None) -> Pose:
         self._T_world_last = T_world_camera
         self._T_world_doubted = None
         self._lost_frames = 0
@@ -266,7 +284,7 @@ class VoxelHashingIcp(PoseTracker):
                 self._keyframes.add(seen.frame, T_world_camera)
             if not any(self._scale.near(T, T_world_camera, VISITED_SEPARATION) for T in reversed(self._visited)):
                 self._visited.append(T_world_camera)
-        return Pose(T_world_camera)
+        return Pose(T_world_camera, covariance=covariance)
 
     def _relocalized(
         self, alignment: Alignment, seen: FrameFeatures, levels: list[PyramidLevel], scene: SceneMap
@@ -352,10 +370,13 @@ class VoxelHashingIcp(PoseTracker):
             equations = linearize(levels[0], smooth, intensities[0], T_view_camera, weights, brightness, linear)
             if term is not None:
                 own = term.linearized(levels, 0, T_view_camera, weights, key_brightness, linear)
+        terms = [equations] if term is None else [equations, own]
         compared = levels[0]
         # until many frames are mapped, the view of the map is empty where depth is scattered
         if self._scattered_depth and term is not None and own.visible > equations.visible:
             equations, compared = own, levels[FINEST]
+        # linear weights are no inverse variances
+        covariance = pose_covariance(terms, T_view_camera) if linear is None else None
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially
         T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
@@ -369,7 +390,7 @@ class VoxelHashingIcp(PoseTracker):
             doubt = f"{agreement:.0%} of the visible points agree with the map, {behind:.1%} lie behind it"
         elif matched < self.min_matched:
             doubt = f"{agreement:.0%} of the visible points agree with the map, but only {matched:.0%} in their normals"
-        return Alignment(T_world_camera, matched, agreement, behind, agreement_in_front, reason, doubt)
+        return Alignment(T_world_camera, matched, agreement, behind, agreement_in_front, reason, doubt, covariance)
 
     def _linear_weights(self, scene: SceneMap) -> LinearWeights | None:
         """Return the limits of linear weights, None for Tukey's weights."""

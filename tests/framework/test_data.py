@@ -283,6 +283,32 @@ def test_pose_rigidity_check_tolerates_rounding() -> None:
         Pose(sheared)
 
 
+def test_pose_accepts_semidefinite_covariance() -> None:
+    for rank in (0, 1, 6):
+        J = np.random.default_rng(0).normal(size=(rank, 6)) * np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])
+        Pose(np.eye(4), covariance=J.T @ J)
+    assert Pose(np.eye(4)).covariance is None
+
+
+@pytest.mark.parametrize(
+    ("entries", "error"),
+    [
+        ({(0, 1): 0.5}, "symmetric, positive semidefinite"),
+        ({(0, 1): 1.5, (1, 0): 1.5}, "symmetric, positive semidefinite"),
+        ({(2, 2): -0.1}, "symmetric, positive semidefinite"),
+        ({(3, 3): np.nan}, "finite"),
+    ],
+)
+def test_pose_rejects_invalid_covariance(entries: dict[tuple[int, int], float], error: str) -> None:
+    C = np.eye(6)
+    for index, value in entries.items():
+        C[index] = value
+    with pytest.raises(DataError, match=rf"Pose\.covariance: expected .*{error}"):
+        Pose(np.eye(4), covariance=C)
+    with pytest.raises(DataError, match="expected shape"):
+        Pose(np.eye(4), covariance=np.eye(3))
+
+
 # Ground truth that is rendered on access
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import pickle
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from framework.tracking.features import Features
 from framework.tracking.keyframes import Keyframe
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers import voxel_hashing_icp
-from plugins.trackers.voxel_hashing_icp import STEADY, Alignment, VoxelHashingIcp
+from plugins.trackers.voxel_hashing_icp import STEADY, Alignment, ResidualWeights, VoxelHashingIcp
 from tests.support.scenes.analytic_scene import CAMERA, NOTHING, Scene, room, walk
 from tests.support.scenes.papered_room import papered_frame
 
@@ -392,6 +393,69 @@ def test_voxel_hashing_icp_resumes_without_relocalization(moving: bool) -> None:
     assert all(pose.lost for pose in poses[7:11])
     assert not any(pose.lost for pose in poses[11:])
     assert drift(poses[-1], last[-1])[0] < 0.006
+
+
+LARGER = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
+
+
+def noisy(step: float, count: int) -> list[Frame]:
+    """Return frames with a Kinect's noise, `step` m and 0.3 `step` rad apart."""
+    rng = np.random.default_rng(0)
+    frames = [room().frame(exp_se3(step * k * np.array([1, 0, 0, 0, 0.3, 0])), k, LARGER) for k in range(count)]
+    return [
+        dataclasses.replace(
+            f,
+            depth=f.depth
+            + rng.normal(0, 1, LARGER.shape).astype(np.float32) * (0.0012 + 0.0019 * (f.depth - 0.4) ** 2),
+        )
+        for f in frames
+    ]
+
+
+def test_standing_camera_keeps_pose() -> None:
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), noisy(0.0, 25))
+    for pose in poses[-20:]:
+        np.testing.assert_array_equal(pose.T_world_camera, poses[-1].T_world_camera)
+
+
+def test_slow_motion_is_tracked() -> None:
+    """Steps of 0.1 mm are below their uncertainty; 6 mm are not."""
+    frames = noisy(0.0001, 60)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
+    stops = sum(np.array_equal(a.T_world_camera, b.T_world_camera) for a, b in pairwise(poses))
+    assert 20 < stops < 59
+    assert drift(poses[-1], frames[-1])[0] < 0.0015
+
+
+@pytest.mark.parametrize(("step", "held"), [(0.0005, True), (0.002, False)])
+def test_only_small_uncertain_motion_is_held(step: float, held: bool) -> None:
+    """As along a wall with little texture: the uncertainty is larger than the motion of a moving camera."""
+    tracker = VoxelHashingIcp()
+    tracker._T_world_last = moved(1.0)
+    uncertain = aligned(moved(1.0 + step))._replace(covariance=np.eye(6))
+    found = tracker._held(uncertain).T_world_camera
+    np.testing.assert_array_equal(found, moved(1.0) if held else uncertain.T_world_camera)
+    assert tracker._held(uncertain._replace(covariance=1e-12 * np.eye(6))).T_world_camera is uncertain.T_world_camera
+
+
+def test_pose_covariance_predicts_errors() -> None:
+    """Errors relative to the previous frame, in units of their covariance."""
+    frames = noisy(0.004, 30)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
+    assert poses[0].covariance is not None
+    assert not poses[0].covariance.any(), "the first pose defines the world"
+    squares = []
+    for (a, b), (q_a, q_b) in zip(pairwise(poses[5:]), pairwise(frames[5:]), strict=True):
+        E = inverse(inverse(q_a.T_world_camera) @ q_b.T_world_camera) @ inverse(a.T_world_camera) @ b.T_world_camera
+        e = np.array([*E[:3, 3], E[2, 1], E[0, 2], E[1, 0]])
+        squares.append(e @ np.linalg.solve(a.covariance + b.covariance, e) / 6)
+    assert 0.02 < np.mean(squares) < 3
+
+
+def test_linear_weights_have_no_covariance() -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(3))]
+    tracker = VoxelHashingIcp(finest_scale=1.0, residual_weights=ResidualWeights.LINEAR, raw_keyframe=False)
+    assert run(tracker, frames)[0][-1].covariance is None
 
 
 def scattered(frame: Frame, missing: float) -> Frame:

@@ -1,0 +1,51 @@
+"""Uncertainty of an aligned pose, from the normal equations and their residuals.
+
+With weights that are inverse variances, the covariance of a least-squares estimate is A^-1. Residuals correct the
+assumed variances: each term's factor is s^2 = sum w r^2 / n for its n matched points. Errors of neighboring pixels are
+correlated, and the errors of a frame are common to the map and the keyframe. CORRELATED points have one common error:
+
+    C = CORRELATED A^-1 (sum over terms of s^2 A_term) A^-1
+
+The covariance is that of a pose given the map. It does not contain the drift of the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from framework.data import Float64
+from framework.geometry import adjoint, inverse
+from framework.tracking.alignment import NormalEquations
+
+CORRELATED = 16.0  # number of points with one common error, from the errors of tracked poses (docs/results/halls.md)
+MIN_VARIANCE = 1e-18  # smallest variance of a motion, m^2 and rad^2, without noise
+
+
+def pose_covariance(terms: Sequence[NormalEquations], T_view_camera: Float64) -> Float64:
+    """Return the covariance (6, 6) of a pose, as defined by `Pose.covariance`.
+
+    The terms are the normal equations at T_view_camera for twists of the view's frame.
+    """
+    A, spread = np.zeros((6, 6)), np.zeros((6, 6))
+    for term in terms:
+        A += term.A
+        spread += term.energy / max(term.matched, 1) * (term.A - term.A_color)
+        spread += term.color_energy / max(term.matched_colors, 1) * term.A_color
+    gain = adjoint(inverse(T_view_camera)) @ np.linalg.pinv(A, hermitian=True)
+    C = CORRELATED * gain @ spread @ gain.T
+    return np.asarray((C + C.T) / 2)
+
+
+def is_significant(T_a_b: Float64, covariance: Float64) -> bool:
+    """Return True if a small motion exceeds its uncertainty: xi^T C^-1 xi > 6, the expected value for noise alone.
+
+    Args:
+        T_a_b: The motion exp(xi).
+        covariance: The covariance C (6, 6) of xi.
+    """
+    R = T_a_b[:3, :3]
+    xi = np.array([*T_a_b[:3, 3], *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2)])
+    variances, directions = np.linalg.eigh(covariance)
+    return bool(((directions.T @ xi) ** 2 / np.maximum(variances, MIN_VARIANCE)).sum() > len(xi))
