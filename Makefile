@@ -44,8 +44,8 @@ test: check ## run make check and the integration tests
 	$(PYTEST) -m "integration and not acceptance"
 
 .PHONY: acceptance
-acceptance: $(INSTALLED_DEV) ## run the missing and outdated acceptance measurements; LINE=NAME runs one
-	$(BIN)/python -m tests.acceptance $(LINE)
+acceptance: $(INSTALLED_DEV) ## run the missing and outdated acceptance measurements; MEASUREMENT=NAME runs one
+	$(BIN)/python -m tests.acceptance $(MEASUREMENT)
 
 .PHONY: docs
 docs: $(INSTALLED_DEV) ## build the documentation into outputs/docs

@@ -1,12 +1,12 @@
-"""Measure acceptance lines: `python -m tests.acceptance [LINE ...]`."""
+"""Measure acceptance measurements: `python -m tests.acceptance [MEASUREMENT ...]`."""
 
 from __future__ import annotations
 
 import sys
 
-from tests.acceptance import lines  # noqa: F401  # registers them
-from tests.acceptance.runner import LINES, run
+from tests.acceptance import measurements  # noqa: F401  # registers them
+from tests.acceptance.runner import MEASUREMENTS, run
 
-if unknown := [name for name in sys.argv[1:] if name not in LINES]:
-    sys.exit(f"LINE: expected one of {', '.join(LINES)}, got {', '.join(unknown)}")
+if unknown := [name for name in sys.argv[1:] if name not in MEASUREMENTS]:
+    sys.exit(f"MEASUREMENT: expected one of {', '.join(MEASUREMENTS)}, got {', '.join(unknown)}")
 sys.exit(not run(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""Registered acceptance lines, and the page with their latest values: docs/results/acceptance.md."""
+"""Registered acceptance measurements, and the page with their latest values: docs/results/acceptance.md."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 PAGE = CHECKOUT / "docs" / "results" / "acceptance.md"
-COLUMNS = ("line", "value", "bound", "date", "commit", "machine", "minutes")
+COLUMNS = ("measurement", "value", "bound", "date", "commit", "machine", "minutes")
 HEADER = """# Acceptance
 
-`make acceptance` measures the lines that are missing or whose code has changed since the measured commit.
-`make acceptance LINE=NAME` measures one line. `tests/acceptance/lines.py` defines the lines.
+`make acceptance` runs the measurements that are missing or whose code has changed since the measured commit.
+`make acceptance MEASUREMENT=NAME` runs one. `tests/acceptance/measurements.py` defines them.
 
 """
 Measured = tuple[float, bool]  # the value, and if it is within the bound
 
 
 @dataclass(frozen=True)
-class Line:
+class Measurement:
     """One acceptance criterion."""
 
     name: str
@@ -32,21 +32,21 @@ class Line:
     measure: Callable[[], Measured]
 
 
-LINES: dict[str, Line] = {}
+MEASUREMENTS: dict[str, Measurement] = {}
 
 
-def line(bound: str, *paths: str) -> Callable[[Callable[[], Measured]], Callable[[], Measured]]:
-    """Register a function as the acceptance line of its name."""
+def measurement(bound: str, *paths: str) -> Callable[[Callable[[], Measured]], Callable[[], Measured]]:
+    """Register a function as the acceptance measurement of its name."""
 
     def register(measure: Callable[[], Measured]) -> Callable[[], Measured]:
-        LINES[measure.__name__] = Line(measure.__name__, bound, paths, measure)
+        MEASUREMENTS[measure.__name__] = Measurement(measure.__name__, bound, paths, measure)
         return measure
 
     return register
 
 
 def read_rows(page: Path = PAGE) -> dict[str, list[str]]:
-    """Return the cells of each measured line, by name."""
+    """Return the cells of each measurement, by name."""
     if not page.exists():
         return {}
     rows = [
@@ -61,15 +61,15 @@ def write_rows(rows: dict[str, list[str]], page: Path = PAGE) -> None:
 
 
 def is_current(row: Sequence[str], paths: Sequence[str]) -> bool:
-    """Return True if the code of the line is the same as at the measured commit."""
+    """Return True if the measured code is the same as at the measured commit."""
     commit = row[COLUMNS.index("commit")]
     if commit.endswith("+"):  # measured with uncommitted changes
         return False
     return not _git("diff", "--name-only", commit, "--", *paths, missing="unknown commit")
 
 
-def measure(chosen: Line) -> list[str]:
-    """Measure a line and return its row."""
+def measure(chosen: Measurement) -> list[str]:
+    """Run a measurement and return its row."""
     commit = _git("rev-parse", "--short", "HEAD") + "+" * bool(_git("status", "--porcelain", "--", *chosen.paths))
     begin = time.monotonic()
     value, met = chosen.measure()
@@ -79,11 +79,11 @@ def measure(chosen: Line) -> list[str]:
 
 
 def run(names: Sequence[str]) -> bool:
-    """Measure the named lines, or all that are missing or outdated. Return True if all meet their bounds."""
+    """Run the named measurements, or all that are missing or outdated. Return True if all meet their bounds."""
     rows = read_rows()
-    for name in names or [k for k, known in LINES.items() if k not in rows or not is_current(rows[k], known.paths)]:
-        rows[name] = measure(LINES[name])
-        write_rows({known: row for known, row in rows.items() if known in LINES})
+    for name in names or [k for k, known in MEASUREMENTS.items() if k not in rows or not is_current(rows[k], known.paths)]:
+        rows[name] = measure(MEASUREMENTS[name])
+        write_rows({known: row for known, row in rows.items() if known in MEASUREMENTS})
         print(" | ".join(rows[name]), flush=True)
     return not any("(missed)" in rows[name][1] for name in names or rows)
 

@@ -1,4 +1,4 @@
-"""The acceptance lines. Each function returns its value and if the value is within the bound."""
+"""The acceptance measurements. Each function returns its value and if the value is within the bound."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import venv
 from pathlib import Path
 from typing import Any
 
-from tests.acceptance.runner import CHECKOUT, Measured, line
+from tests.acceptance.runner import CHECKOUT, Measured, measurement
 
 SHARED = CHECKOUT.parent / "shared" / "data"
 PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
@@ -20,7 +20,7 @@ PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
 
 @functools.cache
 def mapped(*overrides: str) -> dict[str, Any]:
-    """Map a sequence and return its metrics. Lines that share a run in one process map it once."""
+    """Map a sequence and return its metrics. Measurements that share a run in one process map it once."""
     with tempfile.TemporaryDirectory() as directory:
         command = [sys.executable, "-m", "framework", *overrides, f"hydra.run.dir={directory}/run"]
         subprocess.run(command, cwd=CHECKOUT, check=True)
@@ -57,37 +57,37 @@ def ap50(bound: float, scene: str) -> Measured:
     return value, value >= bound
 
 
-@line("ATE <= 25 mm, 300 frames", *PIPELINE)  # the reference, KinectFusion, is off by 10 to 20 mm
+@measurement("ATE <= 25 mm, 300 frames", *PIPELINE)  # the reference, KinectFusion, is off by 10 to 20 mm
 def kitchen_ate() -> Measured:
     return ate_mm(25, *folder("redkitchen"), "detector=none")
 
 
-@line("0 frames, 300 frames", *PIPELINE)
+@measurement("0 frames, 300 frames", *PIPELINE)
 def kitchen_lost_frames() -> Measured:
     return lost_frames(*folder("redkitchen"), "detector=none")
 
 
-@line("ATE <= 40 mm", *PIPELINE)
+@measurement("ATE <= 40 mm", *PIPELINE)
 def freiburg1_rpy_ate() -> Measured:
     return ate_mm(40, *RPY)
 
 
-@line("0 frames", *PIPELINE)
+@measurement("0 frames", *PIPELINE)
 def freiburg1_rpy_lost_frames() -> Measured:
     return lost_frames(*RPY)
 
 
-@line("AP50 >= 0.8, given poses", *PIPELINE)
+@measurement("AP50 >= 0.8, given poses", *PIPELINE)
 def replica_floor2_ap50() -> Measured:
     return ap50(0.8, "replica_floor2")
 
 
-@line("AP50 >= 0.6, given poses", *PIPELINE)
+@measurement("AP50 >= 0.6, given poses", *PIPELINE)
 def kitchen_ap50() -> Measured:
     return ap50(0.6, "redkitchen")
 
 
-@line("whole loop >= 6 times as fast as Open3D, kitchen, 1 cm", *PIPELINE, "tests/benchmarks")
+@measurement("whole loop >= 6 times as fast as Open3D, kitchen, 1 cm", *PIPELINE, "tests/benchmarks")
 def speed_ratio() -> Measured:
     with tempfile.TemporaryDirectory() as directory:
         report = Path(directory, "benchmark.json")
@@ -98,22 +98,22 @@ def speed_ratio() -> Measured:
     return theirs / ours, theirs / ours >= 6
 
 
-@line("exit status 0, 2,000 cases a test", *PIPELINE, "tests")
+@measurement("exit status 0, 2,000 cases a test", *PIPELINE, "tests")
 def fuzzing() -> Measured:
     return failures("tests", "-k", "fuzz", INSTANCEMAP_FUZZ="2000")
 
 
-@line("exit status 0, 30 kills", *PIPELINE, "tests/framework/commands/running")
+@measurement("exit status 0, 30 kills", *PIPELINE, "tests/framework/commands/running")
 def random_kills() -> Measured:
     return failures("tests/framework/commands/running/test_random_kills.py", INSTANCEMAP_KILLS="30")
 
 
-@line("exit status 0", *PIPELINE, "tests")
+@measurement("exit status 0", *PIPELINE, "tests")
 def long_tests() -> Measured:
     return failures("-m", "acceptance", "tests")
 
 
-@line(
+@measurement(
     "0 failing commands, fresh virtual environment", "framework", "plugins", "conf", "instancemap.py", "pyproject.toml"
 )
 def wheel() -> Measured:
