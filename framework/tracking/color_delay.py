@@ -2,15 +2,15 @@
 
 Depth edges of a frame, moved by the camera's motion over a time d, coincide with color edges if d is the time between
 the two images. For each compared frame k, the delay d_k has the largest mean color gradient at the moved depth edges.
-Its error in px is constant. An inaccurate registration adds a constant offset o (px). With the mean image motion v_k
-(px / s) of the edges and its direction n_k:
+Its error in the image is constant. An inaccurate registration adds a constant offset o. With the mean image motion v_k
+of the edges and its direction n_k, in image widths and s:
 
     |v_k| d_k = |v_k| d + n_k . o + noise
 
-Robust regression (Tukey's biweight) over the compared frames gives the delay d, with a normal prior of the offset. The
-standard deviation is the larger one of the regression and of a jackknife over blocks of frames, because errors of
-nearby frames are correlated. Slow frames are not compared. A camera that turns to one side at a constant rate does not
-separate d from o, and the standard deviation is then large.
+Robust regression (Tukey's biweight) over the compared frames gives the delay d, with a normal prior of the offset.
+Errors of nearby frames are correlated: CORRELATED frames count as one, and the standard deviation is at least that of a
+jackknife over blocks of frames. Slow frames are not compared. If a camera turns to one side at a constant rate, only the
+prior separates d from o.
 """
 
 from __future__ import annotations
@@ -38,8 +38,10 @@ DENSE_COMPARISONS, LATER_STRIDE = 60, 8  # number of successive comparisons; aft
 MIN_COMPARISONS, MAX_COMPARISONS = 16, 512  # number of latest comparisons for an estimate
 BLOCKS = 8  # number of blocks of the jackknife
 MAX_DEVIATION = 0.002  # s, maximum standard deviation of a usable estimate ...
-MAX_RELATIVE_DEVIATION = 0.2  # ... or, if larger, the maximum as a fraction of the estimate
-OFFSET_DEVIATION = 2.0  # px, standard deviation of the constant offset before the first comparison
+MAX_RELATIVE_DEVIATION = 0.25  # ... or, if larger, the maximum as a fraction of the estimate
+OFFSET_DEVIATION = 0.5 / 640  # image widths, standard deviation of the constant offset of registered images
+CORRELATED = 8  # number of comparisons with one common error
+MIN_NOISE = 0.1 / 640  # image widths, minimum standard deviation of a comparison
 CUT_OFF = 4.685  # standard deviations with weight 0 in Tukey's biweight
 ITERATIONS = 10  # of the robust regression
 
@@ -63,7 +65,7 @@ class DelayEstimator:
         self.estimate = UNKNOWN
         self._recent: deque[_Tracked] = deque(maxlen=HISTORY)
         self._frames = 0  # number of added frames
-        # delay, s, and mean image motion (x, y), px / s
+        # delay, s, and mean image motion (x, y), image widths / s
         self._comparisons: deque[tuple[float, float, float]] = deque(maxlen=MAX_COMPARISONS)
         self._strengths = np.zeros(len(TESTED_DELAYS))  # sum over the compared frames
 
@@ -89,8 +91,8 @@ class DelayEstimator:
         before, (frame, T_world_camera), after = (self._recent[HISTORY // 2 + k] for k in (-1, 0, 1))
         camera = frame.camera
         seconds = after.frame.depth_time - before.frame.depth_time
-        least = MIN_SPEED * camera.width  # px / s
-        if pose_distance(before.T_world_camera, after.T_world_camera) * camera.fx < least * seconds:
+        turn = pose_distance(before.T_world_camera, after.T_world_camera) * camera.fx / camera.width
+        if turn < MIN_SPEED * seconds:
             return False
         points = edge_points(frame)
         if len(points) < MIN_EDGES:
@@ -100,8 +102,8 @@ class DelayEstimator:
         at = np.concatenate([frame.color_time + TESTED_DELAYS, [before.frame.depth_time, after.frame.depth_time]])
         moved = np.linalg.inv(poses_at(times, poses, at)) @ T_world_camera  # T_color_depth at each time
         motion = [project(camera, points @ T[:3, :3].T + T[:3, 3]) for T in moved[-2:]]
-        velocity = (motion[1] - motion[0]).mean(axis=0) / seconds
-        if np.hypot(*velocity) < least:
+        velocity = (motion[1] - motion[0]).mean(axis=0) / (seconds * camera.width)
+        if np.hypot(*velocity) < MIN_SPEED:
             return False
         gradient, scale = normalized_gradient(frame)
         strengths = np.empty(len(TESTED_DELAYS))
@@ -154,30 +156,31 @@ def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
 
 
 def regress(comparisons: Float64, start: float) -> DelayEstimate:
-    """Return the estimate of the delay from comparisons (K, 3): delay, s, and image motion (x, y), px / s.
+    """Return the estimate of the delay from comparisons (K, 3): delay, s, and image motion (x, y), image widths / s.
 
     The regression starts at a delay of `start` s without an offset.
     """
     delays, speeds = comparisons[:, 0], np.hypot(comparisons[:, 1], comparisons[:, 2])
-    shifts = speeds * delays  # px
+    shifts = speeds * delays  # image widths
     X = np.column_stack([speeds, comparisons[:, 1:] / speeds[:, None]])
     solution = np.array([start, 0.0, 0.0])
     for _ in range(ITERATIONS):
         residuals = shifts - X @ solution
-        scale = max(1.4826 * float(np.median(np.abs(residuals))), 0.1)
+        scale = max(1.4826 * float(np.median(np.abs(residuals))), MIN_NOISE)
         weights = np.maximum(1 - (residuals / (CUT_OFF * scale)) ** 2, 0) ** 2
-        covariance = scale**2 * np.linalg.inv(_information(X, weights, scale))
-        solution = covariance @ X.T @ (weights * shifts) / scale**2
+        variance = CORRELATED * scale**2
+        covariance = variance * np.linalg.inv(_information(X, weights, variance))
+        solution = covariance @ X.T @ (weights * shifts) / variance
     without = []  # delays without one of the blocks
     for block in np.array_split(np.arange(len(delays)), BLOCKS):
         rest = weights.copy()
         rest[block] = 0
-        without.append(np.linalg.solve(_information(X, rest, scale), X.T @ (rest * shifts))[0])
+        without.append(np.linalg.solve(_information(X, rest, variance), X.T @ (rest * shifts))[0])
     deviation = max(float(np.sqrt((BLOCKS - 1) * np.var(without))), float(np.sqrt(covariance[0, 0])))
     return DelayEstimate(float(solution[0]), deviation, len(delays))
 
 
-def _information(X: Float64, weights: Float64, scale: float) -> Float64:
-    """Return X^T W X (3, 3) with the prior of the offset, for residuals with a standard deviation of `scale` px."""
-    prior = np.array([0.0, 1.0, 1.0]) * (scale / OFFSET_DEVIATION) ** 2
+def _information(X: Float64, weights: Float64, variance: float) -> Float64:
+    """Return X^T W X (3, 3) with the prior of the offset, for residuals with a variance, squared image widths."""
+    prior = np.array([0.0, 1.0, 1.0]) * variance / OFFSET_DEVIATION**2
     return np.asarray((X * weights[:, None]).T @ X + np.diag(prior))

@@ -12,6 +12,7 @@ from framework.data import Camera, Float64, Frame
 from framework.tracking.color_delay import (
     BLOCKS,
     MAX_DEVIATION,
+    OFFSET_DEVIATION,
     TESTED_DELAYS,
     UNKNOWN,
     DelayEstimator,
@@ -91,29 +92,32 @@ def test_delay_estimator_gap_in_time_restarts_history() -> None:
 
 def test_regress_separates_delay_from_constant_offset() -> None:
     rng = np.random.default_rng(0)
-    motion = rng.normal(0, 300, (80, 2))
+    motion = rng.normal(0, 0.5, (80, 2))
     speed = np.hypot(*motion.T)
-    shift = speed * 0.02 + motion @ [3.0, -2.0] / speed + rng.normal(0, 0.5, 80)  # px
+    shift = speed * 0.02 + motion @ [0.0015, -0.001] / speed + rng.normal(0, 0.001, 80)  # image widths
     found = regress(np.column_stack([shift / speed, motion]), start=0.0)
     assert found.seconds == pytest.approx(0.02, abs=3 * found.deviation)
-    assert found.deviation < 0.0005
+    assert found.deviation < 0.002
     assert found.frames == 80
 
 
 def test_regress_ignores_outliers() -> None:
     rng = np.random.default_rng(1)
-    motion = rng.normal(0, 300, (80, 2))
-    delays = 0.02 + rng.normal(0, 0.5, 80) / np.hypot(*motion.T)
+    motion = rng.normal(0, 0.5, (80, 2))
+    delays = 0.02 + rng.normal(0, 0.001, 80) / np.hypot(*motion.T)
     delays[::4] = rng.uniform(-0.1, 0.1, 20)
     assert regress(np.column_stack([delays, motion]), start=0.02).seconds == pytest.approx(0.02, abs=0.001)
 
 
-def test_regress_constant_motion_is_not_usable() -> None:
+def test_regress_deviation_at_constant_motion_is_that_of_offset() -> None:
     """A constant offset and a delay have the same effect if the camera turns at one rate."""
     rng = np.random.default_rng(2)
-    motion = np.array([200.0, 0.0]) + rng.normal(0, 0.5, (8 * BLOCKS, 2))
-    delays = 0.02 + rng.normal(0, 1.0, len(motion)) / 200
-    assert regress(np.column_stack([delays, motion]), start=0.02).deviation > MAX_DEVIATION
+    motion = np.array([0.3, 0.0]) + rng.normal(0, 0.001, (8 * BLOCKS, 2))
+    delays = 0.02 + rng.normal(0, 0.001, len(motion)) / 0.3
+    found = regress(np.column_stack([delays, motion]), start=0.02)
+    assert found.seconds == pytest.approx(0.02, abs=found.deviation)
+    assert found.deviation == pytest.approx(OFFSET_DEVIATION / 0.3, rel=0.2)
+    assert found.deviation > MAX_DEVIATION
 
 
 def test_poses_at_interpolates_and_extrapolates_constant_motion() -> None:
