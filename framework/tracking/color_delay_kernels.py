@@ -69,35 +69,35 @@ def mean_gradients(points, transforms, intrinsics, scale, gradient, means):
         means[d] = total / max(count, 1)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def register(color, depth, otherwise, intrinsics, T_color_depth, registered, pixels):
-    """Set registered (H, W, 3) to the color at each pixel of `depth`, and pixels (H, W) to its flat index.
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def locate_colors(depth, otherwise, intrinsics, T_color_depth, columns, rows, pixels):
+    """Set columns and rows (H, W), px, to the position in the color image of each pixel of `depth`.
 
-    The index is -1 outside of the color image and without a reading. The color there is that of the nearest pixel, for
-    a depth of `otherwise` m. Colors are interpolated bilinearly.
+    `pixels` (H, W) is set to the flat index of the nearest color pixel, -1 outside of the color image and without a
+    reading. Positions outside are moved to the border. Without a reading, the depth is `otherwise` m.
     """
     fx, fy, cx, cy = intrinsics
-    T = T_color_depth
+    R, t = T_color_depth[:, :3], T_color_depth[:, 3]
+    R00, R01, R02, R10, R11, R12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
+    R20, R21, R22 = R[2, 0], R[2, 1], R[2, 2]
+    t0, t1, t2 = t[0], t[1], t[2]
     height, width = depth.shape
-    one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
+    one, zero, half, stride = np.float32(1.0), np.float32(0.0), np.float32(0.5), np.int32(width)
     right, bottom = np.float32(width - 1), np.float32(height - 1)
+    inv_fx = one / fx
     for v in prange(height):
         y = (np.float32(v) - cy) / fy
+        row_x, row_y, row_z = R01 * y + R02, R11 * y + R12, R21 * y + R22
         for u in range(width):
             z = depth[v, u]
             measured = z > zero
             z = z if measured else otherwise
-            x = (np.float32(u) - cx) / fx
-            px = (T[0, 0] * x + T[0, 1] * y + T[0, 2]) * z + T[0, 3]
-            py = (T[1, 0] * x + T[1, 1] * y + T[1, 2]) * z + T[1, 3]
-            pz = max((T[2, 0] * x + T[2, 1] * y + T[2, 2]) * z + T[2, 3], np.float32(0.05))
-            s, t = fx * px / pz + cx, fy * py / pz + cy
-            inside = (s > -half) & (t > -half) & (s < right + half) & (t < bottom + half)
-            s, t = min(max(s, zero), right), min(max(t, zero), bottom)
-            pixels[v, u] = np.int32(t + half) * width + np.int32(s + half) if inside and measured else -1
-            column, row = min(np.int32(s), width - 2), min(np.int32(t), height - 2)
-            a, b = s - np.float32(column), t - np.float32(row)
-            for i in range(3):
-                top = np.float32(color[row, column, i]) * (one - a) + np.float32(color[row, column + 1, i]) * a
-                low = np.float32(color[row + 1, column, i]) * (one - a) + np.float32(color[row + 1, column + 1, i]) * a
-                registered[v, u, i] = np.uint8(top * (one - b) + low * b + half)
+            x = (np.float32(np.int32(u)) - cx) * inv_fx
+            inv_z = one / max((R20 * x + row_z) * z + t2, np.float32(0.05))
+            column = fx * ((R00 * x + row_x) * z + t0) * inv_z + cx
+            row = fy * ((R10 * x + row_y) * z + t1) * inv_z + cy
+            inside = (column > -half) & (row > -half) & (column < right + half) & (row < bottom + half)
+            column, row = min(max(column, zero), right), min(max(row, zero), bottom)
+            columns[v, u], rows[v, u] = column, row
+            nearest = np.int32(row + half) * stride + np.int32(column + half)
+            pixels[v, u] = nearest if inside & measured else np.int32(-1)

@@ -15,12 +15,13 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
-from framework.data import DelayEstimate, Float64, Frame, Int32, Pose
+from framework.data import DelayEstimate, Float64, Frame, Int32, Pose, UInt8
 from framework.geometry import interpolate, inverse, rotation_angle
 from framework.tracking.color_delay import MAX_STEP, DelayEstimator, is_usable
-from framework.tracking.color_delay_kernels import register
+from framework.tracking.color_delay_kernels import locate_colors
 from framework.tracking.pyramid import intrinsics
 
 MIN_SHIFT = 0.5  # px, minimum image motion between color and depth for a registration
@@ -109,7 +110,19 @@ class ColorToDepth:
         readings = readings[readings > 0]
         if shift < MIN_SHIFT or not len(readings) or min(camera.shape) < 2:
             return RegisteredFrame(frame, T_world_color)
-        color, pixels = np.empty_like(frame.color), np.empty(camera.shape, np.int32)
-        T_color_depth = np.ascontiguousarray(inverse(T_depth_color)[:3], np.float32)
-        register(frame.color, frame.depth, np.median(readings), intrinsics(camera), T_color_depth, color, pixels)
+        color, pixels = register(frame, np.median(readings), inverse(T_depth_color))
         return RegisteredFrame(replace(frame, color=color), T_world_color, pixels)
+
+
+def register(frame: Frame, otherwise: np.float32, T_color_depth: Float64) -> tuple[UInt8, Int32]:
+    """Return the color (H, W, 3) at each depth pixel, interpolated bilinearly, and its flat index (H, W).
+
+    The index is -1 outside of the color image and without a reading. The color there is that of the nearest pixel, for
+    a depth of `otherwise` m.
+    """
+    shape = frame.camera.shape
+    columns, rows, pixels = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.int32)
+    T = np.ascontiguousarray(T_color_depth[:3], np.float32)
+    locate_colors(frame.depth, otherwise, intrinsics(frame.camera), T, columns, rows, pixels)
+    color = cv2.remap(frame.color, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(color, np.uint8), pixels

@@ -10,10 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from framework.data import Camera, Float64, Frame, Pose
-from framework.geometry import inverse
-from framework.tracking.color_delay_kernels import register
-from framework.tracking.color_to_depth import ColorToDepth
-from framework.tracking.pyramid import intrinsics
+from framework.geometry import exp_se3, inverse, project
+from framework.tracking.color_to_depth import ColorToDepth, register
 from tests.framework.tracking.test_color_delay import delayed_frames
 from tests.support.scenes.analytic_scene import CAMERA, Scene
 
@@ -132,9 +130,32 @@ def test_register_identity_returns_same_image() -> None:
     color = rng.integers(0, 256, (30, 40, 3), np.uint8)
     depth = rng.uniform(1, 2, (30, 40)).astype(np.float32)
     depth[3, 4] = 0
-    registered, pixels = np.empty_like(color), np.empty((30, 40), np.int32)
-    register(color, depth, np.float32(1.5), intrinsics(camera), np.eye(4, dtype=np.float32)[:3], registered, pixels)
+    registered, pixels = register(Frame(0, 0.0, color, depth, camera), np.float32(1.5), np.eye(4))
     np.testing.assert_array_equal(registered, color)
     expected = np.arange(1200, dtype=np.int32).reshape(30, 40)
     expected[3, 4] = -1
     np.testing.assert_array_equal(pixels, expected)
+
+
+def test_register_equals_bilinear_reference() -> None:
+    rng = np.random.default_rng(1)
+    camera = Camera(40, 30, 35.0, 36.0, 19.5, 14.0)
+    color = rng.integers(0, 256, (30, 40, 3), np.uint8)
+    depth = rng.uniform(1, 2, (30, 40)).astype(np.float32)
+    T_color_depth = exp_se3(np.array([0.02, -0.01, 0.03, 0.03, -0.05, 0.02]))
+    registered, pixels = register(Frame(0, 0.0, color, depth, camera), np.float32(1.5), T_color_depth)
+    inside = 0
+    for v in range(30):
+        for u in range(40):
+            x = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]) * depth[v, u]
+            column, row = project(camera, (T_color_depth[:3, :3] @ x + T_color_depth[:3, 3])[None])[0]
+            if not (0 <= column < 39 and 0 <= row < 29):
+                continue
+            inside += 1
+            assert pixels[v, u] == round(row) * 40 + round(column)
+            a, b, i, j = column % 1, row % 1, int(column), int(row)
+            corners = color[j : j + 2, i : i + 2].astype(float)
+            expected = (1 - b) * ((1 - a) * corners[0, 0] + a * corners[0, 1])
+            expected += b * ((1 - a) * corners[1, 0] + a * corners[1, 1])
+            np.testing.assert_allclose(registered[v, u], expected, atol=255 / 32 + 0.5)  # positions in 1/32 px
+    assert inside > 900
