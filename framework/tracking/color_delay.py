@@ -8,9 +8,9 @@ of the edges and its direction n_k, in image widths and s:
     |v_k| d_k = |v_k| d + n_k . o + noise
 
 Robust regression (Tukey's biweight) over the compared frames gives the delay d, with a normal prior of the offset.
-Errors of nearby frames are correlated: CORRELATED frames count as one, and the standard deviation is at least that of a
-jackknife over blocks of frames. Slow frames are not compared. If a camera turns to one side at a constant rate, only the
-prior separates d from o.
+Errors of nearby frames are correlated: CORRELATED frames count as one, and the standard deviation is at least that of
+a jackknife over blocks of frames. Slow frames are not compared. If a camera turns to one side at a constant rate, only
+the prior separates d from o.
 """
 
 from __future__ import annotations

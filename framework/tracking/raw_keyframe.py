@@ -7,8 +7,8 @@ those of the map's view. With T_key_view and its adjoint Ad, a twist xi of the v
     A <- A + w Ad^T A_key Ad,    b <- b + w Ad^T b_key
 
 The keyframe is compared at half the finest resolution, where averaged depth is less noisy and the cost is a quarter. At
-the finest level, w = 4 replaces the missing points. Beyond NEW_DISTANCE, w falls to 0 at USED_DISTANCE, so that sparse
-frames are aligned to the map alone.
+the finest level, w = 4 replaces the missing points. The coarsest level is aligned to the map alone. Beyond
+NEW_DISTANCE, w falls to 0 at USED_DISTANCE, so that sparse frames are aligned to the map alone.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from framework.tracking.pyramid import PyramidLevel, intrinsics
 
 NEW_DISTANCE = 0.1  # m and rad from the keyframe, beyond which a frame replaces it
 USED_DISTANCE = 0.15  # m and rad from the keyframe, at which its weight reaches 0
-FINEST = 1  # halvings of the finest resolution at which frames and the keyframe are compared
+COMPARED = 1  # level at which frames and the keyframe are compared: halvings of the finest resolution
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,15 @@ class RawKeyframe:
     """A frame at its estimated pose, as a model of later frames."""
 
     T_world_camera: Float64  # (4, 4)
-    models: Sequence[ModelView]  # by level from FINEST on: depth, and normals averaged for the level
-    intensities: Sequence[Float32]  # by level from FINEST on, -1 = no depth
+    model: ModelView  # at level COMPARED
+    intensity: Float32  # (h, w) at level COMPARED, -1 = no depth
 
     @classmethod
     def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64, scattered: bool = False) -> RawKeyframe:
         """Return the keyframe of an image pyramid, finest level first. Normals of scattered depth are averaged more."""
-        used = levels[FINEST:]
-        model = ModelView(used[0].depth, used[0].normals, *intrinsics(used[0].camera))
-        models = [smoothed(model, halvings + scattered) for halvings in range(len(used))]
-        intensities = [np.where(level.depth > 0, level.intensity, np.float32(-1)) for level in used]
-        return cls(T_world_camera, models, intensities)
+        level = levels[COMPARED]
+        model = smoothed(ModelView(level.depth, level.normals, *intrinsics(level.camera)), int(scattered))
+        return cls(T_world_camera, model, np.where(level.depth > 0, level.intensity, np.float32(-1)))
 
 
 class KeyframeTerm(NamedTuple):
@@ -72,13 +70,12 @@ class KeyframeTerm(NamedTuple):
         self, levels: Sequence[PyramidLevel], level: int, T_view_camera: Float64, weights: Weights, brightness: float,
         linear: LinearWeights | None,
     ) -> NormalEquations:  # fmt: skip
-        """Return the weighted equations of the keyframe, for twists of the view's frame."""
-        compared = max(level, FINEST)
+        """Return the weighted equations of the keyframe for an alignment at `level`, for twists of the view's frame."""
         own = linearize(
-            levels[compared], self.keyframe.models[compared - FINEST], self.keyframe.intensities[compared - FINEST],
-            self.T_key_view @ T_view_camera, weights, brightness, linear,
+            levels[COMPARED], self.keyframe.model, self.keyframe.intensity, self.T_key_view @ T_view_camera, weights,
+            brightness, linear,
         )  # fmt: skip
-        weight = self.weight * 4 ** (compared - level)
+        weight = self.weight * 4 ** (COMPARED - level)
         return own._replace(
             A=weight * self.Ad.T @ own.A @ self.Ad,
             b=weight * self.Ad.T @ own.b,

@@ -21,7 +21,7 @@ from framework.tracking.depth_scale import DepthScale
 from framework.tracking.features import FrameFeatures
 from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, is_scattered, model_intensities
-from framework.tracking.raw_keyframe import FINEST, NEW_DISTANCE, KeyframeTerm, RawKeyframe
+from framework.tracking.raw_keyframe import COMPARED, NEW_DISTANCE, KeyframeTerm, RawKeyframe
 from framework.tracking.uncertainty import is_significant, pose_covariance
 
 LEVELS = 3
@@ -358,7 +358,7 @@ class VoxelHashingIcp(PoseTracker):
                 )
                 brightness = equations.brightness if linear is None else 0.0
                 A, b = equations.A, equations.b
-                if term is not None:
+                if term is not None and level <= COMPARED:
                     own = term.linearized(levels, level, T_view_camera, weights, key_brightness, linear)
                     key_brightness = own.brightness if linear is None else 0.0
                     A, b = A + own.A, b + own.b
@@ -374,7 +374,7 @@ class VoxelHashingIcp(PoseTracker):
         compared = levels[0]
         # until many frames are mapped, the view of the map is empty where depth is scattered
         if self._scattered_depth and term is not None and own.visible > equations.visible:
-            equations, compared = own, levels[FINEST]
+            equations, compared = own, levels[COMPARED]
         # linear weights are no inverse variances
         covariance = pose_covariance(terms, T_view_camera) if linear is None else None
         T_world_camera = T_world_view @ T_view_camera
