@@ -36,6 +36,7 @@ MIN_EDGES, MAX_EDGES = 100, 1500  # number of edge points of a compared frame
 MIN_SPEED = 0.125  # minimum image motion of a compared frame, image widths per s
 DENSE_COMPARISONS, LATER_STRIDE = 60, 8  # number of successive comparisons; after them, every 8th frame is compared
 MIN_COMPARISONS, MAX_COMPARISONS = 16, 512  # number of latest comparisons for an estimate
+PERIOD = 4  # number of comparisons from one estimate to the next
 BLOCKS = 8  # number of blocks of the jackknife
 MAX_DEVIATION = 0.002  # s, maximum standard deviation of a usable estimate ...
 MAX_RELATIVE_DEVIATION = 0.25  # ... or, if larger, the maximum as a fraction of the estimate
@@ -65,6 +66,7 @@ class DelayEstimator:
         self.estimate = UNKNOWN
         self._recent: deque[_Tracked] = deque(maxlen=HISTORY)
         self._frames = 0  # number of added frames
+        self._compared = 0  # number of compared frames
         # delay, s, and mean image motion (x, y), image widths / s
         self._comparisons: deque[tuple[float, float, float]] = deque(maxlen=MAX_COMPARISONS)
         self._strengths = np.zeros(len(TESTED_DELAYS))  # sum over the compared frames
@@ -78,7 +80,7 @@ class DelayEstimator:
         skipped = len(self._comparisons) >= DENSE_COMPARISONS and self._frames % LATER_STRIDE
         if skipped or len(self._recent) < HISTORY or not self._compare():
             return
-        if len(self._comparisons) >= MIN_COMPARISONS:
+        if len(self._comparisons) >= MIN_COMPARISONS and self._compared % PERIOD == 0:
             start = float(TESTED_DELAYS[self._strengths.argmax()])
             self.estimate = regress(np.array(self._comparisons), start)
 
@@ -116,6 +118,7 @@ class DelayEstimator:
         low, high, next_ = strengths[best - 1 : best + 2]
         vertex = (low - next_) / (low - 2 * high + next_) / 2
         delay = TESTED_DELAYS[best] + vertex * (TESTED_DELAYS[1] - TESTED_DELAYS[0])
+        self._compared += 1
         self._comparisons.append((float(delay), float(velocity[0]), float(velocity[1])))
         return True
 
@@ -131,9 +134,8 @@ def edge_points(frame: Frame) -> Float32:
 def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
     """Return the smoothed color gradient (h, WIDTH) with mean 0 and standard deviation 1, and its scale."""
     scale = min(WIDTH / frame.camera.width, 1.0)
-    gray = cv2.resize(
-        cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA
-    )
+    small = cv2.resize(frame.color, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
     gradient = cv2.magnitude(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
     gradient = cv2.GaussianBlur(np.minimum(gradient, np.float32(MAX_GRADIENT)), (0, 0), 1.0)
     deviation = max(float(gradient.std()), 1e-6)

@@ -8,7 +8,7 @@ from numba import njit, prange
 DEPTH_STEP = 0.05  # fraction of the depth; a larger step is an edge
 REACH = 4  # px, maximum width of the missing depth at an edge
 DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # (u, v) of the searched neighbors
-ROWS = 2  # step between the searched rows, px
+ROWS = 4  # step between the searched rows, px
 
 
 @njit(cache=True, nogil=True)

@@ -24,8 +24,9 @@ from framework.tracking.color_delay import MAX_STEP, DelayEstimator, is_usable
 from framework.tracking.color_delay_kernels import locate_colors
 from framework.tracking.pyramid import intrinsics
 
-MIN_SHIFT = 0.5  # px, minimum image motion between color and depth for a registration
-NEAR = 1.0  # m, depth of the points for this image motion
+MIN_SHIFT = 1.0  # px, minimum image motion between color and depth for a registration
+MAX_CHANGE = 0.5  # px, maximum image motion between the predicted and the tracked pose to keep a registration
+NEAR = 1.0  # m, depth of the points for both
 STRIDE = 8  # px, step between the depth readings for their median
 
 log = logging.getLogger(__name__)
@@ -37,6 +38,12 @@ class RegisteredFrame(NamedTuple):
     frame: Frame  # with the color at each depth pixel
     T_world_color: Float64  # (4, 4) pose of the color camera
     color_pixels: Int32 | None = None  # (H, W) flat index of the color pixel of each reading, -1 = none; None = same
+
+
+class _Registration(NamedTuple):
+    source: Frame  # the frame before registration
+    T_depth_color: Float64  # (4, 4)
+    result: RegisteredFrame
 
 
 class ColorToDepth:
@@ -52,6 +59,7 @@ class ColorToDepth:
         self._given = 0.0 if delay is None else delay
         self._last: tuple[float, Float64] | None = None  # time, s, and pose of the last frame
         self._step: tuple[float, Float64] | None = None  # time, s, and motion T_last_next of the last step
+        self._latest: _Registration | None = None
 
     @property
     def estimate(self) -> DelayEstimate | None:
@@ -104,14 +112,25 @@ class ColorToDepth:
             return RegisteredFrame(frame, T_world_camera)
         T_depth_color = inverse(T_last_next) @ interpolate(np.eye(4), T_last_next, 1 + dt / seconds)
         T_world_color = T_world_camera @ T_depth_color
-        camera = frame.camera
-        shift = camera.fx * (rotation_angle(T_depth_color[:3, :3]) + math.hypot(*T_depth_color[:3, 3]) / NEAR)
+        if _shift(frame, T_depth_color) < MIN_SHIFT:
+            return RegisteredFrame(frame, T_world_color)
+        if self._latest is not None and self._latest.source is frame:
+            change = inverse(self._latest.T_depth_color) @ T_depth_color
+            if _shift(frame, change) < MAX_CHANGE:
+                return self._latest.result._replace(T_world_color=T_world_color)
         readings = frame.depth[::STRIDE, ::STRIDE]
         readings = readings[readings > 0]
-        if shift < MIN_SHIFT or not len(readings) or min(camera.shape) < 2:
+        if not len(readings):
             return RegisteredFrame(frame, T_world_color)
         color, pixels = register(frame, np.median(readings), inverse(T_depth_color))
-        return RegisteredFrame(replace(frame, color=color), T_world_color, pixels)
+        registered = RegisteredFrame(replace(frame, color=color), T_world_color, pixels)
+        self._latest = _Registration(frame, T_depth_color, registered)
+        return registered
+
+
+def _shift(frame: Frame, T_a_b: Float64) -> float:
+    """Return the image motion, px, of points at NEAR for a small motion of the camera."""
+    return frame.camera.fx * (rotation_angle(T_a_b[:3, :3]) + math.hypot(*T_a_b[:3, 3]) / NEAR)
 
 
 def register(frame: Frame, otherwise: np.float32, T_color_depth: Float64) -> tuple[UInt8, Int32]:

@@ -31,8 +31,8 @@ def pose_covariance(terms: Sequence[NormalEquations], T_view_camera: Float64) ->
     A, spread = np.zeros((6, 6)), np.zeros((6, 6))
     for term in terms:
         A += term.A
-        spread += term.energy / max(term.matched, 1) * (term.A - term.A_color)
-        spread += term.color_energy / max(term.matched_colors, 1) * term.A_color
+        geometric, photometric = term.energy / max(term.matched, 1), term.color_energy / max(term.matched_colors, 1)
+        spread += geometric * term.A + (photometric - geometric) * term.A_color
     gain = adjoint(inverse(T_view_camera)) @ np.linalg.pinv(A, hermitian=True)
     C = CORRELATED * gain @ spread @ gain.T
     return np.asarray((C + C.T) / 2)
