@@ -23,7 +23,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from numbers import Integral, Real
-from typing import ClassVar, cast
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -113,7 +113,7 @@ class FrameTruth:
 
     instance_ids: Int32 = field(repr=False)  # (H, W)
     class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
-    of_depth: ClassVar[bool] = False  # True = at the pose of the depth image, False = of the color image
+    of_depth: bool = False  # True = at the pose of the depth image, False = of the color image
 
     def __post_init__(self) -> None:
         check_array("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
@@ -125,12 +125,10 @@ class FrameTruth:
 
 
 class DeferredTruth(FrameTruth):
-    """Ground truth of a frame with ids rendered on first access, once for all threads.
+    """Ground truth of a frame with ids rendered or read on first access, once for all threads.
 
     Each access raises the errors of `render`. It raises DataError if `render` does not return int32 of `shape`.
     """
-
-    of_depth = True
 
     def __init__(
         self,
@@ -138,13 +136,15 @@ class DeferredTruth(FrameTruth):
         shape: tuple[int, int],  # (height, width) of the ids
         class_names: Mapping[int, str | None],
         origin: str,  # hash of all inputs of the ids, which identifies them before they are rendered
+        of_depth: bool = True,
     ) -> None:
         self._render = render
         self._shape = shape
         self._ids: Int32 | None = None
         self._lock = threading.Lock()
         self.origin = origin
-        object.__setattr__(self, "class_names", class_names)  # a field of the frozen base class
+        object.__setattr__(self, "class_names", class_names)  # fields of the frozen base class
+        object.__setattr__(self, "of_depth", of_depth)
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -187,7 +187,10 @@ def _read(sequence: RGBDSequence, chosen: Sequence[int]) -> tuple[list[Frame], l
     frames, errors = [], []
     for k in chosen:
         try:
-            frames.append(sequence[k])
+            frame = sequence[k]
+            if frame.truth is not None and not frame.truth.of_depth:
+                frame.truth.instance_ids  # noqa: B018  # decodes the stored image, which may be damaged
+            frames.append(frame)
         except FrameError as error:
             errors.append(error)
     if not frames:

@@ -18,6 +18,7 @@ the k-th frame in ascending order. Comments and empty lines are not counted.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from framework.data import FrameTruth, Int32, SceneTruth
+from framework.data import DeferredTruth, FrameTruth, Int32, SceneTruth
 from framework.datasets.calibration.camera_json import read_camera
 from framework.datasets.frames.numbered_images import numbered_images
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording, StoredImages
@@ -34,7 +35,7 @@ from framework.datasets.ground_truth.named_truth import read_class_names
 from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import path_exists
-from framework.files.image_files import read_uint16
+from framework.files.image_files import decode_uint16, read_image_file
 from framework.files.number_lines import read_gravity, read_image_times
 from framework.files.tum_trajectory import TumLine, read_tum_lines
 
@@ -79,11 +80,17 @@ class RgbdFolder(Recording):
         if not self._instances:
             return None
         path = self._instances[index]
-        ids: Int32 = self.calibration.labels(read_uint16(path), path).astype(np.int32)
-        unknown = [int(i) for i in np.flatnonzero(np.bincount(ids.ravel())) if i and i not in self._class_names]
-        if unknown:
-            raise FrameError(f"{path}: expected instances of {self.folder / 'instances.json'}, got {unknown[0]}")
-        return FrameTruth(ids, self._class_names)
+        data = read_image_file(path)
+
+        def decode() -> Int32:
+            ids: Int32 = self.calibration.labels(decode_uint16(path, data), path).astype(np.int32)
+            unknown = [int(i) for i in np.flatnonzero(np.bincount(ids.ravel())) if i and i not in self._class_names]
+            if unknown:
+                raise FrameError(f"{path}: expected instances of {self.folder / 'instances.json'}, got {unknown[0]}")
+            return ids
+
+        origin = f"{hashlib.sha256(data).hexdigest()} {self.camera!r} {self.calibration.distortion!r}"
+        return DeferredTruth(decode, self.camera.shape, self._class_names, origin, of_depth=False)
 
     def own_scene_truth(self) -> SceneTruth | None:
         """Return the fused depth and instance ids of the selected frames, or None without instances or poses.
@@ -101,11 +108,12 @@ class RgbdFolder(Recording):
                 if recorded.error:
                     raise FrameError(f"frame {index}: {recorded.error}")
                 depth, truth = self.metric_depth(index), self.truth_in(index)
+                ids = None if truth is None else truth.instance_ids
             except FrameError as error:
                 log.warning("ground truth: frame skipped: %s", error)
                 continue
-            if truth is not None and recorded.T_world_camera is not None:
-                yield LabeledDepth(depth, truth.instance_ids, self.camera, recorded.T_world_camera)
+            if ids is not None and recorded.T_world_camera is not None:
+                yield LabeledDepth(depth, ids, self.camera, recorded.T_world_camera)
 
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
         """Return the class of each instance and the instance image of each frame, both empty without labels."""

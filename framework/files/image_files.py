@@ -31,7 +31,7 @@ def read_color(path: Path) -> UInt8:
 
     Raises FrameError if the file is damaged or not 8-bit.
     """
-    return decode_color(path, _read(path))
+    return decode_color(path, read_image_file(path))
 
 
 def decode_color(name: Path | str, data: bytes) -> UInt8:
@@ -50,7 +50,7 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
 
 def read_uint16(path: Path) -> UInt16:
     """Return the uint16 values (H, W) of a PNG file. Raises FrameError if it is damaged or of another type."""
-    return decode_uint16(path, _read(path))
+    return decode_uint16(path, read_image_file(path))
 
 
 def decode_uint16(name: Path | str, data: bytes) -> UInt16:
@@ -60,7 +60,7 @@ def decode_uint16(name: Path | str, data: bytes) -> UInt16:
 
 def read_uint8(path: Path) -> UInt8:
     """Return the uint8 values (H, W) of a PNG file. Raises FrameError if it is damaged or of another type."""
-    return np.asarray(_decode_channel(path, _read(path), np.uint8), np.uint8)
+    return np.asarray(_decode_channel(path, read_image_file(path), np.uint8), np.uint8)
 
 
 def _decode_channel(name: Path | str, data: bytes, dtype: type[np.generic]) -> Array:
@@ -72,7 +72,8 @@ def _decode_channel(name: Path | str, data: bytes, dtype: type[np.generic]) -> A
     return image
 
 
-def _read(path: Path) -> bytes:
+def read_image_file(path: Path) -> bytes:
+    """Return the content of an image file. Raises FrameError if it cannot be read."""
     try:
         return read_bytes(path, LARGEST_FILE)
     except DataError as error:

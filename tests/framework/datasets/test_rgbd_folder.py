@@ -369,7 +369,7 @@ def read_all_but(folder, bad):
         if k != bad:
             assert sequence[k].index == k
     with pytest.raises(FrameError) as caught:
-        sequence[bad]
+        sequence[bad].truth.instance_ids  # noqa: B018  # decoded on demand
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -443,6 +443,16 @@ def test_rgbd_folder_rounded_quaternion_is_made_rigid(folder):
     set_pose_line(folder, 1, "0.1 0 0 0 0 0.601 0 0.801")
     R = RgbdFolder(folder)[1].T_world_camera[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def test_rgbd_folder_instance_images_are_decoded_on_demand(folder):
+    path = folder / "instance/000001.png"
+    path.write_bytes(path.read_bytes()[:60] + b"damaged" + path.read_bytes()[67:])
+    frame = RgbdFolder(folder)[1]
+    assert frame.truth.shape == frame.depth.shape
+    assert not frame.truth.of_depth
+    with pytest.raises(FrameError, match=r"instance.000001\.png: expected a decodable PNG"):
+        frame.truth.instance_ids  # noqa: B018
 
 
 def test_rgbd_folder_unnamed_instance_raises_for_its_frame(folder):
