@@ -451,7 +451,7 @@ def test_rgbd_folder_instance_images_are_decoded_on_demand(folder):
     frame = RgbdFolder(folder)[1]
     assert frame.truth.shape == frame.depth.shape
     assert not frame.truth.of_depth
-    with pytest.raises(FrameError, match=r"instance.000001\.png: expected a decodable PNG"):
+    with pytest.raises(FrameError, match=r"instance.000001\.png: expected a valid image"):
         frame.truth.instance_ids  # noqa: B018
 
 
