@@ -92,7 +92,7 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
 def check_image(name: Path | str, data: bytes) -> None:
     """Raise FrameError if `data` is not a complete PNG or JPEG file with an image of at most MAX_PIXELS.
 
-    The size is checked first, because decoders allocate the size in the header: up to 10^10 px in a damaged file.
+    Decoders allocate memory for the size in the header, which may be 10^10 px in a damaged file.
     """
     if not data:
         raise FrameError(f"{name}: expected an image, got an empty file")

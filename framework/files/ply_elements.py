@@ -268,7 +268,7 @@ class _Body:
         return np.ndarray((rows, length), stored, self._data, start * unit, (stride * unit, stored.itemsize))
 
     def _rows_are_alike(self, element: Element, lengths: list[int]) -> bool:
-        """Return True if the lists of all rows have the lengths (`lengths`) of the lists in the first row."""
+        """Return True if the lists of all rows have the same lengths as those of the first row, `lengths`."""
         stride = self._stride(element, lengths)
         end = self._position + element.rows * stride
         if not element.rows or end > self._end:

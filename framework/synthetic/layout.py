@@ -112,7 +112,10 @@ def _try_layout(
 
 
 def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
-    """Return the pose of a group that is `along` m from the middle of a wall: 0 at -y, 1 at +x, 2 at +y, 3 at -x."""
+    """Return the pose of a group at a wall, offset by `along` m from the middle of the wall.
+
+    `wall` is 0 for the wall at -y, 1 at +x, 2 at +y, and 3 at -x.
+    """
     if wall == 0:
         return along, -depth / 2, 0.0
     if wall == 1:

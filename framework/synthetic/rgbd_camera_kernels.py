@@ -12,7 +12,7 @@ from framework.sensors.noise_models_kernels import axial_sigma_at_angle
 MIN_RANGE = 0.4  # m
 EDGE_JUMP = 0.05  # minimum relative step of depth at an edge, where the sensor's correlation window fails
 EDGE_DROP = 0.5  # probability of no reading next to such a step
-GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # rad, incidence of the first and of complete loss
+GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # rad, incidence at the start and end of the loss
 QUANTILE_BITS = 12  # bits of a normal error: 2^QUANTILE_BITS equally likely values, up to 3.7 standard deviations
 SPARE_BITS = 16 - QUANTILE_BITS
 MAX_SAMPLES = 9  # blur samples along the path of a pixel; more samples make no visible difference
@@ -63,7 +63,8 @@ def read_depth(
     largest_loss = min(noise, np.float32(1))
     for v in range(height):
         # The projector, or the other camera, is to the right of the camera. Pixel u is at u - f b / z in the projector.
-        # There, a pixel is left of all pixels on its right, unless it is in the shadow of a nearer surface.
+        # In the projector, a pixel is to the left of all pixels that are to its right in the camera, unless it is in
+        # the shadow of a nearer surface.
         leftmost = np.float32(np.inf)
         for u in range(width - 1, -1, -1):
             z = depth[v, u]

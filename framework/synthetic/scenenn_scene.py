@@ -33,7 +33,7 @@ ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrins
 NOISE, MAX_RANGE = 1.0, 6.0  # noise of the sensor, 1 = Kinect v1; range of the sensor, m
 EXPOSURE = 1 / 60  # s, exposure of color images, centered at the pose; typical for indoor light
 TRUTH_VIEWS = 60  # maximum number of frames for the labeled mesh; neighboring frames have nearly the same view
-MAX_CAMERA_SPEED = 5.0  # maximum camera speed relative to the recommended speed; equal to 2.2 m/s
+MAX_CAMERA_SPEED = 5.0  # maximum camera speed relative to the recommended speed; about 2.2 m/s
 LARGEST_ID = 934338  # largest label in SceneNN; labels are unordered
 PNG = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),

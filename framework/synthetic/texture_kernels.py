@@ -1,10 +1,10 @@
 """Procedural textures, evaluated per pixel.
 
-They need no image files, have no seams, and have sufficient gradients for photometric alignment.
+They need no image files, have no seams, and have sufficient gradients for photometric alignment. Solid textures (wood,
+fabric, paint, metal) use all three texture coordinates. Planar textures (planks, tiles, rug, painting) use the first
+two. Detail below the size of a pixel is faded out to prevent flicker between frames.
 
-Solid textures (wood, fabric, paint, metal) use all three texture coordinates. Planar textures (planks, tiles, rug,
-painting) use the first two. Detail below the size of a pixel is faded out to prevent flicker between frames.
-`footprint` is the size of a pixel on the surface, m. All other lengths are in m, too.
+Lengths are in m unless stated otherwise. `footprint` is the size of a pixel on the surface.
 """
 
 from __future__ import annotations

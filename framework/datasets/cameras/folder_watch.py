@@ -149,7 +149,7 @@ class NewImages:
 
     def __init__(self, folder: Path, suffixes: Sequence[str]) -> None:
         self.folder, self.suffixes = folder, suffixes
-        self.waiting: dict[int, Path] = {}  # by number
+        self.waiting: dict[int, Path] = {}  # by frame number
         self._names: set[str] = set()
         self._first: Path | None = None
 

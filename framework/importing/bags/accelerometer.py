@@ -21,7 +21,7 @@ from framework.importing.bags.ros_transforms import REALSENSE, static_rotation, 
 
 NEAR = 0.05  # s, averaging window before and after a frame, which reduces the effect of hand tremor
 GRAVITY = 9.81  # m/s^2
-MAX_DEVIATION = 0.2  # fraction of GRAVITY, maximum deviation of the median length; rejects data without gravity
+MAX_DEVIATION = 0.2  # fraction of GRAVITY, maximum deviation of the median acceleration; rejects data without gravity
 GYROSCOPE = re.compile("gyro", re.IGNORECASE)  # matches names of topics without acceleration
 
 log = logging.getLogger(__name__)

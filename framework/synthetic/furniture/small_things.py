@@ -123,7 +123,10 @@ def shelf(rng: Rng) -> Furniture:
 
 
 def _fill(piece: Furniture, rng: Rng, start: float, end: float, z: float, height: float) -> None:
-    """Place binders, boxes and gaps on a shelf board at height `z`, from x = `start` to `end`, below `height`; m."""
+    """Place binders, boxes and gaps side by side on a shelf board.
+
+    The board is at the height `z` m, and extends from `start` to `end` m along x. `height`: m, maximum object height.
+    """
     x = start
     while True:
         wide = rng.uniform() < 0.2
