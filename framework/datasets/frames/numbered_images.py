@@ -29,7 +29,8 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
                 f"{folder}: expected names that end in a frame number, such as 000000{path.suffix}, got {path.name}"
             )
         if number in files:
-            raise DataError(f"{path}: expected unique frame numbers, got {number} also for {files[number].name}")
+            found = f"got {number} for {files[number].name} and {path.name}"
+            raise DataError(f"{folder}: expected unique frame numbers, {found}")
         files[number] = path
     check_one_number(list(files.values()))
     if not files:

@@ -121,7 +121,7 @@ def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
         elif at_end and k == len(rows) - 1 and len(line.words) <= 4:
             return None
         else:
-            expected = f"expected four numbers (row {k + 1} of a 4x4 matrix), got {line.shown}"
+            expected = f"expected row {k + 1} of a 4x4 matrix (four numbers), got {line.shown}"
             raise DataError(f"{path}, line {line.number}: {expected}")
     return matrix if len(rows) == 4 else None
 

@@ -179,7 +179,7 @@ def test_folder_watch_ambiguous_but_not_unrelated_names_raise(folder: Path, capl
     for name in (".000000.jpg", "000000.jpg.part", "preview.jpg", f"{2**53}.jpg"):
         (folder / "color" / name).write_bytes(b"?")
     assert watched.look() == watched.look() == []
-    assert sorted(message.partition(": expected a name")[0] for message in caplog.messages) == [
+    assert sorted(message.partition(": expected a frame number")[0] for message in caplog.messages) == [
         f"{folder}/color/{2**53}.jpg",
         f"{folder}/color/preview.jpg",
     ]
