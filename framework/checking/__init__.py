@@ -20,8 +20,8 @@ class Finding:
     """Result of one check."""
 
     verdict: Verdict
-    subject: str
-    text: str
+    subject: str  # checked property, such as "depth"
+    text: str  # one line
     setting: str = ""  # fix, as KEY=VALUE for the command line; "" = no parameter fixes the problem
 
     def __str__(self) -> str:

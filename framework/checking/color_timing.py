@@ -11,13 +11,13 @@ from framework.errors import FrameError
 from framework.geometry import inverse
 from framework.tracking.color_delay import DelayEstimator, is_usable
 
-PARTS, PART_FRAMES = 4, 30  # parts of the sequence, and frames of each part
+PARTS, PART_FRAMES = 4, 30  # number of parts of the sequence, and number of frames in each part
 SUBJECT = "color delay"
 SHORT = 0.003  # s, a shorter delay has no visible effect
 
 
 def check_color_delay(matcher: Matcher) -> Finding:
-    """Return the finding about the delay of color, from the given or matched motion in parts of a sequence."""
+    """Return the finding about the delay of color, estimated from the camera motion in parts of a sequence."""
     delay = matcher.sequence.constant_color_delay()
     if delay is not None:
         return Finding(Verdict.FINE, SUBJECT, f"{1e3 * delay:g} ms, as set; dataset.color_delay=AUTO estimates it")
@@ -37,7 +37,10 @@ def check_color_delay(matcher: Matcher) -> Finding:
 
 
 def estimate_delay(matcher: Matcher) -> DelayEstimate:
-    """Return the delay estimated from parts of the matcher's sequence."""
+    """Return the delay of color, estimated from parts of the matcher's sequence.
+
+    Frames without a given pose are tracked by matched points.
+    """
     sequence, estimator = matcher.sequence, DelayEstimator()
     length = min(PART_FRAMES, len(sequence))
     for start in np.unique(np.linspace(0, len(sequence) - length, PARTS).astype(int)).tolist():

@@ -17,8 +17,8 @@ from framework.tracking.features import FeatureExtractor, Features, match
 
 MAX_RATIO = 0.8  # maximum distance ratio of the best to the second-best match (Lowe 2004)
 MIN_POINTS = 30  # minimum number of matches of a pair
-STEPS = (1, 2, 4, 8, 16, 32)  # frame offsets between the two frames of a pair
-MAX_MOTION = 0.25  # fraction of the image width; after a larger motion, larger steps are not tried
+STEPS = (1, 2, 4, 8, 16, 32)  # frames, offsets between the two frames of a pair
+MAX_MOTION = 0.25  # fraction of the image width; larger steps are not tried after a pair with more motion
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class MatchedPair:
     first: Frame
     second: Frame
     points_first: Float32  # (M, 3) m, in the first camera
-    pixels_first: Float32  # (M, 2)
-    pixels_second: Float32  # (M, 2)
+    pixels_first: Float32  # (M, 2) px
+    pixels_second: Float32  # (M, 2) px
     T_second_first: Float64  # (4, 4), estimated from the matched points (PnP)
 
     @property
@@ -48,7 +48,7 @@ class Matcher:
         self._features = lru_cache(maxsize=4 * len(STEPS))(self._extract)
 
     def pairs(self, starts: Sequence[int], steps: Sequence[int] = STEPS) -> Iterator[MatchedPair]:
-        """Yield the pairs from each position in `starts`, with increasing steps until the overlap is too small."""
+        """Yield the pairs from each frame index in `starts`, with increasing steps until the overlap is too small."""
         for k in starts:
             for step in steps:
                 pair = self.pair(k, step)

@@ -16,9 +16,8 @@ from framework.checking.pose_fit import ALIKE, MAX_RELATIVE_ERROR, MIN_MOTION, P
 from framework.data import Float64
 
 MAX_DELAY = 6  # frames, in both directions; one more is tried, to detect an error that is still decreasing
-MAX_ERROR_RATIO = (
-    0.75  # maximum ratio to the mean error without delay; real recordings have at least 0.88 for wrong delays
-)
+# maximum ratio of the mean errors with and without the delay; in real recordings, wrong delays have at least 0.88
+MAX_ERROR_RATIO = 0.75
 MIN_GAIN = 1 / 640  # fraction of the image width, minimum error difference of a counted pair
 MIN_IMPROVED_FRACTION = 0.75  # minimum fraction of improved pairs among the counted pairs
 MIN_PAIRS = 5  # minimum number of counted pairs
@@ -28,14 +27,14 @@ MIN_PAIRS = 5  # minimum number of counted pairs
 class PoseDelay:
     """A delay of the poses."""
 
-    frames: int  # delay; negative = early
+    frames: int  # delay in frames; negative = early
     error: float  # px, mean over the pairs with the stored poses
     delayed_error: float  # px, mean over the pairs with the poses shifted by the delay
-    pairs: int
-    alike: tuple[int, ...]  # other delays that fit equally well
+    pairs: int  # number of pairs
+    alike: tuple[int, ...]  # frames, other delays that fit equally well
 
     def finding(self, applied: int, step: float) -> Finding:
-        """Return the finding for a recording with the configured delay `applied` and a frame interval of `step` s."""
+        """Return the finding for the configured delay `applied` (frames) and the frame interval `step` (s)."""
         count, (when, where) = abs(self.frames), ("late", "later") if self.frames > 0 else ("early", "earlier")
         frames = f"{count} frame{'s' * (count > 1)}"
         text = (
@@ -89,7 +88,7 @@ def find_delay(
 
 
 def delayed(pair: MatchedPair, poses: Sequence[Float64 | None], delay: int) -> MatchedPair:
-    """Return the pair with the poses of the frames `delay` later."""
+    """Return the pair with the poses from `delay` frames later."""
     stored = dict(enumerate(poses))
     first, second = (
         replace(frame, T_world_camera=stored.get(frame.index + delay)) for frame in (pair.first, pair.second)
@@ -98,6 +97,6 @@ def delayed(pair: MatchedPair, poses: Sequence[Float64 | None], delay: int) -> M
 
 
 def _error(pair: MatchedPair, poses: Mapping[int, Float64], fit: PoseFit, delay: int) -> float:
-    """Return the error of a pair in px with the poses of the frames `delay` later."""
+    """Return the error of a pair in px with the poses from `delay` frames later."""
     T_second_first = motion_between(poses[pair.first.index + delay], poses[pair.second.index + delay], fit.reading)
     return error_of(pair, T_second_first, fit.depth_factor)

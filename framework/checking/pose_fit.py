@@ -14,16 +14,15 @@ from framework.data import Float64
 from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseReading, QuaternionOrder
 from framework.geometry import inverse, project, transform
 
-MAX_ERROR = 1.0  # fraction of the image width, maximum error; also used for points behind the camera
+MAX_ERROR = 1.0  # fraction of the image width, limit of the error of a point; also used for points behind the camera
 MIN_BASELINE = 0.02  # fraction of the median depth, minimum translation for a scale estimate
 MIN_PAIRS = 3  # minimum number of informative pairs
 MIN_MOTION = 0.01  # fraction of the image width; pairs with less motion fit any poses
 MAX_RELATIVE_ERROR = 0.2  # fraction of the motion, maximum error of valid poses; real recordings have 0.01 to 0.06
 ALIKE, ALIKE_PX = 1.15, 0.2  # ratio, and offset in px, up to which two errors count as equal
-MAX_OTHER_RATIO = 0.5  # maximum error of another convention, as a ratio to the configured convention
-MIN_LOG_UNCERTAINTY = (
-    0.07  # minimum log uncertainty of the depth factor, due to inaccurate poses and depth in real recordings
-)
+MAX_OTHER_RATIO = 0.5  # maximum ratio of the error of another convention to the error of the configured convention
+# minimum uncertainty of the logarithm of the depth factor, due to inaccurate poses and depth in real recordings
+MIN_LOG_UNCERTAINTY = 0.07
 MAX_ERROR_INCREASE = 1.3  # maximum error ratio for a wrong scale; pure rotation hardly constrains the scale
 WRONG_SCALE = 2.5  # minimum ratio of a wrong scale; with rotation, the scale is uncertain by up to 1.6 times
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
@@ -35,7 +34,7 @@ class PoseFit:
     """Agreement of the poses with the frame pairs in one pose convention."""
 
     reading: PoseReading
-    depth_factor: float  # factor for all depths
+    depth_factor: float  # factor of all depth readings
     errors: Float64  # (P,) px, median error of the points of each pair
     factor_within: float = 1.0  # uncertainty of depth_factor, as a ratio; 1 if the factor is given
 
@@ -102,7 +101,7 @@ class PoseJudgment:
     findings: tuple[Finding, ...]
     given: PoseFit | None  # fit of the configured convention; None = too few informative pairs
     best: PoseFit | None  # fit of the best convention; None = too few informative pairs
-    others: tuple[PoseFit, ...] = ()  # fits of all conventions, without a depth factor
+    others: tuple[PoseFit, ...] = ()  # fits of all conventions, with depth as stored
 
 
 def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, median_depth: float) -> PoseJudgment:
@@ -127,7 +126,7 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     if reading == given and now <= MAX_RELATIVE_ERROR * motion and chosen.depth_factor == 1.0:
         return PoseJudgment((Finding(Verdict.FINE, "poses", f"valid: {measured}"),), as_given, as_given, others)
     if chosen.error > MAX_RELATIVE_ERROR * motion:
-        text = f"inconsistent with the images in any axes: {measured}"
+        text = f"inconsistent with the images in all supported conventions: {measured}"
         finding = Finding(Verdict.ERROR, "poses", text, "tracker=voxel_hashing_icp, which needs no poses")
         return PoseJudgment((finding,), as_given, best, others)
     findings = []
@@ -177,13 +176,13 @@ def _named(reading: PoseReading) -> str:
 
 
 def _equal_to_best(fits: Sequence[PoseFit]) -> list[PoseFit]:
-    """Return all fits as good as the best fit. For a panning camera, some axes fit equally well."""
+    """Return all fits that are as good as the best fit. For a panning camera, several conventions fit equally well."""
     least = min(one.error for one in fits)
     return [one for one in fits if one.error <= ALIKE * least + ALIKE_PX]
 
 
 def _settings(reading: PoseReading, given: PoseReading) -> tuple[str, ...]:
-    """Return the parameters with different values in the two conventions."""
+    """Return the parameters that differ between the two conventions, as KEY=VALUE of `reading`."""
     names = ("pose_kind", "camera_axes", "quaternion_order")
     changed = [name for name in names if getattr(reading, name) != getattr(given, name)]
     return tuple(f"dataset.{name}={getattr(reading, name).name}" for name in changed)

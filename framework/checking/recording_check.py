@@ -21,13 +21,13 @@ from framework.datasets.frames.sequence_reader import Recording
 from framework.errors import DataError, FrameError
 from framework.interfaces import RGBDSequence, RGBDVideo
 
-CHECKED_FRAMES = 12  # evenly spaced over the sequence
+CHECKED_FRAMES = 12  # number of checked frames, evenly spaced over the sequence
 QUICK_STARTS, QUICK_STEPS = (0.1, 0.35, 0.6, 0.85), (1, 4, 16)  # fractions of the sequence; steps in frames
 MAX_MISSING = 0.7  # maximum fraction of pixels without a depth reading, for a good map
 MAX_BEYOND = 0.3  # maximum fraction of depth readings beyond the mapped range, for a good map
 # maximum width of sharp color edges, as a fraction of the image width; real recordings have 4 to 9 px of 640
 MAX_EDGE_WIDTH = 12 / 640
-EDGE_WINDOW = 15 / 640  # fraction of the image width, window for the contrast of an edge
+EDGE_WINDOW = 15 / 640  # fraction of the image width, size of the window for the contrast of an edge
 MAX_MOTION = 0.2  # fraction of the image width, maximum motion per frame for the trackers
 TYPICAL = 0.5, 4.5  # m, median depth of most rooms; real recordings have 1 to 3.5
 SHOWN_MOTION = 0.06  # fraction of the image width, motion of the pair in the figure; makes errors visible
@@ -41,9 +41,9 @@ class RecordingCheck:
     """Findings about a recording, and the data of the figure."""
 
     findings: tuple[Finding, ...]
-    summary: str
+    summary: str  # one line about the recording
     frames: tuple[Frame, ...]  # checked frames
-    by_delay: tuple[EdgeAlignment, ...]
+    by_delay: tuple[EdgeAlignment, ...]  # edge alignment for each delay of depth
     poses: PoseJudgment
     pair: MatchedPair | None  # pair in the figure, with the stored poses
     meant: MatchedPair | None  # pair in the figure, with the pose delay corrected
@@ -54,7 +54,7 @@ class RecordingCheck:
 
 
 def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
-    """Return findings from some frames of a sequence and their neighbors, for mapping up to `farthest` meters.
+    """Return findings from some frames of a sequence and their neighbors, for a mapped range of `farthest` m.
 
     Raises DataError if no frame is readable.
     """
@@ -153,10 +153,10 @@ def warn_of_poses(sequence: RGBDVideo) -> None:
 
 @dataclass
 class DelayedDepth(RGBDSequence):
-    """A sequence with the depth images of later frames."""
+    """A sequence in which each frame has the depth image from `delay` frames later."""
 
     sequence: RGBDSequence
-    delay: int  # frames
+    delay: int  # frames, may be negative
 
     def __post_init__(self) -> None:
         self.camera: Camera = self.sequence.camera
@@ -223,7 +223,10 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
 
 
 def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
-    """Return the finding about the motion between neighboring frames. `steps` are fractions of the width."""
+    """Return the finding about the motion between neighboring frames.
+
+    `steps` contains the motion of each matched pair as a fraction of `width` (px). `neighbors` is the number of pairs.
+    """
     if not neighbors:
         return Finding(Verdict.UNKNOWN, "motion", "unknown with a single frame")
     lost = neighbors - len(steps)

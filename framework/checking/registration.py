@@ -24,19 +24,19 @@ WIDTH = 320  # px, width of the compared images
 SEARCHED_SHIFT = 16  # px at WIDTH, in both directions
 MAX_DELAY = 6  # frames, in both directions
 ZOOMS = (0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.11, 1.18, 1.25)  # scale of the depth image about its center
-MIN_FRAMES = 3
+MIN_FRAMES = 3  # minimum number of compared frames
 MIN_EDGES = 20.0  # px at WIDTH; frames with fewer edge pixels are ignored
-MIN_STRENGTH_RATIO = 1.2  # minimum strength of another alignment, as a ratio to the stored alignment
+MIN_STRENGTH_RATIO = 1.2  # minimum ratio of the strength of another alignment to that of the stored alignment
 MAX_SHIFT = 0.007  # fraction of the image width, due to lenses and rolling shutters; real recordings have 0.003
 MIN_STRENGTH = 0.25  # standard deviations, minimum strength of a match that is not random
 
 
 @dataclass(frozen=True)
 class EdgeAlignment:
-    """Agreement of color edges with the scaled depth edges of the frame `delay` later."""
+    """Agreement of color edges with scaled depth edges from `delay` frames later."""
 
     delay: int  # frames
-    zoom: float
+    zoom: float  # scale of the depth image
     strength: float  # mean gradient at the depth edges for the best shift, in standard deviations
     shift: tuple[float, float]  # best shift (x, y), as fractions of the image width
 
@@ -70,7 +70,10 @@ class EdgeComparison:
         return found
 
     def _correlation(self, of_color: int, of_depth: int, zoom: float) -> Float32 | None:
-        """Return the mean gradient (2 L + 1, 2 L + 1) at the depth edges for each shift of up to L px."""
+        """Return the mean gradient (2 L + 1, 2 L + 1) at the depth edges for each shift of up to L = SEARCHED_SHIFT px.
+
+        `of_color` and `of_depth` are frame indices. None = unusable frames or too few edges.
+        """
         color, depth = self._edges(of_color), self._edges(of_depth)
         if color is None or depth is None:
             return None
@@ -121,8 +124,9 @@ def judge(
 ) -> tuple[Finding, int]:
     """Return the finding and the delay of the depth images in frames.
 
-    `by_zoom` contains the alignments at the best delay. `applied_delay` is the configured delay. `step` is the image
-    motion per frame as a fraction of the width. A shift of less than half of it may be due to a time offset.
+    `by_zoom` contains the alignments at the best delay. `applied_delay` is the configured delay in frames. `step` is
+    the image motion per frame as a fraction of the width. A shift of at most half of `step` may be due to a time
+    offset.
     """
     subject = "color and depth"
     here = next((alignment for alignment in by_delay if alignment.delay == 0), None)
@@ -131,7 +135,8 @@ def judge(
     best = max(by_delay, key=lambda alignment: alignment.strength)
     clearly = best.strength > MIN_STRENGTH_RATIO * here.strength or (here.moved and not best.moved)
     if best.delay and clearly and best.strength > MIN_STRENGTH:
-        text = f"depth images are {abs(best.delay)} frames {'late' if best.delay > 0 else 'early'}"
+        frames = f"{abs(best.delay)} frame{'s' * (abs(best.delay) > 1)}"
+        text = f"depth images are {frames} {'late' if best.delay > 0 else 'early'}"
         return Finding(Verdict.ERROR, subject, text, f"dataset.depth_delay={applied_delay + best.delay}"), best.delay
     zoomed = max(by_zoom, key=lambda alignment: alignment.strength, default=here)
     if zoomed.strength < MIN_STRENGTH:

@@ -5,7 +5,7 @@
     room0/results/depth000000.png       uint16 along z, `scale` units per meter
     room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers row by row, m
 
-The camera axes are x right, y down, z forward. NICE-SLAM converts them on reading.
+The camera axes are x right, y down, z forward. NICE-SLAM converts these axes when it reads the poses.
 """
 
 from __future__ import annotations
@@ -43,6 +43,6 @@ class ReplicaNiceSlam(Recording):
             if k < len(poses):
                 frames.append(RecordedFrame.posed(pair, k / FRAME_RATE, poses[k].pose))
             else:
-                error = f"{pair.color_name}: expected a pose in traj.txt, got none among its {len(poses)} poses"
+                error = f"{pair.color_name}: expected pose {k} in traj.txt, got only {len(poses)} poses"
                 frames.append(RecordedFrame(pair, k / FRAME_RATE, error=error))
         return Contents(camera, path, depth_scale, frames, sensor=SensorKind.EXACT)

@@ -7,7 +7,8 @@
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw
     timestamps.txt      optional; color depth, one line per frame: timestamps of the two images, s
-    gravity.txt         optional; x y z, one line per frame: up in the camera, from a sensor; nan nan nan = unknown
+    gravity.txt         optional; x y z, one line per frame: up direction in the camera, from a sensor; nan nan nan =
+                        unknown
     instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class = a
                                             COCO name, or null = unknown
 
@@ -59,7 +60,7 @@ class RgbdFolder(Recording):
         path = self.folder / "camera.json"
         if not path.is_file():
             expected = "expected a camera next to color/ and depth/, got no such file"
-            raise DataError(f"{path}: {expected}; see docs/tutorials/own_data.md")
+            raise DataError(f"{path}: {expected}; write it as in docs/tutorials/own_data.md")
         camera, depth_scale, distortion, sensor = read_camera(path)
         color = numbered_images(self.folder / "color", (".jpg", ".jpeg", ".png"))
         depth = numbered_images(self.folder / "depth", (".png",))
@@ -86,7 +87,7 @@ class RgbdFolder(Recording):
             ids: Int32 = self.calibration.labels(decode_uint16(path, data), path).astype(np.int32)
             unknown = [int(i) for i in np.flatnonzero(np.bincount(ids.ravel())) if i and i not in self._class_names]
             if unknown:
-                raise FrameError(f"{path}: expected instances of {self.folder / 'instances.json'}, got {unknown[0]}")
+                raise FrameError(f"{path}: expected instance ids in {self.folder / 'instances.json'}, got {unknown[0]}")
             return ids
 
         origin = f"{hashlib.sha256(data).hexdigest()} {self.camera!r} {self.calibration.distortion!r}"
@@ -116,7 +117,7 @@ class RgbdFolder(Recording):
                 yield LabeledDepth(depth, ids, self.camera, recorded.T_world_camera)
 
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
-        """Return the class of each instance and the instance image of each frame, both empty without labels."""
+        """Return the class of each instance and the instance image of each frame; both are empty without labels."""
         folder, names = self.folder / "instance", self.folder / "instances.json"
         if self.named_truth is not None or (not path_exists(folder) and not path_exists(names)):
             return {}, []
@@ -131,7 +132,11 @@ class RgbdFolder(Recording):
 def _recorded(
     images: StoredImages, index: int, line: TumLine | None, times: tuple[float, float] | None
 ) -> RecordedFrame:
-    """Return a frame with its pose and the timestamps of its images. Without a pose, it has the timestamp of color."""
+    """Return a frame with its pose and the timestamps of its images.
+
+    `line` contains the pose, and `times` the timestamps of color and depth in s. A frame without a pose has the
+    timestamp of color.
+    """
     color, depth = times or (None, None)
     if line is None:
         frame = RecordedFrame(images, index / FRAME_RATE if color is None else color)

@@ -12,7 +12,8 @@ from framework.datasets.calibration.raw_images import NO_READING
 def register_depth(raw: UInt16, ratio: float, u_0: float, v_0: float, disparity_1: float, registered: UInt16) -> None:
     """Move each pixel (u, v) with depth z to (ratio u + u_0 - disparity_1 / z, ratio v + v_0) in `registered`.
 
-    The depth stays the same. The nearest depth reading of a target pixel is kept.
+    The depth in mm stays the same, and the nearest depth reading of a target pixel is kept. `disparity_1` is the
+    disparity in px at a depth of 1 mm.
     """
     height, width = registered.shape
     for v in range(raw.shape[0]):

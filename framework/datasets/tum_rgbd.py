@@ -7,8 +7,8 @@
                             same keys as in an RGB-D folder; read if the folder's name does not contain freiburg
 
 The published depth correction factors are already applied. Color and depth of freiburg1 and freiburg2 have the lens
-distortion of the color camera: 5 px or more in half of the pixels. The reader undistorts both. freiburg3 was published
-undistorted.
+distortion of the color camera: 5 px or more in half of the pixels. The reader undistorts both images. freiburg3 was
+published undistorted.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from framework.files.tum_trajectory import TumLine, read_tum_lines
 from framework.geometry import interpolate
 
 DEPTH_SCALE = 5000.0  # units per meter
-LONGEST_NAME = 255  # characters of a file name
+LONGEST_NAME = 255  # maximum number of characters of a file name
 
 log = logging.getLogger(__name__)
 
@@ -67,8 +67,9 @@ PUBLISHED: Mapping[Intrinsics, StoredCamera] = {
 class TumRgbd(Recording):
     """A sequence of TUM RGB-D, or another recording in the same layout.
 
-    Color and depth images are associated by time: the closest pairs first, each image once. The ground-truth pose is
-    interpolated at the time of the color image. It is unknown if no pose is within `max_time_difference`.
+    Color and depth images are associated by time: the closest pairs are matched first, and each image is used once. The
+    ground-truth pose is interpolated at the time of the color image. It is unknown if no stored pose is within
+    `max_time_difference`.
     """
 
     intrinsics: Intrinsics = Intrinsics.AUTO  # intrinsics of the color camera
@@ -135,7 +136,7 @@ class Trajectory:
 
     lines: Sequence[TumLine]  # in order of time; poses may be invalid
     timestamps: Float64  # (L,) s, of the lines
-    max_time_difference: float  # s
+    max_time_difference: float  # s, maximum time to the nearest pose
 
     @classmethod
     def of(cls, path: Path, lines: Sequence[TumLine], max_difference: float) -> Trajectory:
@@ -156,7 +157,7 @@ class Trajectory:
 
 
 def associate(first: Sequence[float], second: Sequence[float], max_difference: float) -> list[tuple[int, int]]:
-    """Return index pairs of matching times (s), in the order of the times in `first`.
+    """Return index pairs of times (s) that differ by at most `max_difference` s, in the order of the times in `first`.
 
     The closest pairs are matched first, as in the benchmark's own associate.py.
     """

@@ -13,15 +13,15 @@ from pathlib import Path
 from framework.errors import DataError
 
 MAX_TEXT = 2**28  # bytes of text or JSON; one hour of poses takes 10 MB
-_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # names of `atomic_write`
+_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # names of temporary files of `atomic_write`
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to `path`. The file replaces `path` on success and is deleted on failure.
 
-    The temporary name has the same suffix, because image and mesh writers derive the format from the suffix. Links are
-    followed. Raises DataError if writing fails or `path` is not a regular file.
+    The temporary name has the same suffix, because image and mesh writers derive the format from the suffix. If `path`
+    is a link, its target is replaced. Raises DataError if writing fails or `path` is not a regular file.
     """
     path = Path(os.path.realpath(path))
     if path.exists():
@@ -42,7 +42,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if an optional file exists. Broken links and folders count as well, so that reading reports them."""
+    """Return True if an optional file exists. Broken links and folders count, too, so that reading them fails."""
     return os.path.lexists(path)
 
 

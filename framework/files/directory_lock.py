@@ -41,10 +41,10 @@ def new_directory(wanted: str) -> str:
 
 @contextmanager
 def locked(directory: Path, wait: bool = False) -> Iterator[None]:
-    """Lock `directory` while the body runs. The lock ends with the process, even after `kill -9`.
+    """Lock `directory` while the body of the `with` statement runs.
 
-    If another process holds the lock, `wait` waits for it to exit; otherwise, DataError is raised. A warning is logged
-    on file systems without locks.
+    The lock ends with the process, even after `kill -9`. If another process holds the lock, wait for that process to
+    exit if `wait` is True; otherwise raise DataError. A warning is logged on file systems without locks.
     """
     directory.mkdir(parents=True, exist_ok=True)
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
@@ -62,7 +62,9 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
             lock.acquire()
     except OSError as error:
         log.warning(
-            "%s: expected a file system with locks, got %s; do not start other runs in it", directory, error.strerror
+            "%s: expected a file system with locks, got %s; do not start other runs in this directory",
+            directory,
+            error.strerror,
         )
     try:
         with atomic_write(directory / HOLDER) as temporary:
@@ -88,7 +90,7 @@ def is_locked(directory: Path) -> bool:
 
 
 def holder(directory: Path) -> str:
-    """Return the current or last owner of the lock; "" = unknown."""
+    """Return the name of the current or last owner of the lock; "" = unknown."""
     try:
         return read_text(directory / HOLDER).strip()
     except DataError:

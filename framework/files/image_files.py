@@ -27,7 +27,7 @@ LARGEST_FILE = 2**28  # bytes, size of MAX_PIXELS with four 16-bit channels
 
 
 def read_color(path: Path) -> UInt8:
-    """Return the colors (H, W, 3), uint8 RGB, of a JPEG or PNG file.
+    """Return the color (H, W, 3), uint8 RGB, of a JPEG or PNG file.
 
     Raises FrameError if the file is damaged or not 8-bit.
     """
@@ -93,7 +93,7 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
 def check_image(name: Path | str, data: bytes) -> None:
     """Raise FrameError if `data` is not a complete PNG or JPEG file with an image of at most MAX_PIXELS.
 
-    Decoders allocate the size in the header, which may be 10^10 px in a damaged file.
+    Decoders allocate memory for the size in the header, which may be 10^10 px in a damaged file.
     """
     if not data:
         raise FrameError(f"{name}: expected an image, got an empty file")

@@ -11,9 +11,9 @@ from typing import Any
 from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import MAX_TEXT, atomic_write, read_bytes
 
-MAX_DEPTH = 50  # nested objects and lists
+MAX_DEPTH = 50  # maximum depth of nested objects and lists
 TOO_DEEP = f"expected JSON with at most {MAX_DEPTH} nested lists and objects, got deeper nesting"
-MAX_BITS = 63  # of an integer, limit of libraries; timestamps in ns have 61
+MAX_BITS = 63  # maximum size of an integer, a limit of libraries; timestamps in ns have 61 bits
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -67,9 +67,9 @@ def _is_shallow(content: Any) -> bool:
 
 
 def _finite(content: Any) -> Any:
-    """Return the content with null for NaN.
+    """Return the content with None (null in JSON) for NaN and infinity.
 
-    JSON does not support NaN, the value of undefined metrics such as the AP of an absent class.
+    JSON does not support NaN, which is the value of undefined metrics such as the AP of an absent class.
     """
     if isinstance(content, Mapping):
         return {key: _finite(value) for key, value in content.items()}

@@ -1,4 +1,4 @@
-"""Text files of numbers: gravity directions, 4x4 matrices, and helpers for other formats.
+"""Text files of numbers: up directions, timestamps of images, 4x4 matrices, and helpers for other formats.
 
 np.loadtxt does not parse the NaN of Microsoft's C library and does not report line numbers.
 """
@@ -22,13 +22,13 @@ SHOWN = 60  # maximum number of characters of a file in an error message
 COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is NaN in Microsoft's C library
 GRAVITY_COLUMNS = "x y z"
 IMAGE_TIME_COLUMNS = "color depth"
-MIN_LENGTH, MAX_LENGTH = 1e-6, 1e6  # limits of the length of a direction, in any unit
+MIN_LENGTH, MAX_LENGTH = 1e-6, 1e6  # limits of the stored length of a direction
 
 _NO_NUMBER = re.compile(r"[+-]?(1\.#\w+|nan\(\w+\))", re.ASCII | re.IGNORECASE)
 
 
 def read_lines(path: Path, missing: str = "expected a text file, got no such file") -> list[str]:
-    """Return the lines of a text file. Raises DataError; `missing` is the message for a nonexistent file."""
+    """Return the lines of a text file. Raises DataError, with the message `missing` for a nonexistent file."""
     if not path.exists():
         raise DataError(f"{path}: {missing}")
     return read_text(path).splitlines()
@@ -70,9 +70,9 @@ def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
 
 
 def read_image_times(path: Path) -> list[tuple[float, float]]:
-    """Read the timestamps of each frame, s: `color depth` per line. Empty lines, and comments after `#`, are skipped.
+    """Read the timestamps of the two images of each frame, s: `color depth` per line.
 
-    Raises DataError.
+    Empty lines, and comments after `#`, are skipped. Raises DataError.
     """
     words = [(n, COMMENT.sub("", line).split()) for n, line in enumerate(read_lines(path), start=1)]
     times = []
@@ -142,5 +142,5 @@ def read_matrix_lines(path: Path) -> list[PrintedMatrix]:
 
 
 def _numbered_lines(path: Path) -> list[tuple[str, list[str]]]:
-    """Return the position, for messages, and the words of each nonempty line."""
+    """Return the file and line number, for messages, and the words of each nonempty line."""
     return [(f"{path}, line {n}", line.split()) for n, line in enumerate(read_lines(path), start=1) if line.strip()]

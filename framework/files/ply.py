@@ -29,7 +29,7 @@ class PlyMesh:
     """Mesh in a PLY file."""
 
     vertices: Float32  # (V, 3) m
-    triangles: Int32  # (F, 3)
+    triangles: Int32  # (F, 3) vertex indices
     properties: Mapping[str, Array]  # by name: other scalar properties (V,) of the vertices, in the type of the file
     comments: tuple[str, ...]  # comments of the header, in file order
 
@@ -118,7 +118,7 @@ def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
 
 
 def _fans(corners: Int32, lengths: Int64) -> Int32:
-    """Return the triangles (F, 3) of polygons with `lengths` corners: corners 0 1 2, 0 2 3, ..."""
+    """Return the triangles (F, 3) of polygons with `lengths` (P,) corners: corners 0 1 2, 0 2 3, ..."""
     if (lengths == 3).all():
         return corners.reshape(-1, 3)
     triangles = lengths - 2  # number of triangles of each polygon

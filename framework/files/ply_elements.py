@@ -15,13 +15,13 @@ from framework.data import Array, Float64, Int64
 from framework.errors import DataError
 
 LARGEST_HEADER = 2**16  # bytes; a header has tens of lines
-LONGEST_LINE = 2**20  # bytes of a text file; splitting a line takes tens of times its size in memory
+LONGEST_LINE = 2**20  # bytes of a line in a text file; splitting a line takes tens of times its size in memory
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 TYPES = {
     **dict(zip(("char", "uchar", "short", "ushort", "int", "uint", "float", "double"), "bBhHiIfd", strict=True)),
     **{str(np.dtype(code)): code for code in "bBhHiIfd"},  # int8, uint8, ...
 }
-MAX_DIGITS = 18  # of a number of rows
+MAX_DIGITS = 18  # maximum number of digits of a row count
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Header:
     format: str  # one of FORMATS
     elements: tuple[Element, ...]  # in file order
     comments: tuple[str, ...]  # without the keyword `comment`
-    lines: int
+    lines: int  # number of lines
     size: int  # bytes, including the line end_header
 
 
@@ -151,7 +151,7 @@ def _check_size(path: Path, header: Header, body: int) -> None:
             where = f"{path}, line {header.lines}: element {shown(element.name)}"
             raise DataError(f"{where}: expected properties, got none for {element.rows} rows")
         if header.format == "ascii":
-            row = 2 * len(element.properties)  # a digit and a separator each
+            row = 2 * len(element.properties)  # each has at least a digit and a separator
         else:
             row = sum((column.count or column.dtype).itemsize for column in element.properties)
         least += element.rows * row
@@ -260,7 +260,7 @@ class _Body:
         return lengths
 
     def _view(self, dtype: np.dtype[Any], start: int, rows: int, length: int, stride: int) -> npt.NDArray[Any]:
-        """Return the numbers (rows, length) from position `start`, `stride` between rows; empty if beyond the end."""
+        """Return the numbers (rows, length) from position `start`, with `stride` between rows; empty beyond the end."""
         if start + (rows - 1) * stride + length * self._size(dtype) > self._end:
             return np.empty((0, 0))
         stored = np.dtype(np.float64) if self._text else dtype.newbyteorder(self._order)
@@ -268,7 +268,7 @@ class _Body:
         return np.ndarray((rows, length), stored, self._data, start * unit, (stride * unit, stored.itemsize))
 
     def _rows_are_alike(self, element: Element, lengths: list[int]) -> bool:
-        """Return True if the lists of all rows have the same lengths as in the first row."""
+        """Return True if the lists of all rows have the same lengths as those of the first row, `lengths`."""
         stride = self._stride(element, lengths)
         end = self._position + element.rows * stride
         if not element.rows or end > self._end:
@@ -340,7 +340,7 @@ class _Body:
         return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(int(starts[row])))
 
     def _native(self, column: Property, stored: npt.NDArray[Any], positions: Int64 | None) -> Array:
-        """Return the flattened numbers in the type of the column. Scalars own their memory.
+        """Return the flattened numbers in the type of the column. Arrays of scalars own their memory.
 
         Raises DataError if a number of a text file is out of range for the type.
         """

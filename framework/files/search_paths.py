@@ -11,7 +11,7 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else PROJECT_ROOT / "co
 
 
 def candidates(path: Path) -> tuple[Path, ...]:
-    """Return the candidates for a path: relative paths in the working folder, then in the project folder.
+    """Return the candidates for a path. A relative path is searched in the working folder, then in the project folder.
 
     `~` is expanded.
     """

@@ -15,9 +15,9 @@ from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import read_text
 
 LARGEST_FILE = 2**22  # bytes; the config of a run has 3 KB, the config of a sweep 20 KB
-MAX_DEPTH = 50  # nested mappings and lists
+MAX_DEPTH = 50  # maximum depth of nested mappings and lists
 TOO_DEEP = f"expected at most {MAX_DEPTH} nested mappings and lists, got deeper nesting"
-MAX_VALUES = 200_000  # keys and values after the expansion of aliases
+MAX_VALUES = 200_000  # maximum number of keys and values after the expansion of aliases
 
 _EventLoader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loader is ten times as fast
 
@@ -50,7 +50,7 @@ def _events(where: object, text: str) -> Iterator[Any]:
 
 
 def check_yaml(where: object, text: str) -> None:
-    """Raise DataError if YAML is nested too deeply or too large, and YAMLError if it is invalid."""
+    """Raise DataError if YAML is too large or nested too deeply, and YAMLError if it is invalid."""
     counts = [0]  # number of values of each open mapping and list, outermost first
     open_anchors: list[Hashable] = []
     anchors: dict[Hashable, int] = {}

@@ -1,4 +1,4 @@
-"""Resampling of depth to a color image from another camera or a lower resolution."""
+"""Resampling of depth from another camera or a lower resolution to the pixels of a color image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, UInt8
 from framework.importing.depth_resampling_kernels import move_readings, upsample
 
-FINEST = 0.9  # maximum focal length, as a ratio to the depth camera's; at 1.0, rounding would leave lines empty
+FINEST = 0.9  # maximum ratio of the target's focal length to the depth camera's; 1.0 would leave empty lines
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,11 @@ class DepthRegistration:
 def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, target_color: UInt8) -> Float32:
     """Return the depth (H, W) m of the camera `target`, resampled from the depth (h, w) m of the view of `camera`.
 
-    `color` and `target_color` are the images (., ., 3) of the two cameras, which have the same pose. If the four depth
-    readings around a pixel belong to one surface, their inverses are interpolated, which is exact for a plane.
-    Otherwise, the pixel gets the depth reading with the nearest and most similar color, so that no reading lies between
-    two surfaces. The weights are those of joint bilateral upsampling (Kopf et al., SIGGRAPH 2007). Holes are kept.
+    `color` and `target_color` are the color images (., ., 3) of `camera` and `target`, which have the same pose. If the
+    four depth readings around a pixel belong to one surface, their inverses are interpolated, which is exact for a
+    plane. Otherwise, the pixel gets the depth reading with the nearest and most similar color. No depth is therefore
+    between two surfaces. The weights are those of joint bilateral upsampling (Kopf et al., SIGGRAPH 2007). Pixels
+    without a reading remain without a reading.
     """
     height, width = depth.shape
     guide = np.asarray(cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
@@ -51,6 +52,6 @@ def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, targ
 
 
 def _coordinates(size: int, f_target: float, c_target: float, f: float, c: float, scale: float) -> Float64:
-    """Return the positions (size,) in the depth image for the pixels of a row or column of the target."""
+    """Return the coordinates (size,), px, in the depth image for the pixels of a row or column of the target."""
     in_color = (np.arange(size) - c_target) * (f / f_target) + c
     return np.asarray((in_color + 0.5) * scale - 0.5, np.float64)

@@ -7,13 +7,16 @@ from numba import njit
 
 from framework.data import Float32, Float64, UInt8
 
-ONE_SURFACE = 0.05  # maximum range of four depth readings of one surface, as a fraction of the nearest
-COLOR_SIGMA = 15.0  # of 255, RGB distance due to noise and shading of one object
+ONE_SURFACE = 0.05  # fraction of the nearest depth, maximum range of four depth readings of one surface
+COLOR_SIGMA = 15.0  # RGB distance due to noise and shading of one object, with channels from 0 to 255
 
 
 @njit(cache=True, nogil=True)
 def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, registered: Float32) -> None:
-    """Fill `registered` with depth moved to the target camera. The nearest depth reading has precedence."""
+    """Fill `registered` (H, W) with `depth` (h, w), m, as seen by the target camera.
+
+    `T` (4, 4) maps the depth camera to the target camera. The nearest depth reading has precedence.
+    """
     height, width = registered.shape
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -37,7 +40,10 @@ def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, reg
 
 @njit(cache=True, nogil=True)
 def upsample(depth: Float32, guide: UInt8, u: Float64, v: Float64, color: UInt8, found: Float32) -> None:
-    """Fill `found` (H, W) with `depth` (h, w) at the coordinates u (W,), v (H,); `guide` (h, w, 3) is its color."""
+    """Fill `found` (H, W), m, with `depth` (h, w), m, at the coordinates u (W,), v (H,), px.
+
+    `guide` (h, w, 3) is the color at the resolution of `depth`, and `color` (H, W, 3) the color of the target.
+    """
     height, width = depth.shape
     for row in range(len(v)):
         if not -0.5 <= v[row] <= height - 0.5:

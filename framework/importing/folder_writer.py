@@ -35,7 +35,7 @@ class Writing:
 
     width: int = 0  # px, before rotation, at most the stored width; 0 = LONGER_SIDE for the longer side
     stride: int = 1  # step between frames; 1 = every frame
-    confidence: int = 1  # minimum depth confidence, 0, 1 or 2, if the recording has confidence
+    confidence: int = 1  # minimum confidence of depth readings, 0, 1 or 2, for recordings with confidence images
     rotate: int = 0  # rotation of the written images, degrees clockwise, 0, 90, 180 or 270
 
     def __post_init__(self) -> None:
@@ -75,11 +75,11 @@ def check_new(directory: Path) -> None:
     if directory.is_dir() and not any(directory.iterdir()):
         return
     if directory.exists() or directory.is_symlink():
-        raise DataError(f"{directory}: expected a new or empty folder, got an existing path; set another or remove it")
+        raise DataError(f"{directory}: expected a new or empty folder, got an existing path; remove it or set another")
 
 
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
-    """Write the frames, their poses, timestamps and up directions, and finally camera.json.
+    """Write the images, poses, timestamps and up directions of the frames, and finally camera.json.
 
     Unusable frames are skipped. Raises DataError if `directory` is not empty, no frame is usable, or a file cannot be
     written.
@@ -126,7 +126,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
 
 
 def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int, DeviceFrame]]:
-    """Yield the number and content of each usable frame. Errors of unusable frames are added to `written`."""
+    """Yield the number and content of each usable frame, and add the errors of unusable frames to `written`."""
     chosen = islice(enumerate(source.frames), 0, None, stride)
     for number, stored in tqdm(chosen, total=-(-source.count // stride), unit=" frames", disable=None):
         try:

@@ -23,7 +23,7 @@ FORMATS = (
 def open_source(path: Path, topics: Topics | None = None) -> Source:
     """Open the recording at `path`. Raises DataError for an unknown format or an unreadable recording.
 
-    `topics` are the topics of a ROS bag that types and names do not identify.
+    `topics` are topics of a ROS bag; only those that cannot be selected by type and name are required.
     """
     if not path.exists():
         raise DataError(f"{path}: expected a recording, got no such file or folder")

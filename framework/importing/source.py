@@ -30,11 +30,11 @@ class DeviceFrame:
     timestamp: float  # s
     camera: Camera  # of the color image
     color: UInt8  # (H, W, 3) RGB
-    depth: Float32  # (h, w) m along z, 0 = no reading; has the field of view of color
+    depth: Float32  # (h, w) m along z, 0 = no reading; with the field of view of color
     confidence: UInt8 | None = None  # (h, w), of the depth, from UNSURE to SURE; None = unknown
     T_world_camera: Float64 | None = None  # (4, 4), None = unknown
     up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = unknown
-    depth_timestamp: float | None = None  # s, of the depth image, if `timestamp` is of color; None = the same
+    depth_timestamp: float | None = None  # s, of the depth image; None = `timestamp`
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.timestamp):
@@ -58,7 +58,7 @@ class Source:
     """A recording for import. Frames must be read in order, but may be skipped."""
 
     format: str  # name for messages
-    frames: Iterable[StoredFrame]  # in order of time
+    frames: Iterable[StoredFrame]  # in chronological order
     count: int  # number of frames
     posed: bool  # True if the recording has poses; frames without a pose are then skipped
     distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
@@ -73,11 +73,11 @@ class Format:
     needs: str  # characteristic files, for messages
     recognized: Callable[[Path], bool]  # True for a recording in this format
     open: Callable[..., Source]  # parameters: path, and topics if has_topics; raises DataError
-    has_topics: bool = False
+    has_topics: bool = False  # True if `open` has the parameter topics
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
-    """Return T_world_camera (4, 4) of a pose with ARKit's camera axes. Raises DataError that names `where`."""
+    """Return T_world_camera (4, 4) from a pose (4, 4) with ARKit's camera axes. Raises DataError that names `where`."""
     with errors_of(where):
         return _ARKIT.pose(nearest_rigid(T_world_arkit))
 
@@ -91,10 +91,10 @@ def arkit_up(T_world_camera: Float64) -> Float64:
 
 
 def meters(raw: NDArray[np.uint16]) -> Float32:
-    """Return stored millimeters (h, w) as depth in m. The value 65535 (no reading in some sensors) becomes 0."""
+    """Convert depth (h, w) from mm to m. The value 65535 (no reading in some sensors) becomes 0."""
     return np.where(raw == np.iinfo(np.uint16).max, 0, raw).astype(np.float32) / np.float32(1000)
 
 
 def readings(depth: NDArray[np.floating]) -> Float32:
-    """Return stored meters (h, w) as float32 depth. Values that are not positive and finite become 0."""
+    """Return depth (h, w) in m as float32. Values that are not positive and finite become 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)

@@ -20,7 +20,7 @@ For a surface at the angle theta to the image plane:
 - Luetzenburg, Kroon and Bjork, "Evaluation of the Apple iPhone 12 Pro LiDAR for an Application in Geosciences",
   Scientific Reports 11, 2021: 1 cm for objects of at least 10 cm. Teo and Yang, "Evaluating the accuracy and quality of
   an iPad Pro's built-in lidar for 3D indoor mapping", Developments in the Built Environment 14, 2023: 1 cm in motion.
-  Both are of scanned surfaces. We know no published dependence on depth.
+  Both are errors of scanned surfaces. No published dependence on depth is available.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ class DepthNoise(NamedTuple):
     """The coefficients of a noise model, flat for kernels."""
 
     least: float  # m, standard deviation at `near`
-    near: float  # m
-    growth: float  # 1 / m
-    slant: float = 0.0  # m^1.5
-    far_slant: float = 0.0  # m^-0.5
+    near: float  # m, depth of the smallest standard deviation
+    growth: float  # 1 / m, quadratic growth with depth
+    slant: float = 0.0  # m^1.5, growth on slanted surfaces
+    far_slant: float = 0.0  # m^-0.5, growth on slanted surfaces at larger depths
     full_weight_depth: float = 0.0  # m, nearly constant noise up to this depth; 0 = noise grows with depth squared
 
 
@@ -91,7 +91,7 @@ class SensorChoice(Enum):
         return stored if self is SensorChoice.AUTO else SensorKind[self.name]
 
 
-_DEVICES = {  # by words of device names, ROS topics and drivers; the first match counts
+_DEVICES = {  # patterns for names of devices, ROS topics and drivers; the first matching pattern is used
     SensorKind.TIME_OF_FLIGHT: r"femto|azure|k4a|kinect[ _]?v?2|l515|depth_to_rgb",
     SensorKind.KINECT_V1: r"astra|xtion|primesense|openni|sr30[05]",
     SensorKind.REALSENSE_D435: r"realsense|\bd4[0-9]{2}|gemini|aligned_depth_to_color|^/device_0/",
@@ -99,5 +99,5 @@ _DEVICES = {  # by words of device names, ROS topics and drivers; the first matc
 
 
 def kind_of_device(name: str) -> SensorKind | None:
-    """Return the kind of a device by its name or ROS topic; None = unknown."""
+    """Return the kind of the depth sensor for a device name or ROS topic; None = unknown."""
     return next((kind for kind, words in _DEVICES.items() if re.search(words, name, re.IGNORECASE)), None)

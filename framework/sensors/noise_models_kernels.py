@@ -1,6 +1,6 @@
 """Kernels of noise_models.py.
 
-They take the `DepthNoise` as an argument, or another named tuple with the fields `least`, `near` and `growth`. Do not
+They accept a `DepthNoise`, or another named tuple with the fields `least`, `near` and `growth`, as an argument. Do not
 change the order of multiplications: results would differ in the last digit, and maps would no longer be byte-identical.
 """
 
@@ -47,5 +47,5 @@ def axial_sigma_at_angle(z: np.float32, theta: np.float32, noise: DepthNoise) ->
 
 @device
 def noise_ratio(z: float, noise: DepthNoise) -> float:
-    """Return sigma(z, 0) over that of KINECT_V1, for limits that were tuned for KINECT_V1."""
+    """Return the ratio of sigma(z, 0) to that of KINECT_V1, for limits that were tuned for KINECT_V1."""
     return float(axial_sigma(z, noise) / axial_sigma(z, _KINECT_V1))

@@ -1,8 +1,8 @@
 """The ten scenes of the synthetic benchmark.
 
 `bedroom`, `couches`, `student` and `one_room` have objects on beds and couches. `living_chairs`, `meeting` and
-`kitchen` have rows of identical chairs. `books` and `office` have many books. Each of the nine classes is in several
-scenes. All scenes have clutter without class on and next to the furniture.
+`kitchen` have rows of identical chairs. `books` and `office` have many books. Each of the nine classes occurs in
+several scenes. All scenes have clutter without a class on and next to the furniture.
 """
 
 from __future__ import annotations
@@ -36,30 +36,31 @@ from framework.synthetic.walk import CameraPath, plan_path
 
 MIN_ROOM_SIZE = (4.8, 4.2)  # m, width and depth of the smallest candidate room
 STREWN = 9  # maximum number of objects on the floor next to furniture
-ATTEMPTS = 6  # candidate scenes; the trajectory with the best visibility is kept
-JUDGED_VIEWS = 30  # number of views for the visibility score of a trajectory
-WELL_SEEN, LONG_SEEN = 10, 1 / 6  # px, minimum area of a visible object in a view; minimum fraction of such views
-SMALL_VIEW = Camera(80, 60, 68.0, 68.0, 39.5, 29.5)  # camera of these views, with the field of view of a Kinect
+ATTEMPTS = 6  # number of candidate scenes; the scene with the best visibility is kept
+JUDGED_VIEWS = 30  # number of views for the visibility score of a scene
+# minimum number of pixels of a visible object in a view, and minimum fraction of views with so many pixels
+WELL_SEEN, LONG_SEEN = 10, 1 / 6
+SMALL_VIEW = Camera(80, 60, 68.0, 68.0, 39.5, 29.5)  # camera of the scored views, with the field of view of a Kinect
 
 MakeGroup = Callable[[Rng], Group]
 
 
 @dataclass(frozen=True)
 class SceneSpec:
-    """Role and contents of a scene, in addition to the common contents of all scenes."""
+    """Role and contents of a scene, excluding the contents that all scenes have."""
 
-    role: str  # description for messages
+    role: str  # description of the scene, for messages
     groups: tuple[MakeGroup, ...]  # furniture groups, placed largest first
     holds: Mapping[str, int]  # COCO class -> minimum number of objects
 
 
 def bag(rng: Rng) -> Group:
-    """Return a random bag."""
+    """Return a random backpack as a group."""
     return single("bag", fixtures.backpack(rng))
 
 
 def cupboard(rng: Rng) -> Group:
-    """Return a random cupboard."""
+    """Return a random cupboard with objects on top."""
     return laden("cupboard", clutter.cupboard(rng), rng)
 
 
@@ -72,7 +73,7 @@ def kitchen(rng: Rng) -> Group:
 
 
 def shelf(rng: Rng) -> Group:
-    """Return a random shelf."""
+    """Return a random shelf as a group."""
     return single("shelf", small_things.shelf(rng))
 
 
@@ -128,7 +129,7 @@ SCENES: Mapping[str, SceneSpec] = {
         {"bed": 1, "refrigerator": 1, "dining table": 1, "chair": 3, "toilet": 1, "book": 5},
     ),
 }
-"""Scenes by name."""
+"""Scene specifications by scene name."""
 
 
 @dataclass(frozen=True)
@@ -141,9 +142,10 @@ class Scene:
 
 
 def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: float) -> Scene:
-    """Return the candidate scene with the best visibility along `frames` frames.
+    """Return the candidate scene with the best visibility of its objects in `frames` frames.
 
-    `stride` is the stride of walk.plan_path. Raises DataError if no candidate has a layout for the furniture.
+    `stream` is the seed of the random numbers. `stride` is the camera speed, as in walk.plan_path. Raises DataError if
+    no candidate has space for the furniture and the camera path.
     """
     best: Scene | None = None
     most_shown = (-1.0, -1.0)
@@ -163,7 +165,7 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: floa
 
 
 def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
-    """Return a random scene, and the fractions of its classes and of its objects that are well visible."""
+    """Return a random scene, and the fractions of its classes and of its objects that are visible in enough views."""
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
@@ -180,7 +182,7 @@ def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[
 
 
 def furnish_scene(spec: SceneSpec, rng: Rng) -> Room:
-    """Return a random room for a spec. Raises DataError if there is no layout for its furniture."""
+    """Return a random room for a scene specification. Raises DataError if there is no layout for its furniture."""
     contents = [make(rng) for make in spec.groups]
     contents += [
         single("door", clutter.door(rng)),

@@ -1,7 +1,7 @@
 """Furniture layout: groups against walls, without intersections, with free space for the camera path.
 
-Groups are placed at random positions along the walls. The best of several complete layouts has the most free space. If
-its free space is too small, the room is enlarged.
+Groups are placed at random positions along the walls. Of several complete layouts, the one with the most free space is
+kept. If its free space is too small, the room is enlarged.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from framework.synthetic.furniture.groups import WALL_GAP, Group, Place
 from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import axis_rotation
 
-CLEARANCE = 0.06  # m, between groups
-MARGIN = 0.05  # m, between a group and the corner of the room
-LAYOUTS = 16  # complete candidate layouts
-TRIES = 50  # candidate positions of each group
+CLEARANCE = 0.06  # m, minimum gap between groups
+MARGIN = 0.05  # m, minimum gap between a group and the corner of the room
+LAYOUTS = 16  # number of candidate layouts for each room size
+TRIES = 50  # number of candidate positions of each group
 GROWTH = (1.0, 1.06, 1.12, 1.2, 1.3, 1.4, 1.5)  # scale factors of the side lengths of candidate rooms
 WALK_RADIUS = 1.3  # m, minimum radius of the free circle for a camera path
-HEAD_ROOM = 1.9  # m, higher objects do not block the camera path
-CONTACT = 0.003  # m, between the boxes of touching objects on the floor
-PLACES = 60  # candidate positions of each object on the floor
+HEAD_ROOM = 1.9  # m, minimum height of the base of objects that do not block the camera path
+CONTACT = 0.003  # m, gap between the boxes of touching objects on the floor
+PLACES = 60  # number of candidate positions of each object on the floor
 ON_FLOOR = 0.05  # m, maximum height of the base of objects on the floor
-NO_HOSTS = ("door", "window", "rug")  # kinds without objects next to them
+NO_HOSTS = ("door", "window", "rug")  # kinds of furniture without objects next to them
 CELL = 0.05  # m, cell size of the grid of free floor
 
 
@@ -74,7 +74,10 @@ class _Plan:
 def _try_layout(
     groups: list[Group], boxes_of_groups: list[Float64], width: float, depth: float, rng: Rng
 ) -> _Plan | None:
-    """Return a random layout of boxes, None if a group does not fit. Quarter turns of boxes are exact."""
+    """Return a random layout of the groups, or None if a group does not fit.
+
+    Groups are rotated by quarter turns, which keeps their boxes exact.
+    """
     plan = _Plan()
     taken = np.zeros((0, 2, 3))
     walls: dict[str, tuple[int, float]] = {}
@@ -109,7 +112,10 @@ def _try_layout(
 
 
 def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
-    """Return the pose of a group at `along` m on a wall; walls are 0 at -y, 1 at +x, 2 at +y and 3 at -x."""
+    """Return the pose of a group at a wall, offset by `along` m from the middle of the wall.
+
+    `wall` is 0 for the wall at -y, 1 at +x, 2 at +y, and 3 at -x.
+    """
     if wall == 0:
         return along, -depth / 2, 0.0
     if wall == 1:
@@ -184,7 +190,7 @@ def _with_thing(layout: Layout, thing: Furniture, rng: Rng) -> Layout:
 
 
 def _against(host: Float64, thing: Furniture, rng: Rng) -> Furniture:
-    """Return `thing` at a random side of the box `host` (2, 3); at least half of the object is along the side."""
+    """Return `thing` at a random side of the box `host` (2, 3), with its center within the length of the side."""
     turned = thing.placed(0, 0, 0, np.pi / 2 * int(rng.integers(4)))
     low, high = turned.bounds()
     axis, sign = int(rng.integers(2)), (-1 if rng.uniform() < 0.5 else 1)

@@ -18,7 +18,7 @@ from framework.synthetic.surfaces import Surfaces
 
 GATHER_DIRECTIONS = 48  # rays per vertex for light from other surfaces
 BOUNCES = 3
-LIFT = 4e-3  # m, height above the surface from which rays start
+LIFT = 4e-3  # m, height of the ray origins above the surface
 CHUNK = 8192  # vertices per chunk, to limit memory
 WALL_BRIGHTNESS = 0.60  # mean irradiance of floor, walls and ceiling after exposure, with headroom for bright areas
 
@@ -28,7 +28,7 @@ class Lamp:
     """Sample points of one light source."""
 
     points: Float64  # (S, 3) m
-    normals: Float64  # (S, 3) unit, 0 = emits in all directions
+    normals: Float64  # (S, 3) unit vectors, 0 = emission in all directions
     power: Color  # linear RGB, total of the lamp
 
 
@@ -42,7 +42,7 @@ def globe(center: Float64, radius: float, power: Color, samples: int = 16) -> La
 
 
 def rectangle(corner: Float64, along: Float64, up: Float64, normal: Float64, power: Color, side: int = 5) -> Lamp:
-    """Return a rectangular lamp, such as a window, with the edges `along` and `up`."""
+    """Return a rectangular lamp, such as a window, with the edges `along` and `up` (3,), m."""
     f = (np.arange(side) + 0.5) / side
     s, t = np.meshgrid(f, f)
     points = corner + s.reshape(-1, 1) * along + t.reshape(-1, 1) * up
@@ -82,7 +82,7 @@ def _direct(origins: Float32, normals: Float32, caster: RayCaster, lamp: Lamp) -
 
 
 def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int32, Float32]:
-    """Return the visible triangles (V, D) from each vertex, -1 = none, and barycentric weights (V, D, 2)."""
+    """Return the triangles (V, D) visible from each vertex, -1 = none, and barycentric weights (V, D, 2)."""
     local = _cosine_directions(GATHER_DIRECTIONS)
     triangle = np.empty((len(origins), len(local)), np.int32)
     uv = np.empty((*triangle.shape, 2), np.float32)

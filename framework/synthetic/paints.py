@@ -27,8 +27,8 @@ WALLS: tuple[Color, ...] = (
     (0.87, 0.84, 0.77), (0.78, 0.84, 0.85), (0.83, 0.86, 0.78), (0.90, 0.80, 0.72), (0.82, 0.80, 0.86),
 )  # fmt: skip
 
-DARKEST = 0.35  # mean sRGB; darker surfaces absorb infrared light of a projector
-ABSORBED = 0.8  # fraction of the readings lost on a black surface
+DARKEST = 0.35  # mean sRGB value; darker surfaces absorb the infrared light of a projector
+ABSORBED = 0.8  # fraction of the depth readings lost on a black surface
 MATTE_SCREEN = 0.75  # `dark` of a matte screen
 POLISHED, GLAZED = 0.7, 0.5  # `shiny` of metal and of ceramics
 
@@ -67,8 +67,8 @@ class Material:
     extent: tuple[float, float] = (1.0, 1.0)  # m, size of a painting or screen
     seed: int = 0
     emission: float = 0.0  # emitted light, 1 = a white wall in the mean light of the room
-    dark: float = 0.0  # in [0, 1], fraction of a structured-light camera's depth readings lost in all directions
-    shiny: float = 0.0  # in [0, 1], fraction of the other readings lost at slanted angles (shading_kernels.GLANCED_OFF)
+    dark: float = 0.0  # in [0, 1], fraction of a structured-light camera's depth readings lost at all angles
+    shiny: float = 0.0  # in [0, 1], fraction of the other readings lost at oblique angles (shading_kernels.GLANCED_OFF)
 
 
 def material_table(materials: list[Material]) -> Float32:
@@ -156,7 +156,7 @@ def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Materi
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
-    """Return a painting or screen of this size (m); half of the screens are glossy, without depth readings."""
+    """Return a painting or screen of `width` x `height` m; half of the screens are glossy and give no readings."""
     first, second, seed = vivid(rng), vivid(rng), new_seed(rng)
     dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
     return Material(texture, first, second, 0.1, (width, height), seed, emission, dark)

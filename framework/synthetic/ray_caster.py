@@ -27,7 +27,7 @@ class RayHits:
 
 
 class RayCaster:
-    """Thread-safe ray caster of a fixed triangle mesh, with numba's number of threads."""
+    """Thread-safe ray caster of a fixed triangle mesh that uses numba's number of threads."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
         import open3d as o3d
@@ -39,13 +39,13 @@ class RayCaster:
         )
 
     def cast(self, rays: Float32) -> RayHits:
-        """Return the first intersections of rays (..., 6) of origin and direction."""
+        """Return the first intersections of rays (..., 6), each an origin (m) and a direction."""
         answer = self._scene.cast_rays(_tensor(np.ascontiguousarray(rays)), get_num_threads())
         triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's invalid id 2^32 - 1 becomes -1
         return RayHits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
     def occluded(self, origins: Float32, ends: Float32) -> Bool:
-        """Return a mask (...) of the pairs of points (..., 3) with a surface in between, excluding the points."""
+        """Return a mask (...) of the point pairs (..., 3), m, with a surface in between; end points are excluded."""
         rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
         return np.asarray(self._scene.test_occlusions(_tensor(rays), 1e-3, 0.999, get_num_threads()).numpy())
 
@@ -57,9 +57,10 @@ def _tensor(array: Array) -> o3d.core.Tensor:
 
 
 def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:
-    """Return the rays (A, B, 6) through image points u, v (px, pixel centers at integers), broadcast to (A, B).
+    """Return the rays (A, B, 6) in the world frame through image points u, v (px), broadcast to (A, B).
 
-    Directions have length 1 along the optical axis, so that the distance of an intersection equals its depth.
+    Pixel centers are at integers. Directions have length 1 along the optical axis, so that the distance of an
+    intersection equals its depth.
     """
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     rays = np.empty((*np.broadcast_shapes(x.shape, y.shape), 6), np.float32)
@@ -71,5 +72,5 @@ def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) 
 
 
 def image_rays(camera: Camera, T_world_camera: Float64) -> Float32:
-    """Return the rays (H, W, 6) through all pixel centers."""
+    """Return the rays (H, W, 6) in the world frame through all pixel centers."""
     return pixel_rays(camera, T_world_camera, np.arange(camera.width)[None, :], np.arange(camera.height)[:, None])

@@ -23,16 +23,16 @@ from framework.synthetic.shading_kernels import (
 )
 from framework.synthetic.surfaces import Surfaces
 
-EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, rotated grid
+EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, offsets on a rotated grid
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Images from an ideal camera."""
+    """Images of an ideal camera."""
 
     color: UInt8  # (H, W, 3) RGB
     depth: Float32  # (H, W) m along z, 0 = no surface
-    instance_ids: Int32  # (H, W)
+    instance_ids: Int32  # (H, W), 0 = no instance
     incidence: Float32  # (H, W) in [0, 1], cosine of the angle between ray and surface normal
     unread: Float32  # (H, W) in [0, 1], fraction of depth readings lost on dark and shiny materials
 
@@ -78,7 +78,7 @@ class Renderer:
         return Rendering(to_srgb(light), depth, _ids_of(self.surfaces, triangle), incidence, unread)
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Return only exact depth (H, W) m and instance ids (H, W)."""
+        """Return only the exact depth (H, W) m and the instance ids (H, W)."""
         buffer = self._rasterizer.draw(camera, T_world_camera)
         return buffer.depth, _ids_of(self.surfaces, buffer.triangle)
 
@@ -94,7 +94,7 @@ def _ids_of(surfaces: Surfaces, triangle: Int32) -> Int32:
 
 
 def to_srgb(light: Float32) -> UInt8:
-    """Return linear light as 8-bit sRGB by Reinhard's curve with a white point (Reinhard et al. 2002, eq. 4)."""
+    """Convert linear light to 8-bit sRGB with Reinhard's tone curve and a white point (Reinhard et al. 2002, eq. 4)."""
     color = np.empty(light.shape, np.uint8)
     apply_tone_curve(light.reshape(-1), _tone_curve(), color.reshape(-1))
     return color

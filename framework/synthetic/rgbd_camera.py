@@ -1,11 +1,11 @@
 """Error model of RGB-D cameras, by default similar to the Kinect v1.
 
 - Axial depth noise follows the model of the sensor (`framework.sensors.noise_models`).
-- Disparity of a Kinect v1 is quantized to 1/8 px, so the step of depth is 2.9e-3 z^2: Khoshelham and Oude Elberink,
-  "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012. A RealSense D400
-  has steps of 1/32 px. Other sensors have steps of 1 mm.
-- Lateral noise moves readings across edges by about a pixel (Nguyen et al.), applied as by Handa et al., "A Benchmark
-  for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
+- Disparity of a Kinect v1 is quantized to 1/8 px, so that the step of depth z (m) is 2.9e-3 z^2 m: Khoshelham and Oude
+  Elberink, "Accuracy and Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012. The
+  disparity of a RealSense D400 is quantized to 1/32 px. The depth of other sensors has steps of 1 mm.
+- Lateral noise moves readings across edges by about a pixel (Nguyen et al.). It is applied as in Handa et al., "A
+  Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014.
 - Readings are missing in the shadow of the projector or second camera, at many pixels along depth edges, and at
   grazing angles.
 - Dark and shiny surfaces lose readings in patches, because the correlation window is wider than a pixel.
@@ -34,19 +34,19 @@ from framework.synthetic.rgbd_camera_kernels import (
     read_depth,
 )
 
-LATERAL_SIGMA = 0.8  # px at 640 px width: the constant term of Nguyen et al.
+LATERAL_SIGMA = 0.8  # px at 640 px width, standard deviation: the constant term of Nguyen et al.
 PATCH = 14.0  # px at 640 px width, spacing of the random numbers for patches without readings
-COLOR_SIGMA = 1.5  # gray levels, 0..255
+COLOR_SIGMA = 1.5  # standard deviation of color noise, in gray levels from 0 to 255
 
 
 class Triangulation(NamedTuple):
     """Geometry of a sensor that measures disparity."""
 
     baseline: float  # m, to the projector or the second camera; 0 = no triangulation
-    steps_depth: float  # m, depth times steps of disparity; 0 = steps of depth
+    steps_depth: float  # m, product of depth and disparity in quantization steps; 0 = constant steps of depth
 
 
-TRIANGULATION = {  # of depth cameras with 580 px (Kinect v1, at 640 px width) and 424 px (D435, at 848 px width)
+TRIANGULATION = {  # focal lengths: 580 px (Kinect v1, at 640 px width) and 424 px (D435, at 848 px width)
     SensorKind.KINECT_V1: Triangulation(0.075, 8 * 580 * 0.075),
     SensorKind.REALSENSE_D435: Triangulation(0.05, 32 * 424 * 0.05),
 }
@@ -54,7 +54,7 @@ TRIANGULATION = {  # of depth cameras with 580 px (Kinect v1, at 640 px width) a
 
 @dataclass(frozen=True)
 class DepthSensor:
-    """Model of depth readings from exact depth."""
+    """Model of a depth sensor that adds the measurement errors to exact depth."""
 
     noise: float  # 0 = exact, 1 = as measured; scales standard deviations and probabilities
     max_range: float  # m
@@ -70,8 +70,8 @@ class DepthSensor:
     ) -> Float32:
         """Return simulated depth readings (H, W) m of the exact `depth` (H, W) m; 0 = no reading.
 
-        `incidence`: (H, W), cosines of incidence. `unread`: (H, W), fraction of readings lost on materials, in patches;
-        None = no loss.
+        `incidence`: (H, W), cosines of the angles of incidence. `unread`: (H, W), fraction of readings lost in patches
+        on dark and shiny materials; None = no loss.
         """
         if self.noise == 0 or self.kind is SensorKind.EXACT:
             return np.where(depth <= self.max_range, depth, np.float32(0))
@@ -94,7 +94,7 @@ class DepthSensor:
 
 
 def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
-    """Return `color` with the noise of an indoor camera, scaled by `noise`."""
+    """Return `color` (H, W, 3) with the image noise of a camera in indoor light, scaled by `noise`."""
     if noise == 0:
         return color
     noisy = np.empty_like(color)
@@ -106,9 +106,10 @@ def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
 def blurred(
     color: UInt8, depth: Float32, camera: Camera, T_world_camera: Float64, T_world_open: Float64, T_world_close: Float64
 ) -> UInt8:
-    """Return `color` (H, W, 3), rendered at T_world_camera, with motion blur from T_world_open to T_world_close.
+    """Return `color` (H, W, 3), rendered at T_world_camera, with the motion blur of an exposure.
 
-    The motion of a pixel follows from the exact `depth` (H, W) m of the static scene; depth 0 = no blur.
+    The camera moves from T_world_open to T_world_close during the exposure. The motion of a pixel is computed from the
+    exact `depth` (H, W) m of the static scene; depth 0 = no blur.
     """
     picture = np.empty_like(color)
     K = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)

@@ -10,9 +10,9 @@ from framework.sensors.noise_models import FLOOR, DepthNoise
 from framework.sensors.noise_models_kernels import axial_sigma_at_angle
 
 MIN_RANGE = 0.4  # m
-EDGE_JUMP = 0.05  # relative step of depth at which the sensor's correlation window fails
+EDGE_JUMP = 0.05  # minimum relative step of depth at an edge, where the sensor's correlation window fails
 EDGE_DROP = 0.5  # probability of no reading next to such a step
-GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # rad; all readings below, no readings above
+GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # rad, incidence at the start and end of the loss
 QUANTILE_BITS = 12  # bits of a normal error: 2^QUANTILE_BITS equally likely values, up to 3.7 standard deviations
 SPARE_BITS = 16 - QUANTILE_BITS
 MAX_SAMPLES = 9  # blur samples along the path of a pixel; more samples make no visible difference
@@ -23,14 +23,14 @@ SHARP = np.float32(0.5)  # px, minimum path length for blur
 def depth_step(z: np.float32, steps_depth: np.float32) -> np.float32:
     """Return the quantization step (m) of depth at depth z (m).
 
-    `steps_depth` is the product of depth and steps of disparity, m; 0 = steps of depth.
+    `steps_depth`: m, product of depth and disparity in quantization steps; 0 = constant steps of depth.
     """
     return np.float32(z * z / steps_depth) if steps_depth > 0 else np.float32(FLOOR)
 
 
 @njit(cache=True, nogil=True)
 def quantized(z: np.float32, steps_depth: np.float32) -> np.float32:
-    """Return depth z (m) rounded to a step of disparity, or of depth."""
+    """Return depth z (m) rounded to a step of disparity, or to a step of depth if `steps_depth` is 0."""
     if steps_depth > 0:
         steps = np.rint(steps_depth / max(z, np.float32(0.1)))
         return np.float32(steps_depth / max(steps, np.float32(1)))
@@ -51,18 +51,20 @@ def read_depth(
     max_range: np.float32,
     reading: Float32,
 ) -> None:
-    """Write the depth readings (H, W) m; pixels without a reading remain unchanged.
+    """Write the depth readings (H, W) m to `reading`; pixels without a reading remain unchanged.
 
-    `depth`: (H, W) m. `theta`: (H, W) rad, angle of incidence. `random`: (H, W, 4) bits for the loss of a reading, the
-    lateral error along y and x, and the axial error. `normal`: (N,) normal_quantiles. `lateral_sigma`: px.
-    `disparity_scale`: px m. `steps_depth`: see `depth_step`. `model`: noise model, scaled by `noise`.
+    `depth`: (H, W) m. `theta`: (H, W) rad, angle of incidence. `random`: (H, W, 4) random bits for the loss of a
+    reading, the lateral error along y and x, and the axial error. `normal`: (N,) normal_quantiles. `lateral_sigma`: px.
+    `disparity_scale`: px m, product of disparity and depth. `steps_depth`: see `depth_step`. `model`: noise model,
+    scaled by `noise`.
     """
     height, width = depth.shape
     near_edge = _near_edge(depth)
     largest_loss = min(noise, np.float32(1))
     for v in range(height):
         # The projector, or the other camera, is to the right of the camera. Pixel u is at u - f b / z in the projector.
-        # A pixel is in the shadow of a nearer surface unless it is to the left of all pixels on its right.
+        # In the projector, a pixel is to the left of all pixels that are to its right in the camera, unless it is in
+        # the shadow of a nearer surface.
         leftmost = np.float32(np.inf)
         for u in range(width - 1, -1, -1):
             z = depth[v, u]
@@ -80,7 +82,7 @@ def read_depth(
             lateral_v = lateral_sigma * normal[random[v, u, 1] >> SPARE_BITS]
             lateral_u = lateral_sigma * normal[random[v, u, 2] >> SPARE_BITS]
             noisy = _shifted(depth, v, u, lateral_v, lateral_u)
-            # Gaussian noise; its deviation and the following quantization add up to the measured deviation
+            # the variances of this Gaussian noise and of the following quantization add up to the measured variance
             sigma, step = noise * axial_sigma_at_angle(noisy, theta[v, u], model), depth_step(noisy, steps_depth)
             variance = sigma * sigma - step * step / np.float32(12)
             noisy += np.sqrt(max(variance, np.float32(0))) * normal[random[v, u, 3] >> SPARE_BITS]
@@ -95,9 +97,9 @@ def drop_patches(
 ) -> None:
     """Remove a fraction `largest_loss` * `unread` (H, W) of the readings (H, W), in patches.
 
-    A reading is lost if a smooth random field is below the quantile of the fraction. The field interpolates the normal
-    numbers `field` (R, C) with a spacing of `cell` px. The division by the norm of the weights makes it normal in each
-    pixel.
+    A reading is lost if a smooth random field is below the quantile of the fraction. The field interpolates the
+    normally distributed numbers `field` (R, C), which are `cell` px apart. The interpolated value is divided by the
+    norm of the weights and is therefore normally distributed in each pixel, too.
     """
     one, count = np.float32(1), np.float32(len(normal))
     for v in range(reading.shape[0]):
@@ -120,9 +122,9 @@ def drop_patches(
 
 @njit(cache=True, nogil=True)
 def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> np.float32:
-    """Return the depth of a pixel, or of the pixel (dv, du) px away if it is across a depth edge.
+    """Return the depth (m) of a pixel, or of the pixel at the offset (dv, du) px if it is across a depth edge.
 
-    The offset is rounded. Smooth surfaces have no lateral error, because the axial noise contains all measured
+    The offset is rounded. Smooth surfaces have no lateral error, because the axial noise includes the entire measured
     deviation.
     """
     y = min(max(v + int(np.rint(dv)), 0), depth.shape[0] - 1)
@@ -134,7 +136,7 @@ def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> 
 
 @njit(cache=True, nogil=True)
 def _near_edge(depth: Float32) -> Bool:
-    """Return a mask (H, W) of the pixels on both sides of a depth step."""
+    """Return a mask (H, W) of the pixels on both sides of a depth edge."""
     height, width = depth.shape
     edge = np.zeros((height, width), np.bool_)
     for v in range(height):
@@ -150,7 +152,10 @@ def _near_edge(depth: Float32) -> Bool:
 
 @njit(cache=True, nogil=True)
 def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, noisy: UInt8) -> None:
-    """Write `color` (N,) with normal noise, rounded, to `noisy`; `random` (N,) are bits, `normal` normal_quantiles."""
+    """Write `color` (N,) with normally distributed noise to `noisy` (N,), rounded.
+
+    `random`: (N,) random bits. `normal`: normal_quantiles. `sigma`: standard deviation, gray levels.
+    """
     for n in range(len(color)):
         value = np.rint(np.float32(color[n]) + sigma * normal[random[n] >> SPARE_BITS])
         noisy[n] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))
@@ -160,9 +165,9 @@ def add_noise(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, 
 def blur(
     color: UInt8, depth: Float32, K: Float32, T_open_camera: Float32, T_close_camera: Float32, picture: UInt8
 ) -> None:
-    """Write the mean of up to MAX_SAMPLES samples of `color`, evenly spaced along the path of each pixel.
+    """Write `color` (H, W, 3) with motion blur to `picture`: the mean of up to MAX_SAMPLES samples for each pixel.
 
-    `K`: (fx, fy, cx, cy) px.
+    The samples are evenly spaced along the path of the pixel during the exposure. `K`: (fx, fy, cx, cy) px.
     """
     height, width = depth.shape
     for v in range(height):
@@ -198,7 +203,10 @@ def blur(
 
 @njit(cache=True, nogil=True, inline="always")
 def _reprojected(T, K, u, v, z):
-    """Return the coordinates (px) of pixel u, v at depth z, reprojected to another pose; u, v for z = 0."""
+    """Return the coordinates (px) of pixel u, v at depth z (m) after the transform T (4, 4) to another camera.
+
+    Returns u, v if z is 0 or the point is behind the other camera.
+    """
     px, py = (np.float32(u) - K[2]) / K[0] * z, (np.float32(v) - K[3]) / K[1] * z
     z_other = T[2, 0] * px + T[2, 1] * py + T[2, 2] * z + T[2, 3]
     if z <= 0 or z_other <= 0:

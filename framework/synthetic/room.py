@@ -22,8 +22,8 @@ from framework.synthetic.lights import Lamp, globe, rectangle
 from framework.synthetic.paints import Material, Texture
 from framework.synthetic.surfaces import Surfaces, assemble
 
-HEIGHT = 2.55  # m
-WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear colors of lamps and daylight
+HEIGHT = 2.55  # m, of the ceiling
+WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear RGB of lamps and daylight
 
 
 class RoomKind(StrEnum):
@@ -56,7 +56,7 @@ class Room:
 
 
 def furnish(kind: RoomKind, rng: Rng) -> Room:
-    """Return a random room of this kind."""
+    """Return a random room of the given kind."""
     return furnish_with(_groups(kind, rng), *MIN_ROOM_SIZES[kind], rng)
 
 
@@ -135,7 +135,7 @@ def _floor(rng: Rng) -> Material:
 
 
 def _lamps(pieces: list[Furniture]) -> list[Lamp]:
-    """Return the lamps of all emitting objects."""
+    """Return the lamps of all objects that emit light."""
     lamps: list[Lamp] = []
     for piece in pieces:
         low, high = piece.bounds()
@@ -144,7 +144,7 @@ def _lamps(pieces: list[Furniture]) -> list[Lamp]:
             lamps.append(globe(np.array([*center[:2], HEIGHT - 0.22]), 0.24, _scaled(WARM, 9.0), 24))
         elif piece.kind in ("floor lamp", "table lamp"):
             strength, below = (3.0, 0.10) if piece.kind == "floor lamp" else (0.9, 0.08)
-            # sample points are outside of the lampshade, because the shade would block the light
+            # sample points are outside the lampshade, because the shade would block the light
             lamps.append(
                 globe(np.array([*center[:2], high[2] - below]), 0.24 if strength > 1 else 0.16, _scaled(WARM, strength))
             )
@@ -154,7 +154,7 @@ def _lamps(pieces: list[Furniture]) -> list[Lamp]:
 
 
 def _daylight(low: Float64, high: Float64) -> Lamp:
-    """Return the daylight of a window at the nearest wall, emitted between its curtains."""
+    """Return the daylight of a window with the bounds `low` and `high` (3,), m, emitted between its curtains."""
     thin = int(np.argmin((high - low)[:2]))
     wide = 1 - thin
     normal = np.zeros(3)

@@ -11,8 +11,8 @@ from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.surfaces import Surfaces
 
-ON_SURFACE = 1.001  # distance of a vertex divided by the distance of its surface, at most
-LONGEST_EDGE = 0.02  # m
+ON_SURFACE = 1.001  # maximum distance of a ray hit in vertex distances; above 1 to include the vertex's own surface
+LONGEST_EDGE = 0.02  # m, maximum edge length of the mesh
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def visible_mesh(
     reach: tuple[float, float],
     longest_edge: float = LONGEST_EDGE,
 ) -> RoomMesh:
-    """Return the mesh of the visible surfaces from `poses` (T_world_camera), at a depth within `reach` (m, m).
+    """Return the mesh of the surfaces visible from `poses` (T_world_camera), at depths within `reach` (near, far), m.
 
     `caster` contains the triangles of `surfaces`. Surfaces without depth readings, and surfaces behind them, are
     invisible.
@@ -74,7 +74,7 @@ def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
 
 
 def _welded(mesh: RoomMesh) -> RoomMesh:
-    """Return the mesh with merged vertices of an instance at identical positions, without triangles of no area."""
+    """Return the mesh with coincident vertices of each instance merged, and without degenerate triangles."""
     rows = np.empty((len(mesh.vertices), 4), np.int32)
     rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # turns -0 into 0
     rows[:, 3] = mesh.instance_ids
@@ -99,9 +99,10 @@ def seen_from(
     reach: tuple[float, float],
     unreadable: Bool,
 ) -> Bool:
-    """Return a mask (V,) of the visible vertices: in the view of a pose, not occluded, at a depth within `reach`.
+    """Return a mask (V,) of the visible vertices: in view from a pose, not occluded, at a depth within `reach`, m.
 
-    Vertices on the `unreadable` triangles (F,) of the caster, or closely behind them, count as occluded.
+    `unreadable` is a mask (F,) of the caster's triangles without depth readings. Vertices on or closely behind these
+    triangles count as occluded.
     """
     seen = np.zeros(len(vertices), np.bool_)
     for T_world_camera in poses:
@@ -118,7 +119,7 @@ def seen_from(
 def _in_view(
     vertices: Float32, skip: Bool, camera: Camera, T_world_camera: Float64, reach: tuple[float, float]
 ) -> Int64:
-    """Return the indices of the vertices in view, including occluded vertices, except the mask `skip`."""
+    """Return the indices (N,) of the vertices in view, occluded or not, except the vertices in the mask `skip` (V,)."""
     index = np.flatnonzero(~skip)
     dx, dy, dz = vertices[index].T - T_world_camera[:3, 3:]
     x, y, z = (R[0] * dx + R[1] * dy + R[2] * dz for R in T_world_camera[:3, :3].T)

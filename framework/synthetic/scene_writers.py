@@ -35,7 +35,7 @@ from framework.synthetic.scenenn_scene import GENERATION, BenchmarkSettings, Sce
 
 FRAMES_AT_ONCE = 8  # frames per task; small, so that all processes end at about the same time
 
-Piece = Callable[[SceneNNScene], int]  # task that writes some files and returns the number of frames
+Piece = Callable[[SceneNNScene], int]  # task that writes some files and returns the number of written frames
 
 
 def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: BenchmarkSettings, jobs: int) -> None:
@@ -73,7 +73,7 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Benchmar
 
 
 def _begin(root: Path, recording: BenchmarkSettings) -> None:
-    """Write the common files of all scenes. Raises ConfigError for a folder with other content."""
+    """Write the files common to all scenes. Raises ConfigError for a folder with other content."""
     made_by = root / MADE_BY
     wanted = {"generation": GENERATION, **asdict(recording)}
     if made_by.exists():
@@ -83,12 +83,12 @@ def _begin(root: Path, recording: BenchmarkSettings) -> None:
             raise DataError(
                 f"{made_by}: expected valid JSON, got a damaged file; delete the folder or set another folder"
             ) from error
-        if isinstance(found, dict) and "haste" in found:  # earlier name
+        if isinstance(found, dict) and "haste" in found:  # earlier name of camera_speed
             found["camera_speed"] = found.pop("haste")
         if found != wanted:
             raise ConfigError(f"{root}: expected rooms with the parameters {wanted}, got {found}; set another folder")
     elif root.exists() and (not root.is_dir() or any(root.iterdir())):
-        found = next(iter(root.iterdir())).name if root.is_dir() else "a file"
+        found = f"a folder with {next(iter(root.iterdir())).name}" if root.is_dir() else "a file"
         raise ConfigError(
             f"{root}: expected a new or empty folder, or a benchmark folder, got {found}; set another folder"
         )
@@ -153,7 +153,7 @@ def _result(future: Future[int], folder: Path) -> int:
 
 
 def _begin_process() -> None:
-    """Limit the process to one thread, defer Ctrl-C, and exit with the parent process."""
+    """Limit the process to one thread, ignore Ctrl-C between tasks, and exit with the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     numba.set_num_threads(1)
     cv2.setNumThreads(1)

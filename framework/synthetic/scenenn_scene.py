@@ -32,8 +32,8 @@ GENERATION = 3  # version of the generated rooms; increment it after a change to
 ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini
 NOISE, MAX_RANGE = 1.0, 6.0  # noise of the sensor, 1 = Kinect v1; range of the sensor, m
 EXPOSURE = 1 / 60  # s, exposure of color images, centered at the pose; typical for indoor light
-TRUTH_VIEWS = 60  # frames for the labeled mesh; neighboring frames have nearly the same view
-MAX_CAMERA_SPEED = 5.0  # maximum camera speed relative to the recommended speed: 2.2 m/s
+TRUTH_VIEWS = 60  # maximum number of frames for the labeled mesh; neighboring frames have nearly the same view
+MAX_CAMERA_SPEED = 5.0  # maximum camera speed relative to the recommended speed; about 2.2 m/s
 LARGEST_ID = 934338  # largest label in SceneNN; labels are unordered
 PNG = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
@@ -104,7 +104,7 @@ class BenchmarkSettings:
 
 
 class SceneNNScene:
-    """A furnished room and its camera path; parts are written to its folder in any order."""
+    """A furnished room and its camera path, with methods that write the files of the scene."""
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.recording = folder, recording
@@ -128,7 +128,7 @@ class SceneNNScene:
         return len(frames)
 
     def write_frame(self, index: int) -> None:
-        """Write color and depth of the frame `index`, starting at 0."""
+        """Write color and depth of the frame `index` (0 = first)."""
         T_world_camera = self.path.pose(index)
         picture = self.renderer.render(self.camera, T_world_camera)
         rng = np.random.default_rng([*self._stream, index])
@@ -175,7 +175,7 @@ class SceneNNScene:
         return sorted(annotated, key=lambda one: one.id)
 
     def write_walk(self) -> int:
-        """Write the timestamps and then the trajectory, which marks the scene as complete."""
+        """Write the timestamps, and then the trajectory, which marks the scene as complete; return 0."""
         frames = range(self.recording.frames)
         with atomic_write(self.folder / "timestamp.txt") as temporary:
             times = [round(1e6 * index / self.recording.rate) for index in frames]
@@ -186,7 +186,7 @@ class SceneNNScene:
 
 
 def frame_files(folder: Path, index: int) -> tuple[Path, Path]:
-    """Return the color and depth files of the frame `index`, starting at 0; file names start at 1."""
+    """Return the color and depth files of the frame `index` (0 = first). The numbers in file names start at 1."""
     return folder / "image" / f"image{index + 1:05d}.png", folder / "depth" / f"depth{index + 1:05d}.png"
 
 

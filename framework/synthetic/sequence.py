@@ -23,9 +23,9 @@ from framework.synthetic.room import RoomKind, furnish
 from framework.synthetic.walk import FRAME_RATE, plan_path
 
 MAX_FRAMES = 10**6  # nine hours at 30 Hz
-MAX_SIDE = 5792  # px; its square is MAX_PIXELS
-FOCAL_LENGTH = 525.0 / 640  # image widths, color camera of a Kinect
-TRUTH_VIEWS = 60  # frames for the ground-truth surface; neighboring frames have nearly the same view
+MAX_SIDE = 5792  # px, maximum width and height; its square is MAX_PIXELS
+FOCAL_LENGTH = 525.0 / 640  # fraction of the image width, as in the color camera of a Kinect
+TRUTH_VIEWS = 60  # maximum number of frames for the ground-truth surface; neighboring frames have nearly the same view
 
 
 @dataclass
@@ -44,8 +44,8 @@ class Synthetic(RGBDSequence):
     sensor: SensorChoice = SensorChoice.AUTO  # kind of the depth sensor; AUTO = KINECT_V1, or EXACT without noise
     noise: float = 1.0  # scale of the sensor noise; 0 = none, 1 = as in the noise model
     max_depth: float = 6.0  # maximum depth of the sensor, m
-    simulated_color_delay: float = 0.0  # time from depth to color, with equal timestamps, s, in [-0.2, 0.2]
-    color_delay: str = AUTO  # this time as known by the pipeline, s, in [-0.2, 0.2]; AUTO = estimated
+    simulated_color_delay: float = 0.0  # simulated time from depth to color with equal timestamps, s, in [-0.2, 0.2]
+    color_delay: str = AUTO  # time from depth to color assumed by the pipeline, s, in [-0.2, 0.2]; AUTO = estimated
     start: int = 0  # index of the first frame
     stop: int = TO_THE_END  # index after the last frame; -1 = end of the sequence
     stride: int = 1  # step between frames; 1 = every frame
@@ -116,7 +116,7 @@ class Synthetic(RGBDSequence):
         )
 
     def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:
-        """Return the exact depth (H, W) m and instance ids (H, W) at any pose."""
+        """Return the exact depth (H, W) m and the instance ids (H, W) at the pose T_world_camera (4, 4)."""
         return self._renderer.depth_and_ids(self.camera, T_world_camera)
 
     def scene_truth(self) -> SceneTruth:

@@ -12,21 +12,21 @@ from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.synthetic.paints import DARK, EMISSION, SHINY
 from framework.synthetic.texture_kernels import surface_color
 
-EDGE_STEP = 0.04  # relative depth step of an edge
+EDGE_STEP = 0.04  # minimum relative depth step at an edge
 WHITE = 2.2  # linear light of full white; lamps and windows may saturate
 GLANCED_OFF = np.float32(np.deg2rad(60.0))  # rad, incidence at which a mirror loses all readings
-GRAZING = np.float32(0.05)  # minimum cosine for the footprint of a pixel
+GRAZING = np.float32(0.05)  # lower limit of the cosine of incidence for the footprint of a pixel
 
 
 class LitSurfaces(NamedTuple):
     """Triangles of a room with baked light."""
 
-    texture: Float32  # (V, 3) m
+    texture: Float32  # (V, 3) m, texture coordinates
     irradiance: Float32  # (V, 3) linear RGB
-    triangles: Int32  # (F, 3)
-    normals: Float32  # (F, 3) unit, towards either side
+    triangles: Int32  # (F, 3) vertex indices
+    normals: Float32  # (F, 3) unit vectors, toward either side
     materials: Int32  # (F,) rows of the table
-    parts: Int32  # (F,)
+    parts: Int32  # (F,) part of each triangle
     table: Float32  # (M, 14), see paints.material_table
 
 
@@ -44,7 +44,10 @@ class Viewpoint(NamedTuple):
 def gather_light(
     triangle: Int32, uv: Float32, triangles: Int32, materials: Int32, reflectance: Float32, irradiance: Float32
 ) -> Float32:
-    """Return the mean reflected light (V, 3) of the visible points; for cosine-distributed rays, the irradiance."""
+    """Return the mean reflected light (V, 3) of the points visible from each vertex.
+
+    For cosine-distributed rays, this is the irradiance of the vertex.
+    """
     out = np.zeros((len(triangle), 3), np.float32)
     for v in range(len(triangle)):
         for d in range(triangle.shape[1]):
@@ -67,7 +70,7 @@ def gather_light(
 def shade(
     s: LitSurfaces, view: Viewpoint, triangle: Int32, depth: Float32, uv: Float32, light: Float32, incidence: Float32
 ) -> None:
-    """Write the linear light (H, W, 3) and the cosines of incidence (H, W) of each pixel; 0 without a surface."""
+    """Write the linear light (H, W, 3) and the cosine of incidence (H, W) of each pixel; 0 without a surface."""
     texture, irradiance, triangles, normals, materials, _, table = s
     fx = np.float32(view.fx)
     for v in range(triangle.shape[0]):
@@ -101,7 +104,7 @@ def lose_readings(materials: Int32, table: Float32, triangle: Int32, incidence: 
 
 @njit(cache=True, nogil=True, inline="always")
 def _cosine(view, normals, f, u, v):
-    """Return the cosine between the ray through image point u, v (px) and the normal of triangle f."""
+    """Return the cosine of the angle between the ray through image point u, v (px) and the normal of triangle f."""
     T, x, y = view.T_world_camera, (u - view.cx) / view.fx, (v - view.cy) / view.fy
     along = 0.0
     for axis in range(3):
@@ -111,10 +114,13 @@ def _cosine(view, normals, f, u, v):
 
 @njit(cache=True, nogil=True, inline="always")
 def _light_of(texture, irradiance, triangles, materials, table, f, b, c, pixel, cosine):
-    """Return the emitted and reflected RGB light at barycentric b, c of triangle f; a pixel is `pixel` m wide."""
+    """Return the emitted and reflected linear RGB light at a point of triangle f with the barycentric weights b, c.
+
+    `pixel`: m, width of a pixel at the point.
+    """
     i, j, k = triangles[f, 0], triangles[f, 1], triangles[f, 2]
     a = np.float32(1) - b - c
-    # The footprint is an ellipse at grazing angles; its geometric mean is the best compromise between both axes.
+    # The footprint is an ellipse at grazing angles; the geometric mean of its axes is a compromise between them.
     footprint = pixel / np.sqrt(max(cosine, GRAZING))
     material = table[materials[f]]
     red, green, blue = surface_color(
@@ -164,7 +170,7 @@ def smooth_edges(
     depth: Float32,
     light: Float32,
 ) -> None:
-    """Write the mean of the samples of pixels u, v (N,) to `light` (H, W, 3); each sample is clipped to white.
+    """Write the mean of the samples of the pixels u, v (N,) to `light` (H, W, 3); each sample is clipped to WHITE.
 
     `triangle`, `distance` (N, S) and `uv` (N, S, 2): intersections of the samples at `offsets` (S, 2) px from the pixel
     center. `own`: (H, W), triangle of each pixel. A sample has the light of the center if its triangle is on the
@@ -193,7 +199,7 @@ def smooth_edges(
 
 @njit(cache=True, nogil=True)
 def apply_tone_curve(light: Float32, curve: UInt8, color: UInt8) -> None:
-    """Write the nearest entry of the tone curve for each light (N,), clipped to [0, WHITE]."""
+    """Write the nearest entry of the tone curve for each value of `light` (N,), clipped to [0, WHITE]."""
     white, entries = np.float32(WHITE), np.float32((len(curve) - 1) / WHITE)
     for n in range(len(light)):
         index = min(max(light[n], np.float32(0)), white) * entries

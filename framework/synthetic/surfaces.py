@@ -18,9 +18,9 @@ class Surfaces:
     """Exact geometry of a room, the ground truth for reconstructions."""
 
     vertices: Float32  # (V, 3) m, world frame
-    normals: Float32  # (V, 3) unit, smoothed over each part
-    texture: Float32  # (V, 3) m
-    triangles: Int32  # (F, 3)
+    normals: Float32  # (V, 3) unit vectors, smoothed over each part
+    texture: Float32  # (V, 3) m, texture coordinates
+    triangles: Int32  # (F, 3) vertex indices
     instance_ids: Int32  # (F,), 0 = floor, wall or ceiling
     materials: Int32  # (F,) rows of material_table
     parts: Int32  # (F,) part of each triangle; images have edges between parts
@@ -29,12 +29,12 @@ class Surfaces:
 
     @property
     def unreadable(self) -> Bool:
-        """Mask (F,) of triangles without depth readings, on screens and window panes."""
+        """Mask (F,) of the triangles without depth readings, such as glossy screens and window panes."""
         return np.asarray(self.material_table[self.materials, DARK] >= 1)
 
 
 def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:
-    """Return the surfaces of all parts of the (instance id, object) pairs; the objects are in their final poses."""
+    """Return the surfaces of all (instance id, object) pairs. The objects are in their final poses."""
     vertices: list[Float64] = []
     normals: list[Float64] = []
     texture: list[Float64] = []

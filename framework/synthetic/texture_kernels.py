@@ -1,8 +1,10 @@
-"""Procedural textures, evaluated per pixel: no seams, no image files, enough gradient for photometric alignment.
+"""Procedural textures, evaluated per pixel.
 
-Solid textures (wood, fabric, paint, metal) use all three texture coordinates. Planar textures (planks, tiles, rug,
-painting) use the first two. Detail below the size of a pixel is faded out to prevent flicker between frames.
-`footprint` is the size of a pixel on the surface, m. Lengths without a unit are in m.
+They need no image files, have no seams, and have sufficient gradients for photometric alignment. Solid textures (wood,
+fabric, paint, metal) use all three texture coordinates. Planar textures (planks, tiles, rug, painting) use the first
+two. Detail below the size of a pixel is faded out to prevent flicker between frames.
+
+Lengths are in m unless stated otherwise. `footprint` is the size of a pixel on the surface.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ def _lattice(i: int, j: int, k: int, seed: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _noise(x: float, y: float, z: float, seed: int) -> float:
-    """Return smooth value noise in [0, 1] with lattice spacing 1 and Perlin's fade curve of 1985."""
+    """Return smooth value noise in [0, 1] with a lattice spacing of 1 and Perlin's fade curve of 1985."""
     i, j, k = float(np.floor(x)), float(np.floor(y)), float(np.floor(z))
     fx, fy, fz = x - i, y - j, z - k
     fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
@@ -56,13 +58,13 @@ def _noise(x: float, y: float, z: float, seed: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _visible(wavelength: float, footprint: float) -> float:
-    """Return the visible fraction, 0 to 1, of detail with this wavelength in a pixel."""
+    """Return the visible fraction, in [0, 1], of detail with this wavelength in a pixel."""
     return min(1.0, max(0.0, wavelength / (2.0 * footprint) - 0.75))
 
 
 @njit(cache=True, nogil=True)
 def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, footprint: float, seed: int) -> float:
-    """Return a sum of noise octaves, in [-1, 1]. Wavelengths are halved per octave; invisible octaves are omitted."""
+    """Return a sum of noise octaves, in [-1, 1]. The wavelength halves per octave; invisible octaves are omitted."""
     value, amplitude, total = 0.0, 1.0, 0.0
     x, y, z = x / wavelength, y / wavelength, z / wavelength
     for octave in range(octaves):
@@ -85,7 +87,10 @@ def _step(low: float, high: float, x: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _line(x: float, width: float, footprint: float) -> float:
-    """Return the antialiased coverage, in [0, 1], of lines at integer x. x, width and footprint are in periods."""
+    """Return the antialiased coverage, in [0, 1], of lines at integer x.
+
+    `x`, `width` and `footprint` are in periods of the pattern.
+    """
     d = abs(x - float(np.floor(x + 0.5)))
     blur = max(footprint, 0.25 * width)
     return float((1.0 - _step(0.5 * width - 0.5 * blur, 0.5 * width + 0.5 * blur, d)) * min(1.0, 2.0 * width / blur))
@@ -101,7 +106,7 @@ def _within(x: float, low: float, high: float, soft: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: int) -> float:
-    """Return the color mix of wood grain along x: growth rings bent by noise, and fibers."""
+    """Return the color mix of wood grain along x: growth rings distorted by noise, and fibers."""
     bend = 2.2 * _noise(0.9 * x, 5 * y, 5 * z, seed)
     rings = 0.5 + 0.5 * float(np.sin(2 * np.pi * (0.7 * (y + 0.6 * z) / scale + bend)))
     mix = 0.3 + 0.45 * rings * _visible(scale, footprint)
@@ -176,7 +181,7 @@ def _rug(x: float, y: float, scale: float, width: float, height: float, footprin
 
 @njit(cache=True, nogil=True)
 def _book(u: float, v: float, soft: float) -> float:
-    """Return the color mix of a book cover over [0, 1]^2: a frame, a title in several lines, an emblem."""
+    """Return the color mix of a book cover over [0, 1]^2: a frame, a title in several lines and an emblem."""
     frame = _within(u, 0.07, 0.93, soft) * _within(v, 0.05, 0.95, soft)
     inner = _within(u, 0.10, 0.90, soft) * _within(v, 0.07, 0.93, soft)
     lines = _within(u, 0.18, 0.82, soft) * _within(v, 0.62, 0.86, soft) * _line(v * 12.5, 0.5, 12.5 * soft)
@@ -186,7 +191,7 @@ def _book(u: float, v: float, soft: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
-    """Return the color mix of wallpaper: stripes with flowers, every second row shifted."""
+    """Return the color mix of wallpaper: stripes with flowers; every second column is shifted."""
     u, v = x / scale, y / (1.6 * scale)
     cell = np.floor(u)
     v += 0.5 * (cell % 2)

@@ -13,11 +13,11 @@ from framework.synthetic.layout import CELL, Layout
 
 FRAME_RATE = 30.0  # Hz
 MAX_SPEED = 0.45  # m/s
-MAX_TURN = np.deg2rad(28.0)  # rad/s
+MAX_TURN = np.deg2rad(28.0)  # rad/s, maximum angular speed
 DISTANCE = 0.5  # m, minimum distance to furniture and walls
 RADII = np.arange(0.30, 1.06, 0.15)  # m, radii of candidate ellipses
 EYE_HEIGHT = (1.38, 1.58)  # m, range of the mean camera height
-PITCH = np.deg2rad(14.0)  # mean downward pitch of the camera
+PITCH = np.deg2rad(14.0)  # rad, mean downward pitch of the camera
 PHASES = 48  # number of positions on the ellipse for the visibility score
 
 
@@ -34,7 +34,7 @@ class CameraPath:
     phase_speed: float = 1.0  # rad/s
 
     def pose(self, frame: float) -> Float64:
-        """Return T_world_camera (4, 4) of a frame at FRAME_RATE; fractions are between frames."""
+        """Return T_world_camera (4, 4) of a frame at FRAME_RATE; fractional values are times between frames."""
         return self.pose_at(self.start + self.turn * self.phase_speed * frame / FRAME_RATE)
 
     def pose_at(self, phase: float) -> Float64:
@@ -57,7 +57,7 @@ class CameraPath:
 
 
 class LabelView(Protocol):
-    """Renderer of instance ids in a small image."""
+    """Renderer of small images (H, W) of instance ids."""
 
     def __call__(self, T_world_camera: Float64) -> Int32: ...
 
@@ -65,8 +65,9 @@ class LabelView(Protocol):
 def plan_path(
     layout: Layout, frames: int, labels: LabelView, wanted: set[int], rng: np.random.Generator, stride: float = 1.0
 ) -> CameraPath:
-    """Return the path with the best visibility of the `wanted` instances in `frames` frames with a step of `stride`.
+    """Return the path with the best visibility of the `wanted` instances in `frames` frames.
 
+    `stride` is the camera speed as a multiple of the recommended speed, which is limited by MAX_SPEED and MAX_TURN.
     Raises DataError if the free floor is too small.
     """
     center, radii = _widest_ellipse(layout)
@@ -78,7 +79,7 @@ def plan_path(
 
 
 def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
-    """Return the center and radii of the longest ellipse (from RADII) that keeps the minimum DISTANCE."""
+    """Return the center (2,) and radii (2,), m, of the largest ellipse with radii in RADII at the minimum DISTANCE."""
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
     free, width, depth = layout.free, layout.width, layout.depth
     rows, columns = free.shape
@@ -114,7 +115,10 @@ def _allowed_phase_speed(path: CameraPath) -> float:
 
 
 def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[int]) -> float:
-    """Return the start phase with the most visible wanted instances over `sweep` rad; visible pixels break ties."""
+    """Return the start phase (rad) with the most visible wanted instances over `sweep` rad.
+
+    The number of visible pixels breaks ties.
+    """
     phases = 2 * np.pi * np.arange(PHASES) / PHASES
     ids = sorted(wanted)
     pixels = np.array(
@@ -129,7 +133,7 @@ def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[i
 
 
 def look(position: Float64, yaw: float, pitch: float, roll: float) -> Float64:
-    """Return T_world_camera of a camera at `position`; world z is up, yaw 0 faces +x."""
+    """Return T_world_camera (4, 4) at `position` (3,), m, with angles in rad; world z is up, yaw 0 faces +x."""
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     down = np.cross(forward, right)

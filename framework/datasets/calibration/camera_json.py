@@ -77,7 +77,7 @@ def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> 
     for key in unread:
         close = get_close_matches(key.lower(), known, n=1, cutoff=0.8)
         if close:
-            raise DataError(f"{path}: expected known keys, got {key!r}; did you mean {close[0]!r}?")
+            raise DataError(f"{path}: expected a known key, got {key!r}; did you mean {close[0]!r}?")
     if unread:
         log.warning("%s: ignored unknown keys: %s; known keys: %s", path, ", ".join(unread), ", ".join(known))
 
@@ -107,11 +107,11 @@ def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
 
 
 def sensor_of(path: Path, content: Mapping[str, Any]) -> SensorKind:
-    """Return the kind of the depth sensor in the content of a file; without the key, KINECT_V1. Raises DataError."""
+    """Return the kind of the depth sensor in the content of a file, or KINECT_V1 without the key. Raises DataError."""
     name = content.get(SENSOR, SensorKind.KINECT_V1.name)
     if not isinstance(name, str) or name not in SensorKind.__members__:
         raise DataError(
-            f"{path}, {SENSOR}: expected one of {', '.join(SensorKind.__members__)}, got {str(name)[:40]}; set the "
+            f"{path}: {SENSOR}: expected one of {', '.join(SensorKind.__members__)}, got {str(name)[:40]}; set the "
             "kind of the depth sensor, or remove the key for KINECT_V1"
         )
     return SensorKind[name]

@@ -39,7 +39,7 @@ class ColorRegistration:
     def apply(self, image: UInt8) -> UInt8:
         """Return the colors (H, W, 3) of the depth camera from an image of the color camera.
 
-        Each pixel is the mean color of its area. The image is resampled (bilinear) at `fine` times the resolution of
+        Each pixel is the mean color of its area. The image is resampled bilinearly at `fine` times the resolution of
         the depth camera, then averaged over fine x fine pixels. Outside the color image, the nearest color is repeated.
         """
         fine = self._fine
@@ -58,7 +58,7 @@ class ColorRegistration:
 
 
 def registered_images(images: StoredImages, registration: ColorRegistration) -> StoredImages:
-    """Return the images of a frame with color registered to the depth camera on reading."""
+    """Return the images of a frame with color that is registered to the depth camera when it is read."""
     return replace(images, color=partial(_registered_color, images, registration))
 
 

@@ -28,10 +28,10 @@ def check_max_depth(max_depth: float) -> None:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera and the properties of its images. Raises DataError for an invalid lens."""
+    """A camera and the properties of its images. Raises DataError for an invalid lens distortion."""
 
     camera: Camera
-    source: Path | str  # file or parameter of the camera, for messages
+    source: Path | str  # file or parameter with the camera, for messages
     depth_scale: float  # units per meter
     max_depth: float  # m; farther depth readings are dropped; 0 = keep all
     distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
@@ -41,12 +41,12 @@ class Calibration:
         object.__setattr__(self, "lens", Undistortion(self.camera, self.distortion) if self.distortion else None)
 
     def color(self, raw: UInt8, name: Path | str) -> UInt8:
-        """Return the color (H, W, 3) of the pinhole camera. Raises FrameError that names the image for a wrong size."""
+        """Return the color (H, W, 3) of the pinhole camera. Raises FrameError that names an image of the wrong size."""
         self.check_size(name, raw.shape)
         return self.lens.smooth(raw) if self.lens else raw
 
     def depth(self, raw: UInt16, name: Path | str) -> Float32:
-        """Return the depth (H, W) in m, 0 = no reading. Raises FrameError that names the image for a wrong size."""
+        """Return the depth (H, W) in m, 0 = no reading. Raises FrameError that names an image of the wrong size."""
         self.check_size(name, raw.shape)
         depth = raw.astype(np.float32)
         depth /= np.float32(self.depth_scale)
@@ -56,12 +56,12 @@ class Calibration:
         return self.lens.exact(depth) if self.lens else depth
 
     def labels(self, raw: UInt16, name: Path | str) -> UInt16:
-        """Return the labels (H, W), not interpolated. Raises FrameError that names the image for a wrong size."""
+        """Return the undistorted labels (H, W). Raises FrameError that names an image of the wrong size."""
         self.check_size(name, raw.shape)
         return self.lens.exact(raw) if self.lens else raw
 
     def check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:
-        """Raise FrameError that names the image if its size differs from the camera."""
+        """Raise FrameError that names the image if its size differs from the size of the camera's images."""
         if shape[:2] != self.camera.shape:
             expected = f"expected {self.camera.width}x{self.camera.height} px as in {self.source}"
             raise FrameError(f"{name}: {expected}, got {shape[1]}x{shape[0]} px")

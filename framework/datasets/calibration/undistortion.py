@@ -38,7 +38,7 @@ class Distortion:
             raise DataError(f"distortion (k1, k2, p1, p2, k3): expected finite coefficients, got {astuple(self)}")
 
     def distorted(self, camera: Camera, pixels: Float64) -> Float64:
-        """Return the positions (N, 2) in the recorded image for `pixels` (N, 2) of the pinhole camera."""
+        """Return the positions (N, 2), px, in the recorded image of `pixels` (N, 2), px, of the pinhole camera."""
         x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -68,7 +68,7 @@ class Undistortion:
         self._u, self._v = source.T.reshape(2, *camera.shape).astype(np.float32)
 
     def smooth(self, image: UInt8) -> UInt8:
-        """Return the undistorted colors (H, W, 3), with linear interpolation."""
+        """Return the undistorted colors (H, W, 3), interpolated bilinearly."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR), np.uint8)
 
     def exact(self, image: NDArray[Value]) -> NDArray[Value]:

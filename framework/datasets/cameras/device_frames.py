@@ -32,7 +32,7 @@ class DepthCamera(LiveVideo):
     """A camera with factory calibration. The library registers depth to color."""
 
     brand: ClassVar[str]
-    default_sensor: ClassVar[SensorKind]  # kind of devices with unknown names
+    default_sensor: ClassVar[SensorKind]  # kind of the depth sensor in devices with unknown names
     serial: str = ""  # serial number of the device; "" = the first device found
     width: int = 640  # width of the color image, px, in [64, 4096]
     height: int = 480  # height of the color image, px, in [64, 4096]
@@ -69,14 +69,14 @@ class DepthCamera(LiveVideo):
 
     @abstractmethod
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
-        """Return copies of color (H, W, 3), RGB, and the registered depth (H, W); None = missing."""
+        """Return copies of color (H, W, 3), RGB, and registered depth (H, W) in device units; None = missing."""
 
     @abstractmethod
     def device_name(self) -> str:
         """Return the model name of the streaming device, such as "Intel RealSense D435"."""
 
     def depth_after_color(self, images: Any) -> float | None:
-        """Return the time from the color to the depth image by the device's clock, s; None = unknown."""
+        """Return the time from the color image to the depth image in s, by the device's clock; None = unknown."""
         return None
 
     def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:

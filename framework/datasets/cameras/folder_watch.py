@@ -34,8 +34,8 @@ from framework.interfaces import FrameReader, LiveVideo
 from framework.sensors.noise_models import SensorChoice, SensorKind
 
 COLOR, DEPTH = (".jpg", ".jpeg", ".png"), (".png",)
-LONGEST_WAIT = 86_400.0  # s
-LARGEST_NUMBER = 2**53  # of a frame; smaller numbers are exact in double precision
+LONGEST_WAIT = 86_400.0  # s, limit of both timeouts
+LARGEST_NUMBER = 2**53  # limit of frame numbers; smaller numbers are exact in double precision
 MIN_REST = 3.0  # minimum pause between polls, as a multiple of the last poll's duration; listing a folder can be slow
 CLOCK_TICK = 1e-6  # s, minimum difference between the timestamps of two frames of the same poll
 
@@ -134,7 +134,7 @@ class Arrivals:
             if color_file is None or depth_file is None:
                 self._halves.add(number)
             if number <= self._last:
-                yield number, f"{color_file or depth_file}: expected ascending frames, got {number} after {self._last}"
+                yield number, f"{color_file or depth_file}: expected a frame number > {self._last}, got {number}"
                 continue
             self._last = number
             if color_file is None or depth_file is None:
@@ -149,7 +149,7 @@ class NewImages:
 
     def __init__(self, folder: Path, suffixes: Sequence[str]) -> None:
         self.folder, self.suffixes = folder, suffixes
-        self.waiting: dict[int, Path] = {}  # by number
+        self.waiting: dict[int, Path] = {}  # by frame number
         self._names: set[str] = set()
         self._first: Path | None = None
 
@@ -167,7 +167,7 @@ class NewImages:
                 continue
             number = number_of(path)
             if number is None or number >= LARGEST_NUMBER:
-                log.warning("%s: expected a name that ends in a frame number below 2^53; file ignored", path)
+                log.warning("%s: expected a frame number below 2^53 at the end of the name, got none; ignored", path)
                 continue
             self._first = self._first or path
             check_one_number([self._first, path])

@@ -17,9 +17,9 @@ from framework.data import Float64
 from framework.geometry import inverse
 
 COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # depth units per meter; most sensors have 1000
-LONGEST_DELAY = 1000  # frames
+LONGEST_DELAY = 1000  # frames, maximum absolute delay of poses and depth images
 AUTO = "AUTO"  # value of `dataset.color_delay`: estimated
-LONGEST_COLOR_DELAY = 0.2  # s
+LONGEST_COLOR_DELAY = 0.2  # s, maximum absolute delay of color
 
 
 class PoseKind(Enum):
@@ -69,7 +69,10 @@ class PoseReading:
     def __post_init__(self) -> None:
         require(1e-6 <= self.pose_unit <= 1e6, "dataset.pose_unit", self.pose_unit, "a value in [1e-6, 1e6] m")
         require(
-            abs(self.pose_delay) <= LONGEST_DELAY, "dataset.pose_delay", self.pose_delay, "a value in [-1000, 1000]"
+            abs(self.pose_delay) <= LONGEST_DELAY,
+            "dataset.pose_delay",
+            self.pose_delay,
+            f"a value in [-{LONGEST_DELAY}, {LONGEST_DELAY}] frames",
         )
 
     def pose(self, stored: Float64) -> Float64:
@@ -109,8 +112,14 @@ class DepthReading:
     def __post_init__(self) -> None:
         fine = self.depth_scale == 0 or COARSEST_DEPTH <= self.depth_scale <= FINEST_DEPTH
         require(
-            fine, "dataset.depth_scale", self.depth_scale, f"0 or a value in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}]"
+            fine,
+            "dataset.depth_scale",
+            self.depth_scale,
+            f"0 or a value in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}] units per m",
         )
         require(
-            abs(self.depth_delay) <= LONGEST_DELAY, "dataset.depth_delay", self.depth_delay, "a value in [-1000, 1000]"
+            abs(self.depth_delay) <= LONGEST_DELAY,
+            "dataset.depth_delay",
+            self.depth_delay,
+            f"a value in [-{LONGEST_DELAY}, {LONGEST_DELAY}] frames",
         )

@@ -12,7 +12,7 @@ from framework.errors import DataError, FrameError
 
 
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """Return the images of a folder by the number at the end of their names, in ascending order.
+    """Return the paths of the images in a folder by the number at the end of their names, in ascending order.
 
     Raises DataError for a folder without images, a name without a number, or two names with the same number. Names
     that differ in other digits, such as the decimals of a timestamp, also raise DataError.
@@ -29,7 +29,8 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
                 f"{folder}: expected names that end in a frame number, such as 000000{path.suffix}, got {path.name}"
             )
         if number in files:
-            raise DataError(f"{path}: expected unique frame numbers, got {number} for {files[number].name} too")
+            found = f"got {number} for {files[number].name} and {path.name}"
+            raise DataError(f"{folder}: expected unique frame numbers, {found}")
         files[number] = path
     check_one_number(list(files.values()))
     if not files:
@@ -38,7 +39,7 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
 
 
 def paired_images(colors: dict[int, Path], depths: dict[int, Path]) -> dict[int, StoredImages]:
-    """Return the images of each frame by frame number. Reading a missing image raises FrameError."""
+    """Return the color and depth image of each frame by frame number. Reading a missing image raises FrameError."""
     numbers = sorted(colors.keys() | depths.keys())
     return {
         k: StoredImages.of_files(*(files.get(k) or _missing(files, k) for files in (colors, depths))) for k in numbers
@@ -62,11 +63,11 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[in
             errors.append(str(error))
             continue
         return width, height
-    raise DataError(f"expected a readable image, got none of {len(errors)}; first error: {errors[0]}")
+    raise DataError(f"expected a readable image, got none among {len(errors)} images; first error: {errors[0]}")
 
 
 def number_of(path: Path) -> int | None:
-    """Return the number at the end of an image's name, or None if it has no number."""
+    """Return the number at the end of an image's name, or None if the name has no number."""
     digits = path.stem[len(_before_number(path)) :]
     return int(digits) if digits else None
 

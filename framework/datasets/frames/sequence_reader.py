@@ -46,7 +46,7 @@ from framework.sensors.noise_models import SensorChoice, SensorKind
 FARTHEST = 1e4  # m, maximum distance of a pose from the origin; at this distance, float32 resolves 1 mm
 FRAME_RATE = 30.0  # Hz, for recordings without valid timestamps
 
-TO_THE_END = -1  # value of `stop`
+TO_THE_END = -1  # value of `stop` for the end of the sequence
 _STREAM = zlib.crc32(b"share")  # separates this random stream from others with the same seed
 
 log = logging.getLogger(__name__)
@@ -76,8 +76,8 @@ class RecordedFrame:
     T_world_camera: Float64 | None = None  # (4, 4), None = unknown
     error: str = ""  # reason why the frame is unusable; "" = usable
     up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = unknown
-    color_timestamp: float | None = None  # s, of the color image; None = timestamp
-    depth_timestamp: float | None = None  # s, of the depth image; None = timestamp
+    color_timestamp: float | None = None  # s, of the color image; None = `timestamp`
+    depth_timestamp: float | None = None  # s, of the depth image; None = `timestamp`
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
@@ -93,7 +93,7 @@ class Contents:
     """Contents of a recording before the frame selection."""
 
     camera: Camera
-    camera_source: Path | str  # file or parameter of the camera, for messages
+    camera_source: Path | str  # file or parameter with the camera, for messages
     depth_scale: float  # units per meter
     frames: Sequence[RecordedFrame]
     distortion: Distortion | None = None  # lens distortion of color and depth; None = pinhole camera
@@ -182,7 +182,8 @@ class Recording(RGBDSequence):
             return None
         trajectory = self._given_trajectory() if named is None or named.trajectory is None else named.trajectory
         if not len(trajectory.timestamps):
-            log.warning("%s: instances not evaluated: no given pose in the world frame of the ground truth", self.name)
+            expected = "expected given poses in the world frame of the ground truth, got none"
+            log.warning("%s: %s; instances not evaluated", self.name, expected)
             return None
         return replace(truth, trajectory=trajectory)
 
@@ -255,7 +256,7 @@ class Recording(RGBDSequence):
 
 
 def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
-    """Return the frames with the pose of the frame `delay` later, or with an error if there is no such frame."""
+    """Return the frames, each with the pose from `delay` frames later, or with an error if there is no such frame."""
     moved = []
     for frame, other in _with_later(frames, delay):
         error = frame.error or (other.error if other else f"expected a pose at an offset of {delay} frames, got none")
@@ -264,7 +265,10 @@ def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[Recorde
 
 
 def delay_depth(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
-    """Return the frames with the depth image of the frame `delay` later, or with an error if there is no such frame."""
+    """Return the frames, each with the depth image from `delay` frames later.
+
+    A frame has an error if there is no such depth image.
+    """
     moved = []
     for frame, other in _with_later(frames, delay):
         if other:
@@ -282,7 +286,7 @@ def _without_image_times(frame: RecordedFrame) -> RecordedFrame:
 
 
 def _with_plausible_image_times(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
-    """Return the frames, without separate timestamps of color and depth if some are implausible."""
+    """Return the frames, without separate timestamps of color and depth if any of these are implausible."""
     offsets = [
         frame.color_timestamp - frame.depth_timestamp
         for frame in frames
@@ -291,18 +295,19 @@ def _with_plausible_image_times(name: str, frames: Sequence[RecordedFrame]) -> S
     largest = max(offsets, key=abs, default=0.0)
     if abs(largest) <= LONGEST_COLOR_DELAY:
         return frames
-    message = "%s: expected timestamps of color and depth within %g s of each other, got %.6g s; not used"
+    message = "%s: expected timestamps of color and depth within %g s of each other, got %.6g s; using one timestamp"
     log.warning(message, name, LONGEST_COLOR_DELAY, largest)
     return [_without_image_times(frame) for frame in frames]
 
 
 def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[RecordedFrame, RecordedFrame | None]]:
+    """Yield each frame, and the frame `delay` frames later, None = no such frame."""
     for k, frame in enumerate(frames):
         yield frame, frames[k + delay] if 0 <= k + delay < len(frames) else None
 
 
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
-    """Return the frame with its pose in the default convention, or with an error if it is too far from the origin."""
+    """Return the frame with its pose in the default convention, or with an error if the pose is far from the origin."""
     if recorded.T_world_camera is None:
         return recorded
     T_world_camera = reading.pose(recorded.T_world_camera)
@@ -328,9 +333,9 @@ def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[Re
 
 
 def check_selection(start: int, stop: int, stride: int, frame_fraction: float = 1.0) -> None:
-    """Raise ConfigError if the parameters are invalid."""
+    """Raise ConfigError if a parameter of the frame selection is invalid."""
     require(start >= 0, "dataset.start", start, "at least 0")
-    above = f"above dataset.start ({start}), or {TO_THE_END} for the end"
+    above = f"a value above dataset.start ({start}), or {TO_THE_END} for the end"
     require(stop == TO_THE_END or stop > start, "dataset.stop", stop, above)
     require(stride >= 1, "dataset.stride", stride, "at least 1")
     require(0 < frame_fraction <= 1, "dataset.frame_fraction", frame_fraction, "a value in (0, 1]")
@@ -348,7 +353,7 @@ def choose_frames(
         start: Index of the first frame.
         stop: Index after the last frame; TO_THE_END = to the end.
         stride: Step between frames; 1 = every frame.
-        frame_fraction: Fraction of these frames, selected at random, in (0, 1].
+        frame_fraction: Fraction of these frames that is selected at random, in (0, 1]; 1 = all frames.
         seed: Seed of the random selection.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Meshes with vertex instance labels, as published by datasets of scanned rooms."""
+"""Meshes with an instance label for each vertex, as published by datasets of scanned rooms."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from framework.rendering.rasterizer import Rasterizer
 class LabeledMesh:
     """The ground-truth surface of a scene with its instances."""
 
-    vertices: Float32  # (V, 3) m, world
-    triangles: Int32  # (F, 3)
+    vertices: Float32  # (V, 3) m, world frame
+    triangles: Int32  # (F, 3) vertex indices
     instance_ids: Int32  # (V,), 0 = no instance
     class_names: Mapping[int, str | None]  # as in FrameTruth
     classes: tuple[str, ...] | None = None  # as in SceneTruth
@@ -30,7 +30,10 @@ class LabeledMesh:
         return SceneTruth(self.vertices, self.instance_ids, dict(self.class_names), self.classes)
 
     def seen_by(self, camera: Camera, T_world_camera: Float64) -> FrameTruth:
-        """Return the instance of the vertex nearest to each pixel's surface point, rendered on demand."""
+        """Return the ground truth of a view at the pose T_world_camera (4, 4), rendered on demand.
+
+        Each pixel has the instance of the vertex nearest to its surface point.
+        """
         return DeferredTruth(
             render=lambda: self._rasterizer.draw(camera, T_world_camera).nearest(self.triangles, self.instance_ids),
             shape=camera.shape,
@@ -54,7 +57,7 @@ class LabeledMesh:
 
 
 def unseen(camera: Camera, why: str) -> FrameTruth:
-    """Return the ground truth of a frame that cannot be rendered: access raises NoPoseError with the reason."""
+    """Return the ground truth of a frame that cannot be rendered: access raises NoPoseError with the reason `why`."""
 
     def render() -> Int32:
         raise NoPoseError(why)

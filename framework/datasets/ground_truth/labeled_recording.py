@@ -40,7 +40,7 @@ class LabeledRecording(Recording):
         if not missing:
             self.mesh = read(*files)
         elif self.frame_ground_truth:
-            raise DataError(f"dataset.frame_ground_truth: expected a labeled mesh, got no {missing[0]}")
+            raise DataError(f"dataset.frame_ground_truth: expected a labeled mesh {missing[0]}, got no such file")
         elif len(missing) < len(files):
             log.warning("%s: expected a file of ground-truth instances, got none; instances not evaluated", missing[0])
 

@@ -32,15 +32,15 @@ from framework.files.tum_trajectory import read_tum
 from framework.vocabulary.label_spaces import COCO
 
 KEY = "dataset.ground_truth"
-MESH, INSTANCES, TRAJECTORY, METRICS = "mesh.ply", "instances.json", "trajectory.txt", "metrics.json"  # of a run
-LABELS = "instance"  # the vertex property
+MESH, INSTANCES, TRAJECTORY, METRICS = "mesh.ply", "instances.json", "trajectory.txt", "metrics.json"  # run outputs
+LABELS = "instance"  # name of the vertex property
 LARGEST_ID = np.iinfo(np.int32).max
-MAX_DIGITS = 10  # of an id, including leading zeros
+MAX_DIGITS = 10  # maximum number of digits of an id, including leading zeros
 
 
 @dataclass(frozen=True)
 class NamedTruth:
-    """A labeled mesh and the trajectory of its run."""
+    """A labeled mesh and, for the map of a run, the trajectory of the run."""
 
     mesh: LabeledMesh
     name: str  # for tables: the file and its folder
@@ -49,7 +49,7 @@ class NamedTruth:
     def pose(self, timestamp: float, given: Float64 | None) -> Float64 | None:
         """Return T_world_camera (4, 4) of a frame in the world frame of the mesh, or None if it is unknown.
 
-        The frame has this timestamp (s) and given pose (4, 4).
+        `timestamp` is the time of the frame in s, and `given` is its given pose (4, 4).
         """
         if self.trajectory is None:
             return given
@@ -74,7 +74,9 @@ def read_named_truth(path: Path) -> NamedTruth:
     class_names = read_class_names(names, LARGEST_ID)
     unlisted = set(np.unique(ids).tolist()) - class_names.keys() - {0}
     if unlisted:
-        raise DataError(f"{names}: expected an entry for each instance of {mesh.name}, got none for {min(unlisted)}")
+        raise DataError(
+            f"{names}: expected an entry for each instance of {mesh.name}, got none for instance {min(unlisted)}"
+        )
     return NamedTruth(_labeled(mesh, ply, ids, class_names), label, None)
 
 

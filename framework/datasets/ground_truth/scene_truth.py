@@ -1,4 +1,4 @@
-"""Fusion of exact depth, instance images and ground-truth poses into the ground-truth surface."""
+"""Fusion of depth, instance images and ground-truth poses into a ground-truth surface."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from framework.data import Camera, Float32, Float64, Int32, SceneTruth
 from framework.datasets.ground_truth.scene_truth_kernels import KEY_OFFSET, Slots, move_slots, vote
 from framework.errors import DataError
 
-INITIAL_CAPACITY = 1 << 16  # slots; a power of two, doubled before more than half of the slots are occupied
+INITIAL_CAPACITY = 1 << 16  # number of slots, a power of two; doubled before more than half of them are occupied
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ def check_truth_voxel(size: float) -> None:
 def fuse_scene_truth(
     views: Iterable[LabeledDepth], class_names: Mapping[int, str | None], ground_truth_spacing: float = 0.02
 ) -> SceneTruth:
-    """Return one labeled point for each occupied voxel of `ground_truth_spacing` meters.
+    """Return one labeled point for each occupied voxel with a side length of `ground_truth_spacing` m.
 
     Every pixel with depth votes for its instance id in its voxel. A voxel gets the id with the most votes; ties go to
     the smaller id. Its point is the mean of the points that voted for this id. Points are in the order of first
-    observation. Memory depends on the surface, not on the number of views.
+    observation. Memory depends on the size of the surface, not on the number of views.
     """
     slots, taken = Slots.empty(INITIAL_CAPACITY), 0
     for view in views:
@@ -57,13 +57,15 @@ def fuse_scene_truth(
         )
         if taken < 0:
             farthest = KEY_OFFSET * ground_truth_spacing
-            raise DataError(f"ground truth: expected points within {farthest:.0f} m of the origin, got a point beyond")
+            raise DataError(
+                f"ground truth: expected points within {farthest:.0f} m of the origin, got a point farther away"
+            )
     points, ids = _elect(slots)
     return SceneTruth(points_world=points, instance_ids=ids, class_names=dict(class_names))
 
 
 def _elect(slots: Slots) -> tuple[Float32, Int32]:
-    """Return the mean point (V, 3) and the majority id (V,) of each voxel, in the order of first observation."""
+    """Return the mean point (V, 3), m, and the majority id (V,) of each voxel, in the order of first observation."""
     keys, ids, votes, sums, first = slots
     taken = np.flatnonzero(votes)
     best_first = taken[np.lexsort((ids[taken], -votes[taken], keys[taken]))]

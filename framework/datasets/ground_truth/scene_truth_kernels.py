@@ -9,18 +9,18 @@ from numba import njit
 
 from framework.data import Float32, Float64, Int32, Int64
 
-KEY_BITS = 21  # per voxel coordinate in a packed key: 2^20 voxels of 2 cm in each direction are 20 km
-KEY_OFFSET = 1 << (KEY_BITS - 1)
+KEY_BITS = 21  # bits per voxel coordinate in a packed key; 2^20 voxels of 2 cm in each direction are 20 km
+KEY_OFFSET = 1 << (KEY_BITS - 1)  # added to voxel coordinates, which makes them positive
 
 
 class Slots(NamedTuple):
     """A hash table with linear probing, as arrays (S,). A slot without votes is empty."""
 
-    keys: Int64  # packed voxel
-    ids: Int32
-    votes: Int64
-    sums: Float64  # (S, 3) of the points' coordinates, m
-    first: Int64  # order of first observation
+    keys: Int64  # packed voxel coordinates
+    ids: Int32  # instance id
+    votes: Int64  # number of points
+    sums: Float64  # (S, 3) m, sum of the points
+    first: Int64  # position in the order of first observation
 
     @classmethod
     def empty(cls, capacity: int) -> Slots:
@@ -46,7 +46,11 @@ def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
 def vote(
     depth: Float32, instance_ids: Int32, intrinsics: Float64, T: Float64, scale: float, slots: Slots, taken: int
 ) -> int:
-    """Add the pixels of a view and return the number of occupied slots, or -1 if a point is too far away."""
+    """Add the pixels of a view and return the number of occupied slots, or -1 if a point is too far away.
+
+    `depth`: (H, W) m. `instance_ids`: (H, W). `intrinsics`: (fx, fy, cx, cy) px. `T`: T_world_camera (4, 4). `scale`:
+    voxels per m. `taken`: number of slots occupied before.
+    """
     keys, ids, votes, sums, first = slots
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     height, width = depth.shape
@@ -81,7 +85,7 @@ def vote(
 
 @njit(cache=True, nogil=True)
 def move_slots(slots: Slots, to: Slots) -> None:
-    """Copy all entries into a larger table."""
+    """Copy all entries of `slots` into the larger table `to`."""
     for s in range(len(slots.keys)):
         if slots.votes[s] > 0:
             slot = _slot(to, slots.keys[s], slots.ids[s])

@@ -7,7 +7,7 @@
     scene0000_00/intrinsic/             intrinsic_color.txt, intrinsic_depth.txt and, optional, extrinsic_*.txt: 4x4
     scene0000_00/scene0000_00_vh_clean_2.ply, _vh_clean_2.0.010000.segs.json, .aggregation.json
                                         optional: mesh, segments, and objects as sets of segments
-    scannetv2-labels.combined.tsv       optional, in the folder of the scenes or its parent: the class of each
+    scannetv2-labels.combined.tsv       optional, in the folder of the scenes or in its parent: the class of each
                                         annotated name; without this file, fewer objects are evaluated
     scannet-labels.combined.tsv         optional, in the same folders: for annotations of the first release
 
@@ -41,11 +41,11 @@ from framework.files.image_files import read_color, read_uint16
 from framework.files.number_lines import PrintedMatrix, read_matrix
 from framework.geometry import inverse, rotation_angle
 
-MESH_FILES = ("_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")  # after the scene's name
+MESH_FILES = ("_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")  # suffixes of the scene name
 DEPTH_SCALE = 1000.0  # units per meter, of exported depth
 MICROSECONDS = 1e6  # per second
-COLOR_SIZE = (1296, 968)  # px, for the exported intrinsics; exported color images may be smaller
-NEAR = 2.0  # m, depth for the logged parallax
+COLOR_SIZE = (1296, 968)  # px, image size of the exported intrinsics; exported color images may be smaller
+NEAR = 2.0  # m, depth at which the logged parallax is computed
 LARGEST_SHIFT = 0.5  # px of the depth camera, maximum shift of color without a warning
 
 log = logging.getLogger(__name__)
@@ -159,7 +159,7 @@ def _fits(camera: Camera) -> bool:
 
 
 def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, camera: Camera) -> None:
-    """Log the shift of color due to different extrinsics of the two cameras."""
+    """Log a warning about the shift of color if the two cameras have different extrinsics."""
     try:
         T_color_depth = inverse(color.pose()) @ depth.pose()
     except DataError:

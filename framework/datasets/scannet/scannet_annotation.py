@@ -26,7 +26,7 @@ LABEL_TABLE = "scannetv2-labels.combined.tsv"
 FIRST_LABEL_TABLE = "scannet-labels.combined.tsv"  # of the first release (2017), with other names
 NAME_COLUMNS = ("raw_category", "category")  # annotated names; the first release has no raw_category
 CLASS_COLUMN = "nyu40class"
-UNNAMED = frozenset(  # names without a class: the class of the object is unknown
+UNNAMED = frozenset(  # names that do not identify a class
     {"object", "objects", "unknown", "junk", "furniture", "decoration"}
     | {"otherprop", "otherfurniture", "otherstructure"}
 )
@@ -57,7 +57,7 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     ply = read_ply(mesh)
     segments = _whole_numbers(f"{segs}: segIndices", _read_list(segs, "segIndices"))
     if len(segments) != len(ply.vertices):
-        expected = f"expected one for each of {len(ply.vertices)} vertices of {mesh.name}"
+        expected = f"expected {len(ply.vertices)} ids, one for each vertex of {mesh.name}"
         raise DataError(f"{segs}: segIndices: {expected}, got {len(segments)}")
     present, segment_of_vertex = np.unique(segments, return_inverse=True)
     groups = read_aggregation(aggregation)
@@ -77,7 +77,7 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
         absent = group.segments[~np.isin(group.segments, present)]
         if len(absent):
             expected = f"expected segments of {segs.name}"
-            raise DataError(f"{aggregation}: object {group.object_id}: {expected}, got {absent[0]}")
+            raise DataError(f"{aggregation}: object {group.object_id}: {expected}, got segment {absent[0]}")
         instance = group.object_id + 1
         own = _spelled(group.label, spellings)
         # the annotated name is preferred: NYU40 has a single class for microwaves, keyboards and bottles
@@ -132,7 +132,7 @@ def read_label_table(path: Path) -> Mapping[str, str]:
 
 
 def _spellings(nyu40: Mapping[str, str]) -> dict[str, str]:
-    """Return the known name for each spelling: the name itself, and its letters and digits only."""
+    """Return the known name for each spelling: the name itself, and the name without spaces and punctuation."""
     names = {**nyu40, **MEANINGS, **dict.fromkeys(UNNAMED)}
     return {_letters(name): name for name in names} | {name: name for name in names}
 
@@ -149,7 +149,7 @@ def _letters(name: str) -> str:
 
 def _group(where: str, group: Any) -> SegGroup:
     if not isinstance(group, dict):
-        raise DataError(f"{where}: expected an object, got {type(group).__name__}")
+        raise DataError(f"{where}: expected a JSON object, got {type(group).__name__}")
     object_id, label, segments = (group.get(key) for key in ("objectId", "label", "segments"))
     if type(object_id) is not int or not 0 <= object_id <= MAX_OBJECT_ID:
         raise DataError(f"{where}: objectId: expected an integer from 0 to {MAX_OBJECT_ID}, got {object_id!r:.60}")

@@ -36,7 +36,7 @@ VERSION = 4
 RAW, PNG, JPEG = 0, 1, 2  # compression of color
 ZLIB, OCCIPITAL = 1, 2  # compression of depth, in addition to RAW
 LONGEST_NAME = 1024  # bytes of the sensor name; "StructureSensor" has 15
-MAX_FRAMES = 2**18  # two and a half hours at 30 Hz; the longest ScanNet video has about 6,000 frames
+MAX_FRAMES = 2**18  # maximum number of frames, 2.4 hours at 30 Hz; the longest ScanNet video has about 6,000
 START = struct.Struct("<IQ")
 MATRIX_BYTES = 64
 IMAGES = struct.Struct("<iiIIIIfQ")
@@ -65,7 +65,7 @@ class SensFrame:
     path: Path
     header: SensHeader
     number: int
-    byte: int  # file position of the color image, which the depth image follows
+    byte: int  # file position of the color image; the depth image follows the color image
     color_bytes: int
     depth_bytes: int
     color_time: int  # microseconds
@@ -95,7 +95,7 @@ class SensFrame:
         return np.frombuffer(data, np.uint8).reshape(shape)
 
     def depth(self) -> UInt16:
-        """Return the depth (H, W) of the depth camera, 0 = no reading. Raises FrameError."""
+        """Return the depth (H, W) of the depth camera in units of the header, 0 = no reading. Raises FrameError."""
         data = self._read(self._depth_name, self.byte + self.color_bytes, self.depth_bytes)
         shape = self.header.depth_camera.shape
         length = 2 * prod(shape)

@@ -24,7 +24,7 @@ from framework.data import UInt8, UInt16
 from framework.datasets.scenenn.oni_records import Images, OniContents, Stream, playable
 from framework.errors import ConfigError, DataError, InstanceMapError, errors_of
 
-LARGEST_TIME_DIFFERENCE = 33_000  # us, between the two images of a frame, as in SceneNN's playback
+LARGEST_TIME_DIFFERENCE = 33_000  # us, maximum between the two images of a frame, as in SceneNN's playback
 WAITING = 30  # maximum number of unpaired images of a stream (1 s), in case the other stream ends
 LIBRARIES = ("libOpenNI2.so.0", "libOpenNI2.so", "libOpenNI2.dylib", "OpenNI2.dll")
 LONGEST_PATH = 255  # bytes, limit of OpenNI 2

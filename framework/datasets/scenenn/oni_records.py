@@ -57,11 +57,11 @@ class Images:
 
 @dataclass(frozen=True)
 class OniContents:
-    """Contents of a file's records."""
+    """Contents of a recording, collected from its records."""
 
     path: Path
     streams: Mapping[Stream, Images]  # for depth and color
-    end: int  # bytes of complete records
+    end: int  # bytes, file position after the last complete record
     cut_off: bool  # True if the recording has no end record
     largest_node: int
     wide: bool  # True = 64-bit file positions; False = 32-bit
@@ -109,8 +109,8 @@ class _Record(NamedTuple):
     kind: int
     node: int
     fields: bytes
-    fields_end: int  # position in the file
-    end: int
+    fields_end: int  # bytes, file position after the fields
+    end: int  # bytes, file position after the record
 
 
 def _read_contents(path: Path, file: BinaryIO) -> OniContents:

@@ -109,7 +109,7 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
 
 
 def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
-    """Return the matrix (4, 4) of four rows, finite or not, or None if the file ends earlier."""
+    """Return the matrix (4, 4) of four rows, possibly not finite, or None if the file ends before the last row."""
     matrix = np.empty((4, 4))
     for k, line in enumerate(rows):
         try:
@@ -121,7 +121,7 @@ def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
         elif at_end and k == len(rows) - 1 and len(line.words) <= 4:
             return None
         else:
-            expected = f"expected row {k + 1} of a 4x4 matrix, four numbers, got {line.shown}"
+            expected = f"expected row {k + 1} of a 4x4 matrix (four numbers), got {line.shown}"
             raise DataError(f"{path}, line {line.number}: {expected}")
     return matrix if len(rows) == 4 else None
 
@@ -155,9 +155,9 @@ def read_timestamps(path: Path) -> Mapping[int, tuple[float, float]]:
 
 
 def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mapping[int, float] | None = None) -> None:
-    """Write the depth and color timestamps (s) of each image number atomically.
+    """Write the timestamps of color and depth (s) of each image number atomically.
 
-    If `color_times` is None, the depth timestamps are also written for color.
+    `times` contains the timestamps of depth. If `color_times` is None, they are also written for color.
     """
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for image, time in times.items():

@@ -93,14 +93,17 @@ def _recorded(
 
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[float, float]]:
-    """Return the timestamps (s) of all images, or no timestamps if some are missing, so that clocks are not mixed."""
+    """Return the timestamps of color and depth (s) of all images, or no timestamps if any are missing.
+
+    This prevents a mix of clocks.
+    """
     if not path_exists(path):
         return {}
     times = read_timestamps(path)
     without = [k for k in images if k not in times]
     if not without:
         return times
-    message = "%s: expected timestamps of all images, got none for %d of %d, first %d; using a frame rate of %g Hz"
+    message = "%s: expected timestamps of all images, got none for %d of %d images, first %d; using %g Hz"
     log.warning(message, path, len(without), len(images), without[0], FRAME_RATE)
     return {}
 
@@ -122,7 +125,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
     unlisted = set(present.tolist()) - names.keys() - {0}
     if unlisted:
-        message = "%s: expected all labels in %s, got none for %d, such as %d; these are not evaluated"
+        message = "%s: expected an entry in %s for each label, got %d without an entry, such as %d; not evaluated"
         log.warning(message, mesh, annotation.name, len(unlisted), min(unlisted))
     class_names: dict[int, str | None] = {}
     ids = np.zeros(len(present), np.int32)

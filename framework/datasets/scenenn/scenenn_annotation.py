@@ -21,7 +21,7 @@ from framework.errors import DataError
 from framework.files.atomic_write import atomic_write, read_bytes
 
 LARGEST_FILE = 2**24  # bytes; annotations have about 100 KB; 16 MiB of crafted XML take 9 s and 0.5 GB
-LARGEST_ID = int(np.iinfo(np.int32).max)  # of a mesh label
+LARGEST_ID = int(np.iinfo(np.int32).max)  # largest mesh label
 QUATERNION_TOLERANCE = 1e-2  # maximum | |q| - 1 |, due to rounding of printed digits
 NO_COLOR = (0, 0, 0)
 NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -35,8 +35,8 @@ class Annotated:
     text: str  # name given by the annotators
     nyu_class: str  # NYU class
     color: tuple[int, int, int] = NO_COLOR  # RGB
-    aabb: Float64 | None = None  # (2, 3) m, minimum and maximum corner
-    obb: Box | None = None
+    aabb: Float64 | None = None  # (2, 3) m, minimum and maximum corner of the axis-aligned box
+    obb: Box | None = None  # oriented box
 
 
 def read_annotation(path: Path) -> tuple[Annotated, ...]:
@@ -161,7 +161,7 @@ def _color(text: str) -> tuple[int, int, int]:
 
 
 def _aabb(text: str) -> Float64 | None:
-    """Parse a box `minx miny minz maxx maxy maxz`, or return None for an invalid box."""
+    """Parse a box `minx miny minz maxx maxy maxz`, m, or return None for an invalid box."""
     numbers = _numbers(text, 6)
     if numbers is None or (numbers[:3] > numbers[3:]).any():
         return None
@@ -169,7 +169,7 @@ def _aabb(text: str) -> Float64 | None:
 
 
 def _obb(text: str) -> Box | None:
-    """Parse a box of center, extent and quaternion xyzw, or return None for an invalid box.
+    """Parse a box of center (m), extent (m) and quaternion xyzw, or return None for an invalid box.
 
     The order of the numbers is documented in github.com/hkust-vgd/scenenn, issue 11.
     """

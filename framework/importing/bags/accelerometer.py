@@ -21,7 +21,7 @@ from framework.importing.bags.ros_transforms import REALSENSE, static_rotation, 
 
 NEAR = 0.05  # s, averaging window before and after a frame, which reduces the effect of hand tremor
 GRAVITY = 9.81  # m/s^2
-MAX_DEVIATION = 0.2  # maximum deviation of the median from gravity, as a fraction; rejects data without gravity
+MAX_DEVIATION = 0.2  # fraction of GRAVITY, maximum deviation of the median acceleration; rejects data without gravity
 GYROSCOPE = re.compile("gyro", re.IGNORECASE)  # matches names of topics without acceleration
 
 log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ class Accelerometer:
 
 
 def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> Accelerometer | None:
-    """Return the first usable accelerometer of a bag by name, or None.
+    """Return the first usable accelerometer of a bag in the order of topic names, or None.
 
     `color` is the topic of the color images, and `timestamps` are their times in s. A warning is logged if all
     accelerometers are unusable.
@@ -67,13 +67,13 @@ def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> 
 
 
 def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
-    """Return the accelerometer of a topic, or the reason if it is unusable."""
+    """Return the accelerometer of a topic, or the reason why it is unusable."""
     times, measured, frame_id = _read(bag, topic)
     if not len(times):
         return f"{topic}: expected readable messages, got none"
     length = float(np.median(np.linalg.norm(measured, axis=1)))
     if abs(length - GRAVITY) > MAX_DEVIATION * GRAVITY:
-        return f"{topic}: expected a median of {GRAVITY:g} m/s^2, got {length:.3g} m/s^2"
+        return f"{topic}: expected a median acceleration of {GRAVITY:g} m/s^2, got {length:.3g} m/s^2"
     try:
         R_camera_imu = _rotation(bag, topic, frame_id, color)
     except DataError as error:

@@ -6,10 +6,10 @@
                                             "optical" or is missing, otherwise in ROS axes (x forward)
     sensor_msgs/Imu, tf2_msgs/TFMessage     up direction, optional, from the accelerometer and /tf_static
     /device_0/sensor_1/Color_0/image/data   RealSense's color; Depth_0 contains depth. .../tf/0 is T_stream_depth, with
-                                            the rotation as in the recorder's player. .../option/Depth Units is m per
-                                            unit. Depth is registered to color on import
+                                            the rotation as in the recorder's player. .../option/Depth Units is the
+                                            depth unit in m. Depth is registered to color on import
 
-The kind of the depth sensor is known from the topics of RealSense, Azure Kinect and Orbbec's drivers.
+The kind of the depth sensor is derived from the topic names of the drivers for RealSense, Azure Kinect and Orbbec.
 
 Color and depth images are associated by time, as in TUM RGB-D. Poses are interpolated at the time of the color image.
 """
@@ -43,7 +43,7 @@ from framework.sensors.noise_models import kind_of_device
 MAX_PAIR_INTERVAL = 0.02  # s, maximum time between a color image and its depth image
 MAX_POSE_INTERVAL = 0.1  # s, maximum time between a color image and the nearest pose
 MILLIMETER = 0.001  # m
-SAME_CAMERA = 0.01  # fraction of the image width; intrinsics that differ less belong to the same camera
+SAME_CAMERA = 0.01  # fraction of the image width, maximum difference between intrinsics of the same camera
 MAX_WAITING = 64  # maximum number of unpaired images
 BROWN = ("plumb_bob", "Brown Conrady", "")  # names of the lens model with k1, k2, p1, p2, k3
 DEPTH_STREAM = "/Depth_"  # in RealSense's topic names
@@ -75,7 +75,7 @@ def open_source(path: Path, given: Topics) -> Source:
 
 @dataclass(frozen=True)
 class Pair:
-    """A color and a depth image of about the same time, as indices in their topics."""
+    """A color and a depth image taken at about the same time, as indices of the messages in their topics."""
 
     color: int
     depth: int
@@ -119,7 +119,7 @@ class Device:
 
 
 def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
-    """Return pairs by header timestamps, or by recording times if the header clocks differ."""
+    """Return the pairs matched by header timestamps, or by recording times if the clocks of the headers differ."""
     sensed: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     stored: dict[str, list[float]] = {topics.color: [], topics.depth: []}
     try:
@@ -141,7 +141,10 @@ def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
 
 
 def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> list[Pair]:
-    """Return pairs by time (s), with the first image of each time only, because some recorders write only zeros."""
+    """Return the pairs matched by time (s).
+
+    Only the first image of each time is used, because some recorders write zero for all times.
+    """
     # the indices of first occurrences are sorted to restore the recording order
     colors, depths = (sorted(np.unique(times, return_index=True)[1].tolist()) for times in (color_times, depth_times))
     pairs = associate([color_times[i] for i in colors], [depth_times[j] for j in depths], MAX_PAIR_INTERVAL)
@@ -209,7 +212,10 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
 
 
 def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistration | None:
-    """Return the registration of depth to color, None = already registered. Raises DataError if it is unknown."""
+    """Return the registration of depth to color, None = already registered.
+
+    Raises DataError if the bag has no extrinsics for the registration.
+    """
     own = camera_info_of(bag, topics.depth)
     if topics.depth_is_registered or not own or own == topics.camera_info:
         return None
@@ -249,7 +255,7 @@ def _depth_unit(bag: RosBag, topics: Topics) -> float:
 
 
 def _numbers(info: Any, name: str) -> list[float]:
-    """Return a field of a CameraInfo. Field names are upper case in ROS 1."""
+    """Return the values of a CameraInfo field. Field names are in upper case in ROS 1."""
     return [float(value) for value in getattr(info, name.upper() if hasattr(info, name.upper()) else name)]
 
 

@@ -42,7 +42,7 @@ DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: unused integer, quan
 
 @dataclass(frozen=True)
 class Message:
-    """A message that is not yet decoded."""
+    """A message before decoding."""
 
     topic: str
     kind: str  # message type
@@ -104,7 +104,7 @@ class RosBag:
             ) from error
 
     def sensed_at(self, message: Message) -> float:
-        """Return the measurement time in s from the header of a message. The header is the first field."""
+        """Return the measurement time in s from the header of a message. The header must be the first field."""
         try:
             if self._is_ros1:
                 seconds, nanoseconds = struct.unpack_from("<xxxxII", message.raw)
@@ -121,7 +121,7 @@ def color_of(where: str, message: Any) -> UInt8:
     if hasattr(message, "format"):
         return decode_color(where, message.data.tobytes())
     if message.encoding not in COLOR_CHANNELS:
-        expected = f"expected color encoding {', '.join(COLOR_CHANNELS)}"
+        expected = f"expected one of the color encodings {', '.join(COLOR_CHANNELS)}"
         raise FrameError(f"{where}: {expected}, got {message.encoding[:60]!r}")
     channels, order = COLOR_CHANNELS[message.encoding]
     return np.ascontiguousarray(_pixels(where, message, np.dtype(np.uint8), channels)[..., order])
@@ -140,7 +140,7 @@ def depth_of(where: str, message: Any, unit: float) -> Float32:
     if message.encoding in METERS:
         return readings(_pixels(where, message, np.dtype(f"{order}f4"), 1)[..., 0].astype(np.float32))
     known = ", ".join((*MILLIMETERS, *METERS))
-    raise FrameError(f"{where}: expected depth encoding {known}, got {message.encoding[:60]!r}")
+    raise FrameError(f"{where}: expected one of the depth encodings {known}, got {message.encoding[:60]!r}")
 
 
 def _whole(stored: Array, unit: float) -> Float32:
@@ -150,7 +150,8 @@ def _whole(stored: Array, unit: float) -> Float32:
 def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
     """Return the depth (H, W) in m of a PNG image.
 
-    compressedDepth has a 12-byte header with the quantization of inverse float depth.
+    In the compressedDepth format, a 12-byte header precedes the image. For float depth, the header contains the
+    quantization of inverse depth.
     """
     encoding, _, codec = message.format.partition(";")
     data = message.data.tobytes()
@@ -173,7 +174,7 @@ def _pixels(where: str, message: Any, dtype: np.dtype[Any], channels: int) -> Ar
     height, width, step = int(message.height), int(message.width), int(message.step)
     row = width * channels * dtype.itemsize
     if not 0 < row <= step or height < 1 or len(message.data) != height * step:
-        size = f"{width}x{height} px of {message.encoding[:60]!r}, {step} bytes a row"
+        size = f"{width}x{height} px of {message.encoding[:60]!r}, {step} bytes per row"
         raise FrameError(f"{where}: expected data of {size}, got {len(message.data)} bytes")
     rows = np.asarray(message.data, np.uint8).reshape(height, step)[:, :row]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)

@@ -67,7 +67,7 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
 
 
 def camera_info_of(bag: RosBag, image: str) -> str:
-    """Return the only CameraInfo topic, or the nearest to an image topic in the tree of topic names; "" = none."""
+    """Return the only CameraInfo topic, or the one nearest to `image` in the tree of topic names; "" = none."""
     infos = bag.topics(CAMERA_INFO)
     folders = {topic: f"/{topic.strip('/').rpartition('/')[0]}" for topic in (image, *infos)}
     shared = {topic: len(PurePosixPath(commonpath([folders[topic], folders[image]])).parts) for topic in infos}
@@ -78,7 +78,7 @@ def camera_info_of(bag: RosBag, image: str) -> str:
 
 
 def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Pattern[str]) -> str:
-    """Return the single matching topic. Topics with the preferred name, and uncompressed topics, have precedence."""
+    """Return the single matching topic. Topics with a preferred name, and uncompressed topics, have precedence."""
     fitting = [topic for topic in candidates if preferred.search(topic)] or list(candidates)
     left = [topic for topic in fitting if bag.kinds[topic] == IMAGE] or fitting
     if len(left) == 1:

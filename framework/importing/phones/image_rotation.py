@@ -18,14 +18,15 @@ from framework.datasets.calibration.undistortion import Distortion
 
 Value = TypeVar("Value", bound=np.generic)
 QUARTER = 90  # degrees
-SIDEWAYS = 0.5  # minimum length of the mean up direction in the image plane; smaller if the camera faces up or down
+# minimum length of the mean up direction in the image plane; it is smaller if the camera faces up or down
+SIDEWAYS = 0.5
 
 
 @dataclass(frozen=True)
 class Turn:
     """A clockwise rotation by quarter turns."""
 
-    quarters: int = 0  # 0 to 3
+    quarters: int = 0  # number of quarter turns, 0 to 3
 
     @property
     def R_turned_camera(self) -> Float64:

@@ -40,9 +40,10 @@ from framework.sensors.noise_models import SensorKind
 
 CHANNEL = "R"  # of the EXR files
 LZFSE_BLOCK = b"bvx"  # first bytes of each block of compressed data
-BYTES_A_BLOCK = 20_000  # minimum block size of an image; blocks end after 40,000 bytes without repetitions
-UNTURNED = 1e-3  # sine of half the angle; a hand-held phone is never aligned this exactly with the world axes
-MAX_BLOCKS = 8  # additional blocks; the number is limited because a block may decompress to 27 MB
+BYTES_A_BLOCK = 20_000  # minimum block size; blocks of data without repetitions have 40,000 bytes
+# sine of half the rotation angle; a hand-held phone is never aligned this exactly with the world axes
+UNTURNED = 1e-3
+MAX_BLOCKS = 8  # number of additional blocks; limited, because a block may decompress to 27 MB
 
 _load_openexr = partial(import_optional, "OpenEXR", "reads Record3D's depth", "phone")
 _load_lzfse = partial(import_optional, "lzfse", "unpacks Record3D's .r3d files", "phone")
@@ -81,7 +82,7 @@ class ExrFolder:
         return readings(_read_exr(path, read_bytes(path, LARGEST_FILE), shape))
 
     def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
-        """Return the confidence (h, w) of depth, 0 to 2; None = unknown."""
+        """Return the confidence (h, w) of depth, from 0 to 2; None = unknown."""
         return None
 
     def name(self, number: int) -> str:
@@ -218,7 +219,7 @@ def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[fl
 
 
 def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
-    """Return the size (h, w) of depth in px. Older versions lack the keys and use the size of color."""
+    """Return the shape (h, w) of depth, px. In older versions without this size, depth has the size of color."""
     if "dw" not in content:
         return camera.shape
     width, height = numbers_of(where, content, "dw", "dh")
@@ -226,7 +227,7 @@ def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) 
 
 
 def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDArray[np.floating]:
-    """Return the depth channel (h, w). The header is checked first, because it determines the required memory."""
+    """Return the depth (h, w), m. The header is checked first, because it determines the required memory."""
     OpenEXR = _load_openexr()
     try:
         header = OpenEXR.File(io.BytesIO(data), header_only=True).header()

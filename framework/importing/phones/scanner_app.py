@@ -36,8 +36,8 @@ def open_source(path: Path) -> Source:
     complete = [n for n in digits if (path / f"frame_{n}.jpg").exists() and (path / f"depth_{n}.png").exists()]
     if not complete:
         raise DataError(
-            f"{path}: expected frames with frame_00000.jpg and depth_00000.png, got none; in the app, make a low "
-            'resolution scan, which includes depth, and export "All Data"'
+            f"{path}: expected frames with frame_00000.jpg and depth_00000.png, got none; in the app, make a "
+            'low-resolution scan, which includes depth, and export "All Data"'
         )
     frames = [partial(_read, path, number) for number in complete]
     return Source("3D Scanner App", frames, len(frames), posed=True, sensor=SensorKind.PHONE_LIDAR)

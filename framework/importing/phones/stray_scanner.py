@@ -34,8 +34,8 @@ POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # first co
 INTRINSICS = ("fx", "fy", "cx", "cy")  # next columns, in newer versions
 # type of MP4 and QuickTime files; other types may make FFmpeg open other files
 KIND_AT, KIND = 4, b"ftyp"
-QUIET = "-8"  # FFmpeg's AV_LOG_QUIET; DataError reports damage
-LAST_FRAME = 10**6 - 1  # six digits
+QUIET = "-8"  # FFmpeg's AV_LOG_QUIET; damage is reported by DataError instead
+LAST_FRAME = 10**6 - 1  # largest frame number of six digits
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,11 @@ def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: b
 
 
 def _read_odometry(path: Path, camera: Camera) -> list[OdometryRow | DataError]:
-    """Return the row or error of each frame. `camera` is used for rows without intrinsics."""
+    """Return the row of each frame, or its error. `camera` is used for rows without intrinsics."""
     lines = read_lines(path)
     header = [word.strip() for word in lines[0].split(",")] if lines else []
     if tuple(header[: len(POSE)]) != POSE:
-        raise DataError(f"{path}, line 1: expected {', '.join(POSE)}, got {', '.join(header)[:100]!r}")
+        raise DataError(f"{path}, line 1: expected columns {', '.join(POSE)}, got {', '.join(header)[:100]!r}")
     has_intrinsics = tuple(header[len(POSE) : len(POSE) + len(INTRINSICS)]) == INTRINSICS
     last = len(POSE) + len(INTRINSICS) if has_intrinsics else len(POSE)
     numbered = [(n, line.split(",")[:last]) for n, line in enumerate(lines[1:], start=2) if line.strip()]
@@ -140,7 +140,10 @@ class Video:
         self._next = 0
 
     def frame(self, number: int) -> UInt8:
-        """Return the color (H, W, 3), RGB, of a frame, from 0. Frames must be read in order. Raises FrameError."""
+        """Return the color (H, W, 3), RGB, of frame `number` (0 = first). Raises FrameError.
+
+        Frames must be read in ascending order.
+        """
         if number < self._next - 1:
             raise FrameError(f"{self.path}: expected increasing frames, got {number} after {self._next - 1}")
         while self._next <= number:

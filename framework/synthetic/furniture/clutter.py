@@ -11,7 +11,7 @@ from framework.synthetic.furniture.solids import Solid, cushion, cylinder, lathe
 from framework.synthetic.paints import Material, Texture
 
 WEAVE = 0.04  # m, vertex spacing of cloth, fine enough for creases
-LAMP_GLOW = 2.2  # emission of a lampshade
+LAMP_GLOW = 2.2  # emission of a lampshade, 1 = a white wall in the mean light of the room
 
 
 def cupboard(rng: Rng) -> Furniture:
@@ -34,7 +34,7 @@ def cupboard(rng: Rng) -> Furniture:
 
 
 def low_board(rng: Rng) -> Furniture:
-    """Return a random TV board."""
+    """Return a random low sideboard."""
     size = rng.uniform(1.35, 1.6), rng.uniform(0.40, 0.45), rng.uniform(0.46, 0.56)
     return _drawers("low board", rng, *size, 3)
 
@@ -252,7 +252,7 @@ def door(rng: Rng) -> Furniture:
 
 
 def rug(rng: Rng, width: float, depth: float) -> Furniture:
-    """Return a random rug of this size."""
+    """Return a random rug of `width` x `depth` m."""
     piece = Furniture("rug")
     base = paints.pick(rng, paints.CLOTHS)
     other = paints.shade(paints.pick(rng, paints.CLOTHS), 1.2)
@@ -271,7 +271,7 @@ def partition(rng: Rng) -> Furniture:
 
 
 def ceiling_lamp(rng: Rng) -> Furniture:
-    """Return a hanging globe, with the ceiling at z = 0."""
+    """Return a hanging globe lamp; the ceiling is at z = 0."""
     piece = Furniture("ceiling lamp")
     globe = [(-0.34, 0.06), (-0.30, 0.15), (-0.22, 0.19), (-0.14, 0.13), (-0.10, 0.03)]
     piece.add(lathe(globe, 28, 0.05), _glowing(rng))
@@ -289,7 +289,7 @@ def throw_cushion(rng: Rng) -> Furniture:
 
 
 def blanket(rng: Rng, width: float, depth: float) -> Furniture:
-    """Return a blanket with creases up to 3 cm high."""
+    """Return a blanket of `width` x `depth` m with creases up to 3 cm high."""
     piece = Furniture("blanket")
     sheet = rounded_box(width, depth, 0.03, 0.012, 2, WEAVE)
     piece.add(_crumpled(sheet, rng, 0.03, 0.05), paints.patterned_cloth(rng), z=0.015)
@@ -308,7 +308,7 @@ def clothes(rng: Rng) -> Furniture:
 
 
 def _crumpled(sheet: Solid, rng: Rng, height: float, fringe: float) -> Solid:
-    """Return a sheet with creases up to `height` m and an uneven border of up to `fringe` m."""
+    """Return the sheet with creases up to `height` m high, and its border displaced by up to `fringe` m."""
     a, b, c, d = rng.uniform(0, 2 * np.pi, 4)
 
     def crumple(p: Float64) -> Float64:

@@ -16,12 +16,12 @@ PILLOWS = 0.68  # m, distance from the wall to the free part of a bed
 BACKREST = 0.50  # m, distance from the wall to the free part of a couch
 BORDER = 0.06  # m, empty border of a bed or couch
 ARM = 0.24  # m, maximum width of a couch arm
-SINK = 0.012  # m, penetration depth of objects in soft surfaces
-PLACES = 60  # candidate positions of each scattered object
-TOUCHING = (0.001, 0.005)  # m, gap between touching neighbors, below sensor resolution
-LADEN_CHAIRS = 0.5  # fraction of the chairs along a wall with an object on them
+SINK = 0.012  # m, depth to which objects sink into soft surfaces
+PLACES = 60  # number of candidate positions of each scattered object
+TOUCHING = (0.001, 0.005)  # m, range of the gap between touching neighbors, below sensor resolution
+LADEN_CHAIRS = 0.5  # probability of an object on a chair of a row
 SEAT = 0.19  # m, distance from the front of a chair to the middle of its seat
-LEATHER_COUCHES = 0.3  # fraction of black leather couches
+LEATHER_COUCHES = 0.3  # fraction of the couches that have black leather
 RIM = 0.02  # m, empty border of a table
 APRON = 0.13  # m, height of the blocked space below a table top
 
@@ -48,7 +48,7 @@ def cluttered_bed_group(rng: Rng) -> Group:
 
 
 def cluttered_couch_group(rng: Rng) -> Group:
-    """Return a couch with cushions, a blanket, a bag and books, and a touching, cluttered coffee table."""
+    """Return a couch with cushions, a blanket, a bag and books, and a cluttered coffee table that touches it."""
     group = cluttered_couch(rng)
     front = float(group.pieces[0].bounds()[1][1])
     table = tabletops.coffee_table(rng)
@@ -102,7 +102,8 @@ def _scatter(
 ) -> None:
     """Place `things` on the first object of `lying`, between the corners `low` and `high` (2,), m.
 
-    The objects do not overlap, except blankets. Objects without a free position are omitted.
+    The objects overlap only with blankets. Objects without a free position are omitted. The other objects of `lying`
+    are obstacles.
     """
     lying = [*lying]
     in_the_way = [np.stack(piece.bounds()) for piece in lying[1:]]
@@ -120,7 +121,10 @@ def _scatter(
 
 
 def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
-    """Return `thing` at a random position between the corners, lengthwise or across; a large object is centered."""
+    """Return `thing` with a random rotation and a random position between the corners `low` and `high` (2,), m.
+
+    An object larger than the area is centered.
+    """
     turned = thing.placed(0.0, 0.0, 0.0, np.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.3, 0.3))
     turned_low, turned_high = turned.bounds()
     middle = (turned_low + turned_high)[:2] / 2
@@ -130,12 +134,12 @@ def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Fu
 
 
 def _overlap(box: Float64, other: Float64) -> bool:
-    """Return True if two boxes (2, 3) overlap, seen from above."""
+    """Return True if two boxes (2, 3) overlap, as seen from above."""
     return bool((np.minimum(box[1], other[1])[:2] > np.maximum(box[0], other[0])[:2]).all())
 
 
 def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
-    """Return the height (m) of the top surface between the corners `low` and `high` (2,)."""
+    """Return the height (m) of the top surface of the objects between the corners `low` and `high` (2,), m."""
     vertices = np.concatenate([solid.vertices for piece in pieces for solid, _ in piece.parts])
     within = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
     return float(vertices[within, 2].max())
@@ -197,9 +201,9 @@ def laid_table_group(rng: Rng) -> Group:
 
 
 def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Furniture:
-    """Add a chair to the group, pushed under a table until its back or arms touch, and return it.
+    """Push a chair under a table until its back or arms touch the table, add it to the group and return it.
 
-    The table faces +y, and the chair is `x` m from its middle.
+    The table faces +y. The chair is offset by `x` m from the middle of the table.
     """
     low, high = table.bounds()
     turned = chair.placed(0, 0, 0, np.pi)
@@ -209,7 +213,7 @@ def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Fu
 
 
 def _between(piece: Furniture, bottom: float, top: float) -> Float64:
-    """Return the vertices (N, 3) of an object near the heights from `bottom` to `top`, m."""
+    """Return the vertices (N, 3), m, of an object at heights from `bottom` to `top` m, with a margin of SPACING."""
     solids = [solid.vertices for solid, _ in piece.parts]
     reaching = [v for v in solids if v[:, 2].max() > bottom and v[:, 2].min() < top]
     sections = [v[(v[:, 2] > bottom - SPACING) & (v[:, 2] < top + SPACING)] for v in reaching]
@@ -217,7 +221,7 @@ def _between(piece: Furniture, bottom: float, top: float) -> Float64:
 
 
 def strew_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
-    """Place `things` at free positions on a flat top, possibly touching; omit objects without a free position."""
+    """Place `things` at free positions on the flat top of `table`; omit objects without a free position."""
     low, high = table.bounds()
     there: list[Float64] = []
     for thing in things:
@@ -237,7 +241,7 @@ def _touch(rng: Rng) -> float:
 
 
 def board_group(rng: Rng) -> Group:
-    """Return a low board with piles and rows of books, and a bag next to the board."""
+    """Return a low sideboard with piles and rows of books, and a bag next to it."""
     group = Group("board")
     board = clutter.low_board(rng)
     board = group.add(board, y=against_wall(board))
@@ -250,7 +254,7 @@ def board_group(rng: Rng) -> Group:
 
 
 def laden(name: str, support: Furniture, rng: Rng) -> Group:
-    """Return a cupboard or another tall support with objects on top."""
+    """Return a group of `support`, a cupboard or another tall object, with objects on top."""
     group = single(name, support)
     strew_on(group, group.pieces[0], rng, small_things.some(rng, small_things.ON_TOPS, 2))
     return group

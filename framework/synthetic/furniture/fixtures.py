@@ -42,7 +42,7 @@ def refrigerator(rng: Rng) -> Furniture:
 
 
 def tv(rng: Rng) -> Furniture:
-    """Return a flat screen on a foot."""
+    """Return a flat-screen television on a foot."""
     piece = Furniture("tv", "tv")
     width = rng.uniform(0.90, 1.20)
     height = width * 9 / 16
@@ -94,7 +94,10 @@ def toilet(rng: Rng) -> Furniture:
 
 
 def _ring(a: float, b: float, inner_a: float, inner_b: float, height: float, front: float, inner_front: float) -> Solid:
-    """Return a toilet seat: an egg-shaped ring about y = 0.03, from z = 0 to `height`."""
+    """Return a toilet seat: an egg-shaped ring about y = 0.03 m, from z = 0 to `height` m.
+
+    `a`, `b` and `front` describe the outer edge as in Section, the other parameters the inner edge.
+    """
     n, m = 40, 8
     around, across = np.meshgrid(np.linspace(0, 2 * np.pi, n + 1), np.linspace(0, 2 * np.pi, m + 1), indexing="ij")
     blend = 0.5 + 0.5 * np.cos(across)  # 1 at the outer edge, 0 at the inner edge

@@ -41,17 +41,17 @@ class Group:
 
     @property
     def solid(self) -> Bool:
-        """Mask (N,) of the solid objects, which excludes rugs."""
+        """Mask (N,) of the solid objects: all objects except rugs."""
         return np.array([piece.kind != "rug" for piece in self.pieces])
 
 
 def against_wall(piece: Furniture) -> float:
-    """Return the y offset of an object with its back at the wall, the plane y = 0."""
+    """Return the y offset (m) that places the back of an object at the wall, the plane y = 0."""
     return WALL_GAP - float(piece.bounds()[0][1])
 
 
 def on_top(piece: Furniture) -> float:
-    """Return the height 1 mm above the object's highest point, m."""
+    """Return the height (m) of a point 1 mm above the highest point of an object."""
     return float(piece.bounds()[1][2]) + 0.001
 
 
@@ -62,13 +62,13 @@ def size(piece: Furniture) -> Float64:
 
 
 def next_to(piece: Furniture, other: Furniture, side: int, gap: float) -> float:
-    """Return the x offset of `piece`, `gap` m to the right (side 1) or left (side -1) of `other`."""
+    """Return the x offset (m) that places `piece` next to `other`, `gap` m away: at +x (side 1) or -x (side -1)."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(other_high[0] + gap - low[0] if side > 0 else other_low[0] - gap - high[0])
 
 
 def bed_group(rng: Rng) -> Group:
-    """Return a random bed group."""
+    """Return a random bed and a nightstand with objects."""
     group = Group("bed")
     bed = seating.bed(rng)
     bed = group.add(bed, y=against_wall(bed))
@@ -80,12 +80,12 @@ def bed_group(rng: Rng) -> Group:
 
 
 def couch_group(rng: Rng) -> Group:
-    """Return a random couch group."""
+    """Return a random couch with a rug and a coffee table."""
     return with_low_table(seating.couch(rng), rng)
 
 
 def with_low_table(couch: Furniture, rng: Rng) -> Group:
-    """Return a couch with a rug and a coffee table."""
+    """Return a group of `couch`, a rug and a coffee table."""
     group = Group("couch")
     couch = group.add(couch, y=against_wall(couch))
     front = couch.bounds()[1][1]
@@ -110,7 +110,7 @@ def put_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) ->
 
 
 def tv_group(rng: Rng) -> Group:
-    """Return a random TV group."""
+    """Return a TV on a low sideboard, sometimes with a plant."""
     group = Group("tv", opposite="couch")
     board = clutter.low_board(rng)
     board = group.add(board, y=against_wall(board))
@@ -159,7 +159,7 @@ def dining_group(rng: Rng) -> Group:
 
 
 def kitchen_group(rng: Rng) -> Group:
-    """Return a random kitchen group."""
+    """Return a kitchen counter and a refrigerator next to it."""
     group = Group("kitchen")
     fridge, row = fixtures.refrigerator(rng), clutter.counter(rng)
     side = 1 if rng.uniform() < 0.5 else -1
@@ -169,7 +169,7 @@ def kitchen_group(rng: Rng) -> Group:
 
 
 def toilet_group(rng: Rng) -> Group:
-    """Return a random toilet group."""
+    """Return a toilet next to a partition."""
     group = Group("toilet")
     toilet, wall = fixtures.toilet(rng), clutter.partition(rng)
     group.add(toilet, y=against_wall(toilet))
@@ -179,7 +179,7 @@ def toilet_group(rng: Rng) -> Group:
 
 
 def desk_group(rng: Rng) -> Group:
-    """Return a random desk group."""
+    """Return a desk with objects and an office chair."""
     group = Group("desk")
     desk = tabletops.desk(rng)
     desk = group.add(desk, y=against_wall(desk))
@@ -190,7 +190,7 @@ def desk_group(rng: Rng) -> Group:
 
 
 def single(name: str, piece: Furniture, z: float = 0.0, hung: bool = False) -> Group:
-    """Return a group with one object."""
+    """Return a group with one object at the height `z` m; `hung` places its back directly on the wall."""
     group = Group(name)
     group.add(piece, y=0.002 if hung else against_wall(piece), z=z)
     return group

@@ -26,12 +26,12 @@ class Furniture:
         self.parts.append((solid.moved(x, y, z), material))
 
     def add_pair(self, solid: Solid, material: Material, x: float, y: float = 0.0, z: float = 0.0) -> None:
-        """Add a part twice, at -x and x."""
+        """Add a part twice, at the offsets (-x, y, z) and (x, y, z), m."""
         for side in (-1, 1):
             self.add(solid, material, side * x, y, z)
 
     def add_legs(self, solid: Solid, material: Material, x: float, y: float) -> None:
-        """Add a part four times, at the corners (±x, ±y)."""
+        """Add a part four times, at the corners (±x, ±y), m."""
         for corner in ((-x, -y), (x, -y), (x, y), (-x, y)):
             self.add(solid, material, *corner)
 
@@ -47,7 +47,7 @@ class Furniture:
         return Furniture(self.kind, self.class_name, parts)
 
     def tilted(self, angle: float) -> Furniture:
-        """Return a copy rotated by `angle` rad about x, with its front upwards, and placed on z = 0."""
+        """Return a copy tilted backward by `angle` rad about x and placed on z = 0."""
         parts = [(solid.turned("x", angle), material) for solid, material in self.parts]
         tilted = Furniture(self.kind, self.class_name, parts)
         return tilted.placed(0.0, 0.0, -float(tilted.bounds()[0][2]))

@@ -1,4 +1,4 @@
-"""Beds, chairs and couches with random, common sizes."""
+"""Random beds, chairs and couches of common sizes."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def bare_couch(rng: Rng) -> Furniture:
 
 
 def _couch_body(rng: Rng) -> tuple[Furniture, float, float, float]:
-    """Return a couch without pillows, its width and depth, and the width of an arm, m."""
+    """Return a couch without pillows, and its width, its depth and the width of an arm in m."""
     piece = Furniture("couch", "couch")
     cover, feet = paints.cloth(rng), paints.wood(rng)
     seats = int(rng.integers(2, 4))

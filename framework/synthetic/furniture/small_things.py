@@ -123,7 +123,10 @@ def shelf(rng: Rng) -> Furniture:
 
 
 def _fill(piece: Furniture, rng: Rng, start: float, end: float, z: float, height: float) -> None:
-    """Place binders, boxes and gaps side by side on one shelf board."""
+    """Place binders, boxes and gaps side by side on a shelf board.
+
+    The board is at the height `z` m, and extends from `start` to `end` m along x. `height`: m, maximum object height.
+    """
     x = start
     while True:
         wide = rng.uniform() < 0.2
@@ -144,5 +147,5 @@ ON_TOPS: tuple[MakeThing, ...] = (clutter.carton, clutter.throw_cushion, basket,
 
 
 def some(rng: Rng, makers: tuple[MakeThing, ...], count: int) -> list[Furniture]:
-    """Return `count` objects, each from a random maker."""
+    """Return `count` objects, each created by a random function of `makers`."""
     return [makers[int(rng.integers(len(makers)))](rng) for _ in range(count)]

@@ -1,7 +1,7 @@
 """Shapes of furniture: rounded boxes, lofts and tubes, as triangles with smooth normals.
 
-A shape is centered on the origin, with z up. Its texture coordinates are its initial 3D coordinates in meters, so that
-a solid texture moves with the shape. Faces are subdivided, because light is baked into the vertices.
+A shape is at the origin, with z up and lengths in meters. Its texture coordinates are its initial 3D coordinates in
+meters, so that a solid texture moves with the shape. Faces are subdivided, because light is baked into the vertices.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class Solid:
     """A triangle mesh; triangles are counter-clockwise as seen from outside."""
 
     vertices: Float64  # (V, 3) m
-    normals: Float64  # (V, 3) unit
-    triangles: Int32  # (F, 3)
+    normals: Float64  # (V, 3) unit vectors
+    triangles: Int32  # (F, 3) vertex indices
     texture: Float64  # (V, 3) m, texture coordinates
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
@@ -43,7 +43,7 @@ class Solid:
     def flat(self, along: int, up: int) -> Solid:
         """Return a copy with texture coordinates (s, t, 0) in meters from the corner, for image textures.
 
-        s and t run along the coordinate axes `along` and `up` of the vertices.
+        s and t run along the coordinate axes `along` and `up` of the vertices (0 = x, 1 = y, 2 = z).
         """
         s = self.vertices[:, along] - self.vertices[:, along].min()
         t = self.vertices[:, up] - self.vertices[:, up].min()
@@ -61,12 +61,15 @@ def axis_rotation(axis: str, angle: float) -> Float64:
 
 
 def _turn(R: Float64, vectors: Float64) -> Float64:
-    """Return the vectors (V, 3) rotated without BLAS, whose rounding may depend on the number of threads."""
+    """Return the vectors (V, 3) rotated by R (3, 3).
+
+    BLAS is not used, because its rounding may depend on the number of threads.
+    """
     return np.asarray(np.einsum("ck,vk->vc", R, vectors))
 
 
 def smooth_normals(vertices: Float64, triangles: Int32) -> Float64:
-    """Return the area-weighted normals (V, 3) of vertices; vertices at equal positions share a normal."""
+    """Return the area-weighted normals (V, 3) of the vertices; vertices at equal positions share a normal."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     faces = np.cross(b - a, c - a)
     _, point = np.unique(np.round(vertices / WELD).astype(np.int64), axis=0, return_inverse=True)
@@ -114,7 +117,7 @@ def _grain_first(vertices: Float64, size: Float64) -> Float64:
 
 
 def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
-    """Return a pillow that is thick in the middle and thin at the seam."""
+    """Return a pillow with side lengths x, y, z m; `plump` is the fraction by which it is thinner at the seam."""
     box = rounded_box(x, y, z, radius=0.45 * z, segments=4, spacing=min(x, y) / 9)
 
     def swell(p: Float64) -> Float64:
@@ -129,13 +132,13 @@ def cushion(x: float, y: float, z: float, plump: float = 0.5) -> Solid:
 
 @dataclass(frozen=True)
 class Section:
-    """A horizontal section of a loft: a superellipse |x/a|^n + |y/b|^n = 1 about (x, y) at height z."""
+    """A horizontal section of a loft at height z: a superellipse |x/a|^n + |y/b|^n = 1, moved to the center (x, y)."""
 
-    z: float
+    z: float  # m
     a: float  # m, half width along x
     b: float  # m, half width along y
-    x: float = 0.0
-    y: float = 0.0
+    x: float = 0.0  # m, of the center
+    y: float = 0.0  # m, of the center
     n: float = 2.0  # 2 = ellipse, larger = closer to a rectangle
     front: float = 1.0  # scale of the half with positive y, for egg shapes
 
@@ -227,7 +230,10 @@ def _spline(points: Float64) -> Float64:
 
 
 def panel(width: float, height: float, spacing: float = 0.1) -> Solid:
-    """Return a flat rectangle in the plane y = 0 that faces +y; texture (s, t, 0) in meters from the lower left."""
+    """Return a flat rectangle in the plane y = 0 that faces +y.
+
+    Its texture coordinates are (s, t, 0) in meters from the lower left corner.
+    """
     s, t = (np.linspace(0, side, max(2, int(np.ceil(side / spacing)) + 1)) for side in (width, height))
     S, T = np.meshgrid(s, t, indexing="ij")
     zero = np.zeros_like(S)
@@ -238,7 +244,7 @@ def panel(width: float, height: float, spacing: float = 0.1) -> Solid:
 
 
 def grid_triangles(rows: int, columns: int, flip: bool) -> Int32:
-    """Return two triangles for each cell of a (rows, columns) grid of vertices."""
+    """Return two triangles for each cell of a (rows, columns) grid of vertices; `flip` reverses their orientation."""
     index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     triangles = np.stack([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]).reshape(-1, 3)

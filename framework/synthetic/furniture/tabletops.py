@@ -54,7 +54,7 @@ def _table(kind: str, width: float, depth: float, height: float, material: Mater
 
 
 def book(rng: Rng) -> Furniture:
-    """Return a flat, closed book."""
+    """Return a closed book that lies flat."""
     piece = Furniture("book", "book")
     _add_book(piece, rng, rng.uniform(0.17, 0.25), rng.uniform(0.24, 0.32), rng.uniform(0.025, 0.05))
     return piece

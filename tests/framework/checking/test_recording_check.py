@@ -170,7 +170,7 @@ def test_recording_check_unrelated_poses_fit_in_no_axes(tmp_path: Path) -> None:
 
     [fault] = check(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=another)), FARTHEST).errors
     assert fault.subject == "poses"
-    assert "in any axes" in fault.text
+    assert "in all supported conventions" in fault.text
     assert "tracker=voxel_hashing_icp" in fault.setting
 
 

@@ -114,7 +114,7 @@ def test_replica_missing_scene_parameter_raises_with_hint(root: Path) -> None:
 def test_replica_frames_without_pose_are_counted(root: Path) -> None:
     write_poses(root / "room0", [pose_at(0), pose_at(1)])
     sequence = ReplicaNiceSlam(root, scene="room0")
-    assert "frame000002.jpg: expected a pose in traj.txt, got none among its 2 poses" in fault_of(sequence, 2)
+    assert "frame000002.jpg: expected pose 2 in traj.txt, got only 2 poses" in fault_of(sequence, 2)
     result, _ = mapped(sequence)
     assert (result.frames, result.frames_skipped) == (FRAMES, 1)
 

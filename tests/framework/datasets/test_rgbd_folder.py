@@ -285,7 +285,7 @@ def test_rgbd_folder_unreadable_file_is_not_missing(folder, name, kind):
 @pytest.mark.parametrize("key", ["Distortion", "distorsion", "depthscale", "Width"])
 def test_rgbd_folder_misspelled_camera_key_has_suggestion(folder, key):
     change_camera(folder, **{key: 1})
-    with pytest.raises(DataError, match=f"expected known keys, got '{key}'; did you mean"):
+    with pytest.raises(DataError, match=f"expected a known key, got '{key}'; did you mean"):
         RgbdFolder(folder)
 
 
@@ -561,7 +561,7 @@ def test_rgbd_folder_times_far_apart_are_not_used(folder, caplog):
     (folder / "timestamps.txt").write_text("".join(f"{k} {k + 9}\n" for k in range(FRAMES)))
     frame = RgbdFolder(folder)[1]
     assert frame.color_time == frame.depth_time == frame.timestamp
-    assert "expected timestamps of color and depth within 0.2 s of each other, got -9 s; not used" in caplog.text
+    assert "expected timestamps of color and depth within 0.2 s of each other, got -9 s; using one" in caplog.text
 
 
 def test_recording_depth_delay_drops_times_of_images(folder):
@@ -593,5 +593,5 @@ def test_rgbd_folder_sensor_parameter_overrides_camera_json(folder):
 def test_rgbd_folder_unknown_sensor_in_camera_json_raises(folder, name):
     change_camera(folder, sensor=name)
     names = "EXACT, KINECT_V1, REALSENSE_D435, TIME_OF_FLIGHT, PHONE_LIDAR"
-    with pytest.raises(DataError, match=rf"camera\.json, sensor: expected one of {names}, got {name}; set the kind"):
+    with pytest.raises(DataError, match=rf"camera\.json: sensor: expected one of {names}, got {name}; set the kind"):
         RgbdFolder(folder)

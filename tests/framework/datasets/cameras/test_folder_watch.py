@@ -150,7 +150,7 @@ def test_folder_watch_reports_decreasing_frame_number(folder: Path) -> None:
     write(folder, 7)
     assert watched.look() == [7]
     write(folder, 3)
-    assert watched.look() == [f"{folder}/color/000003.jpg: expected ascending frames, got 3 after 7"]
+    assert watched.look() == [f"{folder}/color/000003.jpg: expected a frame number > 7, got 3"]
     write(folder, 9)
     assert watched.look() == [9]
 
@@ -179,7 +179,7 @@ def test_folder_watch_ambiguous_but_not_unrelated_names_raise(folder: Path, capl
     for name in (".000000.jpg", "000000.jpg.part", "preview.jpg", f"{2**53}.jpg"):
         (folder / "color" / name).write_bytes(b"?")
     assert watched.look() == watched.look() == []
-    assert sorted(message.partition(": expected a name")[0] for message in caplog.messages) == [
+    assert sorted(message.partition(": expected a frame number")[0] for message in caplog.messages) == [
         f"{folder}/color/{2**53}.jpg",
         f"{folder}/color/preview.jpg",
     ]

@@ -142,8 +142,8 @@ def test_scannet_annotation_duplicate_object_is_merged(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("groups", "message"),
     [
-        ([group(0, "bed", 4)], r"object 0: expected segments of s\.segs\.json, got 4"),
-        ([group(0, "bed", 3), 5], r"segGroups\[1\]: expected an object, got int"),
+        ([group(0, "bed", 4)], r"object 0: expected segments of s\.segs\.json, got segment 4"),
+        ([group(0, "bed", 3), 5], r"segGroups\[1\]: expected a JSON object, got int"),
         ([group(-1, "bed", 3)], r"segGroups\[0\]: objectId: expected an integer from 0"),
         ([group(2**31, "bed", 3)], "objectId: expected an integer from 0"),
         ([group(0, "bed", 3) | {"objectId": True}], "objectId: expected an integer from 0"),
@@ -162,7 +162,7 @@ def test_scannet_annotation_invalid_object_raises(tmp_path: Path, groups: Any, m
 @pytest.mark.parametrize(
     ("segments", "message"),
     [
-        (SEGMENTS[:-1], r"segIndices: expected one for each of 10 vertices of s\.ply, got 9"),
+        (SEGMENTS[:-1], r"segIndices: expected 10 ids, one for each vertex of s\.ply, got 9"),
         ([*SEGMENTS[:-1], None], "segIndices: expected integers, got NoneType"),
         ([SEGMENTS], "segIndices: expected integers, got list"),
         ("3", "expected a list 'segIndices', got str"),

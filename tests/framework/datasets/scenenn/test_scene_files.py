@@ -142,7 +142,7 @@ def test_trajectory_log_empty_file_has_no_poses(path):
         (1, "-1 -1 0", "line 1: expected the header"),
         (6, "6.5 6 7", "line 6: expected the header"),
         (6, "4294967296 6 7", "line 6: expected the header"),
-        (2, "1 0 0", "line 2: expected row 1 of a 4x4 matrix, four numbers, got '1 0 0'"),
+        (2, "1 0 0", r"line 2: expected row 1 of a 4x4 matrix \(four numbers\), got '1 0 0'"),
         (3, "1", "line 3: expected row 2"),
         (4, "0 0 one 0", "line 4: expected row 3 .* got '0 0 one 0'"),
         (4, "", "line 6: expected row 4 .* got '6 6 7'"),

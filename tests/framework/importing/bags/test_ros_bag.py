@@ -414,7 +414,7 @@ def test_ros_bag_realsense_accelerometer_gives_up_vector(tmp_path: Path) -> None
             {"frame_id": "unheard_of"},
             "/camera/imu: expected its rotation to the camera of /camera/color/image_raw in the bag",
         ),
-        ({"length": 0.0}, r"/camera/imu: expected a median of 9\.81 m/s\^2, got 3\.46 m/s\^2"),
+        ({"length": 0.0}, r"/camera/imu: expected a median acceleration of 9\.81 m/s\^2, got 3\.46 m/s\^2"),
         ({"late": 100.0}, r"/camera/imu: expected a measurement within 0\.05 s of a frame"),
     ],
 )

@@ -116,7 +116,7 @@ def test_stray_scanner_short_video_keeps_decoded_frames(folder: Path, tmp_path: 
         ("rgb.mp4", None, r"rgb\.mp4: expected a readable file"),
         ("rgb.mp4", b"#EXTM3U\nhttp://localhost/1.ts\n", r"rgb\.mp4: expected an MP4 or QuickTime file"),
         ("rgb.mp4", b"\0\0\0\x18ftypmp42" + bytes(200), r"rgb\.mp4: expected a video in a codec"),
-        ("odometry.csv", b"", r"odometry\.csv, line 1: expected timestamp, frame"),
+        ("odometry.csv", b"", r"odometry\.csv, line 1: expected columns timestamp, frame"),
         ("odometry.csv", b"1, 2, 3, 4\n", r"odometry\.csv, line 1: expected"),
         ("odometry.csv", b"timestamp, frame, x, y, z, qx, qy, qz, qw\n", "the recording has no frames"),
         ("camera_matrix.csv", b"1, 0, 2\n0, 1, 2\n", r"camera_matrix\.csv: expected 3 lines"),
