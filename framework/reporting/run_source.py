@@ -20,7 +20,7 @@ from framework.runs.metrics import TRUTH, truth_sha256
 from framework.runs.provenance import leaves
 
 MAX_WIDTH = 640  # px, of stored images
-MIN_CLARITY = 0.3  # a blurred image of an object is better than a distant view
+MIN_CLARITY = 0.3  # minimum clarity, because a blurred image of an object is better than a distant view
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class TruePath:
 
     @classmethod
     def of(cls, poses: Float64, true_positions: Mapping[int, Float64]) -> TruePath | None:
-        """Return the path of aligned ground-truth positions (3,), given by pose index; None for fewer than three."""
+        """Return the aligned path of ground-truth positions (3,), m, by pose index; None for fewer than three."""
         chosen = sorted(true_positions)
         if len(chosen) < 3:
             return None
@@ -139,6 +139,6 @@ class TruePath:
         try:
             R, t = umeyama(true, estimated)
         except np.linalg.LinAlgError as error:
-            raise DataError(f"ground truth: expected poses that match the trajectory, got {error}") from error
+            raise DataError(f"ground truth: expected poses alignable with the trajectory, got {error}") from error
         aligned = true @ R.T + t
         return cls(chosen, aligned, np.linalg.norm(aligned - estimated, axis=1))
