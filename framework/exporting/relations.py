@@ -73,8 +73,8 @@ class _Thing:
 
     id: int
     box: RoomObject
-    points: Float32  # (P, 3) m, P > 0
-    level: Bool  # (P,)
+    points: Float32  # (P, 3) m, in the room frame, P > 0
+    level: Bool  # (P,) True for points on upward-facing surfaces
 
     @cached_property
     def base(self) -> float:

@@ -26,7 +26,7 @@ class Door:
     """The opening between two rooms."""
 
     rooms: tuple[int, int]
-    place: Float64  # (2,) m, center
+    place: Float64  # (2,) m, center of the opening
     width: float  # m
 
 

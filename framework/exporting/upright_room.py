@@ -51,7 +51,7 @@ class RoomObject:
     confidence: float  # in [0, 1]
     probability: float | None  # of the class, in [0, 1]; None = unknown
     vertices: Int32  # (M,) indices into the room's mesh, M > 0, without small components
-    box: Box  # upright, room frame
+    box: Box  # upright, in the room frame
     color: UInt8  # (3,) sRGB, as in overview.png
     class_color: UInt8  # (3,) sRGB
 
@@ -70,12 +70,12 @@ class RoomObject:
 
     @property
     def base(self) -> float:
-        """Height of the lowest point, m."""
+        """Height of the lowest point, m, in the room frame."""
         return float(self.box.center[2] - self.box.extent[2] / 2)
 
     @property
     def top(self) -> float:
-        """Height of the highest point, m."""
+        """Height of the highest point, m, in the room frame."""
         return float(self.box.center[2] + self.box.extent[2] / 2)
 
 
@@ -83,7 +83,7 @@ class RoomObject:
 class UprightRoom:
     """The surface and objects of a stored run."""
 
-    mesh: InstanceMesh  # room frame; with the labels of all objects, including objects not in `objects`
+    mesh: InstanceMesh  # in the room frame, with the labels of all objects, including objects not in `objects`
     objects: tuple[RoomObject, ...]  # sorted by id
     poses: Float64  # (F, 4, 4) T_room_camera of the mapped frames
     T_room_world: Float64  # (4, 4)
@@ -246,7 +246,7 @@ def _hint(word: str, objects: Sequence[RoomObject]) -> str:
 class SurfacePoints:
     """P points on a room's surface, evenly spaced regardless of triangle sizes."""
 
-    points: Float32  # (P, 3) m, room
+    points: Float32  # (P, 3) m, in the room frame
     normal_z: Float32  # (P,) z component of the unit normal
     owner: Int32  # (P,) id of the object that contains the whole triangle, 0 = none
 

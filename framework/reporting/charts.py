@@ -71,7 +71,7 @@ class Footprint:
 class PlottedPath:
     """The path of one camera."""
 
-    positions: Float64  # (P, 3) m, world
+    positions: Float64  # (P, 3) m, in the world frame
     lost_after: Sequence[int] = ()  # indices of the last positions before tracking was lost
     color: str = "accent"  # of COLORS
     width: float = 2.0  # px

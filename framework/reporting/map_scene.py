@@ -49,7 +49,7 @@ class MapScene:
     mesh: InstanceMesh  # decimated; the front sides of its triangles face the cameras
     surface: Surface  # of the mesh
     sightings: Sightings
-    up: Float64  # (3,)
+    up: Float64  # (3,) unit vector in the world frame
 
     @classmethod
     def of(cls, contents: RunContents, footage: Footage, fraction: float = 1.0) -> MapScene | None:

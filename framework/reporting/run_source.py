@@ -99,7 +99,7 @@ class Footage:
     camera: Camera  # of the images
     images: Mapping[int, UInt8]  # (H, W, 3) RGB
     frames: Mapping[int, int]  # frame numbers in the sequence
-    true_positions: Mapping[int, Float64]  # (3,) m, of frames with a ground-truth pose
+    true_positions: Mapping[int, Float64]  # (3,) m, ground-truth positions of frames with a ground-truth pose
     clarity: Mapping[int, float]  # in [MIN_CLARITY, 1], 1 = at least as sharp as the median
 
     @classmethod
@@ -126,7 +126,7 @@ class TruePath:
     """The ground-truth camera path, aligned rigidly with the trajectory as for the ATE."""
 
     chosen: list[int]  # indices of n poses of the trajectory
-    positions: Float64  # (n, 3) m
+    positions: Float64  # (n, 3) m, in the world frame of the map
     errors: Float64  # (n,) m, distances to the positions of the trajectory
 
     @classmethod

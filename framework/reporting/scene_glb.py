@@ -29,7 +29,7 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
         mesh: Mesh of the map.
         first_seen: (V,) in [0, 1], fraction of the sequence before the first view of each vertex.
         names: Class by id, for the objects with a node.
-        up: (3,) unit vector, world.
+        up: (3,) unit vector in the world frame.
     """
     labels = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
     of_triangle = triangle_labels(mesh.triangles, labels)

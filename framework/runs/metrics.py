@@ -72,7 +72,7 @@ def trajectory_metrics(result: RunResult) -> Metrics:
 
 
 def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
-    """Return the up direction, its source and the floor height; empty if the up direction is unknown."""
+    """Return the up direction, its source and the floor height, m; empty if the up direction is unknown."""
     gravity = scene.gravity()
     up = gravity.up
     if up is None:

@@ -65,7 +65,7 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
         values = _values(override)
         runs[override.get_key_element()] = len(values) or GLOB_COUNT
         if not values and override.value_type in COUNTED:
-            raise ConfigError(f"{override.input_line}: expected at least one value for the sweep, got none")
+            raise ConfigError(f"{override.input_line}: expected at least one value, got none")
         if override.key_or_group == "row" and rows:
             check_row(values, rows)
     return prod(runs.values())

@@ -93,7 +93,7 @@ def test_class_probabilities_are_written_with_float32_digits(tmp_path: Path) -> 
         ([ENTRY | {"class": 7}], "entry 1: class: expected a name or null, got 7"),
         (
             [{key: ENTRY[key] for key in ENTRY if key != "class"}],
-            "entry 1: class: expected a name or null, got 'no cla",
+            "entry 1: class: expected a name or null, got no class",
         ),
         ([ENTRY | {"confidence": 1.5}], r"entry 1: confidence: expected a number in \[0, 1\], got 1\.5"),
         ([ENTRY | {"confidence": float("nan")}], "entry 1: confidence"),

@@ -86,7 +86,7 @@ def test_new_plugin_failure_keeps_existing_files(tmp_path: Path, monkeypatch: py
     with pytest.raises(ConfigError, match="expected a new folder"):
         write_repository("refiner", "mine", tmp_path)
     assert (made / "README.md").read_text() == "my own"
-    with pytest.raises(ConfigError, match="--in: expected a folder"):
+    with pytest.raises(ConfigError, match="--in: expected an existing folder"):
         write_repository("refiner", "other", tmp_path / "nowhere")
     (tmp_path / "instancemap-linked").symlink_to(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match="expected a new folder"):
