@@ -1,4 +1,4 @@
-"""Error handling of commands: one line on stderr and an exit status; a traceback only with `debug=true`."""
+"""Arguments and errors of commands. An error gives one line on stderr and an exit status; `debug=true` a traceback."""
 
 from __future__ import annotations
 

@@ -15,12 +15,12 @@ from scipy.spatial import cKDTree
 from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, Int64
 
 OBJECTS_FRACTION = 0.5  # fraction of the triangles for objects
-MIN_TRIANGLES = 4  # minimum triangles of a closed surface
-QUADRIC_STEP = 2.5  # maximum ratio of triangles for quadric decimation alone, which takes quadratic time in the ratio
-LEFT_TO_QUADRIC = 1.8  # ratio of triangles after clustering and after quadric decimation
-MIN_CLUSTERED = 20_000  # minimum triangles after clustering; for fewer triangles, cells would be as large as objects
-RELIEF = 0.03  # m, offset between white and black vertices
-BRIGHTNESS = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R BT.601
+MIN_TRIANGLES = 4  # minimum number of triangles of a closed surface
+QUADRIC_STEP = 2.5  # maximum reduction by quadric decimation alone, as a factor; its time is quadratic in the factor
+LEFT_TO_QUADRIC = 1.8  # ratio of the triangles after clustering to the triangles after quadric decimation
+MIN_CLUSTERED = 20_000  # minimum number of triangles after clustering; with fewer, cells would be as large as objects
+RELIEF = 0.03  # m, offset of white vertices relative to black vertices along the normal
+BRIGHTNESS = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue, ITU-R BT.601
 COARSER = 1.3  # ratio of successive cell sizes
 
 
@@ -43,10 +43,9 @@ def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Return the decimated mesh, with finer objects than background.
+    """Return the decimated mesh, in which objects are finer than the background.
 
-    Objects and background are decimated separately to preserve their border. Vertices outside objects lose their
-    labels.
+    Objects and background are decimated separately to preserve their border. Vertices outside objects get the label 0.
     """
     owners = triangle_labels(mesh.triangles, mesh.instance_ids)
     of_object = owners > 0
@@ -62,9 +61,9 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_of_triangle: int) -> InstanceMesh:
-    """Return the mesh with clustered vertices, of at most `most_bytes`.
+    """Return the mesh, with vertices clustered until it has at most `most_bytes` bytes.
 
-    Unlike edge collapse, clustering also reduces triangles without a common edge.
+    Unlike edge collapse, clustering also merges triangles without a common edge.
     """
     cell = 0.5 * _cell(mesh, max(1, len(mesh.triangles)))
     while bytes_of_vertex * len(mesh.vertices) + bytes_of_triangle * len(mesh.triangles) > most_bytes:
@@ -103,7 +102,7 @@ def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def _cell(mesh: InstanceMesh, count: int) -> float:
-    """Return the cell size, m, for about `count` triangles: two triangles per square of the surface."""
+    """Return the cell size, m, for about `count` triangles: two triangles per square cell of the surface."""
     a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
     return max(float(np.sqrt(2 * area / count)), 1e-4)
@@ -141,7 +140,7 @@ def _nearest(places: Float32 | Float64, queries: Float32 | Float64) -> Int64:
 
 
 def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
-    """Return the mesh of the vertices (V,) and triangles (F,) in the masks; None = all triangles between them."""
+    """Return the mesh of the vertices in `kept` (V,) and of `triangles` (F,); None = all triangles between them."""
     number = np.cumsum(kept, dtype=np.int32) - 1
     chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
     return InstanceMesh(

@@ -54,11 +54,11 @@ class Chosen:
 
     objects: Sequence[str] = ()  # ids or classes; () = the whole room
     min_confidence: float = LIKELY  # minimum confidence of an object, in [0, 1]; LIKELY = as in figures
-    triangles: int | None = None  # maximum triangles of the scene and of each object file, >= 4; None = no limit
+    triangles: int | None = None  # maximum triangle count of the scene and of each object file, >= 4; None = no limit
     coloring: Coloring = Coloring.APPEARANCE
     collision: Collision = Collision.HULL
     resolution: float = 0.05  # cell size of a plan, m, in [0.01, 1]
-    robot_height: float = 1.0  # clearance of free space, m, in [0.1, 3]
+    robot_height: float = 1.0  # minimum height of observed empty space above a free cell, m, in [0.1, 3]
 
     def __post_init__(self) -> None:
         for name, low, high in (("min_confidence", 0.0, 1.0), ("resolution", 0.01, 1.0), ("robot_height", 0.1, 3.0)):
@@ -86,7 +86,7 @@ Option = TypeVar("Option", bound=Enum)
 
 
 def one_of(kind: type[Option], name: str, value: object) -> Option:
-    """Return the enumeration member with this value. Raises ConfigError that lists all values."""
+    """Return the enumeration member with this value. Raises ConfigError with a list of all values."""
     found = next((option for option in kind if option.value == value), None)
     if found is None:
         known = ", ".join(option.value for option in kind)

@@ -36,12 +36,12 @@ TINT = 0.6  # fraction of the object's color in its cells
 DARKER = 0.65  # brightness factor of outlines
 LONGER_SIDE, SHORTEST_SIDE = 9.0, 4.5  # of the plan, inches
 FOOT = 0.72  # height of the legend, inches
-EDGE = 0.15  # inches
+EDGE = 0.15  # margin of the page, inches
 TEXT_PT, SMALL_PT = 8.0, 7.0
 BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # possible lengths of the scale bar, m
 MAX_BAR_FRACTION = 0.25  # maximum length of the scale bar, as a fraction of the plan's width
 MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1), (-0.6, -1))
-"""Candidate offsets of a name, in its own widths and heights."""
+"""Candidate offsets of a name, as multiples of its width and height."""
 COORDINATES = "x, y in meters in the room frame (z up, floor at z = 0), not longitude and latitude"
 DIGITS = 4  # decimal places, of meters
 
@@ -186,7 +186,7 @@ def write_geojson(path: Path, room: UprightRoom) -> None:
 
 
 def outline(room: UprightRoom, one: RoomObject) -> Float64:
-    """Return the counterclockwise outline (N, 2) m of an object on the floor: its convex hull, or its box if flat."""
+    """Return the counterclockwise outline (N, 2) m of an object in top view: its convex hull, or its box if flat."""
     points = room.mesh.vertices[one.vertices, :2]
     hull = cv2.convexHull(np.ascontiguousarray(points), clockwise=False)[:, 0].astype(np.float64)
     return hull if len(hull) >= 3 else one.footprint

@@ -1,7 +1,7 @@
 """Binary glTF 2.0: one node per object, with its data in `extras`, and one node for the rest of the room.
 
-y is up. Colors are linear. Appearance is unlit (KHR_materials_unlit), because image colors already contain the light.
-Instance and class colors are lit. The rest of the room is one-sided: its inside is visible from outside.
+y is up. Colors are linear. Appearance is unlit (KHR_materials_unlit), because image colors already contain the
+lighting. Instance and class colors are lit. The rest of the room is one-sided, so its inside is visible from outside.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from framework.exporting.object_meshes import Coloring, Part, linear, part_color
 from framework.rendering.surface import Surface
 
 T_GLTF_ROOM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-COLOR = "_LINEAR"  # attribute for trimesh: its own 8-bit colors are too coarse for dark linear colors
+COLOR = "_LINEAR"  # color attribute, because the 8-bit colors of trimesh are too coarse for dark linear colors
 UNLIT = "KHR_materials_unlit"
 UNSIGNED_SHORT = 5123
 
@@ -68,7 +68,7 @@ def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
 
 
 def _node(part: Part, colors: UInt8) -> Node:
-    """Return a part as a node; the node's own frame is also y up."""
+    """Return a part as a node. In the node's own frame, y is also up."""
     vertices = (part.mesh.vertices @ T_GLTF_ROOM[:3, :3].T).astype(np.float32)
     T_gltf_part = T_GLTF_ROOM @ part.T_room_part @ T_GLTF_ROOM.T
     return Node(part.name, vertices, part.mesh.triangles, colors, T_gltf_part, part.object is None, extras(part))

@@ -88,13 +88,13 @@ def _decimated(found: Sequence[Part], most: Sequence[int]) -> list[Part]:
     return fewer
 
 
-GRAY = (176, 176, 172)  # of the rest of the room
+GRAY = (176, 176, 172)  # color of the rest of the room, sRGB
 
 
 class Coloring(Enum):
     """The coloring of vertices."""
 
-    APPEARANCE = "appearance"  # of the camera images
+    APPEARANCE = "appearance"  # colors of the camera images
     INSTANCE = "instance"
     CLASS = "class"
 

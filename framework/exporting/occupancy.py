@@ -7,9 +7,9 @@ along the whole trajectory. A cell is free if
 - no surface is between `CLEARANCE` and the robot's height,
 - all space between these heights was observed as free.
 
-A cell with a surface between these heights is occupied. All other cells are unknown. A run does not contain the
-camera's field of view; the field of view of a Kinect is used (`queries.changes.EYE`). Depth cameras do not observe
-glass and mirrors, which may be classified as free.
+A cell with a surface between these heights is occupied. All other cells are unknown. A run does not store the field of
+view of its camera, so that of a Kinect is used (`queries.changes.EYE`). Depth cameras do not observe glass and mirrors,
+which may therefore be classified as free.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LEVEL_STEP = 0.1  # vertical sampling of free space, m
 SLACK = 0.03  # minimum distance of a surface behind free space, m
 FARTHEST = 5.0  # range of the camera, m: the default of fuser.max_depth
 WALL_SPAN = 1.0  # minimum height of a wall, m
-MAX_CELLS = 2**24  # maximum cells of a plan
+MAX_CELLS = 2**24  # maximum number of cells of a plan
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
     columns, rows = (np.floor((high - origin) / resolution) + 2).astype(np.int64).tolist()
     if rows * columns > MAX_CELLS:
         cells = f"{columns} x {rows} cells of {resolution:g} m"
-        raise DataError(f"plan: expected at most {MAX_CELLS} cells, got {cells}; increase resolution")
+        raise DataError(f"plan: expected at most {MAX_CELLS} cells, got {cells}; increase resolution (cell size)")
     column, row = np.floor((found.points[:, :2] - origin) / resolution).astype(np.int64).T
     number = row * columns + column  # (P,) cell of each point
     heights = found.points[:, 2]
@@ -126,7 +126,7 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
 
 
 def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
-    """Return the mask (cells,) of cells with at least WALL_SPAN of upright surface outside of objects."""
+    """Return the mask (cells,) of cells where vertical surfaces outside of objects have at least WALL_SPAN height."""
     chosen = found.upright & (found.owner == 0)
     step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)
     lowest, highest = step.min(initial=0), step.max(initial=0)

@@ -19,7 +19,7 @@ from framework.data import Bool, Float32, Float64, Int64
 from framework.exporting.occupancy import Plan
 from framework.exporting.upright_room import RoomObject, UprightRoom, surface_points
 
-SPACING = 0.02  # of surface points, m
+SPACING = 0.02  # spacing of surface points, m
 CELL = 0.03  # cell size of footprints, m
 TOUCHING = 0.05  # maximum distance of a base from its support, m: depth is noisy at edges
 ON_FLOOR = 0.10  # maximum height of the observed part of an object above the floor, m; thin legs are incomplete
@@ -28,12 +28,12 @@ AROUND = 2  # width of the ring around a foot, cells
 COVERED = 0.35  # minimum fraction of the ring with a level surface at the base
 STACKED = 0.5  # minimum fraction of the foot above the support
 WITHIN = 0.9  # minimum fraction of a surface in the box of its container
-SECTORS = 36  # number of directions around an object; the legs of a table fill few
+SECTORS = 36  # number of sectors around an object; the legs of a table fill only a few
 ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in a bowl, and on a covered shelf
-MAX_NEIGHBOR_DISTANCE = 0.3  # m
+MAX_NEIGHBOR_DISTANCE = 0.3  # maximum distance of neighbors, m
 ON_WALL = 0.10  # maximum distance from a wall, m
 HANGING = 0.7  # minimum fraction of points near a wall
-STRAY = 2.0  # %, noise fraction of a surface at its lower and upper end
+STRAY = 2.0  # %, points ignored as noise at the lower and at the upper end of a surface
 MAX_POINTS = 3000  # maximum number of points of an object for distances
 
 
@@ -44,7 +44,7 @@ class Relation:
     source: int
     name: str  # "on", "in", "next_to", "attached_to"
     target: int | str
-    measures: Mapping[str, float] = field(default_factory=dict)  # m
+    measures: Mapping[str, float] = field(default_factory=dict)  # "height" or "distance", m
 
 
 def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:
@@ -73,8 +73,8 @@ class _Thing:
 
     id: int
     box: RoomObject
-    points: Float32  # (P, 3) m, P > 0
-    level: Bool  # (P,)
+    points: Float32  # (P, 3) m, in the room frame, P > 0
+    level: Bool  # (P,) True for points on upward-facing surfaces
 
     @cached_property
     def base(self) -> float:
@@ -155,7 +155,10 @@ def _is_in(inner: _Thing, outer: _Thing) -> bool:
 
 
 def _gap(a: _Thing, b: _Thing) -> float:
-    """Return the distance of two surfaces, m; infinite for disjoint heights or more than MAX_NEIGHBOR_DISTANCE."""
+    """Return the distance between two surfaces, m.
+
+    The distance is infinite if their height ranges are disjoint or if it exceeds MAX_NEIGHBOR_DISTANCE.
+    """
     if min(a.top, b.top) < max(a.base, b.base):
         return float("inf")
     fewer, more = sorted((a, b), key=lambda thing: thing.tree.n)

@@ -16,7 +16,7 @@ from scipy import ndimage
 from framework.data import Bool, Float64, Int32
 from framework.exporting.occupancy import Plan
 
-DOOR = 1.0  # m, maximum width of an opening between rooms; most doors have 0.7 to 0.95 m
+DOOR = 1.0  # m, maximum width of an opening between rooms; most doors are 0.7 to 0.95 m wide
 GAP = 0.3  # maximum width of filled gaps, m
 MIN_INSIDE = 0.5  # minimum interior area of a room, m^2
 
@@ -26,7 +26,7 @@ class Door:
     """The opening between two rooms."""
 
     rooms: tuple[int, int]
-    place: Float64  # (2,) m, center
+    place: Float64  # (2,) m, center of the opening
     width: float  # m
 
 
@@ -51,7 +51,7 @@ class Rooms:
         return _place(self.plan, self.labels == room)
 
     def of(self, xy: Float64) -> int:
-        """Return the nearest room to most of the points (P, 2) m, P > 0; 0 = no rooms."""
+        """Return the room that is nearest to most of the points (P, 2) m, P > 0; 0 = no rooms."""
         if not self.count:
             return 0
         nearest = ndimage.distance_transform_edt(self.labels == 0, return_distances=False, return_indices=True)
@@ -82,7 +82,7 @@ def rooms(plan: Plan) -> Rooms:
 
 
 def _grown(labels: Int32, domain: Bool) -> Int32:
-    """Return the labels (H, W), grown over the domain (H, W) cell by cell until they meet."""
+    """Return the labels (H, W) after growing them over the domain (H, W), cell by cell, until they meet."""
     cross = ndimage.generate_binary_structure(2, 1)
     while True:
         spread = np.where((labels == 0) & domain, ndimage.maximum_filter(labels, footprint=cross), labels)

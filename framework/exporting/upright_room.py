@@ -32,11 +32,11 @@ from framework.runs.run_directory import LIKELY
 from framework.runs.stored_map import read_labeled_mesh
 from framework.runs.stored_runs import INSTANCES, MESH, TRAJECTORY, read_metrics
 
-LONGEST_NAME = 60  # maximum characters of a class in names of files and nodes
+LONGEST_NAME = 60  # maximum number of characters of a class in names of files and nodes
 UP = np.array([0.0, 0.0, 1.0])
 HIGHEST = 1e4  # maximum absolute floor height, m; vertices are float32
 SPECK = 0.01  # maximum fraction of vertices in removed components; components at depth edges would enlarge the box
-MAX_POINTS = 2**24  # maximum points of a room; 100 m^2 of surface have 4 million points at 1 cm voxels
+MAX_POINTS = 2**24  # maximum number of points of a room; 100 m^2 of surface have 4 million points at 1 cm voxels
 LEVEL = float(np.cos(np.radians(30.0)))  # minimum z of the normal of a supporting surface
 UPRIGHT = float(np.sin(np.radians(20.0)))  # maximum |z| of the normal of a wall
 SHORTEST_UP = 1e-6  # minimum length of an up direction
@@ -51,7 +51,7 @@ class RoomObject:
     confidence: float  # in [0, 1]
     probability: float | None  # of the class, in [0, 1]; None = unknown
     vertices: Int32  # (M,) indices into the room's mesh, M > 0, without small components
-    box: Box  # upright, room frame
+    box: Box  # upright, in the room frame
     color: UInt8  # (3,) sRGB, as in overview.png
     class_color: UInt8  # (3,) sRGB
 
@@ -70,12 +70,12 @@ class RoomObject:
 
     @property
     def base(self) -> float:
-        """Height of the lowest point, m."""
+        """Height of the lowest point, m, in the room frame."""
         return float(self.box.center[2] - self.box.extent[2] / 2)
 
     @property
     def top(self) -> float:
-        """Height of the highest point, m."""
+        """Height of the highest point, m, in the room frame."""
         return float(self.box.center[2] + self.box.extent[2] / 2)
 
 
@@ -83,7 +83,7 @@ class RoomObject:
 class UprightRoom:
     """The surface and objects of a stored run."""
 
-    mesh: InstanceMesh  # room frame; with the labels of all objects, including objects not in `objects`
+    mesh: InstanceMesh  # in the room frame, with the labels of all objects, including objects not in `objects`
     objects: tuple[RoomObject, ...]  # sorted by id
     poses: Float64  # (F, 4, 4) T_room_camera of the mapped frames
     T_room_world: Float64  # (4, 4)
@@ -112,7 +112,8 @@ class UprightRoom:
             if not by_id and not of_class:
                 best = max(one.confidence for one in by_class)
                 raise DataError(
-                    f"object: expected a confidence >= {min_confidence:g} of {word!r}, got at most {best:.2f}"
+                    f"object: expected a confidence >= {min_confidence:g} of {word!r}, got at most {best:.2f}; "
+                    "lower the minimum confidence"
                 )
             found |= {one.id: one for one in (*by_id, *of_class)}
         return replace(self, objects=tuple(found[key] for key in sorted(found)))
@@ -206,7 +207,7 @@ def facing(box: Box) -> Box:
 
 
 def upright(up: Float64, floor: float) -> Float64:
-    """Return T_room_world (4, 4): rotates the unit vector `up` to z by the smallest angle, and moves `floor` m to 0."""
+    """Return the T_room_world (4, 4) that rotates `up` (unit) to z by the smallest angle and moves `floor` (m) to 0."""
     T = np.eye(4)
     across, cosine = skew(np.cross(up, UP)), float(up @ UP)
     T[:3, :3] += across + across @ across / (1 + cosine) if cosine > -1 + 1e-9 else np.diag([0.0, -2.0, -2.0])
@@ -229,7 +230,7 @@ def _unit(name: str, values: Sequence[Any]) -> Float64:
     vector = np.array(values, np.float64)
     length = float(np.linalg.norm(vector))
     if vector.shape != (3,) or not np.isfinite(vector).all() or length < SHORTEST_UP:
-        raise DataError(f"{name}: expected a direction of 3 numbers, got {values!r:.60}")
+        raise DataError(f"{name}: expected a direction of 3 numbers (finite, not all 0), got {values!r:.60}")
     return vector / length
 
 
@@ -245,9 +246,9 @@ def _hint(word: str, objects: Sequence[RoomObject]) -> str:
 class SurfacePoints:
     """P points on a room's surface, evenly spaced regardless of triangle sizes."""
 
-    points: Float32  # (P, 3) m, room
+    points: Float32  # (P, 3) m, in the room frame
     normal_z: Float32  # (P,) z component of the unit normal
-    owner: Int32  # (P,) id of the object with the whole triangle, 0 = none
+    owner: Int32  # (P,) id of the object that contains the whole triangle, 0 = none
 
     @property
     def level(self) -> Bool:
@@ -272,7 +273,7 @@ def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
     if float((cuts**2).sum()) > MAX_POINTS:
         raise DataError(
             f"surface: expected at most {MAX_POINTS} points at a spacing of {spacing:g} m, got "
-            f"{float((cuts**2).sum()):.0f}; increase resolution, or map with larger voxels"
+            f"{float((cuts**2).sum()):.0f}; increase resolution (cell size), or map with larger voxels"
         )
     normals = room.surface.face_normals
     normal_z = (normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-20)).astype(np.float32)

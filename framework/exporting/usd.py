@@ -39,7 +39,7 @@ class Collision(Enum):
 
 
 def check_usd() -> None:
-    """Raise DataError that names the extra if USD is not installed."""
+    """Raise DataError with the installation command if USD is not installed."""
     try:
         import pxr  # noqa: F401
     except ImportError as error:

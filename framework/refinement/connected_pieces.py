@@ -1,7 +1,7 @@
 """Connected components of a cluster, in the image and in depth.
 
-OpenCV and SciPy label binary images: they ignore depth and connect only adjacent pixels. A graph of all near pairs
-takes 12 edges per point.
+A custom kernel is used, because OpenCV and SciPy label binary images: they ignore depth and connect only adjacent
+pixels. A graph over all pairs of nearby pixels would have 12 edges per point.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LARGEST_ONLY = 2.0  # min_ratio that only the largest component satisfies
 def in_largest_piece(clusters: PointClusters, frame: Frame, connection: Connection) -> Bool:
     """Return an array (P,), True for points in the largest connected component of their cluster.
 
-    Ties go to the first component in the image. Points of no cluster are True.
+    Ties go to the component that starts first in row order. Points that belong to no cluster are True.
     """
     return in_near_pieces(clusters, frame, connection, min_ratio=LARGEST_ONLY, max_slope=0.0)
 
@@ -28,9 +28,10 @@ def in_near_pieces(
 ) -> Bool:
     """Return an array (P,), True for points in the largest component of their cluster or a component at similar depth.
 
-    Candidates are components with at least `min_ratio` times the points of the largest component, in order of size. A
+    Candidates are components with at least `min_ratio` times the points of the largest component, largest first. A
     candidate is kept if most of its points agree in depth with the nearest kept point. The allowed difference is the
-    gap plus `max_slope` (m per m) times the lateral distance. Large components are sampled.
+    gap of `connection` plus `max_slope` (m per m) times the lateral distance. Large components are subsampled. Points
+    that belong to no cluster are True.
     """
     order, firsts = members(clusters)
     stays = np.empty(firsts[-1], np.bool_)

@@ -12,15 +12,15 @@ from framework.refinement.neighborhood_kernels import ThreadSchedule, bounding_b
 from framework.refinement.segmentation.union_find import root, unite
 
 CHUNK = 512  # number of cells compared at once
-CANDIDATE_SAMPLES, KEPT_SAMPLES = 32, 256  # samples of a candidate and of each kept component
+CANDIDATE_SAMPLES, KEPT_SAMPLES = 32, 256  # maximum number of samples of a candidate and of each kept component
 
 
 class Connection(NamedTuple):
-    """The largest distance between connected points."""
+    """Limits of the distance between connected points."""
 
     gap: np.float32  # maximum depth difference at depth 0, m
-    gap_per_depth: np.float32  # increase of the difference with the depth of the nearer point, m per m
-    radius: int  # maximum pixel distance, px
+    gap_per_depth: np.float32  # increase of the maximum difference with the depth of the nearer point, m per m
+    radius: int  # maximum offset along u and along v, px
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -28,7 +28,7 @@ def find_pieces(
     pixels: Int32, firsts: Int64, depth: Float32, connection: Connection, min_ratio: np.float32, max_slope: np.float32,
     schedule: ThreadSchedule, stays: Bool,
 ) -> None:  # fmt: skip
-    """Set `stays` (M,) to True for the points that `in_near_pieces` keeps; `max_slope` is per pixel."""
+    """Set `stays` (M,) to True for the points that `in_near_pieces` keeps; `max_slope` is its slope over fx, 1/px."""
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
             if firsts[k + 1] > firsts[k]:
@@ -84,7 +84,7 @@ def _keep_near(
     pixels: Int32, piece: Int32, sizes: Int32, largest: int, min_ratio: np.float32, depth: Float32,
     connection: Connection, max_slope: np.float32, stays: Bool,
 ) -> None:  # fmt: skip
-    """Mark the components at a depth similar to the kept components, larger components first."""
+    """Mark each component whose depth is similar to that of the kept components, largest first."""
     least = min_ratio * np.float32(sizes[largest])
     candidates, waiting, count = np.empty(len(sizes), np.int64), np.zeros(len(sizes), np.bool_), 0
     for other in range(len(sizes)):
@@ -106,7 +106,7 @@ def _keep_near(
 
 @njit(cache=True, nogil=True)
 def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
-    """Return the largest waiting component; ties go to the first. A scan, because np.argsort compiles slowly."""
+    """Return the largest waiting component; ties go to the first. A scan avoids np.argsort, which compiles slowly."""
     largest = -1
     for piece in pieces:
         if waiting[piece] and (largest < 0 or sizes[piece] > sizes[largest]):
@@ -156,7 +156,7 @@ def _name_by_roots(parents: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _find_runs(readings: Float32, connection: Connection, runs: Int32, parents: Int32, sizes: Int32) -> int:
-    """Label the runs from 1 as separate components, 0 for empty cells; return the number of labels."""
+    """Label each run as a separate component from 1 on, and empty cells as 0; return the number of labels with 0."""
     run, begin = 0, 0
     parents[0], sizes[0] = 0, 0
     previous = np.float32(np.nan)
@@ -181,7 +181,7 @@ def _connected(a: np.float32, b: np.float32, connection: Connection) -> bool:
 def _unite_near(
     readings: Float32, runs: Int32, cells: int, offset: int, connection: Connection, parents: Int32
 ) -> None:
-    """Unite the runs of all cells at distance `offset` that are connected in depth."""
+    """Unite the runs of each cell and the cell `offset` cells after it, if they are connected in depth."""
     for begin in range(0, cells, CHUNK):
         end = min(begin + CHUNK, cells)
         here, there = slice(begin, end), slice(begin + offset, end + offset)
@@ -193,7 +193,7 @@ def _unite_near_of(
     z: Float32, z_there: Float32, runs: Int32, runs_there: Int32, connection: Connection, parents: Int32
 ) -> None:
     apart = False
-    for i in range(len(z)):  # vectorized, because usually all connected cells are already united
+    for i in range(len(z)):  # vectorized check: usually all connected cells are already united
         apart |= _connected(z[i], z_there[i], connection) & (runs[i] != runs_there[i])
     if not apart:
         return

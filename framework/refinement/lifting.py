@@ -12,10 +12,11 @@ from framework.refinement.lifting_kernels import count_readings, gather_readings
 
 
 def lift(detections: Detections, frame: Frame, pose: Pose, color_pixels: Int32 | None = None) -> PointClusters:
-    """Return each mask's pixels with a depth reading as points in the world frame.
+    """Return the depth readings in each mask as points, m, in the world frame.
 
-    `color_pixels` (H, W) is the flat index of the color pixel at each depth reading, -1 = none; None = the same pixel.
-    It does not apply to exact masks of the depth image.
+    `color_pixels` (H, W) has the flat index of the color pixel for each depth reading, -1 = none. With None, color and
+    depth have the same pixels. `color_pixels` is not applied to exact masks of the depth image.
+
     Masks may overlap. A mask without depth readings gives an empty cluster, so that cluster k is detection k. Raises
     DataError if the mask size differs from the frame size or if `detections` has another type.
     """
@@ -23,7 +24,9 @@ def lift(detections: Detections, frame: Frame, pose: Pose, color_pixels: Int32 |
         raise DataError(f"frame {frame.index}: expected Detections from the detector, got {type(detections).__name__}")
     height, width = frame.depth.shape
     if detections.masks.shape[1:] != (height, width):
-        raise DataError(f"frame {frame.index}: expected masks of {(height, width)}, got {detections.masks.shape[1:]}")
+        raise DataError(
+            f"frame {frame.index}: expected masks of shape {(height, width)}, got {detections.masks.shape[1:]}"
+        )
     masks = detections.masks
     of_depth = detections.exact and frame.truth is not None and frame.truth.of_depth
     if color_pixels is not None and not of_depth:

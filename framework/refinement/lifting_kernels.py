@@ -9,7 +9,7 @@ from framework.data import Bool, Float32, Float64, Int32, Int64
 
 @njit(cache=True, nogil=True, parallel=True)
 def move_masks(masks: Bool, color_pixels: Int32, moved: Bool) -> None:
-    """Set moved (N, H, W) to the masks (N, H, W) at the flat indices color_pixels (H, W), False for -1."""
+    """Set moved (N, H, W) to the values of masks (N, H, W) at the flat indices color_pixels (H, W); False at -1."""
     count, height, width = masks.shape
     for v in prange(height):
         for k in range(count):
@@ -36,7 +36,7 @@ def gather_readings(
     masks: Bool, depth: Float32, camera: tuple[float, float, float, float], T: Float64, starts: Int64,
     points_world: Float32, pixels: Int32, cluster: Int32,
 ) -> None:  # fmt: skip
-    """Set points_world (P, 3), pixels (P, 2) and cluster (P,) by row of each mask; T is T_world_camera."""
+    """Set points_world (P, 3) m, pixels (P, 2) (u, v) and cluster (P,) by row of each mask; T is T_world_camera."""
     height = depth.shape[0]
     fx, fy, cx, cy = camera
     for row in prange(masks.shape[0] * height):

@@ -1,7 +1,7 @@
 """Points of each mask and of a ring around it, which shows the object's surroundings.
 
-A custom kernel computes distances to a mask's border. OpenCV's distance transform would pass over each mask twice, for
-the inside and the outside.
+A custom kernel computes the distances to a mask's border. OpenCV's distance transform would need two passes over each
+mask, one for the inside and one for the outside.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class Neighborhoods:
     """
 
     points_camera: Float32  # (S, 3) m
-    depth_in_mask: Float32  # (S,) px to the mask's border, positive inside, negative in the ring
+    depth_in_mask: Float32  # (S,) distance to the mask's border, px, positive in the mask, negative in the ring
     starts: Int64  # (N + 1,)
     mask_counts: Int64  # (N,)
     ring_widths: Int64  # (N,) px
-    mask_radii: Float32  # (N,) px, largest depth in the mask; 0 for an empty cluster
+    mask_radii: Float32  # (N,) largest `depth_in_mask` of the mask, px; 0 for an empty cluster
 
     def __len__(self) -> int:
         return len(self.mask_counts)
@@ -60,7 +60,7 @@ class Neighborhoods:
         """Return the log-odds (S,) of each point for the object: `largest` deep in the mask, -`largest` far outside.
 
         The linear ramp in between is 0 at `expected_bleed` ring widths inside the mask's border. It ends 1 - 2
-        `expected_bleed` ring widths outside the border. A thin mask gets a shorter ramp, so that its center has
+        `expected_bleed` ring widths outside the border. A thin mask gets a shorter ramp, so that its center gets
         `largest`.
         """
         reach = np.maximum(np.minimum(self.ring_widths, self.mask_radii), 1).astype(np.float32)
@@ -107,7 +107,7 @@ class Surroundings:
         """Return an array (P,), True for the points of the PointClusters to keep.
 
         Clusters in `judged` (N,) keep the points of `own` that are `good` (M,). Points of other clusters and of no
-        cluster stay.
+        cluster are kept.
         """
         kept = np.ones(len(self.clusters.cluster), np.bool_)
         kept[self.order] = good | np.repeat(~judged, self.mask_counts)
@@ -180,7 +180,7 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
 
 
 def thread_schedule(costs: Int64) -> ThreadSchedule:
-    """Return the clusters of each thread: costliest first, to the thread with the least work (Graham 1969).
+    """Return the clusters of each thread, assigned costliest first to the thread with the least work (Graham 1969).
 
     Numba splits a parallel loop into parts of equal length, but a few large clusters contain most of the points.
     """
@@ -189,5 +189,5 @@ def thread_schedule(costs: Int64) -> ThreadSchedule:
 
 
 def pinhole(camera: Camera) -> Float32:
-    """Return fx, fy, cx, cy (4,) for kernels, in the precision of geometry.back_project."""
+    """Return fx, fy, cx, cy (4,), px, for kernels, in the precision of geometry.back_project."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)

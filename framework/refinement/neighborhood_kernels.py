@@ -19,7 +19,7 @@ PX_PER_STEP = np.float32(1) / np.float32(CHAMFER_STEP)
 
 
 class Windows(NamedTuple):
-    """Pixels of N clusters, and the image windows of each cluster with its ring."""
+    """Pixels of N clusters, and the image window of each cluster with its ring."""
 
     pixels: Int32  # (M, 2) (u, v), cluster by cluster
     firsts: Int64  # (N + 1,) start of each cluster in `pixels`
@@ -105,11 +105,11 @@ def signed_distances(
     windows: Windows, widths: Int64, depth: Float32, schedule: ThreadSchedule, steps: Int16, ring_counts: Int64,
     radii: Float32,
 ) -> None:  # fmt: skip
-    """Set each pixel's signed distance in steps (cells,), the number of readings in each ring, and the masks' radii.
+    """Set each pixel's signed distance `steps` (cells,), the number of readings in each ring, and the masks' radii, px.
 
-    Distances are in thirds of a pixel: above 0 in the mask, to the next reading outside; below 0 in the ring, to the
-    mask; 0 elsewhere. Pixels without a reading are not a border of the mask, because objects often have holes in the
-    depth.
+    Distances are in thirds of a pixel. They are above 0 in the mask (to the nearest reading outside), below 0 in the
+    ring (to the mask), and 0 elsewhere. Pixels without a reading are not a border of the mask, because the depth of
+    objects often has holes.
     """
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
@@ -125,11 +125,11 @@ def signed_distances(
 def _signed_distances_of(
     pixels: Int32, ring: np.int16, bounds: Int64, depth: Float32, steps: Int16
 ) -> tuple[int, np.float32]:
-    """Return the number of readings in the ring and the mask's radius.
+    """Return the number of readings in the ring and the mask's radius, px.
 
-    The distances to the mask and to the rest are side by side in one grid, each surrounded by FAR cells. A shortest
-    path may take its horizontal steps first, in the row of its source. So rows are filled by runs. Then two vectorized
-    sweeps add the steps down and up, straight and diagonal.
+    One grid holds the distances to the mask and to the rest side by side, each surrounded by FAR cells. A shortest path
+    may take its horizontal steps first, in the row of its source. So each row is first filled with the distances along
+    the row. Two vectorized sweeps, down and up, then add the vertical and diagonal steps.
     """
     v0, u0 = bounds[0], bounds[1]
     rows, columns = bounds[2] - v0, bounds[3] - u0
@@ -188,7 +188,7 @@ def _highest(steps: Int16) -> np.int16:
 
 @njit(cache=True, nogil=True)
 def _distances_along(sources: Bool, row: Int16) -> None:
-    """Set the distance of every cell to the nearest source of its row, FAR without a source."""
+    """Set the distance of every cell to the nearest source in its row; FAR if the row has no source."""
     columns = len(row)
     row[:] = 0
     begin = 0
@@ -222,7 +222,7 @@ def _spread_across(neighbors: Int16, row: Int16, middle: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
-    """Set `row` to the minimum of row, across + step, and before or behind + diagonal, in vectorizable code."""
+    """Set `row` to the minimum of itself and of `before`, `across` and `behind` plus a step, in vectorizable code."""
     for i in range(len(row)):
         diagonal = np.int16((before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL)
         straight = np.int16(across[i] + CHAMFER_STEP)
@@ -235,7 +235,7 @@ def gather(
     windows: Windows, steps: Int16, depth: Float32, pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64,
     schedule: ThreadSchedule, points: Float32, depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    """Set the points, as geometry.back_project would, and their depth in the mask."""
+    """Set the points (S, 3), m, as in geometry.back_project, and their `depth_in_mask` (S,), px."""
     firsts, cells = windows.firsts, windows.cells
     for thread in prange(len(schedule.starts) - 1):
         for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
@@ -246,7 +246,7 @@ def gather(
                 points[starts[k] : middle], depth_in_mask[starts[k] : middle],
             )  # fmt: skip
             if middle < end:
-                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # every n-th, over both
+                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # n-th points of mask and ring together
                 _gather_ring(
                     bounds, own_steps, depth, pinhole, skipped, nth[k], points[middle:end], depth_in_mask[middle:end]
                 )

@@ -15,10 +15,11 @@ from framework.refinement.refine_kernels import compress, part_starts
 
 
 def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> PointClusters:
-    """Return the refined clusters. Exact clusters from ground-truth masks and frames without detection stay unchanged.
+    """Return the refined clusters.
 
-    Raises DataError if the refiner does not return PointClusters or returns pixels outside the image. Later stages
-    index the frame with these pixels unchecked.
+    Exact clusters from ground-truth masks and clusters of frames without detection stay unchanged. Raises DataError if
+    the refiner does not return PointClusters or returns pixels outside the image. Later stages index the frame with
+    these pixels without another check.
     """
     if clusters.exact or not clusters.detected:
         return clusters

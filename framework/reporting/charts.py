@@ -29,7 +29,7 @@ FOOT = 36.0  # px below a top view, for the scale bar
 MARGIN = 0.08  # relative to the size of a top view
 MIN_EXTENT_M = 0.04  # minimum extent of the shorter side of a top view
 LABEL_WIDTH_PX = 46.0  # minimum width of a footprint with a label
-MAX_POINTS = 240  # maximum points of a line
+MAX_POINTS = 240  # maximum number of points of a line
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 COLORS = {
     "card": "#ffffff",
@@ -54,7 +54,7 @@ COLORS = {
 }
 """Light colors of report.css by variable name; the SVG contains the variables."""
 RUN_COLORS = ("accent", "refinement", "tracking", "run-3", "run-4", "run-5")
-RUN_WIDTHS = (6.0, 4.5, 3.0, 2.2, 1.6, 1.2)  # px: coinciding paths remain visible
+RUN_WIDTHS = (6.0, 4.5, 3.0, 2.2, 1.6, 1.2)  # px, decreasing so that coinciding paths remain visible
 VARIABLES = {color: f"var(--{name})" for name, color in COLORS.items()}
 
 
@@ -71,7 +71,7 @@ class Footprint:
 class PlottedPath:
     """The path of one camera."""
 
-    positions: Float64  # (P, 3) m, world
+    positions: Float64  # (P, 3) m, in the world frame
     lost_after: Sequence[int] = ()  # indices of the last positions before tracking was lost
     color: str = "accent"  # of COLORS
     width: float = 2.0  # px
@@ -93,7 +93,7 @@ def box_corners(box: Box) -> Float64:
 
 
 def stage_rows(times: StageTimes) -> list[StageRow]:
-    """Return the stages that ran, in their order."""
+    """Return the times of the stages that ran, in the order of the pipeline."""
     rows = []
     for stage in (*STAGES, FUSION):
         values = times.milliseconds.get(stage, np.zeros(0))
@@ -152,7 +152,7 @@ def top_view(
 
 
 def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> str:
-    """Return a chart of the position error (n,) m of each frame."""
+    """Return a chart of the position errors (n,), m, over the frames."""
     figure, axes = _chart(height, frames[0], frames[-1], "Position error, mm")
     axes.plot(frames, 1e3 * errors, color=COLORS["accent"], linewidth=2, gid="chart-errors")
     axes.set_ylim(0, max(1.08e3 * float(errors.max(initial=0.0)), 1e-3))
@@ -223,7 +223,7 @@ def _chart(height: float, first: float, last: float, title: str, right: float = 
 
 
 def _horizontal(positions: Float64, up: Float64) -> Float64:
-    """Return the right and forward directions (2, 3) of the top view with the widest path."""
+    """Return the right and forward directions (2, 3) of the top view in which the path is widest."""
     any_level = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     level = np.stack([any_level, np.cross(up, any_level)]) / np.linalg.norm(any_level)
     _, _, Vt = np.linalg.svd((positions - positions.mean(axis=0)) @ level.T, full_matrices=True)

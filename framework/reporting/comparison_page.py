@@ -22,7 +22,7 @@ from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
-MAX_MAPS = 6  # maximum runs with a map in the page; together they have the size limit of one map
+MAX_MAPS = 6  # maximum number of maps in the page, with a total size of at most one map
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Cell:
 
     text: str  # "" = unknown
     best: bool = False
-    difference: str = ""
+    difference: str = ""  # from the first run, "" = none
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from framework.runs.instances_file import StoredInstance
 from framework.runs.run_directory import LIKELY
 
 VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, aspect ratio of the initial view
-PATH_POINTS = 400  # maximum points of the camera path
+PATH_POINTS = 400  # maximum number of points of the camera path
 PROGRESS_PICTURES = 4  # number of images at equal intervals; the last image shows the whole map
 PROGRESS_SCALE = 0.5  # image size relative to the initial view
 PROGRESS_QUALITY = 80  # of WebP
@@ -46,14 +46,14 @@ class MapScene:
     """The map of one run in the viewer."""
 
     contents: RunContents
-    mesh: InstanceMesh  # decimated; its front faces the cameras
+    mesh: InstanceMesh  # decimated; the front sides of its triangles face the cameras
     surface: Surface  # of the mesh
     sightings: Sightings
-    up: Float64  # (3,)
+    up: Float64  # (3,) unit vector in the world frame
 
     @classmethod
     def of(cls, contents: RunContents, footage: Footage, fraction: float = 1.0) -> MapScene | None:
-        """Return the map, decimated to a fraction of the maximum triangles and bytes; None for an empty map."""
+        """Return the map, decimated to a fraction of MAX_TRIANGLES and MAX_BYTES; None for an empty map."""
         if contents.mesh is None or not len(contents.poses):
             return None
         mesh = replace(contents.mesh, instance_ids=contents.instance_ids(contents.mesh))
@@ -115,7 +115,7 @@ class MapScene:
         }
 
     def progress_pictures(self) -> list[ProgressPicture]:
-        """Return images of the instances visible up to some frames, from the initial view; none for short runs."""
+        """Return images, from the initial view, of the surface visible up to several frames; none for short runs."""
         steps = len(self.sightings.chosen)
         if steps < PROGRESS_PICTURES:
             return []

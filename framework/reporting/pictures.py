@@ -18,7 +18,7 @@ from framework.rendering.surface import Surface
 from framework.reporting.run_source import Footage
 
 WIDTH, HEIGHT = 264, 198  # px
-MAX_LARGE_PICTURES = 120  # objects; images are smaller for more objects
+MAX_LARGE_PICTURES = 120  # maximum number of objects with images of full size; more objects get smaller images
 QUALITY = 78  # of WebP
 MARGIN = 0.25  # around an object, relative to its size
 MIN_CROP = 0.12  # relative to the width of the image
@@ -42,7 +42,7 @@ class Photographer:
         self._rasterizer = Rasterizer(mesh.vertices, mesh.triangles)
 
     def pictures(self, labels: Int32, best: Mapping[int, int], colors: Mapping[int, UInt8]) -> dict[int, Picture]:
-        """Return an image of each label, outlined in its color, from the pose with the best view.
+        """Return an image of each label from the pose with the best view, with the object outlined in its color.
 
         Args:
             labels: (V,) labels of the mesh's vertices, 0 = none.

@@ -20,7 +20,7 @@ from framework.runs.metrics import TRUTH, truth_sha256
 from framework.runs.provenance import leaves
 
 MAX_WIDTH = 640  # px, of stored images
-MIN_CLARITY = 0.3  # a blurred image of an object is better than a distant view
+MIN_CLARITY = 0.3  # minimum clarity, because a blurred image of an object is better than a distant view
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Footage:
     camera: Camera  # of the images
     images: Mapping[int, UInt8]  # (H, W, 3) RGB
     frames: Mapping[int, int]  # frame numbers in the sequence
-    true_positions: Mapping[int, Float64]  # (3,) m, of frames with a ground-truth pose
+    true_positions: Mapping[int, Float64]  # (3,) m, ground-truth positions of frames with a ground-truth pose
     clarity: Mapping[int, float]  # in [MIN_CLARITY, 1], 1 = at least as sharp as the median
 
     @classmethod
@@ -126,12 +126,12 @@ class TruePath:
     """The ground-truth camera path, aligned rigidly with the trajectory as for the ATE."""
 
     chosen: list[int]  # indices of n poses of the trajectory
-    positions: Float64  # (n, 3) m
+    positions: Float64  # (n, 3) m, in the world frame of the map
     errors: Float64  # (n,) m, distances to the positions of the trajectory
 
     @classmethod
     def of(cls, poses: Float64, true_positions: Mapping[int, Float64]) -> TruePath | None:
-        """Return the path of aligned ground-truth positions (3,), given by pose index; None for fewer than three."""
+        """Return the aligned path of ground-truth positions (3,), m, by pose index; None for fewer than three."""
         chosen = sorted(true_positions)
         if len(chosen) < 3:
             return None
@@ -139,6 +139,6 @@ class TruePath:
         try:
             R, t = umeyama(true, estimated)
         except np.linalg.LinAlgError as error:
-            raise DataError(f"ground truth: expected poses that match the trajectory, got {error}") from error
+            raise DataError(f"ground truth: expected poses alignable with the trajectory, got {error}") from error
         aligned = true @ R.T + t
         return cls(chosen, aligned, np.linalg.norm(aligned - estimated, axis=1))

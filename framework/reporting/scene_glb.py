@@ -12,7 +12,7 @@ from framework.exporting.glb import T_GLTF_ROOM, Node, glb_of
 from framework.exporting.object_meshes import REST
 from framework.exporting.upright_room import plain_name, upright
 
-MAX_BYTES = 9_500_000  # maximum size of the file, for browsers of phones
+MAX_BYTES = 9_500_000  # maximum size of the file, bytes, for mobile browsers
 BYTES_OF_VERTEX, BYTES_OF_TRIANGLE = 24, 12  # position, color, first view; three indices
 MAX_TRIANGLES = 300_000  # 7 MB together with their vertices
 NOT_GEOMETRY = 200_000  # bytes for names and nodes
@@ -29,7 +29,7 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
         mesh: Mesh of the map.
         first_seen: (V,) in [0, 1], fraction of the sequence before the first view of each vertex.
         names: Class by id, for the objects with a node.
-        up: (3,) unit vector, world.
+        up: (3,) unit vector in the world frame.
     """
     labels = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
     of_triangle = triangle_labels(mesh.triangles, labels)
@@ -47,5 +47,5 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
 
 
 def light_enough(mesh: InstanceMesh, most_bytes: int = MAX_BYTES) -> InstanceMesh:
-    """Return the mesh, decimated to at most `most_bytes` in its file."""
+    """Return the mesh, decimated so that its file has at most `most_bytes` bytes."""
     return clustered(mesh, most_bytes - NOT_GEOMETRY, BYTES_OF_VERTEX, BYTES_OF_TRIANGLE)

@@ -12,7 +12,7 @@ from framework.data import Bool, Camera, Float32, Float64, InstanceMesh, Int32
 from framework.geometry import inverse
 from framework.rendering.rasterizer import Rasterizer
 
-LOOKS = 80  # maximum rendered poses of a trajectory
+LOOKS = 80  # maximum number of rendered poses of a trajectory
 LOOK_WIDTH = 200  # px, of the rendered images
 TOLERANCE, TOLERANCE_PER_DEPTH = (
     0.05,

@@ -17,7 +17,7 @@ from framework.files.search_paths import folder_of
 from framework.runs.provenance import leaves, relevant
 
 INPUTS = "inputs_sha256"  # the key of metrics.json
-MAX_FILES = 200_000  # of a recording (hashed in 3 s); the longest sequences of known datasets have 20,000
+MAX_FILES = 200_000  # maximum number of hashed files of a recording (3 s); known datasets have up to 20,000
 OUTPUTS = {"outputs", "multirun"}  # Hydra's output folders
 
 
@@ -41,7 +41,7 @@ def inputs_sha256(config: Mapping[str, Any]) -> str:
 
 
 def _truth_files(value: str) -> list[str]:
-    """Return the files of a named ground truth; empty if a file is missing, which the run reports."""
+    """Return the files of a named ground truth; empty if one is missing, because the run itself reports the error."""
     try:
         return [str(path) for path in truth_files(Path(value))]
     except (ConfigError, DataError):

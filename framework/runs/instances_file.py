@@ -15,7 +15,7 @@ from framework.files.json_file import read_json, write_json
 from framework.runs.metrics import class_name
 
 LARGEST_ID = 2**31 - 1
-FARTHEST = 1e6  # m, limit of coordinates and sizes; resolution of float32: 6 cm
+FARTHEST = 1e6  # m, limit of coordinates and sizes; the resolution of float32 there is 6 cm
 NO_CLASS = "object"  # class name in a map without classes
 
 
@@ -36,14 +36,14 @@ class StoredInstance:
 
     @property
     def probability(self) -> float | None:
-        """Return the probability of its class; None = unknown."""
+        """Return the probability of `class_name`; None = unknown."""
         return self.class_probabilities.get(self.class_name)
 
 
 def write_instances(
     path: Path, mesh: InstanceMesh, instances: Mapping[int, Instance], classes: tuple[str, ...]
 ) -> None:
-    """Write the objects by id; lengths in m. Confidences and probabilities are not rounded, to avoid ties."""
+    """Write the objects sorted by id; lengths in m. Confidences and probabilities are not rounded, to avoid ties."""
     write_json(
         path,
         [
@@ -51,7 +51,7 @@ def write_instances(
                 "id": instance.id,
                 "class": class_name(instance, classes),
                 "confidence": float(instance.confidence),
-                # the shortest decimals of each float32: 0.9, not 0.8999999761581421
+                # shortest decimal form of each float32: 0.9, not 0.8999999761581421
                 "class_probabilities": {
                     name: float(str(value)) for name, value in zip(classes, instance.class_probabilities, strict=True)
                 },
@@ -123,7 +123,8 @@ def _integer(where: str, entry: Mapping[str, Any], key: str, lowest: int | None 
 def _class(where: str, entry: Mapping[str, Any]) -> str:
     value = entry.get("class", ...)
     if value is not None and not isinstance(value, str):
-        raise DataError(f"{where}: class: expected a name or null, got {entry.get('class', 'no class')!r:.40}")
+        got = "no class" if value is ... else repr(value)
+        raise DataError(f"{where}: class: expected a name or null, got {got:.40}")
     return NO_CLASS if value is None else value
 
 
@@ -141,6 +142,7 @@ def _array(where: str, entry: Mapping[str, Any], key: str, shape: tuple[int, ...
         values = np.zeros(0)
     if values.shape != shape or not (np.abs(values) <= FARTHEST).all():  # rejects NaN
         raise DataError(
-            f"{where}: {key}: expected numbers of shape {shape}, at most {FARTHEST:g}, got {entry.get(key)!r:.60}"
+            f"{where}: {key}: expected numbers of shape {shape} in [{-FARTHEST:g}, {FARTHEST:g}], got "
+            f"{entry.get(key)!r:.60}"
         )
     return values

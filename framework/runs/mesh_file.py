@@ -14,7 +14,7 @@ CHANNELS = ("red", "green", "blue")
 TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.int32}
 """Properties of a vertex in addition to its position."""
 
-CLASSES = "classes "  # prefix of the comment that names the classes
+CLASSES = "classes "  # prefix of the comment with the class names
 
 
 def write_mesh(path: Path, mesh: InstanceMesh) -> None:
@@ -39,13 +39,14 @@ def read_mesh(path: Path) -> InstanceMesh:
     ply = read_ply(path)
     for name, kind in TYPES.items():
         if name not in ply.properties or ply.properties[name].dtype != kind:
+            got = ply.properties[name].dtype if name in ply.properties else "no such property"
             raise DataError(
-                f"{path}: expected the vertex property {name!r} of {np.dtype(kind)}, got none; use mesh.ply of a run"
+                f"{path}: expected {np.dtype(kind)} for the vertex property {name!r}, got {got}; use mesh.ply of a run"
             )
     class_lines = [comment for comment in ply.comments if f"{comment} ".startswith(CLASSES)]
     if len(class_lines) != 1:
         raise DataError(
-            f"{path}: expected one line 'comment {CLASSES}...', got {len(class_lines)}; use mesh.ply of a run"
+            f"{path}: expected one line 'comment {CLASSES}...', got {len(class_lines)} lines; use mesh.ply of a run"
         )
     names = class_lines[0][len(CLASSES) :]
     return InstanceMesh(

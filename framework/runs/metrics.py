@@ -29,14 +29,14 @@ MAIN_FIGURES = (
     "ap",
     "ap50_agnostic",
     "mean_iou",
-)  # below `instances.`, for both label transfers
+)  # keys below `instances.` that are stored for both label transfers
 TRUTH = "truth_sha256"  # key of the hash of the ground truth
 
 
 def run_metrics(result: RunResult) -> Metrics:
     """Return counts, speed, stage times, map size and the estimated color delay.
 
-    For live video, add dropped frames and latency.
+    For live video, also return dropped frames and latency.
     """
     metrics: Metrics = {
         "frames": result.frames,
@@ -72,7 +72,7 @@ def trajectory_metrics(result: RunResult) -> Metrics:
 
 
 def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
-    """Return the up direction, its source and the floor height; empty if the up direction is unknown."""
+    """Return the up direction, its source and the floor height, m; empty if the up direction is unknown."""
     gravity = scene.gravity()
     up = gravity.up
     if up is None:
@@ -110,8 +110,8 @@ def evaluation_metrics(
 ) -> Metrics:
     """Return `InstanceEvaluation.metrics`, and the main metrics of the other label transfer as `instances.to_map.*`.
 
-    `aligned` is the ground truth in the world frame of the map. `annotation_release` is the release of the ground
-    truth, None = a single release. `truth_sha256` is its hash.
+    `aligned` is the ground truth in the world frame of the map. The metric `annotation_release` is the release of the
+    ground truth; None = the dataset has a single release. The metric `truth_sha256` is the hash of the ground truth.
     """
     figures = instances.evaluate(predictions, aligned).metrics()
     to_map = instances.evaluate(predictions, aligned, transfer=Transfer.TO_MAP).metrics()

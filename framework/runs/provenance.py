@@ -18,7 +18,7 @@ PACKAGES = ("torch", "numpy", "numba", "open3d")
 UNKNOWN = "unknown"
 WITHOUT_EFFECT = (
     *("hydra", "debug", "skip_completed", "prefetch", "detection_cache", "detection_cache_dir", "viewer"),
-    "threads",  # changes only the last digits of networks
+    "threads",  # changes only the last digits of network outputs
     *("row", "rows", "sequences", "table", "figure"),  # settings of an experiment
 )
 """Config keys that do not change results."""
@@ -28,7 +28,7 @@ OF_MACHINE = ("environment.processor", "environment.cpus")  # keys of metrics.js
 
 
 def config_hash(resolved: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of the keys that change results, independent of their order."""
+    """Return the SHA-256 (hex) of the config keys and values that change results, independent of their order."""
     return hashlib.sha256(json.dumps(relevant(resolved), sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -57,7 +57,7 @@ def speed_settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dic
 
 
 def code_version() -> dict[str, str | bool]:
-    """Return the commit of the checkout, and whether files are modified; "unknown" outside of a checkout."""
+    """Return the commit of the checkout and a flag for modified files; "unknown" outside of a checkout."""
     checkout = Path(framework.__file__).resolve().parent.parent
     top = _git(checkout, "rev-parse", "--show-toplevel")
     if top is None or Path(top).resolve() != checkout:  # installed from a wheel, possibly inside another repository

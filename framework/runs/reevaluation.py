@@ -64,7 +64,8 @@ class Reevaluation:
         if truth.scene is None:
             if any(map(is_evaluation, record.metrics)):
                 raise DataError(
-                    f"{record.directory}: expected the ground truth of its metrics, got a dataset without instances"
+                    f"{record.directory}: expected a dataset with instances (as in its metrics), got a dataset without "
+                    "instances; set --ground-truth"
                 )
             return cls(record, record.metrics)
         aligned = truth.in_world_of(record)
@@ -88,7 +89,7 @@ class Reevaluation:
 
     @property
     def changed(self) -> dict[str, tuple[Any, Any]]:
-        """Return the changed metrics, old and new; None = unknown."""
+        """Return the changed metrics as (old, new) by key; None = unknown."""
         old, new = self.record.metrics, self.metrics
         return {
             key: (value, new.get(key)) for key, value in old.items() if is_evaluation(key) and new.get(key) != value
@@ -96,7 +97,7 @@ class Reevaluation:
 
     @property
     def added(self) -> list[str]:
-        """Return the metrics that were not stored."""
+        """Return the keys of the new metrics that were not stored."""
         return [key for key in self.metrics if is_evaluation(key) and key not in self.record.metrics]
 
     def write(self) -> None:

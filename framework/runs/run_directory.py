@@ -54,7 +54,7 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Writer of one run directory."""
+    """Writer for one run directory."""
 
     directory: Path
     config: Mapping[str, Any]  # resolved
@@ -161,7 +161,7 @@ class RunRecord:
         likely = Counter(name for name, _ in labels.values())
         counted = ", ".join(f"{count} {name}" for name, count in likely.most_common()) or "no likely instance"
         unlikely = int(figures.get("instances.count") or 0) - len(labels)
-        rest = f"; {unlikely} with a confidence below {LIKELY} only in the files" if unlikely else ""
+        rest = f"; {unlikely} with a confidence below {LIKELY} are only in the files" if unlikely else ""
         log.info("objects: %s%s", counted, rest)
         written = [name for name in ("overview.png", "mesh.ply", "instances.json") if (self.directory / name).exists()]
         if written:  # one line: directories of sweep jobs have long names
@@ -195,7 +195,7 @@ def _write_config(path: Path, config: Mapping[str, Any]) -> None:
 
 
 def _from_here(path: Path) -> Path:
-    """Return the path relative to the working folder if it is inside."""
+    """Return the path relative to the working folder if it is inside this folder."""
     here, place = Path.cwd(), path.absolute()
     return place.relative_to(here) if place.is_relative_to(here) else place
 
@@ -249,7 +249,7 @@ def write_timings(path: Path, result: RunResult) -> None:
 def peak_memory() -> int | None:
     """Return the peak resident memory of this process in bytes; on Linux since the start of the run.
 
-    None on Windows, which has no `resource`.
+    None on Windows, which has no module `resource`.
     """
     try:
         import resource

@@ -55,7 +55,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class RunRow:
-    """Runs with equal keys, except for the averaged keys."""
+    """Runs with equal config values, except for the averaged keys."""
 
     name: str
     records: Mapping[Run, Record]
@@ -103,7 +103,7 @@ def rows_of(
     """Return `records` grouped into rows: rows in `overrides` first, then other rows by name.
 
     A row is a `row` of an experiment. Other records are grouped by their differing options and parameters, except for
-    the keys `over` and keys that follow them, as dataset.seed follows seed.
+    the keys `over` and keys that always have the same value as one of them, such as dataset.seed and seed.
 
     A row of an experiment is split by differences within it, by data folder and by annotation. It is also split by
     differences between rows that no override causes, such as the pose source or the number of frames. The later of two
@@ -179,7 +179,7 @@ class _Variant:
 
 
 def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
-    """Return the keys of other names whose value equals that of a key in `over` in every record, even by chance."""
+    """Return the keys with other names whose value equals that of a key in `over` in every record, even by chance."""
     variants = [_Variant.of(record, over) for record in records]
     names = {key.rpartition(".")[2] for key in over}
     differing = set(_differing([("", one.parameters) for one in variants]))
@@ -207,5 +207,5 @@ def _differing(groups: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
 
 
 def natural(run: Run) -> tuple[tuple[float, str], ...]:
-    """Return a sort key: seeds as numbers, then other words."""
+    """Return a sort key that orders seeds as numbers, and other words after them."""
     return tuple((float(word) if word.isdecimal() else math.inf, word) for word in run)

@@ -33,7 +33,7 @@ class StoredMap:
         mesh, instances = read_objects(record)
         _, poses = read_tum(record.directory / TRAJECTORY)
         if not len(mesh.triangles) or not len(poses):
-            raise DataError(f"{record.directory}: expected a map, got an empty map")
+            raise DataError(f"{record.directory}: expected a map with triangles and poses, got an empty map")
         names = {instance.id: instance.class_name for instance in instances}
         ids = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
         return cls(mesh, ids, names, poses, record)

@@ -1,4 +1,4 @@
-"""Stored runs: completed runs, and the reasons of incomplete runs."""
+"""Stored runs: completed runs, and incomplete runs with the reasons."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from framework.runs.timings_file import current_key
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"  # exists only for completed runs
-PARTIAL_METRICS = "metrics.partial.json"  # of partial runs, with the reason under `partial`
+PARTIAL_METRICS = "metrics.partial.json"  # metrics of a partial run, with the reason under `partial`
 LOG = "instancemap.log"
 MAP = "map.npz"
 MESH = "mesh.ply"
@@ -234,7 +234,7 @@ def _run_directories(root: Path) -> Iterator[Path]:
 
 
 def _why_incomplete(directory: Path) -> str:
-    """Return why a run is incomplete. A failed job's error is the last message in its log."""
+    """Return the reason why a run is incomplete. The error of a failed job is the last message in its log."""
     if (directory / PARTIAL_METRICS).exists():
         try:
             return f"partial: {_read_flat(directory / PARTIAL_METRICS).get('partial')}"

@@ -18,11 +18,11 @@ from framework.config.validation import checked_rows
 
 _OF_ITSELF = re.compile(
     r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}"
-)  # references to its own keys, as in the included experiments
+)  # references to keys of the same config, as in the included experiments
 
 SWEEP = "multirun.yaml"  # written by Hydra's sweeper
-MAX_VALUES = 1000  # of a key; a range may have any number of values
-MAX_RUNS = 100_000  # combinations of the values of all keys
+MAX_VALUES = 1000  # maximum number of values of a key; a range may have more
+MAX_RUNS = 100_000  # maximum number of combinations of the values of all keys
 
 
 def requested_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:
@@ -58,7 +58,7 @@ def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
 
 
 def _params(sweep: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the sweeper's parameters as overrides; ${sequences.all} is resolved."""
+    """Yield the sweeper's parameters as overrides; references such as ${sequences.all} are resolved."""
     params = _below(sweep, "sweeper", "params", dict)
     node = OmegaConf.merge(_without_hydra(sweep), {"params": _of_itself(params)}).params
     for key in params:
@@ -67,12 +67,12 @@ def _params(sweep: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _without_hydra(sweep: Mapping[str, Any]) -> DictConfig:
-    """Return the sweep's config without Hydra's part; ${...} may refer only to its own keys."""
+    """Return the sweep's config without Hydra's part; references ${...} to keys outside it are replaced by "???"."""
     return OmegaConf.create({key: _of_itself(value) for key, value in sweep.items() if key != "hydra"})
 
 
 def _of_itself(node: Any) -> Any:
-    """Return the node with "???" in place of other references, such as the machine-dependent ${oc.env:...}."""
+    """Return the node with "???" in place of references that are not to its own keys, such as ${oc.env:...}."""
     if isinstance(node, Mapping):
         return {key: _of_itself(value) for key, value in node.items()}
     if isinstance(node, list):

@@ -22,8 +22,8 @@ OLD_STAGES = {
     "refine": "refinement",
     "fuse": "fusion",
 }
-"""Current stage names by their names before 0.1.0, which stored runs and sweeps may contain."""
-MAX_FRAME = 2**53  # limit of frame numbers: exact in float64
+"""Current stage names by the names before 0.1.0, which stored runs and sweeps may contain."""
+MAX_FRAME = 2**53  # limit of frame numbers; smaller integers are exact in float64
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class StageTimes:
     """The stage times of a run."""
 
     frames: Int64  # (F,) frame numbers, ascending
-    milliseconds: Mapping[str, Float64]  # by stage: (F,), NaN = not run, as after a lost pose
+    milliseconds: Mapping[str, Float64]  # by stage: (F,), NaN = stage not run, as after a lost pose
 
 
 def current_key(key: str) -> str:

@@ -18,7 +18,7 @@ from statistics import median
 
 import numba
 
-LOW_PRIORITY = 10  # of nice(2): a tenth of the CPU time of normal threads on a busy core
+LOW_PRIORITY = 10  # value for nice(2): a tenth of the CPU time of normal threads on a busy core
 RECENT = 15  # number of frames in the median of the work per frame
 
 

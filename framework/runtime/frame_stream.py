@@ -16,7 +16,7 @@ import numba
 from framework.errors import DataError
 from framework.interfaces import FrameReader, LiveVideo, RGBDSequence, RGBDVideo
 
-POLL_INTERVAL_S = 0.1  # between checks for the end while waiting for a frame
+POLL_INTERVAL_S = 0.1  # s, interval of checks for the end while waiting for a frame
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
@@ -30,11 +30,11 @@ class FrameStream(AbstractContextManager["FrameStream"]):
 
     @abstractmethod
     def take(self) -> FrameReader | None:
-        """Return the next frame; None at the end."""
+        """Return the reader of the next frame; None at the end."""
 
 
 def stream_of(video: RGBDVideo, ended: Callable[[], bool]) -> FrameStream:
-    """Return the stream of a video. A live stream also ends when `ended` returns true."""
+    """Return the stream of a video. A live stream also ends when `ended` returns True."""
     if isinstance(video, LiveVideo):
         return LiveFrames(video, ended)
     if isinstance(video, RGBDSequence):
@@ -80,7 +80,7 @@ class LiveFrames(FrameStream):
         self._listener.join()
 
     def take(self) -> FrameReader | None:
-        """Wait for a frame. Raises the error of the video after all earlier frames."""
+        """Wait for a frame and return its reader. Raises the error of the video after all earlier frames."""
         with self._changed:
             while self._newest is None and not self._over and not self._ended():
                 self._changed.wait(POLL_INTERVAL_S)

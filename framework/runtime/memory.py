@@ -11,9 +11,9 @@ import os
 import sys
 from functools import cache
 
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-MAX_KEPT = 2**28  # free bytes at the end of the heap
-MAX_SHARED = 2**25  # bytes of an array that reuses freed memory; the maximum of glibc
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # parameters of mallopt(3)
+MAX_KEPT = 2**28  # maximum free memory kept at the end of the heap, bytes
+MAX_SHARED = 2**25  # maximum size of an array that reuses freed memory, bytes; the largest value that glibc accepts
 
 
 @cache

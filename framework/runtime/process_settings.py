@@ -1,4 +1,4 @@
-"""Process-wide settings: environment, threads, seeds, memory. The command line applies them; a library must not."""
+"""Process-wide settings: environment, threads, seeds and memory. Only the command line applies them automatically."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 BOUNDS = {
     "seed": (0, 2**63 - 1),  # the range of torch
-    "threads": (0, 4096),  # no machine has more cores
+    "threads": (0, 4096),  # more than the cores of any supported machine
     "prefetch": (0, 1000),
     "detection_interval": (1, 10**6),
 }
@@ -69,9 +69,9 @@ def _is_writable(folder: Path) -> bool:
 def configure_process(threads: int = 0, seed: int | None = None) -> None:
     """Apply the process-wide settings of the command line to this process.
 
-    `import instancemap`, `Mapper` and `Pipeline` change no process-wide settings. Call this function at the start of
-    your program if it may change them. Detection then runs in parallel with mapping on every platform, and frames take
-    less time.
+    `import instancemap`, `Mapper` and `Pipeline` do not change process-wide settings. Call this function at the start
+    of your program if process-wide changes are acceptable. Detection then runs in parallel with mapping on every
+    platform, and frames take less time.
 
         import instancemap
 
@@ -117,7 +117,7 @@ class Settings:
     device: str  # one of DEVICES; the stages that run networks read it
     threads: int  # 0 = all cores
     prefetch: int = 0  # number of prefetched frames, about 10 MB each with masks
-    detection_interval: int = 1  # frames
+    detection_interval: int = 1  # interval between detections, frames
 
     def __post_init__(self) -> None:
         for name, (least, most) in BOUNDS.items():

@@ -22,11 +22,11 @@ from framework.sensors.noise_models import SensorKind
 
 log = logging.getLogger(__name__)
 
-SKIPS_LOGGED = 10  # further unusable frames are only counted, so that a broken disk does not flood the log
+SKIPS_LOGGED = 10  # maximum number of logged unusable frames, so that a broken disk does not flood the log
 FUSION_STAGES: tuple[str, ...] = get_args(FusionStage)
 STAGES = ("reading", "detection", "tracking", "lifting", "refinement", *FUSION_STAGES)
-FUSION = "fusion"  # the total of FUSION_STAGES, if the fuser does not time them
-COUNT_INTERVAL_S = 1.0  # s, interval of the number of instances in the progress bar
+FUSION = "fusion"  # total time of FUSION_STAGES, if the fuser does not time them separately
+COUNT_INTERVAL_S = 1.0  # s, update interval of the number of instances in the progress bar
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class TrackedFrame:
     """The estimated and the ground-truth pose of a frame."""
 
     index: int  # Frame.index
-    position: int  # in the sequence, including skipped frames
+    position: int  # position in the sequence, counting skipped frames
     timestamp: float  # s
     pose: Pose
     T_world_camera_truth: Float64 | None  # (4, 4)
@@ -53,7 +53,7 @@ class TrackedFrame:
 class LiveFigures:
     """Statistics of a live video."""
 
-    frames_dropped: int  # frames replaced by a newer frame before they were mapped
+    frames_dropped: int  # number of frames that a newer frame replaced before mapping
     latencies: tuple[float, ...]  # s, from capture to map, of each fused frame
 
 
@@ -62,8 +62,8 @@ class RunResult:
     """The result of a run in memory."""
 
     scene: SceneMap
-    frames: int  # mapped, lost and skipped
-    frames_skipped: int  # unreadable, inconsistent, or without a required pose
+    frames: int  # number of mapped, lost and skipped frames
+    frames_skipped: int  # number of frames that are unreadable, inconsistent or without a required pose
     tracked: tuple[TrackedFrame, ...]  # including lost frames
     timings: tuple[StageTime, ...]
     seconds: float  # wall clock of the whole loop
@@ -103,7 +103,7 @@ class Journal:
     first_without_pose: str = ""  # message of the first frame without a pose
     tracked: list[TrackedFrame] = field(default_factory=list)
     timings: list[StageTime] = field(default_factory=list)
-    frames_in_map: int = 0  # at least partly fused
+    frames_in_map: int = 0  # number of frames that are at least partly fused
     stopped_by: BaseException | None = None
     frames_began: list[float] = field(default_factory=list)  # start of each frame, s
     lost_for: int = 0  # number of consecutive lost frames

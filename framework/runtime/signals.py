@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from types import FrameType
 
-# Ctrl-C; `kill`, SLURM and containers; a closed terminal (not on Windows)
+# SIGINT: Ctrl-C. SIGTERM: `kill`, SLURM and containers. SIGHUP (not on Windows): a closed terminal.
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 

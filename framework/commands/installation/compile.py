@@ -35,10 +35,13 @@ def compile_named(kernels: list[Kernel], parts: list[str]) -> str:
     if parts:
         kernels = [kernel for kernel in kernels if any(part in f"{kernel.module}.{kernel.name}" for part in parts)]
     if not kernels:
-        raise ConfigError(f"kernels: expected part of a name, got {' or '.join(parts)}; no name contains it")
+        raise ConfigError(
+            f"NAME: expected part of a kernel name, got {' or '.join(parts)}; omit NAME to compile the kernels of the "
+            "default stages"
+        )
     missing = [kernel for kernel in kernels if not kernel.is_compiled()]
     if missing:
         started = time.perf_counter()
         compile_all(missing)
         return f"{len(missing)} of {len(kernels)} kernels compiled in {time.perf_counter() - started:.0f} s"
-    return f"all {len(kernels)} kernels are compiled"
+    return f"all {len(kernels)} kernels are already compiled"

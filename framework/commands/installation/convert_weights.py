@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--kind", choices=["torchvision", "detectron2"], help="format of IN; default: detected")
     classes = "comma-separated class names in network order; default: COCO"
     parser.add_argument("--classes", metavar="NAMES", help=classes)
-    epsilon = "epsilon of batch normalization, for torchvision only; default: 0, as in its COCO checkpoint"
+    epsilon = "epsilon of batch normalization, torchvision only; default: 0, as in torchvision's COCO checkpoint"
     parser.add_argument("--norm-eps", metavar="EPS", type=float, default=0.0, help=epsilon)
     parser.add_argument("--half", action="store_true", help="store weights as float16, which halves the file size")
     parsed = arguments(parser)

@@ -97,7 +97,7 @@ def _kernels(outcomes: Outcomes) -> Iterator[Check]:
     for (name, command), (compiled, count) in zip(commands.items(), found["counts"], strict=True):
         yield Check.of(name, compiled == count, f"{compiled} of {count} kernels compiled", command)
     _, writable = machine.writable_parent(Path(found["folder"]))
-    detail = anonymous(found["folder"]) + ("" if writable else " is not writable: every process compiles its kernels")
+    detail = anonymous(found["folder"]) + ("" if writable else " is not writable; each process compiles the kernels")
     yield Check.of("kernel cache", writable, detail, "set the environment variable NUMBA_CACHE_DIR")
 
 

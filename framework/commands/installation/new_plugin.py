@@ -1,6 +1,6 @@
 """`instancemap new-plugin STAGE NAME`: create a package with a working plugin.
 
-framework/templates has a folder for each stage, one for viewers and one for common files.
+framework/templates has one folder for each stage, one for viewers and one for common files.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ PLACES = {  # path of each template in the new package; templates of the stage t
     "gitignore": ".gitignore",
     "test.yml": ".github/workflows/test.yml",
 }
-LONGEST_NAME = 30  # characters; keeps lines of the templates within 120
-FOLDERS = ("conf", "tests")  # names that a module of the package must not have
+LONGEST_NAME = 30  # maximum length of a name, characters; keeps the lines of templates within 120 characters
+FOLDERS = ("conf", "tests")  # folder names, which are invalid as plugin names
 SMALL = "dataset=synthetic dataset.frames=30 dataset.width=320 dataset.height=240"
 FIRST = "hydra.sweep.dir=outputs/first_sweep"
 TRIES = {  # by stage: command that compares a new plugin with an existing plugin; viewers are only run
@@ -62,7 +62,7 @@ DATA: dict[str, tuple[type, ...]] = {  # by stage: types of its arguments and re
     "dataset": (Frame, Camera),
     "viewer": (Frame, Camera, Detections, Pose, Instance),
 }
-VARIANTS = {  # by stage: parameter of a variant
+VARIANTS = {  # by stage: changed parameter of the example variant in the README
     "detector": "tolerance: 30",
     "tracker": "max_distance: 0.2",
     "refiner": "reach: 0.6",
@@ -97,13 +97,13 @@ def main() -> None:
 
 
 def write_repository(stage: str, name: str, folder: Path) -> Path:
-    """Create the new folder in `folder` atomically and return it.
+    """Create the repository in `folder` atomically and return its path.
 
     Raises ConfigError for an invalid or existing name, and DataError if the folder cannot be written.
     """
     check_name(stage, name)
     if not folder.is_dir():
-        raise ConfigError(f"--in: expected a folder, got {folder}")
+        raise ConfigError(f"--in: expected an existing folder, got {folder}; create it")
     place = folder / names_of(stage, name)["distribution"]
     if os.path.lexists(place):
         raise ConfigError(
@@ -125,12 +125,12 @@ def check_name(stage: str, name: str) -> None:
     """Raise ConfigError unless the name is valid for a module and a new option of the stage."""
     if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > LONGEST_NAME:
         raise ConfigError(
-            f"NAME: expected words of a-z and 0-9 joined by _ such as my_{stage}, at most {LONGEST_NAME} "
-            f"characters, got {name!r}"
+            f"NAME: expected words of a-z and 0-9 joined by _, with a letter first and at most {LONGEST_NAME} "
+            f"characters, got {name!r}; choose a name such as my_{stage}"
         )
     if is_value(name):
         raise ConfigError(
-            f"NAME: expected a name, got {name}, a null, boolean or number in YAML; choose another name such as "
+            f"NAME: expected a text value in YAML, got {name} (a null, boolean or number); choose another name such as "
             f"my_{name}"
         )
     if keyword.iskeyword(name) or name in FOLDERS:
@@ -140,12 +140,14 @@ def check_name(stage: str, name: str) -> None:
         )
     if name in options_of(stage):
         raise ConfigError(
-            f"NAME: expected a new name, got the existing option {stage}={name}; `instancemap plugins "
-            f"{stage} {name}` shows it"
+            f"NAME: expected a new name, got the existing option {stage}={name}; choose another name such as my_{name}"
         )
     class_name = names_of(stage, name)["class_name"]
     if any(re.search(rf"\b{class_name}\b", _template(stage, template)) for template in ("plugin.py", "test.py")):
-        raise ConfigError(f"NAME: expected a unique class name, got {class_name} for {name}; choose a longer name")
+        raise ConfigError(
+            f"NAME: expected a unique class name, got {class_name} for {name}, a name in the template; choose a longer "
+            "name"
+        )
 
 
 def is_value(name: str) -> bool:

@@ -109,7 +109,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
 
 
 def _nested(made_of: Mapping[str, str], place: str, plugin_class: type) -> str:
-    """Return the options in the field at `place` (detector.detector): one option, or several by name."""
+    """Return the options in the field at `place`, such as detector.detector: one option, or several by name."""
     if holds_one(plugin_class, place.rpartition(".")[2]):
         own = [path for path, package in made_of.items() if package == place]
         return own[-1].rpartition("/")[2] if own else ""  # after the inherited options
@@ -152,7 +152,7 @@ def main() -> None:
     parsed = arguments(parser)
     with one_line_errors():
         stages = [parsed.stage] if parsed.stage else list(GROUPS)
-        # garbage collection of torch's objects takes a fifth of the time here, and again at exit
+        # garbage collection of torch's objects would take a fifth of the time here, and again at exit
         atexit.register(gc.freeze)
         gc.disable()
         options = registered(*stages, only=parsed.name)

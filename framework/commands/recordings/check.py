@@ -1,6 +1,6 @@
 """`instancemap check dataset=D [out=FILE]`: validate a recording and suggest parameter fixes.
 
-Exit status 1: the recording is not usable.
+Exit status 1 means that the recording is not usable.
 """
 
 from __future__ import annotations

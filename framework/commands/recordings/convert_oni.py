@@ -48,7 +48,8 @@ def convert(source: Path, target: Path) -> None:
     for path in (image, depth, timestamp):
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):
             raise DataError(
-                f"{path}: expected an empty or missing folder, got existing files; remove them or choose another OUT"
+                f"{path}: expected a missing path or an empty folder, got existing files; remove them or choose "
+                "another OUT"
             )
     image.mkdir(parents=True, exist_ok=True)
     depth.mkdir(exist_ok=True)
@@ -68,16 +69,16 @@ def convert(source: Path, target: Path) -> None:
         if depth_times:
             write_timestamps(timestamp, depth_times, color_times)
     if not number:
-        raise DataError(f"{source}: expected color and depth images of equal times, got none")
+        raise DataError(f"{source}: expected color and depth images with equal timestamps, got none")
     left_out = {stream: count - number for stream, count in counts.items()}
     print(
         f"{target}: {number} frames; skipped {left_out[Stream.COLOR]} color and {left_out[Stream.DEPTH]} "
-        "depth images, damaged or without a pair"
+        "depth images (damaged or without a pair)"
     )
     if contents.cut_off:
         raise DataError(
             f"{contents.path}: expected a complete file, got a truncated or damaged file at byte "
-            f"{contents.end}; kept the frames up to image{number:05d}.png; download it again for the rest"
+            f"{contents.end}; kept the frames up to image{number:05d}.png; download it again for the other frames"
         )
 
 

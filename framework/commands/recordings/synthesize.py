@@ -44,4 +44,4 @@ def main() -> None:
         recording = BenchmarkSettings(parsed.seed, parsed.frames, parsed.rate, parsed.width, parsed.camera_speed)
         write_scenes(parsed.directory, {name: SCENES[name] for name in names}, recording, parsed.jobs)
         root = parsed.directory.resolve()
-        print(f"{root} is complete: instancemap dataset=scenenn dataset.root={root} dataset.scene={names[0]}")
+        print(f"{root} is complete; map it: instancemap dataset=scenenn dataset.root={root} dataset.scene={names[0]}")

@@ -29,14 +29,17 @@ def main() -> None:
     )
     parser.add_argument("before", metavar="FIRST", type=Path, help="run directory of the first visit")
     parser.add_argument("after", metavar="SECOND", type=Path, help="run directory of the second visit")
-    unchanged = "also list objects that stayed, or that the other run did not see"
+    unchanged = "also list objects that stayed and objects that the other run did not see"
     parser.add_argument("--all", action="store_true", help=unchanged)
     parser.add_argument("--out", metavar="FILE", type=Path, help="JSON file for all changes; default: none")
     parsed = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
         if not in_world(parsed.after, parsed.before):
-            message = "%s: expected the world frame of %s; run it with localize_in=%s, or both with given poses"
+            message = (
+                "%s: expected the world frame of %s, got another or an unknown frame; map it again with "
+                "localize_in=%s, or map both with given poses"
+            )
             log.warning(message, parsed.after, parsed.before, parsed.before)
         found = changes(visit_of(parsed.before), visit_of(parsed.after))
         if parsed.out is not None:

@@ -124,5 +124,5 @@ def _find(roots: Sequence[Path]) -> tuple[list[Record], list[DataError]]:
         records |= {record.directory.resolve(): record for record in complete}
         failures |= {one.directory.resolve(): DataError(f"{one.directory}: {one.reason}") for one in others}
         if not complete and not others:
-            failures[root.resolve()] = DataError(f"{root}: expected a run at or below it, got none")
+            failures[root.resolve()] = DataError(f"{root}: expected a run directory or a folder of runs, got neither")
     return list(records.values()), list(failures.values())

@@ -49,7 +49,7 @@ def heading(answer: QueryResult, wanted: str | None) -> str:
     if answer.by == "embeddings":
         return f"by embeddings of {answer.space}"
     unavailable = wanted is None and not answer.space
-    reason = f", because this run has no embeddings: run with {WITH_EMBEDDINGS}" if unavailable else ""
+    reason = f", because this run has no embeddings; map it again with {WITH_EMBEDDINGS}" if unavailable else ""
     return f"by class names and colors{reason}"
 
 

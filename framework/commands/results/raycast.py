@@ -84,4 +84,4 @@ def pose_of_frame(contents: RunContents, frame: int | None) -> int:
         raise DataError(f"--frame: expected {min(known)} to {max(known)}, got {frame}")
     nearest = min(numbers, key=lambda number: abs(number - frame))
     what = "a lost frame" if frame in lost else "a frame that was not mapped"
-    raise DataError(f"--frame: expected a mapped frame, got {frame} ({what}); the nearest mapped frame is {nearest}")
+    raise DataError(f"--frame: expected a mapped frame, got {frame} ({what}); use the nearest one, --frame {nearest}")

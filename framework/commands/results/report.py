@@ -47,7 +47,7 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
         raise DataError(f"{again[0]}: expected each run once, got it twice; remove the duplicate")
     if out is not None:
         if not out.parent.is_dir():
-            raise DataError(f"{out}: expected a file in an existing folder, got no folder {out.parent}; create it")
+            raise DataError(f"{out}: expected a file in an existing folder, got the missing {out.parent}; create it")
         if out.exists():
             check_regular(out)
     runs = [RunContents.read(directory) for directory in directories]

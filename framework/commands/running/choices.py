@@ -1,7 +1,7 @@
 """Choices on the command line: swept keys and rows of an experiment, checked before the first run.
 
-Hydra's sweeper varies one key at a time. An experiment therefore sweeps over the key `row`, and a job adds the
-overrides of its row in `rows`.
+Hydra's sweeper combines the values of independent keys, but a row of an experiment sets several keys together. An
+experiment therefore sweeps over the key `row`, and each job adds the overrides of its row in `rows`.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
         values = _values(override)
         runs[override.get_key_element()] = len(values) or GLOB_COUNT
         if not values and override.value_type in COUNTED:
-            raise ConfigError(f"{override.input_line}: expected at least one value, got none; the sweep would be empty")
+            raise ConfigError(f"{override.input_line}: expected at least one value, got none")
         if override.key_or_group == "row" and rows:
             check_row(values, rows)
     return prod(runs.values())
@@ -89,8 +89,8 @@ def check_row(chosen: Sequence[str], rows: Collection[str]) -> None:
 def error_of_first_run(words: Sequence[str]) -> HydraException | None:
     """Return the error of the first run of a sweep started by an experiment; None = no error.
 
-    If the experiment's config cannot be composed, Hydra takes the command line for a single run and reports its
-    choices as errors. `words` is the command line.
+    If the experiment's config cannot be composed, Hydra treats the command line as a single run and reports its swept
+    values as errors. `words` is the command line.
     """
     overrides = [word for word in words if word.startswith("~") or ("=" in word and not word.startswith("-"))]
     try:

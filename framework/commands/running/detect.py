@@ -1,4 +1,4 @@
-"""`instancemap detect detector=X dataset=D out=FILE` writes the detections of a sequence as a COCO result file.
+"""`instancemap detect detector=X dataset=D out=FILE`: write the detections of a sequence as a COCO result file.
 
 With ground truth, it also reports mask AP and the rates of detection errors.
 """

@@ -1,4 +1,4 @@
-"""`instancemap` without a command: a run, or with -m or an experiment a sweep of runs."""
+"""`instancemap` without a command: execute a run or, with -m or an experiment, a sweep of runs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def job(config: DictConfig) -> None:
         received_from_sweep().check()
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
-    # workers of a killed sweep may still run; a single run has locked its directory since its start
+    # workers of a killed sweep may still write here; a single run has already locked its directory
     with locked(directory, wait=True) if is_of_sweep(hydra_config) else nullcontext():
         if config.skip_completed and is_recorded(directory, config):
             return
@@ -73,7 +73,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     pipeline = begin(config)
     settings.apply()  # apply to torch, if a stage has loaded it
     gc.collect()  # otherwise a collection delays one of the first few hundred frames
-    video = build(RGBDVideo, config.get("dataset"))  # after the stages: a synthetic scene takes longest
+    video = build(RGBDVideo, config.get("dataset"))  # after the stages, because a synthetic scene takes longest
     compile_for_run()  # kernels of its renderer
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")

@@ -1,4 +1,4 @@
-"""`instancemap show-refinement dataset=D detector=X refiner=R out=FILE` draws a frame before and after refinement.
+"""`instancemap show-refinement dataset=D detector=X refiner=R out=FILE`: draw a frame before and after refinement.
 
 The figure shows the masks in the image, their points from the side, and metrics.
 """
@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # heavy imports are local
 log = logging.getLogger(__name__)
 jobs = Jobs()
 
-CANDIDATES = 6  # number of candidates of the default frame, evenly spaced
+CANDIDATES = 6  # number of evenly spaced candidates for the default frame
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="show_refinement")
@@ -60,7 +60,7 @@ def job(config: DictConfig) -> None:
 
 
 def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tuple[int, Frame, Detections]:
-    """Return a position with its frame and detections; None = the candidate frame with the most detections.
+    """Return `position` with its frame and detections; None selects the candidate frame with the most detections.
 
     Raises ConfigError for an invalid position, FrameError for an unusable frame, DataError if no candidate is usable.
     """
@@ -87,7 +87,7 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
         if best is None or len(found) > len(best[2]):
             best = k, frame, found
     if best is None:
-        raise DataError(f"{sequence.name}: expected a usable frame, got none of {len(tried)}; set frame=K")
+        raise DataError(f"{sequence.name}: expected a usable frame, got none of {len(tried)} tried frames; set frame=K")
     return best
 
 

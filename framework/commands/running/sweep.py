@@ -53,7 +53,7 @@ OmegaConf.register_new_resolver("new_directory", new_directory, use_cache=True, 
 class PlaceCallback(Callback):
     """Hydra callback at the start of a run or sweep.
 
-    Hydra calls it in the main process before it writes anything, not in workers.
+    Hydra calls it in the main process, before writing anything, but not in workers.
     """
 
     of_run: bool = True  # True if a run has its own directory; False for commands that write one file
@@ -94,7 +94,7 @@ def run_in(directory: Path, wait: bool) -> Iterator[None]:
 def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[None]:
     """Return the context of a sweep with at least one run. Raises InstanceMapError.
 
-    joblib is limited to one worker per run. A signal of the terminal would end an idle worker, and joblib would then
+    joblib is limited to one worker per run. A signal from the terminal would end an idle worker, and joblib would then
     end all workers.
     """
     own = config.hydra

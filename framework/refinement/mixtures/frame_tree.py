@@ -1,7 +1,7 @@
 """Tree of Gaussian mixtures over all masks of a frame, our first interpretation of section 3.2.2 of the paper.
 
 Level 1 has one Gaussian per mask, initialized with the mask's pixels as responsibilities. Every further level splits
-each node into children, fitted to the node's own points. A point belongs to the mask above its most probable leaf. The
+each node into children, fitted to the node's own points. A point belongs to the mask of its most probable leaf. The
 split and the number of levels are our choice: the paper names a hierarchical EM algorithm without these details.
 """
 
@@ -20,7 +20,7 @@ from framework.refinement.mixtures.mixture_kernels import EmSettings, Mixtures, 
 from framework.refinement.mixtures.mixture_tree import Level, MixtureTree, cut, level_below, ranges
 from framework.refinement.neighborhood_kernels import grouped
 
-NOWHERE = 1e6  # center of a mask without points, m
+NOWHERE = 1e6  # coordinates of the center of a mask without points, m
 MIN_NODE = 32  # minimum number of points of a node with children
 
 
@@ -28,7 +28,7 @@ class Initialization(Enum):
     """Initial responsibilities of the Gaussians of level 1."""
 
     MASKS = "masks, our interpretation of the paper"
-    K_MEANS = "k-means over the frame's points from the masks' means, the usual method"
+    K_MEANS = "k-means over the frame's points, started at the masks' means, the usual method"
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FrameTree:
     masks: tuple[Int64, ...]  # (M,) mask of each node, for each level
 
     def leaves(self) -> tuple[Float64, Float64, Float64, Int64]:
-        """Return the weights (L,), means (L, 3), covariances (L, 3, 3) and masks (L,) of the leaves."""
+        """Return the weights (L,), means (L, 3) m, covariances (L, 3, 3) m^2 and masks (L,) of the leaves."""
         parts = []
         for k, (level, masks) in enumerate(zip(self.levels, self.masks, strict=True)):
             below = self.levels[k + 1].firsts if k + 1 < len(self.levels) else np.zeros(len(level) + 1, np.int64)
@@ -49,7 +49,7 @@ class FrameTree:
         return weights, means, covariances, masks
 
     def masks_of(self, points: Float32) -> Int32:
-        """Return the mask (S,) of the most probable leaf for each point (S, 3), -1 if the tree has no leaf."""
+        """Return the mask (S,) of the most probable leaf for each point (S, 3) m; -1 if the tree has no leaf."""
         weights, means, covariances, masks = self.leaves()
         best = np.empty(len(points), np.int32)
         find_most_probable(points, coefficients(weights, means, covariances), best)
@@ -60,7 +60,7 @@ def grow(
     points: Float32, masks: Int32, count: int, settings: EmSettings, *, levels: int, children: int,
     gaussians_per_mask: int, initialization: Initialization, min_support: float,
 ) -> FrameTree:  # fmt: skip
-    """Grow a tree of at most `levels` levels over points (S, 3) with masks (S,) in [0, `count`), ascending.
+    """Grow a tree of at most `levels` levels over points (S, 3) m with masks (S,) in [0, `count`), in ascending order.
 
     A node with at least MIN_NODE points gets `children` children. A node is dropped in favor of its siblings if its
     weight is below `min_support`, or if it has too few points for a covariance.
@@ -89,9 +89,10 @@ def grow(
 
 
 def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
-    """Return the initial children of M Gaussians, one standard deviation along the longest axes in both directions.
+    """Return the initial children of M Gaussians, offset by one standard deviation along the longest axes.
 
-    2, 4 or 8 children lie along one, two or three axes. They have equal weights and a quarter of the covariance.
+    The offsets have both signs, so 2, 4 or 8 children lie along one, two or three axes. The children have equal weights
+    and a quarter of the covariance.
     """
     count, axes = len(means), children.bit_length() - 1
     values, vectors = np.linalg.eigh(covariances)  # ascending
@@ -110,7 +111,7 @@ def corners(means: Float64, covariances: Float64, children: int) -> Mixtures:
 
 
 def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) -> tuple[Level, Int64]:
-    """Return the level below nodes with weights `above`, and the indices of the components that became its nodes."""
+    """Return the level below the nodes with weights `above`, and the index of the component of each new node."""
     boxes = np.zeros((len(chosen), 2, 3))  # no uniform component
     level = level_below(fitted, boxes, chosen, above, min_support)
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
@@ -120,7 +121,7 @@ def _level(fitted: Mixtures, chosen: Int64, above: Float64, min_support: float) 
 def _start(
     points: Float32, masks: Int32, count: int, gaussians: int, initialization: Initialization, max_iterations: int
 ) -> Int32:
-    """Return the initial Gaussian (S,) of each point; the Gaussians of mask k start at k * `gaussians`."""
+    """Return the initial Gaussian (S,) of each point; those of mask k start at index k * `gaussians`."""
     starts = np.searchsorted(masks, np.arange(count + 1))
     labels = np.asarray(masks * np.int32(gaussians), np.int32)
     if gaussians > 1:

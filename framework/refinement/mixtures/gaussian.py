@@ -15,7 +15,8 @@ from framework.data import Float32, Float64
 
 LOG_2PI = float(np.log(2 * np.pi))
 JACOBI_SWEEPS = 6  # upper limit; 4 suffice for a 3x3 matrix in double precision
-NEGLIGIBLE = 1e-28  # of the squared trace; smaller off-diagonal elements change an eigenvalue in the 14th digit
+# ratio of the sum of squared off-diagonal elements to the squared trace; below it, eigenvalues are exact to 14 digits
+NEGLIGIBLE = 1e-28
 ABSENT = np.float32(-1e30)  # log density of a component with weight 0; finite, so that differences are finite
 FACTORS = 64  # factors per logarithm; with up to 10^4 components, the product stays below 1e256
 SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and respect infinities
@@ -80,7 +81,7 @@ def _exp(t: np.float32) -> np.float32:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def constant_exponential(log_density: np.float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """Add exp(log_density - largest) to the first n values of `evidence`."""
+    """Set the first n values of `evidence` to exp(log_density - largest)."""
     for i in range(n):
         evidence[i] = _exp(log_density - largest[i])
 
@@ -95,7 +96,7 @@ def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int
 
 @njit(cache=True, nogil=True)
 def log_evidence(largest: Float32, evidence: Float32, n: int) -> float:
-    """Return sum_i largest[i] + log(evidence[i]) over the first n, with one logarithm per FACTORS factors.
+    """Return sum_i largest[i] + log(evidence[i]) over the first n points, with one logarithm per FACTORS factors.
 
     A factor is between 1 and 1 + the number of components.
     """
@@ -204,9 +205,9 @@ def floor_eigenvalues(Sigma: Float64, floor: float) -> None:
 
 @njit(cache=True, nogil=True)
 def set_coefficients(weight: float, mean: Float64, Sigma: Float64, row: Float32) -> None:
-    """Set row = log(pi_k / sqrt((2 pi)^3 |Sigma|)), mu_k, and L^-1 of Sigma = L L^T, row by row.
+    """Set row to log(pi_k / sqrt((2 pi)^3 |Sigma|)), mu_k, and L^-1 of Sigma = L L^T, row by row.
 
-    In single precision, whitening by L^-1 is accurate even if entries of Sigma^-1 would cancel.
+    In single precision, whitening by L^-1 is accurate even where terms with Sigma^-1 would cancel.
     """
     if weight <= 0.0:
         row[:] = 0.0

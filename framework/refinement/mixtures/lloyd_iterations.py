@@ -13,10 +13,10 @@ from framework.refinement.neighborhood import Neighborhoods
 
 
 def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: int) -> tuple[Int32, Float64]:
-    """Return the labels (S,) and centers (N, K, 3) of k-means on each set `points[starts[k]:starts[k + 1]]`.
+    """Return the labels (S,) and centers (N, K, 3) m of k-means on each set `points[starts[k]:starts[k + 1]]`.
 
-    `centers` (N, K, 3) are the initial centers. Iteration ends if no label changes or after `max_iterations`. A center
-    that loses all its points stays in place. Ties go to the first center.
+    `centers` (N, K, 3) m are the initial centers. Iteration ends when no label changes or after `max_iterations`. A
+    center without points stays in place. Ties go to the first center.
     """
     labels = np.full(len(points), -1, np.int32)
     centers = centers.copy()
@@ -25,12 +25,12 @@ def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: in
 
 
 def nearest_centers(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
-    """Return the nearest center (S,) of set k for each of `points[begins[k]:ends[k]]`; -1 outside the ranges."""
+    """Return the index (S,) of the nearest center of set k for `points[begins[k]:ends[k]]`; -1 outside the ranges."""
     return np.asarray(nearest_all(points, begins, ends, centers), np.int32)
 
 
 def depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
-    """Return the means (N, groups, 3) of `groups` equal-sized groups of points by depth, to initialize `cluster`.
+    """Return the means (N, groups, 3) m of `groups` equal-sized groups of points by depth, to initialize `cluster`.
 
     Depth separates an occluder, the supporting surface and the wall behind. A set with fewer points than groups gives
     repeated centers. An empty set gives zeros.
@@ -39,7 +39,7 @@ def depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
 
 
 def start_centers(around: Neighborhoods, object_centers: int, background_centers: int) -> Float64:
-    """Return the `depth_groups` (N, object_centers + background_centers, 3) of mask and ring."""
+    """Return the `depth_groups` (N, object_centers + background_centers, 3) of each mask, then those of its ring."""
     of_ring = around.of_ring
     mask_starts = np.concatenate([[0], np.cumsum(around.mask_counts)])
     ring_starts = np.concatenate([[0], np.cumsum(around.ring_counts)])
@@ -53,9 +53,9 @@ def start_labels(
 ) -> Int32:
     """Return the initial component (S,) of each point for EM: object components first, then background components.
 
-    Lloyd's algorithm groups the ring's points, and the mask's points with `log_odds` (S,) of at least 0. It starts from
-    groups of equal size by depth and runs up to `iterations`. The mask's other points start in the nearest group of the
-    ring. Without background components they start in the object.
+    Lloyd's algorithm groups the ring's points and, separately, the mask's points with `log_odds` (S,) of at least 0. It
+    starts from groups of equal size by depth and runs for at most `iterations` iterations. The mask's other points
+    start in the nearest group of the ring, or in the object if there are no background components.
     """
     labels = np.empty(len(around.points_camera), np.int32)
     start_all(

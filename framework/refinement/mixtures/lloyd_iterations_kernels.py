@@ -53,7 +53,7 @@ def nearest(point: Float32, centers: Float64) -> int:
 
 @njit(cache=True, nogil=True, parallel=True)
 def nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
-    """Return the nearest center of each point."""
+    """Return the index (S,) of each point's nearest center, -1 outside the ranges."""
     labels = np.full(len(points), -1, np.int32)
     for k in range(len(begins)):
         for i in prange(begins[k], ends[k]):
@@ -88,7 +88,7 @@ def depth_groups_of(points: Float32, groups: int) -> Float64:
 
 @njit(cache=True, nogil=True)
 def _by_depth(points: Float32) -> Int64:
-    """Return the points' indices by increasing depth, by a stable radix sort. np.argsort takes long to compile."""
+    """Return the points' indices by increasing depth. This stable radix sort compiles faster than np.argsort."""
     n = len(points)
     depths = np.empty(n, np.float32)
     for i in range(n):
@@ -149,7 +149,7 @@ def _start_one(
 
 @njit(cache=True, nogil=True)
 def _group(points: Float32, chosen: Bool, groups: int, first_label: int, iterations: int, labels: Int32) -> Float64:
-    """Set the labels of the chosen points; return their groups' centers."""
+    """Set the labels of the chosen points; return the centers (groups, 3) of their groups."""
     own, own_labels, count = np.empty_like(points), np.empty(len(points), np.int32), 0
     for i in range(len(points)):
         if chosen[i]:

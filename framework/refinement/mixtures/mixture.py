@@ -35,8 +35,8 @@ def fit(
     set's bounding box.
 
     `prior_log_odds` (S,) is the evidence of each point for the first `own_components`. Their densities at point i are
-    multiplied by exp(prior_log_odds[i]) in eq. [2]. The log-likelihood uses the weighted densities, so it is known up
-    to a constant.
+    multiplied by exp(prior_log_odds[i]) in eq. [2]. The log-likelihood uses the weighted densities, so it is defined
+    only up to a constant.
     """
     n = len(starts) - 1
     shape, odds = (n, components), _zeros_if_none(prior_log_odds, points)
@@ -49,7 +49,7 @@ def fit(
 
 
 def improve(points: Float32, starts: Int64, mixtures: Mixtures, settings: EmSettings) -> None:
-    """Run EM in place on each point set `points[starts[k]:starts[k + 1]]` from the current components of mixture k."""
+    """Run EM in place on each point set `points[starts[k]:starts[k + 1]]`, starting from the current mixture k."""
     improve_all(points, starts, np.zeros(len(points), np.float32), settings, mixtures)
 
 
@@ -59,8 +59,8 @@ def likely_members(
 ) -> Bool:  # fmt: skip
     """Return an array (S,), True for `points[begins[k]:ends[k]]` with a posterior above `min_posterior` in mixture k.
 
-    The posterior is the probability of the first `own_components`, which form the object. A mixture without components
-    claims every point, because there is no evidence against them. Points outside the ranges are not claimed.
+    The posterior is the probability of the first `own_components`, which form the object. For a mixture without
+    components, all points are True, because there is no evidence against them. Points outside the ranges are False.
     """
     weights, means, covariances = mixtures.weights, mixtures.means, mixtures.covariances
     rows = coefficients(weights.ravel(), means.reshape(-1, 3), covariances.reshape(-1, 3, 3))

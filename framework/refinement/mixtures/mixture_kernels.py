@@ -55,8 +55,8 @@ class Blocks(NamedTuple):
     """B blocks of points, each of one set."""
 
     sets: Int64  # (B,) index of the set
-    begins: Int64  # (B,)
-    ends: Int64  # (B,)
+    begins: Int64  # (B,) index of the first point
+    ends: Int64  # (B,) index after the last point
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -73,7 +73,7 @@ def fit_all(
 
 @njit(cache=True, nogil=True, parallel=True)
 def improve_all(points: Float32, starts: Int64, odds: Float32, settings: EmSettings, mixtures: Mixtures) -> None:
-    """Run EM on the mixture of each cluster from its current parameters."""
+    """Run EM on the mixture of each cluster, starting from its current parameters."""
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
             own = slice(starts[k], starts[k + 1])
@@ -101,7 +101,7 @@ def _iterate(
     points: Float32, odds: Float32, own_components: int, center: Float64, settings: EmSettings, mixtures: Mixtures,
     k: int,
 ) -> None:  # fmt: skip
-    """Run EM on mixture k from its current components."""
+    """Run EM on mixture k, starting from its current components."""
     weights, means, covariances = mixtures.weights[k], mixtures.means[k], mixtures.covariances[k]
     outlier_weights, log_likelihoods = mixtures.outlier_weights, mixtures.log_likelihoods
     variance_floor, count, components = settings.variance_floor, len(points), len(weights)
@@ -196,7 +196,10 @@ def _maximize(
 
 @njit(cache=True, nogil=True)
 def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64, float]:
-    """Return the points' mean and the volume of their bounding box, with sides of at least 4 standard deviations."""
+    """Return the points' mean, m, and the volume of their bounding box, m^3.
+
+    A side of the box is at least 4 times the square root of `variance_floor`.
+    """
     center, low, high = np.zeros(3), np.empty(3), np.empty(3)
     for a in range(3):
         low[a] = high[a] = points[0, a]
@@ -226,7 +229,7 @@ def claim(
     points: Float32, blocks: Blocks, odds: Float32, rows: Float32, log_outliers: Float32, own_components: int,
     min_posterior: float, claimed: Bool,
 ) -> None:  # fmt: skip
-    """Set `claimed` to True for each point of the blocks with own / (own + others) > min_posterior."""
+    """Set `claimed` to True for each point of the blocks if own / (own + others) > min_posterior."""
     for b in prange(len(blocks.sets)):
         k, begin, end = blocks.sets[b], blocks.begins[b], blocks.ends[b]
         absent = True

@@ -21,7 +21,7 @@ from framework.refinement.neighborhood_kernels import grouped
 
 @dataclass(frozen=True)
 class Level:
-    """M nodes of one level, below the Q nodes of the level above. Above the first level are the N trees.
+    """M nodes of one level, below the Q nodes of the level above; for the first level, Q is the number of trees.
 
     The children of node q are the rows `firsts[q]:firsts[q + 1]`. A node without children is a leaf. Weights are
     fractions of the whole tree: a node's weight is the sum over its children and their uniform component.
@@ -66,10 +66,10 @@ class MixtureTree:
     def shared(
         self, k: int, points: Float32, starts: Int64, ratios: Float32, outlier_ratios: Float32, log_odds: Float32
     ) -> tuple[Int64, Float32]:
-        """Return the result of `passed`, and the object's posterior (S,) at each point by the densities of level `k`.
+        """Return the result of `passed`, and the object's posterior (S,) at each point from the densities of level `k`.
 
-        `ratios` (M,) are the object's fractions of the nodes, and `outlier_ratios` (Q,) of the uniform components. The
-        object's density is multiplied by exp(`log_odds`) (S,). The posterior of a point at a leaf is 0.
+        `ratios` (M,) are the object's fractions of the nodes, and `outlier_ratios` (Q,) those of the uniform
+        components. The object's density is multiplied by exp(`log_odds`) (S,). The posterior of a point at a leaf is 0.
         """
         level = self.levels[k]
         child, posterior = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
@@ -116,7 +116,7 @@ def cut(points: Float32, starts: Int64, groups: int) -> Int32:
     """Return labels (S,) in [0, groups) that cut each set into compact groups, to initialize `mixture.fit`.
 
     Variance-based bisection cuts the group with the largest scatter along one axis at its mean. A group is not cut if
-    too few points for a component would remain.
+    one part would have too few points for a component.
     """
     labels = np.zeros(len(points), np.int32)
     cut_all(points, starts, groups, labels)
@@ -136,9 +136,9 @@ def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: f
 
 
 def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, parent_points: float) -> list[Float32]:
-    """Return the object's fraction (M,) of each node, by level, from the log-odds (S,) of the sample's points.
+    """Return the object's fraction (M,) of each node, for each level, from the log-odds (S,) of the sample's points.
 
-    The parent's fraction counts as `parent_points` points.
+    The parent's fraction has the weight of `parent_points` points.
     """
     points, starts = sample.points_camera, sample.starts
     above, ratios = np.full(len(sample), 0.5, np.float32), []
@@ -169,7 +169,7 @@ def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: 
 
 
 def level_below(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
-    """Return the level below nodes with weights `above` (Q,). Only the `chosen` nodes have children."""
+    """Return the level below the nodes with weights `above` (Q,). Only the `chosen` nodes have children."""
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
     survivors = np.count_nonzero(kept, axis=1)
     weights = np.where(kept, fitted.weights, 0.0)

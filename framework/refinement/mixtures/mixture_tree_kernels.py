@@ -9,7 +9,7 @@ from framework.data import Float32, Float64, Int32, Int64
 from framework.refinement.mixtures.gaussian import SIMD, constant_exponential, exponentials, log_densities
 from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT, Blocks
 
-RATIO_ITERATIONS = 20  # EM iterations for a node's object fraction; with clear classes, each iteration halves the error
+RATIO_ITERATIONS = 20  # EM iterations for a node's object fraction; for distinct classes, each halves the error
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -62,7 +62,7 @@ def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
 @njit(cache=True, nogil=True)
 def _measure(points: Float32, members: Int64, mean: Float64, scatter: Float64) -> None:
     """Set the members' mean and their scatter along each axis."""
-    origin = points[members[0]]  # sums of offsets from a member do not cancel
+    origin = points[members[0]]  # offsets from a member avoid cancellation in the variance
     count, sums, squares = len(members), np.zeros(3), np.zeros(3)
     for i in members:
         for a in range(3):
@@ -93,7 +93,7 @@ def pass_down(
     points: Float32, log_odds: Float32, blocks: Blocks, rows: Float32, ratios: Float32, firsts: Int64,
     log_outliers: Float32, outlier_ratios: Float32, child: Int64, posterior: Float32,
 ) -> None:  # fmt: skip
-    """Set the child with the largest density at each point, and its posterior."""
+    """Set the child with the largest density and the object's posterior at each point."""
     for b in prange(len(blocks.sets)):
         q, own = blocks.sets[b], slice(blocks.begins[b], blocks.ends[b])
         children = slice(firsts[q], firsts[q + 1])
@@ -137,7 +137,7 @@ def _pass_block(
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
-    """Replace `best` by j for points with a larger density."""
+    """Set `best` to j and `largest` to the density where the density is larger than `largest`."""
     for i in range(len(largest)):
         better = densities[i] > largest[i]
         best[i] = j if better else best[i]
@@ -152,7 +152,7 @@ def _add_scaled(densities: Float32, scale: np.float32, values: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def set_own_ratios(log_odds: Float32, starts: Int64, above_points: float, ratios: Float32) -> None:
-    """Replace the parents' fractions in `ratios` (M,) with the nodes' own fractions."""
+    """Replace the parents' fractions in `ratios` (M,) with the fractions of the nodes."""
     for j in prange(len(starts) - 1):
         if starts[j + 1] > starts[j]:
             odds = np.exp(log_odds[starts[j] : starts[j + 1]])

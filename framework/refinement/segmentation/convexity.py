@@ -49,11 +49,11 @@ def segments(
     depth: Float32, camera: Camera, *, cell: int, window: int, limits: Limits, closing: int, min_pixels: int,
     sensor: SensorKind = SensorKind.KINECT_V1,
 ) -> tuple[Int32, int]:  # fmt: skip
-    """Return the segment (H, W) of each pixel in [0, count), -1 = none, and the count.
+    """Return the segment label (H, W) of each pixel, in [0, count) or -1 = none, and the count.
 
     Planes are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px. Gaps of up to 2 `closing` cells in
-    edges are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors. Noise is that of
-    the kind of depth sensor, `sensor`.
+    edges are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors. The noise is that of
+    the depth sensor `sensor`.
     """
     slope = np.float32(limits.max_slope * cell * 2 / (camera.fx + camera.fy))  # relative change of depth per cell
     pinhole = np.array(
@@ -75,10 +75,10 @@ def segments(
 
 
 def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> float:
-    """Return the standard deviation (rad) of the angle between two normals fitted at 1 m under `depth_noise` (m).
+    """Return the standard deviation (rad) of the angle between two normals, fitted at 1 m with `depth_noise` (m).
 
-    The deviation falls as 1 / z. The slope of a line through M readings has the deviation sigma / (sqrt(M) * rms
-    offset).
+    It is proportional to 1 / z. The slope of a line through M readings has the standard deviation sigma / (sqrt(M) *
+    rms offset).
     """
     readings = (cell * (2 * window + 1)) ** 2
     offset = cell * np.sqrt(window * (window + 1) / 3) * 2 / (camera.fx + camera.fy)  # m at 1 m
@@ -86,6 +86,6 @@ def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> 
 
 
 def _closed(edges: Bool, radius: int) -> Bool:
-    """Return the edges after morphological closing by a square of 2 `radius` + 1 cells."""
+    """Return the edges after morphological closing with a square of side 2 `radius` + 1 cells."""
     square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     return np.asarray(cv2.morphologyEx(edges.view(np.uint8), cv2.MORPH_CLOSE, square), np.bool_)

@@ -13,9 +13,9 @@ from framework.refinement.segmentation.union_find import root, unite
 from framework.sensors.noise_models_kernels import axial_sigma, axial_sigma_single
 
 MIN_CELLS = 6  # minimum number of cells of a plane fit; any three cells fit a plane exactly
-MIN_SPREAD = 0.1  # minimum determinant of a window's second moments over its square, cells^4; 0 for a line
+MIN_SPREAD = 0.1  # minimum determinant of the covariance of the positions in a window, cells^4; 0 for a line
 SWITCH = 1.5  # minimum factor by which an adjacent window must fit better than the cell's own window
-STRIP = 16  # number of rows of cells connected in parallel
+STRIP = 16  # number of rows of cells in a strip; strips are connected in parallel
 
 
 class Noise(NamedTuple):
@@ -99,7 +99,7 @@ def _add_offset(
 def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -> Float32:
     """Return the fit (4, rows, columns) around each cell: a, b, c of inverse depth a x + b y + c, and the residual.
 
-    The residual is the mean squared residual, inf without a fit.
+    Inverse depth is in 1 / m, x and y in cells. The residual is the mean squared residual, inf without a fit.
     """
     rows, columns = inverse.shape
     fits = np.zeros((4, rows, columns), np.float32)
@@ -126,7 +126,7 @@ def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
-    """Solve the least squares of e = a x + b y + c for each cell of a row, by the centered normal equations."""
+    """Fit e = a x + b y + c to the window of each cell of a row by least squares (centered normal equations)."""
     zero, one = np.float32(0), np.float32(1)
     n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
     for c in range(len(own)):
@@ -195,7 +195,7 @@ def _take_better(
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float) -> Bool:
-    """Return the edges (rows, columns): cells without a plane, or with a surface border between opposite neighbors."""
+    """Return the edges (rows, columns): cells without a plane or with a surface border between opposite neighbors."""
     _, rows, columns = planes.shape
     surface = np.empty((9, rows, columns), np.float32)
     for r in prange(rows):
@@ -224,10 +224,10 @@ def _set_surface(
 ) -> None:  # fmt: skip
     """Set the surface (9, columns) of a row.
 
-    The entries are unit normals (3) away from the camera, plane distances and points (3). The last two are the noise of
-    the distance to a plane and the minimum cosine between normals of a flat surface.
+    The entries are unit normals (3) away from the camera, plane distances, m, and points (3), m. The last two are the
+    noise of the distance to a plane, m, and the minimum cosine between normals of a flat surface.
 
-    1 / z = A (u - cx) + B (v - cy) + C is the plane (A fx, B fy, C) . p = 1. Without a plane the point is 0.
+    1 / z = A (u - cx) + B (v - cy) + C is the plane (A fx, B fy, C) . p = 1. Without a plane, the point is 0.
     """
     zero, one = np.float32(0), np.float32(1)
     fx, fy, cx, _ = pinhole
@@ -245,7 +245,7 @@ def _set_surface(
         px[c], py[c], pz[c] = x / fx * z, y / fy * z, z if valid else zero
         sigma = _axial_sigma(z, noise)
         gate[c] = k * (sigma if sigma > floor else floor)
-        # cos t = 1 - t^2 / 2 + t^4 / 24, within 0.01 rad up to a right angle; a larger angle is no crease
+        # cos t = 1 - t^2 / 2 + t^4 / 24, within 0.02 up to a right angle; a larger angle is not a crease
         t = angle + gate[c] * angle_sigma / z
         t2 = t * t
         min_cosine[c] = one - np.float32(0.5) * t2 + t2 * t2 * np.float32(1 / 24) if t < np.float32(1.5) else zero
@@ -255,8 +255,8 @@ def _set_surface(
 def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool) -> None:
     """Mark a cell if its two opposite neighbors are too far off each other's plane or form a concave crease.
 
-    `spacing` is the distance between the neighbors at 1 m. At a convex edge, each neighbor may be this far behind the
-    other's plane.
+    `spacing` is the distance between the neighbors at a depth of 1 m, m per m. At a convex edge, each neighbor may be
+    this far behind the other's plane.
     """
     zero = np.float32(0)
     ax, ay, az, ad, apx, apy, apz, gate, min_cosine = one
@@ -325,7 +325,7 @@ def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, mi
 
 @njit(cache=True, nogil=True)  # too little work for threads
 def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> tuple[Int32, Float32]:
-    """Return the segments grown by one cell. A free cell joins the neighbor that best predicts its depth."""
+    """Return labels and planes grown by one cell. A free cell joins the neighbor that best predicts its depth."""
     rows, columns = inverse.shape
     new_labels, new_planes = labels.copy(), planes.copy()
     for r in range(rows):

@@ -6,8 +6,8 @@ Odometry", IROS 2018). Planes are fitted in inverse depth.
 
 On a plane n . p = d the inverse depth is q = 1 / z = m . r, with r = ((u - cx) / fx, (v - cy) / fy, 1) and m = n / d.
 It is linear in the pixel. So a fit is a 3x3 system, and the moments of a union of cells are sums. The noise of stereo
-and structured-light sensors grows with z^2 and is constant in inverse depth. Open3D's RANSAC finds one plane at a time,
-at random, without the image grid.
+and structured-light sensors grows with z^2 and is constant in inverse depth. Open3D's RANSAC finds one plane at a time
+by random sampling and does not use the image grid.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Planes:
     deviations: Float64  # (K,) 1/m, rms deviation of the readings' inverse depth, at most the allowed noise
     areas: Float64  # (K,) visible area, m^2
     fractions: Float64  # (K,) fraction of the frame's readings
-    behind: Float64  # (K,) readings behind the plane over readings on the plane
+    behind: Float64  # (K,) ratio of readings behind the plane to readings on the plane
 
     def __len__(self) -> int:
         return len(self.m)
@@ -57,12 +57,12 @@ class Planes:
 
 
 def find_planes(frame: Frame, distance: float, noise: float, min_area: float) -> Planes:
-    """Return the planes with a visible area of at least `min_area` m^2, a quarter of it connected.
+    """Return the planes with a visible area of at least `min_area` m^2, at least a quarter of it connected.
 
-    A cell of 16x16 px belongs to a plane if the rms of its readings is at most `distance` (m, along the normal) plus
-    `noise` (1/m, of inverse depth: `noise` * z^2 m at depth z; for KINECT_V1, more for sensors with more noise). A
-    plane begins at the flattest free cell and grows over neighboring cells. Then it takes all cells of the frame that
-    lie in the plane, including cells across an occluder.
+    A cell of 16x16 px belongs to a plane if the rms distance of its readings is at most `distance` (m, along the
+    normal) plus the noise. `noise` (1/m) is the noise of inverse depth for KINECT_V1, or `noise` * z^2 m at depth z. It
+    is scaled up for sensors with more noise. A plane starts at the flattest free cell and grows over adjacent cells.
+    Then all cells of the frame that lie in the plane are added, including cells on the other side of an occluder.
     """
     height, width = frame.camera.shape
     sensor = frame.sensor.noise
@@ -84,7 +84,8 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
 def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
     """Return 1 + the index of the nearest plane (H, W) for each depth reading, 0 = none.
 
-    A reading is on a plane within `distance` (m, along the normal) plus three standard deviations of the plane's noise.
+    A reading is on a plane if its distance along the normal is at most `distance` (m) plus three standard deviations of
+    the plane's noise.
     """
     image = np.zeros(frame.depth.shape, np.uint8)
     if len(planes):
@@ -99,8 +100,8 @@ def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
 def off_planes(clusters: PointClusters, on_plane: UInt8, planes: int, max_own: float) -> tuple[Bool, Bool]:
     """Return a point array (P,), True for points to keep, and a pixel array (H, W), True for structure.
 
-    `on_plane` is the `plane_image`. A cluster loses a plane if it has at most a fraction `max_own` of the plane's
-    readings. Structure pixels are on a plane, but not in a cluster that keeps the plane.
+    `on_plane` is the `plane_image`. A cluster's points on a plane are removed if they are at most a fraction `max_own`
+    of the plane's readings. Structure pixels are on a plane, but not in a cluster that keeps its points on this plane.
     """
     structure = on_plane > 0
     rows = len(clusters) + 1  # the last row is for points of no cluster

@@ -15,7 +15,7 @@ from framework.sensors.noise_models_kernels import noise_ratio
 CELL = 16  # side of a cell, px: 9 cm at 3 m and 540 px focal length, smaller than a relevant plane
 STEP = 2  # stride of the readings used in a cell, px
 FULL = (CELL // STEP) ** 2  # number of readings in a full cell
-REFITS = 3  # number of passes that collect the cells of a plane again; the last pass hardly moves it
+REFITS = 3  # number of passes that collect the cells of a plane again; the last pass hardly changes the plane
 TRIM = 1.5  # maximum deviation of a cell in a fit, times the median deviation of the plane's cells
 SIGMAS = 3.0  # maximum distance of a reading on a plane, standard deviations of the noise
 MAX_PLANES = 32  # maximum number of planes; frames have fewer large planes
@@ -90,7 +90,7 @@ def _length(m: Float64) -> float:
 def _allowed(moment: Float64, noise: float, sensor: DepthNoise) -> float:
     """Return the maximum rms of inverse depth at the mean depth of a cell, 1/m, for this sensor.
 
-    Less noise than that of KINECT_V1 does not lower it, because real floors and walls are not flat.
+    The noise of KINECT_V1 is the minimum, because real floors and walls are not flat.
     """
     return float(noise * max(noise_ratio(moment[0] / moment[6], sensor), 1.0))
 
@@ -112,7 +112,7 @@ def _area(moment: Float64, m: Float64, spacing: float) -> float:
 
 @njit(cache=True, nogil=True)
 def write_flatness(cells: Float64, distance: float, noise: float, sensor: DepthNoise, flatness: Float64) -> None:
-    """Set the deviation of each cell (C, 10) that is full and flat enough to seed a plane."""
+    """Set the rms deviation, 1/m, of each cell (C, 10) that is full and flat enough to seed a plane."""
     m = np.zeros(3)
     for i in range(len(cells)):
         if 2 * cells[i, 0] >= FULL and _solve(cells[i], m) and _lies_in(cells[i], m, distance, noise, sensor):
@@ -124,7 +124,7 @@ def find_plane_cells(
     cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, sensor: DepthNoise,
     min_area: float, spacing: float, found: Float64,
 ) -> int:  # fmt: skip
-    """Set m, deviation, area, fraction and behind of each plane, clear `free` at its cells; return the plane count."""
+    """Set `found` to m, deviation, area, fraction and behind of each plane and clear `free` at its cells; return K."""
     m, total = np.zeros(3), np.zeros(10)
     tried = np.zeros(len(cells), np.bool_)
     readings = 0.0
@@ -170,7 +170,7 @@ def _grow(
     cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, sensor: DepthNoise, m: Float64,
     region: Int64,
 ) -> int:  # fmt: skip
-    """Set `region` to the connected cells of the seed in one plane and m to this plane; return the number of cells.
+    """Set `region` to the cells connected to the seed in one plane and m to this plane; return the number of cells.
 
     The plane is fitted again with every new cell.
     """
@@ -217,7 +217,7 @@ def _collect(
 def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> None:
     """Set m to the plane of the best-fitting cells, at least half of them, and `total` to the sum of their moments.
 
-    The other cells are across the intersection of two planes and would tilt the planes towards each other.
+    The other cells lie on both sides of the intersection of two planes and would tilt the planes towards each other.
     """
     inside, count = np.empty(len(deviations)), 0
     for i in range(len(deviations)):
@@ -264,7 +264,7 @@ def _order(values: Float64, k: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _readings_behind(cells: Float64, m: Float64, deviation: float, distance: float) -> float:
-    """Return the number of readings in cells with a mean clearly behind the plane."""
+    """Return the number of readings in cells whose mean is clearly behind the plane."""
     behind = 0.0
     for i in range(len(cells)):
         n = cells[i, 0]
@@ -281,7 +281,7 @@ def label_points(
     depth: Float32, pinhole: Float32, m: Float32, lengths: Float32, reach: Float32, sigmas: Float32,
     image: UInt8,
 ) -> None:  # fmt: skip
-    """Set image (H, W) to 1 + the index of the nearest plane within reach of each depth reading."""
+    """Set image (H, W) to 1 + the index of the plane nearest to each depth reading within its reach."""
     fx, fy, cx, cy = pinhole
     for v in prange(depth.shape[0]):
         y = np.float32(v - cy) / fy
@@ -300,7 +300,7 @@ def label_points(
 def find_off_planes(
     cluster: Int32, pixels: Int32, on_plane: UInt8, max_own: float, counts: Int64, stays: Bool, structure: Bool
 ) -> Bool:
-    """Return True for the kept points, and clear `structure` at kept points on planes."""
+    """Return an array (P,), True for the kept points, and clear `structure` at kept points on planes."""
     labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
     for part in prange(len(counts)):
         own = slice(part * PART, (part + 1) * PART)
@@ -315,7 +315,7 @@ def find_off_planes(
 
 @njit(cache=True, nogil=True)
 def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
-    """Set `stays` for each cluster (the last row is no cluster) and plane (column 0 is no plane)."""
+    """Set `stays` for each cluster (last row: points of no cluster) and each plane (column 0: points on no plane)."""
     parts, rows, columns = counts.shape
     for label in range(1, columns):
         most = max_own * _count(on_plane.ravel(), label)
@@ -328,7 +328,7 @@ def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UInt8, counts: Int64) -> None:
-    """Count points by cluster and plane, in runs of equal labels. A counter per point would stall on its store."""
+    """Count points by cluster and plane, in runs of equal labels, to avoid a slow memory write for each point."""
     k, label, count = 0, 0, 0
     for i in range(len(cluster)):
         labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]

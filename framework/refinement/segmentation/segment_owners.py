@@ -15,7 +15,8 @@ from framework.geometry import nearest_rotation, transform
 from framework.refinement.refine import keep_points
 from framework.refinement.segmentation.segment_owners_kernels import find_owners, judged
 
-MIN_SPREAD = 0.02  # m, minimum root of the scatter's second eigenvalue; single precision then moves 5 m by under 0.1 mm
+# minimum square root of the scatter's second eigenvalue, m; single precision then shifts points at 5 m by under 0.1 mm
+MIN_SPREAD = 0.02
 SAMPLE = 4096  # number of evenly spaced points; more points change the pose by less than single precision
 TOLERANCE = 1e-3  # maximum distance of a point from its depth reading, m
 
@@ -26,8 +27,8 @@ def owned_segments(
     """Return the clusters without points outside their segments; `labels` (H, W) in [0, `count`), -1 = none.
 
     A segment belongs to the mask that covers the most pixels, if they are more than a fraction `min_overlap` of the
-    segment. With `whole_segments` clusters gain their segments' readings outside their masks, if the camera pose is
-    determined.
+    segment. With `whole_segments`, the readings of a cluster's segments outside its mask are added to the cluster, if
+    the points determine the camera pose.
     """
     owners = find_owners(clusters.pixels, clusters.cluster, len(clusters), labels, count, min_overlap)
     kept, missing, missing_owner = judged(clusters.pixels, clusters.cluster, labels, owners)
@@ -48,7 +49,7 @@ def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
     """Return the T_world_camera (4, 4) that maps the depth readings at the clusters' pixels to the clusters' points.
 
     The pose is the least-squares rigid motion (Arun, Huang and Blostein, "Least-Squares Fitting of Two 3-D Point Sets",
-    PAMI 1987). Returns None if there are too few points or if all points are on one line. SciPy's align_vectors would
+    PAMI 1987). Returns None if there are too few points or if all points are on one line; SciPy's align_vectors would
     only warn. Raises DataError if the points are not from the readings of this frame.
     """
     step = max(len(clusters.pixels) // SAMPLE, 1)
@@ -72,12 +73,12 @@ def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
 
 
 def points_at(pixels: Int32, frame: Frame, T_world_camera: Float64) -> Float32:
-    """Return the world points (P, 3) of `frame` at `pixels` (P, 2) (u, v), with the arithmetic of `lift`."""
+    """Return the points (P, 3), m, of `frame` at `pixels` (P, 2) (u, v) in the world frame, computed as in `lift`."""
     return np.asarray(transform(T_world_camera, _readings(pixels, frame)), np.float32)
 
 
 def _readings(pixels: Int32, frame: Frame) -> Float64:
-    """Return the points (P, 3) m in the camera frame."""
+    """Return the depth readings at `pixels` (P, 2) (u, v) as points (P, 3), m, in the camera frame."""
     camera = frame.camera
     z = frame.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64)
     return np.stack([(pixels[:, 0] - camera.cx) / camera.fx * z, (pixels[:, 1] - camera.cy) / camera.fy * z, z], axis=1)

@@ -40,7 +40,7 @@ class ObjectTable {
     this.body.append(...this.rows);
   }
 
-  /** Hides rows that do not match the search and dims rows with less confidence. Returns the number of shown rows. */
+  /** Hides rows that do not match the search, dims rows below the confidence, and returns the number of shown rows. */
   filter(words, confidence) {
     let shown = 0;
     for (const row of this.rows) {

@@ -288,7 +288,7 @@ function rgb(hex) {
 
 function styleColor(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); }
 
-/** Returns a GLB of the page, stored as base64 of gzip. */
+/** Returns a GLB (ArrayBuffer) of the page, which stores it as base64 of gzip. */
 async function unpacked(element) {
   const bytes = Uint8Array.from(atob(element.textContent), (letter) => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));

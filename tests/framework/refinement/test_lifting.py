@@ -47,7 +47,7 @@ def test_lift_mask_size_mismatch_raises(room: CornerRoom) -> None:
     frame, shape = room[0], (1, 1)  # numpy would broadcast it over the image
     masks = np.ones((1, *shape), np.bool_)
     one = np.ones((1, 1), np.float32)
-    with pytest.raises(DataError, match=r"frame 0: expected masks of \(72, 96\), got \(1, 1\)"):
+    with pytest.raises(DataError, match=r"frame 0: expected masks of shape \(72, 96\), got \(1, 1\)"):
         lift(Detections(masks, np.zeros((1, 4), np.float32), one[0], one, ("a",)), frame, Pose(np.eye(4)))
 
 

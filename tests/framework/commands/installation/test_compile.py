@@ -31,7 +31,7 @@ def test_compile_second_call_compiles_no_kernels(tmp_path: Path) -> None:
     first, _ = compiling(tmp_path, "allocation_kernels.unpack", "binary_masks_kernels.mask_bounds").communicate()
     assert first.startswith("2 of 2 kernels compiled in ")
     second, _ = compiling(tmp_path, "allocation_kernels.unpack", "binary_masks_kernels.mask_bounds").communicate()
-    assert second == "all 2 kernels are compiled\n"
+    assert second == "all 2 kernels are already compiled\n"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
@@ -48,5 +48,5 @@ def test_compile_ctrl_c_ends_in_one_line(tmp_path: Path) -> None:
 
 
 def test_compile_unknown_kernel_name_raises() -> None:
-    with pytest.raises(ConfigError, match="kernels: expected part of a name, got nothing"):
+    with pytest.raises(ConfigError, match="NAME: expected part of a kernel name, got nothing"):
         compile_named(listed(DEFAULT), ["nothing"])

@@ -66,9 +66,9 @@ def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> No
         ("x" * (LONGEST_NAME + 1), f"at most {LONGEST_NAME} characters"),
         ("class", "NAME: expected a name other than a Python keyword, conf or"),
         ("conf", "NAME: expected a name other than a Python keyword, conf or"),
-        ("null", "NAME: expected a name, got null, a null, boolean or number in YAML"),
-        ("nan", "NAME: expected a name, got nan, a null, boolean or number in YAML"),
-        ("on", "NAME: expected a name, got on, a null, boolean or number in YAML"),
+        ("null", "NAME: expected a text value in YAML, got null (a null, boolean or number)"),
+        ("nan", "NAME: expected a text value in YAML, got nan (a null, boolean or number)"),
+        ("on", "NAME: expected a text value in YAML, got on (a null, boolean or number)"),
         ("config_error", "NAME: expected a unique class name, got ConfigError for"),
         ("cluster_refiner", "NAME: expected a unique class name, got ClusterRefiner for"),
     ],
@@ -86,7 +86,7 @@ def test_new_plugin_failure_keeps_existing_files(tmp_path: Path, monkeypatch: py
     with pytest.raises(ConfigError, match="expected a new folder"):
         write_repository("refiner", "mine", tmp_path)
     assert (made / "README.md").read_text() == "my own"
-    with pytest.raises(ConfigError, match="--in: expected a folder"):
+    with pytest.raises(ConfigError, match="--in: expected an existing folder"):
         write_repository("refiner", "other", tmp_path / "nowhere")
     (tmp_path / "instancemap-linked").symlink_to(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match="expected a new folder"):

@@ -101,9 +101,8 @@ def test_convert_oni_existing_output_is_not_overwritten(tmp_path, monkeypatch, s
     (tmp_path / "011" / file).parent.mkdir(parents=True)
     (tmp_path / "011" / file).write_bytes(b"mine")
     deliver(monkeypatch, 4)
-    with pytest.raises(
-        DataError, match="expected an empty or missing folder, got existing files; remove them or choose another OUT"
-    ):
+    message = "expected a missing path or an empty folder, got existing files; remove them or choose another OUT"
+    with pytest.raises(DataError, match=message):
         convert_oni.convert(source, tmp_path / "011")
     assert names(tmp_path / "011") == [file]
 
@@ -139,7 +138,7 @@ def test_convert_oni_truncated_recording_names_last_image(tmp_path, monkeypatch,
 
 def test_convert_oni_recording_without_frames_raises(tmp_path, monkeypatch, source):
     deliver(monkeypatch, 0)
-    with pytest.raises(DataError, match="expected color and depth images of equal times, got none"):
+    with pytest.raises(DataError, match="expected color and depth images with equal timestamps, got none"):
         convert_oni.convert(source, tmp_path / "011")
     assert names(tmp_path / "011") == []
 

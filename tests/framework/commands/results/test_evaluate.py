@@ -196,7 +196,7 @@ def _truncated_mesh(directory: Path) -> None:
         (lambda directory: (directory / "instances.json").unlink(), "instances.json: expected a readable file"),
         (
             lambda directory: _with_dataset(directory, truth=False),
-            "expected the ground truth of its metrics, got a dataset without instances",
+            "expected a dataset with instances (as in its metrics), got a dataset without instances",
         ),
         (lambda directory: _with_dataset(directory, colour=1), "got 'colour'"),
     ],
@@ -220,7 +220,7 @@ def test_evaluate_unusable_run_is_refused_and_others_continue(
 def test_evaluate_folder_without_runs_is_refused(stored: Path, tmp_path: Path, command) -> None:
     status, out, err = command(tmp_path / "nothing", stored)
     assert (status, out) == (1, f"{stored}: unchanged\n")
-    assert err == f"refused: {tmp_path / 'nothing'}: expected a run at or below it, got none\n"
+    assert err == f"refused: {tmp_path / 'nothing'}: expected a run directory or a folder of runs, got neither\n"
 
 
 def test_evaluate_runs_with_same_truth_load_it_once(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -269,7 +269,7 @@ def test_evaluate_process_reports_results_and_status(mapped: Path, tmp_path: Pat
         timeout=120,
     )
     assert done.stdout == "run: unchanged\n", done.stderr
-    assert done.stderr == "refused: absent: expected a run at or below it, got none\n"
+    assert done.stderr == "refused: absent: expected a run directory or a folder of runs, got neither\n"
     assert done.returncode == 1
 
 

@@ -116,7 +116,7 @@ FAR = ("--pose", 0, 0, -50, 0, 1, 0, 0)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--frame", 2], "--frame: expected a mapped frame, got 2 (a lost frame); the nearest mapped frame is 1"),
+        (["--frame", 2], "--frame: expected a mapped frame, got 2 (a lost frame); use the nearest one, --frame 1"),
         (["--frame", 6], "--frame: expected 0 to 5, got 6"),
         (["--frame", -1], "--frame: expected 0 to 5, got -1"),
         (["--pose", 0, 0, 0, 0, 0, 0, 2], "--pose: expected a quaternion qx qy qz qw of length 1, got 2"),

@@ -193,7 +193,7 @@ def test_report_out_of_range_boxes_are_one_line_error(stored: Path, command, key
     (stored / "instances.json").write_text(json.dumps(entries))
     status, _, err = command(stored)
     assert (status, len(err.splitlines())) == (1, 1)
-    assert f"instances.json, entry 2: {key}: expected numbers of shape (3,), at most" in err
+    assert f"instances.json, entry 2: {key}: expected numbers of shape (3,) in [-1e+06, 1e+06], got" in err
 
 
 def test_report_invalid_output_path_fails_before_reading(
