@@ -1,4 +1,7 @@
-"""Exceptions for user-correctable errors. Each message is one line: expected, found, file or key, fix."""
+"""Exceptions for user-correctable errors.
+
+Each message is one line with the file or key, the expected value, the found value, and the fix.
+"""
 
 from __future__ import annotations
 

@@ -163,6 +163,6 @@ def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> No
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
         raise DataError(
-            f"clusters: expected pixels in the image of {shape[1]}x{shape[0]}, got u in [{u.min()}, "
+            f"clusters: expected pixels in the image of {shape[1]}x{shape[0]} px, got u in [{u.min()}, "
             f"{u.max()}], v in [{v.min()}, {v.max()}]"
         )

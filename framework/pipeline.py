@@ -125,7 +125,7 @@ class Pipeline:
         return replace(journal.result(), keyframes=keyframes, color_delay=self.color_to_depth.estimate)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
-        """Return the keyframes of the tracker. A pending error of its thread is raised here and recorded."""
+        """Return the keyframes of the tracker. A pending error of its thread becomes `journal.stopped_by`."""
         try:
             return self.tracker.keyframes()
         except Exception as error:
@@ -139,7 +139,7 @@ class Pipeline:
             return "expected at least one frame, got none"
         if journal.without_pose == result.frames:
             first = journal.first_without_pose
-            return f"expected poses, got none for the {result.frames} frames; the first: {first}; {WITHOUT_POSES}"
+            return f"expected poses, got none for the {result.frames} frames (first: {first}); {WITHOUT_POSES}"
         if result.frames_skipped == result.frames:
             return f"expected usable frames, got none of {result.frames}; the log lists the reasons"
         lost = next((frame.pose.reason for frame in result.tracked if frame.pose.lost), "")

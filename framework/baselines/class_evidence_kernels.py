@@ -56,7 +56,7 @@ def _add_class(labels, sums, label, total):
 
 @device
 def observe_mask(evidence, row, n, masks, k):
-    """Apply the recursion to a voxel seen under cluster k. Returns the number of evictions."""
+    """Apply the recursive update to a voxel seen under cluster k. Returns the number of evictions."""
     labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
     known = 0  # bits of the named classes with a slot
     for s in range(len(labels)):

@@ -43,7 +43,7 @@ class Elections(NamedTuple):
 class ComponentStatistics(NamedTuple):
     """Statistics of K components by id, over the nearest voxel of each of their vertices; entry 0 is unused."""
 
-    probability_sums: Float64  # (K + 1, C) sums of each class over the vertices; the rest belongs to the background
+    probability_sums: Float64  # (K + 1, C) sums of P(class) over the vertices; the remainder is P(background)
     masked: Int32  # (K + 1,) maximum number of frames with a voxel under a mask
     first_frame: Int32  # (K + 1,) first frame with any voxel under a mask, -1 = none
     last_frame: Int32  # (K + 1,) last frame with any voxel under a mask, -1 = none

@@ -95,7 +95,7 @@ class Pictured:
         return [record for row in self.rows.values() if row for record in row.records.values()]
 
     def called(self, run: Run) -> str:
-        """Return the name of the run's sequence, with the seed if there are several."""
+        """Return the name of the run's sequence, with the seed if the runs have several seeds."""
         seeds = {other[0] for other in self.runs}
         return run[-1] if len(run) == 1 or len(seeds) == 1 else f"{run[-1]}, seed {run[0]}"
 

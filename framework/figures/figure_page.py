@@ -89,7 +89,7 @@ def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, wi
     Args:
         axes: Axes of the image, in pixels.
         ids: (H, W) object of each pixel, 0 = none.
-        names: Name by object; names without space are omitted.
+        names: Name by object; names that do not fit are omitted.
         size: Font size, pt.
         width_mm: Width of the printed image, mm.
     """

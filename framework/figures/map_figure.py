@@ -28,7 +28,7 @@ from framework.rendering.camera_path import ProjectedPath
 
 HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # above the columns, below a line, between panels
 LEFT_MM, RIGHT_MM = 3.5, 0.3  # left and right of the panels
-ASPECT = 0.78  # height by width of a panel
+ASPECT = 0.78  # height of a panel divided by its width
 
 
 @dataclass(frozen=True)

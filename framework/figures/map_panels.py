@@ -27,7 +27,7 @@ class Panel:
     image: UInt8  # (H, W, 3) RGB
     objects: Int32  # (H, W) object of each pixel, 0 = none
     names: Mapping[int, str]  # by object
-    path: ProjectedPath | None = None  # None = identical in all columns
+    path: ProjectedPath | None = None  # camera path; None = not drawn
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def _with_path(column: _Column, camera: Camera, T_world_camera: Float64) -> tupl
     R_world_camera = T_world_camera[:3, :3]
     hits = FrontSides(column.surface, T_world_camera[:3, 3]).seen_by(camera.scaled(FRAMING_SCALE), R_world_camera)
     path = column.poses[:, :3, 3].astype(np.float32)
-    # as many points as the surface, because outliers are not framed
+    # as many path points as surface points, so that `fitted` does not remove the path as outliers
     path = path[np.linspace(0, len(path) - 1, int(hits.seen.sum())).astype(int)]
     return fitted(R_world_camera, np.concatenate([hits.points_world[hits.seen], path]), camera.width, camera.height)
 

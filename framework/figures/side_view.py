@@ -34,13 +34,13 @@ SCALE_BAR = 0.15  # approximate length, relative to the width of the view
 class SideView:
     """Orthographic side view of the P depth readings of a frame."""
 
-    rows: Array  # (P,) of the readings in the image
-    columns: Array  # (P,)
-    points: Float32  # (P, 3) m, x right, y down, z forward
-    spacing: Float32  # (P,) m, between neighboring readings
-    center: Float64  # (2,) m, of the view
+    rows: Array  # (P,) image rows of the readings
+    columns: Array  # (P,) image columns of the readings
+    points: Float32  # (P, 3) m, in the frame of the view: x right, y down, z forward
+    spacing: Float32  # (P,) m, distance between neighboring readings
+    center: Float64  # (2,) m, x and y of the center of the view
     size: Float64  # (2,) m, width and height of the view
-    forward: float  # viewing direction of the frame's camera along x
+    forward: float  # x component of the viewing direction of the frame's camera
 
     @classmethod
     def of(cls, frame: Frame, before: ClusterMarks, after: ClusterMarks, aspect: float) -> SideView | None:

@@ -40,10 +40,10 @@ class Label:
 
 
 def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tuple[float, float]]) -> list[Label]:
-    """Return the placed `names`, given by id, in an image of `ids` (H, W), 0 = none; large objects come first.
+    """Return the labels with the `names` (by id) for an image of `ids` (H, W), 0 = none; large objects come first.
 
-    Names do not overlap and are inside the image. Names without space are omitted. `size` returns the width and height
-    of a text, px.
+    Labels do not overlap and are inside the image. Names that do not fit are omitted. `size` returns the width and
+    height of a text, px.
     """
     pixels = np.bincount(ids.ravel(), minlength=max([0, *names]) + 1)
     shown = sorted((key for key in names if pixels[key] >= MIN_PIXELS), key=lambda key: (-pixels[key], key))

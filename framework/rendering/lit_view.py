@@ -12,7 +12,7 @@ from framework.rendering.ambient_occlusion import openness
 from framework.rendering.lit_view_kernels import light_up, paint
 from framework.rendering.surface import FrontSides, Surface
 
-SUPERSAMPLING = 2  # rays per pixel in either direction
+SUPERSAMPLING = 2  # rays per pixel in each direction
 NOTHING = (229, 232, 236)  # RGB of empty pixels; not white, because surfaces may be white
 
 

@@ -42,7 +42,7 @@ class ObjectColors:
 
 
 def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
-    """Return the ground-truth instance of each matched instance, from both ids (V,) of the same points; 0 = none.
+    """Return the ground-truth id of each matched instance, from the two ids of each of V points; 0 = none.
 
     The matching maximizes the sum of IoU. Pairs with an IoU below SAME_OBJECT_IOU are omitted.
     """
