@@ -38,7 +38,7 @@ LIST = Path(__file__).with_name("kernels.txt")
 CHECKOUT = Path(__file__).resolve().parents[2]
 DEFAULT, OTHERS = "# a run with the default stages", "# additional kernels of other stages"
 MAX_WORKERS = 4  # each takes 0.5 GB and compiles shared functions again
-SECONDS_EACH = 0.65  # of a core (AMD EPYC, Zen 5), for an estimate of the time
+SECONDS_EACH = 0.65  # s, compilation time of a kernel on one core (AMD EPYC, Zen 5)
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def _feed(
                 error = (
                     answer.strip()
                     if answer
-                    else f"{kernel.module}.{kernel.name}: expected a result, got the end of its process"
+                    else f"{kernel.module}.{kernel.name}: expected a result, got the end of the worker process"
                 )
                 events.put(("done", error))
 

@@ -29,7 +29,7 @@ from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh
 from framework.errors import DataError
 
 MAX_DISTANCE = 0.05  # m, maximum distance of the nearest neighbor for the label transfer
-MIN_POINTS = 100  # minimum points of an evaluated ground-truth instance
+MIN_POINTS = 100  # minimum number of points of an evaluated ground-truth instance
 IOU_THRESHOLDS = tuple(percent / 100 for percent in range(50, 100, 5))  # averaged by `ap`, as in COCO
 
 
@@ -113,7 +113,7 @@ class Outcome(Enum):
     RIGHT = "correct"  # matched with a ground-truth instance of its class
     WRONG_CLASS = "wrong class"  # IoU with a ground-truth instance of another class reaches the threshold
     FALSE = "false positive"  # insufficient IoU, or a duplicate of a more confident prediction
-    IGNORED = "ignored"  # unknown ground truth
+    IGNORED = "ignored"  # the ground truth is unknown
 
 
 @dataclass(frozen=True)
@@ -151,8 +151,8 @@ class InstanceEvaluation:
         - `mean_iou`: mean over the ground-truth instances of the best overlap with a prediction of any class.
         - `precision50`, `recall50`, `f1_50`: at IoU 0.5, over all predictions and ground-truth instances.
         - `pq50`: panoptic quality at IoU 0.5, averaged over classes.
-        - `true_count`: evaluated ground-truth instances, also by class.
-        - `ignored_count`: ignored predictions at IoU 0.5.
+        - `true_count`: number of evaluated ground-truth instances, also by class.
+        - `ignored_count`: number of ignored predictions at IoU 0.5.
         """
         if self.overall is None:
             return {}

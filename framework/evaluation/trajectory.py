@@ -1,4 +1,4 @@
-"""Trajectory errors ATE and RPE, in evo's notation and with evo's values.
+"""Trajectory errors ATE and RPE, in the notation of evo and with the same results.
 
 Q_i and P_i are the ground-truth and the estimated T_world_camera of frame i.
 

@@ -2,7 +2,7 @@
 
 Frames that arrive during drawing are drawn next. Of images and maps, only the newest is drawn. The fuser may write the
 map at any time, so the pipeline's thread takes snapshots between two frames. The time for snapshots and drawing is
-limited to fixed fractions, regardless of the map's size.
+limited to fixed fractions of the run time, regardless of the map's size.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ LAYOUTS: dict[str, tuple[Callable[[ComparisonTable], TextTable], Callable[[Compa
     "columns_by": (across_grid, difference_across_grid),
     "group_by": (by_grid, difference_grid),
 }
-"""TableChoice.layout -> the table of the values, and the table of the differences from the baseline."""
+"""Functions for the table of values and the table of differences from the baseline, by TableChoice.layout."""
 
 
 def _grids(comparison: ComparisonTable) -> Iterator[TextTable]:
