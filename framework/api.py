@@ -131,7 +131,7 @@ class FrameResult(Pose):
     """The pose of a frame, its tracking state, and the new and removed objects."""
 
     new: tuple[int, ...] = ()  # ids of objects added by this frame
-    removed: tuple[int, ...] = ()  # ids of objects that were merged or outvoted
+    removed: tuple[int, ...] = ()  # ids of objects removed by this frame, because they were merged or outvoted
 
 
 class Mapper(Map):
@@ -252,8 +252,8 @@ class Mapper(Map):
         """Return the object at a pixel of the last frame with a pose, or of another view.
 
         Args:
-            u: The column of the pixel.
-            v: The row of the pixel.
+            u: The column of the pixel, px.
+            v: The row of the pixel, px.
             camera: The camera; None = the camera of the last frame.
             T_world_camera: The pose (4, 4); None = the pose of the color image of the last frame that is not lost.
 

@@ -44,7 +44,7 @@ ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; 
 COVARIANCE_TOLERANCE = 1e-9  # maximum rounding error of a covariance, relative to its largest entry
 MAX_PIXELS = 2**25  # maximum number of pixels of an image; a frame of 8K video is smaller
 WIDEST = 10.0  # maximum lateral distance per depth, m/m: a field of view of 168 degrees
-LONGEST_FOCAL_LENGTH = 1e6  # px
+LONGEST_FOCAL_LENGTH = 1e6  # maximum focal length, px
 UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
 LONGEST_EMBEDDING = 65_536  # maximum number of dimensions; published networks have 500 to 4,000
 LONGEST_SPACE = 300  # maximum number of characters of an embedding space name
@@ -120,7 +120,7 @@ class FrameTruth:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape (height, width) in px."""
+        """Shape (height, width) of the ids, px."""
         return self.instance_ids.shape
 
 
@@ -360,7 +360,7 @@ class Instance:
     id: int  # 32-bit, from 1
     class_probabilities: Float32  # (C,) a distribution over the map's classes
     confidence: float  # in [0, 1], ranks instances in the evaluation
-    observations: int  # frames in which it was detected
+    observations: int  # number of frames in which it was detected
     first_frame: int  # `Frame.index` of the first detection
     last_frame: int  # `Frame.index` of the last detection
     vertices: Int32  # (M,) indices of its vertices in the map's InstanceMesh

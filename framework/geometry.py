@@ -91,13 +91,13 @@ def rotation_angle(R: Float64) -> float:
 
 
 def pose_distance(T_world_a: Float64, T_world_b: Float64) -> float:
-    """Return the larger of translation (m) and rotation angle (rad) between two poses."""
+    """Return the maximum of the distance (m) and the rotation angle (rad) between two poses."""
     T_a_b = inverse(T_world_a) @ T_world_b
     return max(float(np.linalg.norm(T_a_b[:3, 3])), rotation_angle(T_a_b[:3, :3]))
 
 
 def nearest_rotation(R: Float64) -> Float64:
-    """Return the rotation nearest to a matrix (3, 3) in the Frobenius norm (orthogonal Procrustes)."""
+    """Return the rotation (3, 3) nearest to a matrix (3, 3) in the Frobenius norm (orthogonal Procrustes)."""
     U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 

@@ -49,13 +49,13 @@ StageTimer = Callable[[FusionStage], AbstractContextManager[None]]
 
 
 def untimed(stage: FusionStage) -> AbstractContextManager[None]:
-    """Return a timer that measures nothing.
+    """Return a context manager that measures nothing.
 
     Args:
         stage: The stage; ignored.
 
     Returns:
-        An empty context manager.
+        The context manager.
     """
     return nullcontext()
 
@@ -63,8 +63,8 @@ def untimed(stage: FusionStage) -> AbstractContextManager[None]:
 class RGBDVideo(ABC):
     """A source of frames: a stored sequence (`RGBDSequence`) or a running camera (`LiveVideo`)."""
 
-    name: str  # of the scene, for tables
-    annotation: str = ""  # release of the ground truth, for tables; "" = a single release
+    name: str  # name of the scene, for tables
+    annotation: str = ""  # release of the ground truth, for tables; "" = only one release exists
     domain: str = ""  # image domain, compared with `Detector.domain`: "rendered rooms"; "" = photographs or unknown
 
     def has_poses(self) -> bool:
@@ -143,7 +143,7 @@ class Detector(ABC):
 class PoseTracker(ABC):
     """Tracker of the camera pose."""
 
-    pose_source: str = "tracked"  # for tables; `ground_truth` for a tracker that returns the poses of the sequence
+    pose_source: str = "tracked"  # source of the poses, for tables; `ground_truth` = the poses of the sequence
 
     @abstractmethod
     def track(self, frame: Frame, scene: SceneMap) -> Pose:

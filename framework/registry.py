@@ -47,10 +47,11 @@ Plugin = TypeVar("Plugin")
 def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
     """Build the plugin of a config node: `_target_` names the class, the other keys are its parameters.
 
-    The class must be the `_target_` of a registered option of the stage: of this project, an installed package, or
-    --config-dir (without a running Hydra: `framework.config.composition.add_config_dir`). Only then is its module
-    imported. A class that is not a concrete dataclass implementing `interface` is rejected, so a config cannot run
-    unregistered code. Interpolations in the node are resolved against the config that contains it.
+    The class must be the `_target_` of a registered option of the stage. Options are registered by this project, by an
+    installed package, and by --config-dir (without a running Hydra: `framework.config.composition.add_config_dir`). The
+    modules of other classes are not imported, so a config cannot run unregistered code. The class must also be a
+    concrete dataclass that implements `interface`. Interpolations in the node are resolved against the config that
+    contains it.
 
     Args:
         interface: The interface of the plugin. It is not annotated as `type[Plugin]`, which excludes abstract classes.
@@ -290,7 +291,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
 
 
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
-    """Return the interfaces of the fields with a plugin, or with plugins by name (Mapping[str, interface])."""
+    """Return the interfaces of the fields that contain a plugin or plugins by name (Mapping[str, interface])."""
     found = {}
     for name, hint in get_type_hints(plugin_class).items():
         of = get_args(hint)

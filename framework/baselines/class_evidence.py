@@ -57,7 +57,7 @@ class MaskClasses(NamedTuple):
 
     cluster: Int32  # (H * W,) cluster with the best score over each pixel, -1 = none
     log_ratio: Float32  # (N, C) log P(class) / P(background)
-    unnamed: Float32  # (N,) log ratio of the mean of the unnamed classes of each cluster
+    unnamed: Float32  # (N,) log ratio of the mean P(unnamed class) of each cluster to P(background)
     named_classes: UInt8  # (N, NEW_CLASSES) best classes of each cluster
     named_bit: UInt8  # (N, NO_CLASS + 1) bit m of a cluster's m-th named class, 0 = unnamed
     frame: int  # index of the frame
@@ -93,7 +93,7 @@ class ClassRows:
 
     @property
     def byte_count(self) -> int:
-        """Bytes in use."""
+        """Size of the arrays in use, bytes."""
         return sum(array.nbytes for array in self.saved().values())
 
     def begin(self, classes: int) -> None:

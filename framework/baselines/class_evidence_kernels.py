@@ -14,7 +14,7 @@ MAX_FRAMES = np.uint16(65535)  # largest frame count of a voxel
 
 @njit(cache=True, nogil=True)
 def best_clusters(offsets, clusters, scores):
-    """Return the cluster (L,) with the best score in each list, -1 = none; ties go to the first."""
+    """Return the clusters (L,) with the best score in each of the lists, -1 = none; ties go to the first."""
     best = np.full(offsets.shape[0] - 1, -1, np.int32)
     for i in range(best.shape[0]):
         for entry in range(offsets[i], offsets[i + 1]):

@@ -1,11 +1,11 @@
 """Map with one volume per object and a background volume of the whole scene.
 
-Fusion++ (McCormac et al. 2018) gives an object 64^3 voxels of any size and resamples them as the object grows. It
+Fusion++ (McCormac et al. 2018) represents an object by 64^3 voxels, which are resampled as the object grows. It
 integrates every frame that shows the object, corrects object poses by loop closures, and tracks against a coarse
 background. MaskFusion (Runz et al. 2018) has surfels under the masks only, and tracks moving objects.
 
-Here all volumes have voxels of the same size, objects are static, and a volume changes only in frames that detect its
-object.
+Here, all volumes have voxels of the same size, objects are static, and a volume changes only in frames in which its
+object is detected.
 """
 
 from __future__ import annotations

@@ -172,7 +172,7 @@ class BlockGrid:
     def voxels_seen(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> tuple[Int64, Int64]:
         """Return the voxels within `band` voxels of the reading at their pixel, and their pixels, as flat indices (V,).
 
-        Only pixels in `mask` (H, W) count. After integrate_custom.py of Open3D's examples.
+        Only pixels in `mask` (H, W) are used. The method is from integrate_custom.py of Open3D's examples.
         """
         camera = frame.camera
         usable = self._usable(frame.depth)
@@ -259,7 +259,7 @@ class BlockGrid:
         return np.asarray(tsdf * np.float32(self.settings.truncation * self.settings.voxel_size), np.float32)
 
     def _blocks_in_view(self, camera: Camera, T_world_camera: Float64) -> tuple[Int32, float]:
-        """Return the coordinates (B, 3) of the blocks in view, and their maximum depth (m)."""
+        """Return the block coordinates (B, 3) of the blocks in view, and their maximum depth, m."""
         coords = self.block_coords()
         side = self.settings.block_resolution * self.settings.voxel_size
         radius = side * np.sqrt(3) / 2
@@ -348,7 +348,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """Return the world points (H, W, 3) m of a surface."""
+    """Return the points (H, W, 3), m, of a surface in the world frame."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)

@@ -28,7 +28,7 @@ from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
 MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the parameters; AREA in m^2
-SWEEPS = 20  # maximum sweeps of the regularization
+SWEEPS = 20  # maximum number of sweeps of the regularization
 FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
 
 

@@ -1,7 +1,7 @@
 """Worker process for compiling kernels without running them.
 
-numba generates machine code and Python and C wrappers for each function that a kernel calls, although the kernel
-contains a copy. Skipping this step saves a third of the time and results in the same cache.
+For each function that a kernel calls, numba generates machine code and wrappers for Python and C, although the kernel
+contains a copy of the function. Skipping this step saves a third of the time and results in the same cache.
 
 numba also optimizes each function separately, and again as part of each caller. Here, most functions are optimized
 only as part of a kernel, which saves another fifth of the time. The kernels are equally fast. Functions with forced

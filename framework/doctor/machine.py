@@ -13,7 +13,7 @@ from pathlib import Path
 from framework.doctor.check_result import Check, Status, anonymous
 
 MIN_DISK_GB = 2.0  # a run writes 20 to 200 MB; a synthetic benchmark writes several GB
-MIN_MEMORY_GIB = 2.0  # the demo requires 1.2
+MIN_MEMORY_GIB = 2.0  # the demo requires 1.2 GiB
 SYSTEM_LIBRARIES = {
     "libGL.so.1": ("libgl1", "Open3D"),
     "libEGL.so.1": ("libegl1", "Open3D"),

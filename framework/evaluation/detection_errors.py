@@ -43,7 +43,7 @@ class FalseDetection(NamedTuple):
     """A detection with at most half of its pixels on objects of known classes."""
 
     score: float
-    side: float  # px
+    side: float  # px, square root of the area
     on_thing: bool  # True: mostly on one object of unknown class
 
 

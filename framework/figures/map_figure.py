@@ -26,8 +26,8 @@ from framework.figures.figure_page import (
 from framework.figures.map_panels import Panel, PanelLine
 from framework.rendering.camera_path import ProjectedPath
 
-HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # above the columns, below a line, between panels
-LEFT_MM, RIGHT_MM = 3.5, 0.3  # left and right of the panels
+HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # space above the columns, below a line, and between panels
+LEFT_MM, RIGHT_MM = 3.5, 0.3  # space to the left and to the right of the panels
 ASPECT = 0.78  # height of a panel divided by its width
 
 
@@ -35,9 +35,9 @@ ASPECT = 0.78  # height of a panel divided by its width
 class CaptionedLine:
     """A line of panels with its name and captions."""
 
-    name: str  # the sequence
+    name: str  # name of the sequence
     panels: PanelLine
-    captions: Sequence[str]  # below each map; the last is for the ground truth
+    captions: Sequence[str]  # caption below each map; the last caption is for the ground truth
 
     @property
     def rows(self) -> int:

@@ -25,14 +25,14 @@ class Panel:
     """An image of one map."""
 
     image: UInt8  # (H, W, 3) RGB
-    objects: Int32  # (H, W) object of each pixel, 0 = none
-    names: Mapping[int, str]  # by object
+    objects: Int32  # (H, W) objects of the pixels, 0 = none
+    names: Mapping[int, str]  # class name by object
     path: ProjectedPath | None = None  # camera path; None = not drawn
 
 
 @dataclass(frozen=True)
 class Window:
-    """A part of an image, px from its upper left corner."""
+    """A part of an image; coordinates in px from the upper left corner of the image."""
 
     left: int
     top: int
@@ -57,8 +57,8 @@ class PanelLine:
 
     maps: Sequence[Panel | None]  # by column; None = no map
     truth: Panel | None  # None = no ground truth
-    true_count: int  # instances of known class in the image of the ground truth
-    window: Window | None = None  # None = no enlarged panels
+    true_count: int  # number of ground-truth instances of known class
+    window: Window | None = None  # window of the enlarged panels; None = no enlarged panels
     zoomed: Sequence[Panel | None] = ()  # enlarged window of the maps and of the ground truth
 
 
@@ -104,9 +104,9 @@ class _Column:
 
     surface: Surface
     colors: UInt8  # (V, 3) RGB
-    objects: Int32  # (V,) 0 = none
-    names: Mapping[int, str]  # by object
-    poses: Float64  # (F, 4, 4)
+    objects: Int32  # (V,) objects of the vertices, 0 = none
+    names: Mapping[int, str]  # class name by object
+    poses: Float64  # (F, 4, 4) T_world_camera
 
     @classmethod
     def of(cls, stored: StoredMap, truth: SceneTruth, colors: ObjectColors) -> _Column:

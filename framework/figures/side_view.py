@@ -17,17 +17,17 @@ from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import looking, upward
 
 AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(75), np.deg2rad(14)  # at 90 degrees, planes would become lines
-MARGIN = 0.09  # around the clusters, relative to the size of the view
+MARGIN = 0.09  # margin around the clusters, relative to the size of the view
 MIN_HEIGHT_M = 0.4  # minimum height of the view
-CELLS = 300  # grid cells across the view for counting visible points
+CELLS = 300  # number of grid cells across the view for counting visible points
 POINT_SIZE = 1.2  # size of a drawn point, relative to the distance between readings
 MIN_POINT_PT, MAX_POINT_PT = 0.7, 2.2
-GRID_CELLS = 120  # grid cells across the coarse surface for estimating the up direction
+GRID_CELLS = 120  # number of grid cells across the coarse surface for estimating the up direction
 LEVEL_RAD = np.deg2rad(6)  # maximum slope of a floor
 PITCHES_RAD = np.deg2rad([0, 30])  # initial downward pitches of the camera in the floor search
 MAX_DEPTH_STEP = 0.1  # maximum difference between readings of one surface, relative to depth
 SCALE_BARS_M = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0])
-SCALE_BAR = 0.15  # approximate length, relative to the width of the view
+SCALE_BAR = 0.15  # approximate length of the scale bar, relative to the width of the view
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class SideView:
 
     @classmethod
     def of(cls, frame: Frame, before: ClusterMarks, after: ClusterMarks, aspect: float) -> SideView | None:
-        """Return the view from the left or the right, whichever shows more changed points; None = no depth readings.
+        """Return the view, from the left or the right, that shows more changed points; None = no depth readings.
 
         Args:
             frame: Frame with depth.

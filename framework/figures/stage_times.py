@@ -17,7 +17,7 @@ from framework.data import Float64, Int64
 from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, write_message
 from framework.runs.timings_file import StageTimes
 
-WINDOW = 9  # frames, of the running median
+WINDOW = 9  # number of frames of the running median
 COLUMNS = {
     "Mask R-CNN": ("detection",),
     "data association": ("lifting", "association"),
@@ -26,7 +26,7 @@ COLUMNS = {
 }
 """Stages by line, with the names of the paper; the assignment of stages to names is our interpretation."""
 COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # for color-blind readers
-RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # ms per frame
+RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # names of the reference lines, by ms per frame
 PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights of a diagram, its heading and its axis labels
 LEFT_MM, RIGHT_MM = 9.5, 25.5  # margins of the diagram
 PLOT_WIDTH_MM = COLUMN_MM - LEFT_MM - RIGHT_MM

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     import rerun as rr
 
 PATH_PIECE = 200  # maximum number of poses that are redrawn for a new pose
-MM = 1000  # units of depth images per m
+MM = 1000  # depth image units per m
 UNKNOWN = 65535  # label of masks without an instance of the map
 UNKNOWN_COLOR = np.array([235, 235, 235], np.uint8)
 MASK_OPACITY = 0.5
 PATH_COLOR, LOST_COLOR = (40, 160, 255), (230, 60, 50)
-NAME_RADIUS = 0.005  # m
-PATH_RADIUS = 0.004  # m
+NAME_RADIUS = 0.005  # m, radius of the point of an object name
+PATH_RADIUS = 0.004  # m, radius of the line of the camera path
 FRUSTUM_M = 0.25  # m, distance of the image plane from the camera
 MIN_TURN = 0.01  # minimum change of a component of the up direction (unit vector) for a redraw
 
@@ -247,5 +247,5 @@ def turned(up: Float64, forward: Float64) -> Float64:
 
 
 def _lighter(colors: Sequence[UInt8]) -> UInt8:
-    """Return colors (N, 3) RGB for text on a dark background."""
+    """Return lighter RGB colors (N, 3) for text on a dark background."""
     return (np.array(colors, np.uint16).reshape(-1, 3) // 2 + 115).astype(np.uint8)

@@ -48,8 +48,8 @@ class Change:
     """One object of the first visit, the second, or both."""
 
     kind: Kind
-    name: str  # of its class
-    probability: float  # of `kind`; for NOT_SEEN, probability that the object exists
+    name: str  # name of its class
+    probability: float  # probability of `kind`; for NOT_SEEN, probability that the object exists
     before: int | None  # id in the first map
     after: int | None  # id in the second map
     place: Float64  # (3,) m, last center in the world frame
@@ -73,7 +73,7 @@ class _Object:
     """An object of one visit, and its observation in the other visit."""
 
     instance: Instance
-    name: str  # of its class
+    name: str  # name of its class
     seen: float  # observed fraction of the surface in the other visit
     gone: float  # probability of absence in the other visit
     match: int | None  # object of the other visit at the same position
@@ -182,7 +182,7 @@ def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
 
 
 def _match(labels: Int32) -> int | None:
-    """Return the most frequent object of the labels (M,), None if its fraction is below SAME_THING."""
+    """Return the most frequent object id of the labels (M,); None if its fraction is below SAME_THING."""
     ids, counts = np.unique(labels[labels > 0], return_counts=True)
     if not len(ids) or counts.max() < SAME_THING * len(labels):
         return None

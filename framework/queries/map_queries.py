@@ -96,7 +96,7 @@ class Map:
             T_world_camera: (4, 4) pose.
 
         Returns:
-            The view. It contains only ids of `instances`.
+            The view. Its instance ids are those of `instances` only.
         """
         with self.lock:
             view = self.scene.render(camera, T_world_camera)
@@ -170,7 +170,7 @@ class Map:
             return whole.of(found)
 
     def save(self, path: Path | str) -> None:
-        """Write the map to one file by an atomic write. Read it with `load_map`.
+        """Write the map to one file, atomically. Read it with `load_map`.
 
         Args:
             path: Path of the file.

@@ -19,7 +19,7 @@ class ObjectColors:
 
     def __init__(self, truth: SceneTruth) -> None:
         ids = np.setdiff1d(truth.instance_ids, [0]).tolist()
-        self.true_objects = {key: k for k, key in enumerate(ids, start=1)}  # by ground-truth instance
+        self.true_objects = {key: k for k, key in enumerate(ids, start=1)}  # object by ground-truth instance
         self.name_of = {k: name for key, k in self.true_objects.items() if (name := truth.class_names.get(key))}
         self.color_of: dict[int, UInt8] = dict.fromkeys(self.true_objects.values(), np.array(UNKNOWN, np.uint8))  # (3,)
         named = [key for key in ids if self.true_objects[key] in self.name_of]

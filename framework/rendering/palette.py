@@ -14,7 +14,7 @@ PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)
 NEAR_M = 0.8  # distance scale for dissimilar colors
 ALIKE = 22.0  # scale of the CIE76 distance between similar colors
 HUES = 18
-CLEAR = ((165, 245), (105, 250), (190, 200))  # saturation and value
+CLEAR = ((165, 245), (105, 250), (190, 200))  # saturation and value of each shade
 DARK = ((130, 95), (60, 125))  # disjoint from CLEAR
 
 

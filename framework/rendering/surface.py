@@ -20,8 +20,8 @@ class Hits:
 
     camera: Camera
     buffer: VisibilityBuffer
-    vertices: Float32  # (V, 3) m, world
-    triangles: Int32  # (F, 3), indexed by `buffer`
+    vertices: Float32  # (V, 3) m, in the world frame
+    triangles: Int32  # (F, 3); `buffer` contains their indices
 
     @property
     def depth(self) -> Float32:

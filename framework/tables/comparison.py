@@ -38,8 +38,8 @@ class TableChoice:
     """The block `table` of an experiment.
 
     Each line is a row and each column a metric. Cells are means over the runs that differ only in `average_over`. With
-    `columns_by`, each column is a value of that key, such as a sequence, followed by the mean. With `group_by`, each
-    value has a group of lines.
+    `columns_by`, each column is a value of that key, such as a sequence, and the last column is the mean. With
+    `group_by`, each value of that key has a group of lines.
     """
 
     # config keys for averaging and pairing; runs with the same value of the last key are not independent
@@ -88,7 +88,8 @@ class TableChoice:
     def of(cls, node: Any) -> TableChoice:
         """Return the choice of a config's `table`. Raises ConfigError for unknown keys and wrong types."""
         choice = cls(**checked_block(cls, "table", node))
-        return replace(choice, columns=[current_key(key) for key in choice.columns])  # a stored sweep may be older
+        # a stored sweep may have keys of an older version
+        return replace(choice, columns=[current_key(key) for key in choice.columns])
 
 
 @dataclass(frozen=True)
@@ -262,5 +263,5 @@ def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
 
 
 def mean_difference(differences: Mapping[Run, float]) -> Mean:
-    """Return the mean of paired differences with its standard error over sequences; seeds are not independent."""
+    """Return the mean of paired differences, with its standard error over sequences, as seeds are not independent."""
     return Mean.of(mean.value for mean in mean_by_sequence(differences).values())

@@ -16,7 +16,7 @@ from framework.tables.table_notes import counted, digest, notes
 
 
 def write_tables(directory: Path) -> str:
-    """Write table.md, table.tex and table.csv of the runs below `directory` into it; return the Markdown.
+    """Write table.md, table.tex and table.csv of the runs below `directory` into it, and return the Markdown text.
 
     Raises DataError if no run is complete.
     """

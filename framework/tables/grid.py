@@ -14,7 +14,7 @@ class TextTable:
     heads: list[str]  # column headings
     body: list[list[str]]
     label_columns: int = 1  # number of left-aligned columns; the remaining columns contain numbers
-    bold: frozenset[tuple[int, int]] = frozenset()  # (line, column)
+    bold: frozenset[tuple[int, int]] = frozenset()  # (line, column) of each bold cell
     groups: frozenset[int] = frozenset()  # index of the first line of each group
 
 

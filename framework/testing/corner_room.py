@@ -34,7 +34,7 @@ from framework.refinement.lifting import lift
 
 CLASSES = ("chair", "couch")
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
-RATE = 30  # Hz
+RATE = 30  # frame rate, Hz
 PLANES = (((-1.0, 0.0, 0.0), 1.5), ((0.0, -1.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 3.0))
 """Normal n, which points into the room, and offset d, m, of each plane n . p + d = 0."""
 

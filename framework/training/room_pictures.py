@@ -35,8 +35,8 @@ from framework.synthetic.room import Room, RoomKind, furnish
 from framework.synthetic.walk import look
 
 STREAM = 0x7261_696E  # differs from the random streams of all datasets
-WIDTH, HEIGHT = 320, 240  # px
-FOCAL = (0.7, 1.0)  # range of the focal length, image widths
+WIDTH, HEIGHT = 320, 240  # size of the images, px
+FOCAL = (0.7, 1.0)  # range of the focal length, in image widths
 EYE_HEIGHT = (0.9, 1.75)  # m, range of the camera height
 CLEAR = 0.35  # m, minimum distance of the camera to furniture and walls
 TINT = 0.5  # logarithm of the maximum factor for the colors of a surface
@@ -44,7 +44,7 @@ TINTED = 0.7  # fraction of the images with changed colors
 STUDIOS = 0.5  # fraction of rooms with all classes, because some classes occur only in studios
 QUALITY = 93  # JPEG quality of the images
 MIN_PIXELS = 100  # px, minimum area of objects in an image
-TRIES = 20  # candidate views for each image
+TRIES = 20  # maximum number of candidate views for each image
 
 
 @dataclass(frozen=True)

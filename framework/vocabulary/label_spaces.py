@@ -43,7 +43,7 @@ MEANINGS: Mapping[str, str | None] = {name: coco for names in _SECTIONS.values()
 class LabelMapping:
     """The mapping from the labels of a detector to COCO names."""
 
-    classes: tuple[str, ...]  # C' COCO names of the labels, in COCO's order
+    classes: tuple[str, ...]  # (C',) COCO names of the labels, in COCO's order
     meaning: Int32  # (C,) index of each label in `classes`; -1 = no object class of COCO
 
     def apply(self, probabilities: Float32) -> tuple[Float32, Bool]:
