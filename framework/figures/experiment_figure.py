@@ -62,8 +62,8 @@ class Pictured:
             raise DataError(f"{directory}: expected a folder of runs, got no folder")
         if not (directory / SWEEP).exists():
             raise DataError(
-                f"{directory}: expected the folder of an experiment, got no {SWEEP}; run an experiment such as "
-                "experiment=figure4_progress"
+                f"{directory}: expected the folder of an experiment with {SWEEP}, got a folder without it; run an "
+                "experiment such as experiment=figure4_progress"
             )
         sweep = read_yaml(directory / SWEEP)
         if not sweep.get(NAME):

@@ -127,8 +127,8 @@ def by_names(scene: Map, query: str) -> list[Match]:
             unknown = ", ".join(map(repr, words.unknown or [query]))
             there = ", ".join(sorted({scene.name(instance) for instance in scene.instances().values()}))
             raise DataError(
-                f"query: expected classes of this map or colors, got {unknown}; objects: {there or 'none'}; colors: "
-                f"{', '.join(COLOR_NAMES)}"
+                f"query: expected classes of this map or colors, got {unknown}; use the classes of its objects "
+                f"({there or 'none'}) or the colors {', '.join(COLOR_NAMES)}"
             )
         columns = [scene.classes.index(name) for name in words.classes]
         mesh, matches = scene.mesh(), {}

@@ -156,7 +156,7 @@ class RoomPictures:
         for number in range(first, first + rooms):
             room = room_folder(folder, number)
             if not room.is_dir():
-                raise DataError(f"{room}: expected a rendered room, got no folder; render the rooms first")
+                raise DataError(f"{room}: expected a rendered room, got no folder; call render_rooms first")
             self.files += sorted(room.glob("*.jpg"))
             classes = read_json(room / "classes.json")
             self._names[room] = {int(i): str(name) for i, name in classes.items()}
