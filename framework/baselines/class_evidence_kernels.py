@@ -97,7 +97,7 @@ def find_blocks_under_masks(grid, seen, cluster, wants_row):
 @njit(cache=True, nogil=True, parallel=True)
 def update_classes(grid, seen, evidence, masks, evicted):
     """Update the near voxels of the seen blocks; evicted (A,) gets the number of evictions of each block."""
-    unmasked = evidence.unmasked  # numba 0.68 loses assignments to an element of a tuple's array within prange
+    unmasked = evidence.unmasked  # numba 0.68 drops assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0
         block = seen.blocks[a]

@@ -88,7 +88,7 @@ def _without_strays(points: Float32) -> Float32:
 
 
 def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the camera and pose as in `fitted`, but for all points, including outliers."""
+    """Return the camera and pose as in `fitted`, with all points, including outliers, in view."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     x, y, z = R_world_camera.T @ points_world.T
