@@ -1,4 +1,4 @@
-# make demo and make test install missing dependencies, including the system packages of Debian and Ubuntu. Later calls skip
+# `make demo` and `make test` install missing dependencies, including system packages on Debian and Ubuntu. Later calls skip
 # the installation.
 
 SHELL := /bin/bash
@@ -7,7 +7,7 @@ SHELL := /bin/bash
 
 VENV := .venv
 BIN := $(VENV)/bin
-INSTALLED := $(VENV)/.installed # stamp file: older than pyproject.toml = the environment is outdated
+INSTALLED := $(VENV)/.installed # stamp file; the environment is outdated if pyproject.toml is newer
 INSTALLED_DEV := $(VENV)/.installed-dev # stamp file of the development tools
 DEMO := outputs/demo
 
@@ -99,8 +99,8 @@ grep -q 'libEGL\.so\.1' <<<"$$libraries" || missing="$$missing libegl1"; \
 grep -q 'libgomp\.so\.1' <<<"$$libraries" || missing="$$missing libgomp1"
 endef
 
-# Chromium for browser tests, which are skipped without it. Ubuntu's chromium package is only a stub for its snap. Playwright's
-# node requires libatomic1.
+# Chromium for browser tests, which are skipped without it. Ubuntu's chromium package only installs the snap. The Node.js of
+# Playwright requires libatomic1.
 .PHONY: browser
 browser:
 	@PATH="$$PATH:/usr/sbin:/sbin"; \
@@ -125,4 +125,4 @@ system-libraries: ## install missing system packages with apt
 	else \
 		echo "missing system packages; run as root: $$apt" >&2; exit 1; \
 	fi
-	@"$(or $(PYTHON),python3)" -c '$(IN_RANGE)' || { echo "expected Python 3.11 to 3.13, got none; install one" >&2; exit 1; }
+	@"$(or $(PYTHON),python3)" -c '$(IN_RANGE)' || { echo "python: expected Python 3.11 to 3.13, got none; install one of these versions" >&2; exit 1; }

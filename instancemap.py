@@ -26,8 +26,9 @@ lists the matching objects, best first.
 
 A Mapper is thread-safe; queries wait until the current frame is mapped.
 
-Meters, seconds, radians; camera axes x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a;
-pixel centers at integers; instance 0 = no instance. User errors are InstanceMapErrors with a one-line message.
+Conventions: meters, seconds, radians; camera axes x right, y down, z forward; `T_a_b` maps coordinates in b to
+coordinates in a; pixel centers at integers; instance 0 = no instance. User errors are InstanceMapErrors with a one-line
+message.
 
 Your own stages are dataclasses that implement Detector, PoseTracker, ClusterRefiner or MapFuser. Combine them with
 `Pipeline(detector, tracker, refiner, fuser).run(sequence)`, or register them with a YAML file (CONTRIBUTING.md).
@@ -43,8 +44,8 @@ _own = Path(__file__).resolve().with_name("framework")
 _found = find_spec("framework")
 if _found is None or _own not in [Path(path).resolve() for path in _found.submodule_search_locations or ()]:
     raise ImportError(
-        f"framework: expected InstanceMap's package at {_own}, got {_found and _found.origin}; rename it or start "
-        "Python in another folder"
+        f"framework: expected InstanceMap's package at {_own}, got {_found and _found.origin}; rename the other "
+        "package or start Python in another folder"
     )
 
 from framework import __version__
@@ -80,7 +81,7 @@ _SHARED_WITH_PLUGINS = {
     "transform": "framework.geometry",
     "vote_for_best": "framework.mapping.labels.label_rule",
 }
-"""Modules of the names for plugins that framework.api does not export."""
+"""Modules of the names that plugins may import and framework.api does not export."""
 
 if TYPE_CHECKING:
     from framework.api import *
@@ -100,7 +101,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Import the libraries on first use, so that `configure_process` can run before them."""
+    """Import a name on first use, so that `configure_process` can run before the libraries are imported."""
     if name in _SHARED_WITH_PLUGINS:
         return getattr(import_module(_SHARED_WITH_PLUGINS[name]), name)
     if name == "__all__" or not name.startswith("_"):

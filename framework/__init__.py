@@ -1,8 +1,8 @@
 """InstanceMap: incremental instance-oriented semantic 3D mapping from RGB-D video.
 
-*The paper*, in docstrings, is "Incremental Instance-Oriented 3D Semantic Mapping via RGB-D Cameras for Unknown Indoor
-Scene" (Discrete Dynamics in Nature and Society, 2020, article 2528954). Numbers in brackets are equations of
-docs/method.md; the paper's formulas are not available.
+In docstrings, *the paper* is "Incremental Instance-Oriented 3D Semantic Mapping via RGB-D Cameras for Unknown Indoor
+Scene" (Discrete Dynamics in Nature and Society, 2020, article 2528954). Numbers in brackets refer to the equations in
+docs/method.md, because the paper's formulas are not available.
 """
 
 __version__ = "0.1.0"

@@ -1,4 +1,7 @@
-"""Entry point of `instancemap [COMMAND] ...` and `python -m framework [COMMAND] ...`; the default is a run or sweep."""
+"""Entry point of `instancemap [COMMAND] ...` and `python -m framework [COMMAND] ...`.
+
+Without a command, it starts a run or sweep.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +96,7 @@ def leave_working_folder(arguments: list[str]) -> None:
 def open_standard_streams() -> None:
     """Open /dev/null for closed standard streams (`2>&-`).
 
-    Otherwise an output file of the run reuses the file descriptor of a closed stream, and receives library output.
+    Otherwise, an output file of the run would reuse the file descriptor of a closed stream and receive library output.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -112,11 +115,11 @@ def main() -> None:
     leave_working_folder(sys.argv[1:])
     if any(word.startswith("--e") and RERUN.startswith(word.partition("=")[0]) for word in sys.argv[1:]):
         sys.exit(
-            f"error: {RERUN}: expected overrides, got an option that reads a pickle, which can run code; pass the "
-            "overrides of the run"
+            f"error: {RERUN}: expected KEY=VALUE overrides, got a pickle file, which is unsafe; pass the overrides of "
+            "the run"
         )
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # file names may be invalid Unicode
+        if isinstance(stream, TextIOWrapper):  # file names may contain invalid Unicode
             stream.reconfigure(errors="backslashreplace")
     program = "python -m framework" if Path(sys.argv[0]).name == "__main__.py" else Path(sys.argv[0]).name
     word = sys.argv[1] if len(sys.argv) > 1 else ""

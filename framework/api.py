@@ -131,15 +131,15 @@ class FrameResult(Pose):
     """The pose of a frame, its tracking state, and the new and removed objects."""
 
     new: tuple[int, ...] = ()  # ids of objects added by this frame
-    removed: tuple[int, ...] = ()  # ids of objects that were merged or outvoted
+    removed: tuple[int, ...] = ()  # ids of objects removed by this frame, because they were merged or outvoted
 
 
 class Mapper(Map):
     """Incremental mapping, frame by frame: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`.
 
-    Takes the overrides of a run on the command line, as text or by name. The defaults are the same as for recordings.
-    `dataset` is not allowed. `prefetch` and `skip_completed` have no effect. `resume_from=DIR` resumes the map of a
-    run. `viewer="rerun"` shows the map until the mapper is deleted.
+    The arguments are the overrides of a run on the command line, as strings or as keywords. The defaults are those of
+    a run. Overrides of `dataset` are not supported. `prefetch` and `skip_completed` have no effect.
+    `resume_from=DIR` resumes the map of a run. `viewer="rerun"` shows the map until the mapper is deleted.
 
     All methods are thread-safe. To read `scene` itself while another thread may call `add`, hold the lock:
     `with mapper.lock: mesh = mapper.scene.mesh()`.
@@ -155,7 +155,7 @@ class Mapper(Map):
                 raise ConfigError(f"Mapper: expected overrides such as 'fuser.voxel_size=0.02', got {override!r}")
             if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
                 raise ConfigError(
-                    f"Mapper: expected overrides of a mapper, got {override}; use it only on the command line"
+                    f"Mapper: expected a supported override, got {override}; use it only on the command line"
                 )
         config = composed("~dataset", *words)
         self._threads = Settings.of(config).threads
@@ -185,14 +185,14 @@ class Mapper(Map):
         """Detect, track, refine and fuse the next frame of a video. A lost frame is not fused.
 
         Args:
-            color: (H, W, 3) uint8 RGB, or a Frame instead of all arguments.
+            color: (H, W, 3) uint8 RGB, or a Frame, which replaces all arguments.
             depth: (H, W) float32, m along z; 0 = no reading.
             pose: (4, 4) T_world_camera; None = unknown.
             camera: The camera; None = the camera of the last frame.
-            timestamp: Time of the color image, s; None = 30 frames per second.
+            timestamp: Time of the color image, s; None = the time at a rate of 30 frames per second.
             up: (3,) unit vector opposite to gravity in the camera frame; None = unknown.
             depth_timestamp: Time of the depth image, s; None = the time of the color image.
-            sensor: The kind of the depth sensor; None = that of the last frame, at first KINECT_V1.
+            sensor: The kind of the depth sensor; None = the kind of the last frame, initially KINECT_V1.
 
         Returns:
             The pose of the frame, and the new and removed objects.
@@ -252,8 +252,8 @@ class Mapper(Map):
         """Return the object at a pixel of the last frame with a pose, or of another view.
 
         Args:
-            u: The column of the pixel.
-            v: The row of the pixel.
+            u: The column of the pixel, px.
+            v: The row of the pixel, px.
             camera: The camera; None = the camera of the last frame.
             T_world_camera: The pose (4, 4); None = the pose of the color image of the last frame that is not lost.
 
@@ -261,7 +261,7 @@ class Mapper(Map):
             The object; None = no object.
 
         Raises:
-            DataError: The pixel is outside of the image, or no frame is mapped yet.
+            DataError: The pixel is outside of the image, or no frame has been mapped.
         """
         camera = camera or self._camera
         T_world_camera = self._T_world_color if T_world_camera is None else T_world_camera
@@ -297,7 +297,7 @@ def open_dataset(name: str, **parameters: object) -> RGBDSequence:
 
 
 def load_map(path: Path | str) -> Map:
-    """Read a map that a run or `Map.save` has written, from any fuser.
+    """Read a map of any fuser, written by a run or `Map.save`.
 
     Args:
         path: The file, such as map.npz of a run.
@@ -327,8 +327,8 @@ def export(
         formats: "glb", "ply", "usd", "obj", "floorplan" or "graph".
         out: The output folder; None = `export` in the run directory.
         objects: Classes or ids of the exported objects; () = the whole scene.
-        up: The up direction (3,), if the run has none.
-        floor: The floor height along `up`, m, if the run has none.
+        up: The up direction (3,) in the world frame, for a run without one.
+        floor: The floor height along `up`, m, for a run without one.
         choices: min_confidence, triangles, coloring, collision, resolution, robot_height; see
             `instancemap export --help`.
 
@@ -352,9 +352,8 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
     Args:
         run: The run directory, or a map.
         words: The text query.
-        by: "embeddings" of images, "names" of classes and colors, or None = embeddings if available.
-        model: Folder, file or id on huggingface.co of the embedding model; None = the model of
-            the run's detector.
+        by: "embeddings" of images, or "names" of classes and colors; None = embeddings if available.
+        model: Folder, file or huggingface.co id of the embedding model; None = the model of the run's detector.
 
     Returns:
         The matching objects, best first, and the ranking that was used.

@@ -41,14 +41,14 @@ UInt16 = npt.NDArray[np.uint16]
 Bool = npt.NDArray[np.bool_]
 
 ROTATION_TOLERANCE = 1e-3  # maximum entry of |R R^T - I| of a rigid transform; published poses have 4 digits
-COVARIANCE_TOLERANCE = 1e-9  # rounding error of a covariance, fraction of its largest entry
-MAX_PIXELS = 2**25  # px of an image, such as 8K video
+COVARIANCE_TOLERANCE = 1e-9  # maximum rounding error of a covariance, relative to its largest entry
+MAX_PIXELS = 2**25  # maximum number of pixels of an image; a frame of 8K video is smaller
 WIDEST = 10.0  # maximum lateral distance per depth, m/m: a field of view of 168 degrees
-LONGEST_FOCAL_LENGTH = 1e6  # px
+LONGEST_FOCAL_LENGTH = 1e6  # maximum focal length, px
 UNIT_TOLERANCE = 1e-3  # maximum | |v| - 1 | of a unit vector
-LONGEST_EMBEDDING = 65_536  # dimensions; published networks have 500 to 4,000
-LONGEST_SPACE = 300  # characters of an embedding space name
-SAME_TIME = 1e-5  # s, maximum difference of equal timestamps; resolution: 1e-9 in trajectory.txt, 1e-6 of a Unix time
+LONGEST_EMBEDDING = 65_536  # maximum number of dimensions; published networks have 500 to 4,000
+LONGEST_SPACE = 300  # maximum number of characters of an embedding space name
+SAME_TIME = 1e-5  # s, maximum difference of equal timestamps; trajectory.txt has 1e-9 s steps, a Unix time 1e-6 s
 PROBABILITY_TOLERANCE = 1e-3  # maximum error of a sum of probabilities, due to softmax in half precision
 
 
@@ -86,7 +86,7 @@ class Camera:
         if horizontal > WIDEST * self.fx or vertical > WIDEST * self.fy:
             raise DataError(
                 f"Camera: expected a field of view of at most {WIDEST:g} m laterally per m of depth, got "
-                f"{self.width}x{self.height} px with fx, fy, cx, cy = {numbers}; set them in px, not as "
+                f"{self.width}x{self.height} px with fx, fy, cx, cy = {numbers}; set fx, fy, cx, cy in px, not as "
                 "fractions of width and height"
             )
 
@@ -113,21 +113,21 @@ class FrameTruth:
 
     instance_ids: Int32 = field(repr=False)  # (H, W)
     class_names: Mapping[int, str | None]  # by instance id; None = unknown class, not evaluated
-    of_depth: bool = False  # True = at the pose of the depth image, False = of the color image
+    of_depth: bool = False  # True = seen from the pose of the depth image, False = from that of the color image
 
     def __post_init__(self) -> None:
         check_array("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape (height, width) in px."""
+        """Shape (height, width) of the ids, px."""
         return self.instance_ids.shape
 
 
 class DeferredTruth(FrameTruth):
-    """Ground truth of a frame with ids rendered or read on first access, once for all threads.
+    """Ground truth of a frame whose ids are rendered or decoded on first access, once for all threads.
 
-    Each access raises the errors of `render`. It raises DataError if `render` does not return int32 of `shape`.
+    An access raises the errors of `render`, and DataError if `render` does not return int32 ids of `shape`.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class DeferredTruth(FrameTruth):
         render: Callable[[], Int32],
         shape: tuple[int, int],  # (height, width) of the ids
         class_names: Mapping[int, str | None],
-        origin: str,  # hash of all inputs of the ids, which identifies them before they are rendered
+        origin: str,  # hash of all inputs of `render`, which identifies the ids before they are rendered
         of_depth: bool = True,
     ) -> None:
         self._render = render
@@ -196,7 +196,9 @@ class Frame:
         if self.up is not None:
             check_array(where + "up", self.up, (3,), np.float64)
             if abs(np.linalg.norm(self.up) - 1) > UNIT_TOLERANCE:
-                raise DataError(f"{where}up: expected a unit vector, got length {np.linalg.norm(self.up):.4g}")
+                raise DataError(
+                    f"{where}up: expected a unit vector, got a vector of length {np.linalg.norm(self.up):.4g}"
+                )
         if not isinstance(cast(object, self.sensor), SensorKind):
             raise DataError(f"{where}sensor: expected a SensorKind, got {self.sensor!r}; pass SensorKind.KINECT_V1")
         # kernels require contiguous writable arrays; views such as bgr[..., ::-1] and read-only arrays are copied
@@ -241,7 +243,7 @@ class Pose:
 class DelayEstimate:
     """An estimate of the delay between color and depth."""
 
-    seconds: float  # time from depth to color with equal timestamps, s
+    seconds: float  # time from a depth image to the color image with the same timestamp, s
     deviation: float  # standard deviation, s; infinite = unknown
     frames: int  # number of compared frames
 
@@ -358,7 +360,7 @@ class Instance:
     id: int  # 32-bit, from 1
     class_probabilities: Float32  # (C,) a distribution over the map's classes
     confidence: float  # in [0, 1], ranks instances in the evaluation
-    observations: int  # frames in which it was detected
+    observations: int  # number of frames in which it was detected
     first_frame: int  # `Frame.index` of the first detection
     last_frame: int  # `Frame.index` of the last detection
     vertices: Int32  # (M,) indices of its vertices in the map's InstanceMesh
@@ -416,7 +418,7 @@ class ReferenceTrajectory:
         check_array("ReferenceTrajectory.T_world_camera", self.T_world_camera, (f, 4, 4), np.float64)
 
     def at(self, timestamps: Float64) -> Int64:
-        """Return the indices (N,) of the poses at the times (N,), -1 = no pose."""
+        """Return the indices (N,) of the poses at `timestamps` (N,), s; -1 = no pose."""
         if not len(self.timestamps):
             return np.full(len(timestamps), -1)
         last = len(self.timestamps) - 1
@@ -445,10 +447,12 @@ def check_rigid(name: str, T: Float64) -> None:
     check_array(name, T, (4, 4), np.float64)
     R = T[:3, :3]
     error = float(np.abs(R @ R.T - np.eye(3)).max())
-    if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not np.allclose(T[3], (0, 0, 0, 1)):
+    if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         raise DataError(
             f"{name}: expected a rigid transform, got |R R^T - I| = {error:.2g}, det R = {np.linalg.det(R):.2g}"
         )
+    if not np.allclose(T[3], (0, 0, 0, 1)):
+        raise DataError(f"{name}: expected the last row 0 0 0 1, got {T[3].tolist()}")
 
 
 def check_view(camera: Camera, T_world_camera: Float64) -> None:
@@ -459,7 +463,7 @@ def check_view(camera: Camera, T_world_camera: Float64) -> None:
 
 
 def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: npt.DTypeLike) -> None:
-    """Raise DataError unless `array` has this shape (None = any length), this dtype, and finite values."""
+    """Raise DataError unless `array` has the shape (None = any length), the dtype, and finite values."""
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
         found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
         raise DataError(f"{name}: expected an array of {np.dtype(dtype)}, got {found}")
@@ -511,7 +515,9 @@ def _check_embeddings(name: str, rows: Float32 | None, space: str, n: int) -> No
     lengths = np.linalg.norm(rows, axis=1)
     wrong = (lengths != 0) & (np.abs(lengths - 1) > UNIT_TOLERANCE)
     if wrong.any():
-        raise DataError(f"{name}: expected unit vectors or 0 in each row, got length {lengths[wrong][0]:.4g}")
+        raise DataError(
+            f"{name}: expected a unit vector or zeros in each row, got a row of length {lengths[wrong][0]:.4g}"
+        )
 
 
 def _check_distributions(name: str, rows: Float32, shape: tuple[int, int]) -> None:

@@ -1,4 +1,7 @@
-"""Exceptions for user-correctable errors. Each message is one line: expected, found, file or key, fix."""
+"""Exceptions for user-correctable errors.
+
+Each message is one line with the file or key, the expected value, the found value, and the fix.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-LONGEST_WORD = 200  # characters of an input, such as a name, in a message
-LONGEST_MESSAGE = 1000  # characters; a list of all options or labels has about 500
+LONGEST_WORD = 200  # maximum number of characters of an input, such as a name, in a message
+LONGEST_MESSAGE = 1000  # maximum number of characters; a list of all options or labels has about 500
 
 _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 

@@ -91,13 +91,13 @@ def rotation_angle(R: Float64) -> float:
 
 
 def pose_distance(T_world_a: Float64, T_world_b: Float64) -> float:
-    """Return the larger of translation (m) and rotation angle (rad) between two poses."""
+    """Return the maximum of the distance (m) and the rotation angle (rad) between two poses."""
     T_a_b = inverse(T_world_a) @ T_world_b
     return max(float(np.linalg.norm(T_a_b[:3, 3])), rotation_angle(T_a_b[:3, :3]))
 
 
 def nearest_rotation(R: Float64) -> Float64:
-    """Return the rotation nearest to a matrix (3, 3) in the Frobenius norm (orthogonal Procrustes)."""
+    """Return the rotation (3, 3) nearest to a matrix (3, 3) in the Frobenius norm (orthogonal Procrustes)."""
     U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
@@ -163,6 +163,6 @@ def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> No
     u, v = clusters.pixels.T
     if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
         raise DataError(
-            f"clusters: expected pixels in the image of {shape[1]}x{shape[0]}, got u in [{u.min()}, "
+            f"clusters: expected pixels in the image of {shape[1]}x{shape[0]} px, got u in [{u.min()}, "
             f"{u.max()}], v in [{v.min()}, {v.max()}]"
         )

@@ -5,10 +5,11 @@
                   ^                                             |
                   '------------- view of the map ---------------'
 
-A plugin is a dataclass that implements one of these interfaces. Its fields are its parameters: bool, int, float, str,
-Path, Enum or list[str], with unit and bounds next to the default, validated in `__post_init__`. Assign other state
-there as plain attributes. A field may also be a component (a dataclass whose fields become parameters of the plugin),
-another plugin, or a mapping of plugins. A YAML file in the config group of the stage registers the plugin.
+A plugin is a dataclass that implements one of these interfaces. Its fields are its parameters, of type bool, int,
+float, str, Path, Enum or list[str]. Document the unit and bounds next to each default. Validate the values in
+`__post_init__`, and assign other state there as plain attributes. A field may also be a component (a dataclass whose
+fields become parameters of the plugin), another plugin, or a mapping of plugins. A YAML file in the config group of the
+stage registers the plugin.
 """
 
 from __future__ import annotations
@@ -39,22 +40,22 @@ from framework.errors import ConfigError
 from framework.sensors.noise_models import SensorKind
 
 FrameReader = Callable[[], Frame]
-"""Reads one available frame. Raises FrameError if the frame is unusable."""
+"""Reader of one available frame. Raises FrameError if the frame is unusable."""
 
 FusionStage = Literal["association", "update", "integration"]
 
 StageTimer = Callable[[FusionStage], AbstractContextManager[None]]
-"""Timer of a fuser stage: `with timer("association"): ...`. Times of the same stage in a frame are added."""
+"""Timer of a fuser stage: `with timer("association"): ...`. Several times of one stage in a frame are summed."""
 
 
 def untimed(stage: FusionStage) -> AbstractContextManager[None]:
-    """Return a timer that measures nothing.
+    """Return a context manager that measures nothing.
 
     Args:
         stage: The stage; ignored.
 
     Returns:
-        An empty context manager.
+        The context manager.
     """
     return nullcontext()
 
@@ -62,9 +63,9 @@ def untimed(stage: FusionStage) -> AbstractContextManager[None]:
 class RGBDVideo(ABC):
     """A source of frames: a stored sequence (`RGBDSequence`) or a running camera (`LiveVideo`)."""
 
-    name: str  # of the scene, for tables
-    annotation: str = ""  # release of the ground truth, for tables; "" = a single release
-    domain: str = ""  # image domain, compared with the detector: "rendered rooms"; "" = photographs or unknown
+    name: str  # name of the scene, for tables
+    annotation: str = ""  # release of the ground truth, for tables; "" = only one release exists
+    domain: str = ""  # image domain, compared with `Detector.domain`: "rendered rooms"; "" = photographs or unknown
 
     def has_poses(self) -> bool:
         """Return True if frames may have ground-truth poses. Called before any frame is read."""
@@ -75,7 +76,7 @@ class RGBDVideo(ABC):
         return None
 
     def constant_color_delay(self) -> float | None:
-        """Return the time from depth to color with equal timestamps, s; None = unknown, to be estimated.
+        """Return the time from a depth image to the color image with the same timestamp, s; None = to be estimated.
 
         The true time of a color image is its timestamp plus this delay, on the clock of the depth images.
         """
@@ -142,7 +143,7 @@ class Detector(ABC):
 class PoseTracker(ABC):
     """Tracker of the camera pose."""
 
-    pose_source: str = "tracked"  # for tables; `ground_truth` for a tracker that returns the poses of the sequence
+    pose_source: str = "tracked"  # source of the poses, for tables; `ground_truth` = the poses of the sequence
 
     @abstractmethod
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
@@ -219,9 +220,9 @@ class MapFuser(ABC):
 class MapStatistics:
     """The size of a map."""
 
-    voxels: int  # allocated
-    bytes: int  # of the arrays
-    evictions: int = 0  # label slots reassigned to another label
+    voxels: int  # number of allocated voxels
+    bytes: int  # size of the arrays
+    evictions: int = 0  # number of label slots reassigned to another label
 
 
 @dataclass(frozen=True)

@@ -52,9 +52,9 @@ class Pipeline:
     tracker: PoseTracker
     refiner: ClusterRefiner
     fuser: MapFuser
-    prefetch: int = 2  # frames prefetched by other threads (live video: at most 1); 0 = none
+    prefetch: int = 2  # number of frames prefetched by other threads (live video: at most 1); 0 = none
     viewer: Viewer = field(default_factory=Viewer)
-    detection_interval: int = 1  # detect on every n-th frame; all frames are tracked and mapped
+    detection_interval: int = 1  # interval between detections, in frames; all frames are tracked and mapped
 
     def __post_init__(self) -> None:
         if self.detection_interval < 1:
@@ -73,8 +73,8 @@ class Pipeline:
         Frames that raise FrameError are skipped, and lost frames are not fused. Both are counted. Ctrl-C (after the
         current frame) and a full map end the loop early.
 
-        Ctrl-C is the normal end of a live video. Its frames are dropped and counted if mapping falls behind. Other
-        errors of stages are raised.
+        Ctrl-C is the normal end of a live video. If mapping falls behind, frames of a live video are dropped and
+        counted. Other errors of stages are raised.
 
         Args:
             video: The sequence or live video.
@@ -125,7 +125,7 @@ class Pipeline:
         return replace(journal.result(), keyframes=keyframes, color_delay=self.color_to_depth.estimate)
 
     def keyframes(self, journal: Journal) -> Mapping[str, Array]:
-        """Return the keyframes of the tracker. A pending error of its thread is raised here and recorded."""
+        """Return the keyframes of the tracker. A pending error of its thread becomes `journal.stopped_by`."""
         try:
             return self.tracker.keyframes()
         except Exception as error:
@@ -133,13 +133,13 @@ class Pipeline:
             return self.tracker.keyframes()
 
     def empty_map_reason(self, journal: Journal) -> str:
-        """Return why the map is empty."""
+        """Return the error message for an empty map."""
         result = journal.result()
         if result.frames == 0:
             return "expected at least one frame, got none"
         if journal.without_pose == result.frames:
             first = journal.first_without_pose
-            return f"expected poses, got none for the {result.frames} frames; the first: {first}; {WITHOUT_POSES}"
+            return f"expected poses, got none for the {result.frames} frames (first: {first}); {WITHOUT_POSES}"
         if result.frames_skipped == result.frames:
             return f"expected usable frames, got none of {result.frames}; the log lists the reasons"
         lost = next((frame.pose.reason for frame in result.tracked if frame.pose.lost), "")
@@ -263,7 +263,7 @@ class Pipeline:
 
 @contextmanager
 def watched(viewer: Viewer, scene: SceneMap, video: str, directory: Path) -> Iterator[None]:
-    """Start the viewer, and end it after the body, even after an error."""
+    """Start the viewer, and end it after the body of the context, even after an error."""
     viewer.begin(scene, video, directory)
     try:
         yield

@@ -47,18 +47,19 @@ Plugin = TypeVar("Plugin")
 def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
     """Build the plugin of a config node: `_target_` names the class, the other keys are its parameters.
 
-    The class must be the `_target_` of a registered option of the stage: of this project, an installed package, or
-    --config-dir (without a running Hydra: `framework.config.composition.add_config_dir`). Only then is its module
-    imported. A class that is not a concrete dataclass implementing `interface` is rejected, so a config cannot run
-    unregistered code. Interpolations in the node are resolved against the config that contains it.
+    The class must be the `_target_` of a registered option of the stage. Options are registered by this project, by an
+    installed package, and by --config-dir (without a running Hydra: `framework.config.composition.add_config_dir`). The
+    modules of other classes are not imported, so a config cannot run unregistered code. The class must also be a
+    concrete dataclass that implements `interface`. Interpolations in the node are resolved against the config that
+    contains it.
 
     Args:
-        interface: The interface of the plugin. Its type is not `type[Plugin]`, which excludes abstract classes.
+        interface: The interface of the plugin. It is not annotated as `type[Plugin]`, which excludes abstract classes.
         node: The config of the plugin.
 
     Raises:
         ConfigError: The class or a parameter is invalid. The message names the stage and the plugin.
-        InstanceMapError: The plugin raises it. The stage and the plugin are prepended to the message.
+        InstanceMapError: The constructor of the plugin raises it. The message begins with the stage and the plugin.
     """
     stage = stage_of(interface)
     if not isinstance(node, DictConfig) or OmegaConf.is_missing(node, "_target_") or not node.get("_target_"):
@@ -142,7 +143,7 @@ def stage_of(interface: Callable[..., object]) -> str:
 
 @contextmanager
 def _options_loader() -> Iterator[Any]:
-    """Yield the loader of the running Hydra if our configs are on its search path, otherwise a new loader."""
+    """Yield the loader of the running Hydra if its search path has InstanceMap's configs, otherwise a new loader."""
     if (running := running_loader()) is not None:
         yield running
         return
@@ -151,7 +152,7 @@ def _options_loader() -> Iterator[Any]:
 
 
 def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
-    """Yield the class names in the options of a stage, first of the options whose name occurs in `sought`."""
+    """Yield the class names in the options of a stage, starting with the options whose name occurs in `sought`."""
     inheriting = []
     files: Any = CachingConfigRepository(loader.repository)
     for name in sorted(loader.get_group_options(stage), key=lambda name: name not in sought):
@@ -170,7 +171,7 @@ def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
 
 
 def composition(files: Any, stage: str, name: str) -> dict[str, str]:
-    """Return the Hydra package of each config file of a stage's option, by path, in order.
+    """Return the Hydra package of each config file of a stage's option, by path, in the order of composition.
 
     The option is composed as in a run, because it may override the choice of another stage. `files` is the caching
     repository of a loader. Raises HydraException for a broken option.
@@ -212,7 +213,9 @@ def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
         raise ConfigError(f"{where}: expected a dataclass, got {class_name} without @dataclass")
     if inspect.isabstract(found):
         missing = ", ".join(sorted(found.__abstractmethods__))
-        raise ConfigError(f"{where}: expected {missing} of {interface.__name__}, got none in {class_name}")
+        raise ConfigError(
+            f"{where}: expected an implementation of {missing} of {interface.__name__}, got none in {class_name}"
+        )
     with _errors_at(where):
         parameter_fields(found)
     plugin_class: type[Plugin] = found
@@ -244,7 +247,7 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
 def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
     """Raise ConfigError if an option has an unknown parameter or a value of a wrong type.
 
-    Skips values that depend on other configs, and values that the user must set.
+    Values that depend on other configs, and values that the user must set, are not checked.
     """
     plugins = plugin_fields(plugin_class)
     settled = [key for key in map(str, node) if key not in plugins and not OmegaConf.is_interpolation(node, key)]
@@ -264,7 +267,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
         schema: DictConfig = OmegaConf.structured(dataclasses.make_dataclass(plugin_class.__name__, typed))
     except OmegaConfBaseException as error:
         raise ConfigError(
-            f"{where}: expected parameters of bool, int, float, str, Path, Enum or list[str], got an error "
+            f"{where}: expected parameters of type bool, int, float, str, Path, Enum or list[str], got another type "
             f"({first_line(error)})"
         ) from error
     plugins: dict[str, Any] = {}
@@ -288,7 +291,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
 
 
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
-    """Return the interfaces of the fields with a plugin, or with plugins by name (Mapping[str, interface])."""
+    """Return the interfaces of the fields that contain a plugin or plugins by name (Mapping[str, interface])."""
     found = {}
     for name, hint in get_type_hints(plugin_class).items():
         of = get_args(hint)
@@ -360,12 +363,12 @@ def _check_module(where: str, module_name: str) -> None:
 
 
 def _check_plugins_package(plugins: ModuleSpec) -> None:
-    """Raise InstanceMapError if another package `plugins` precedes ours on the module search path."""
+    """Raise InstanceMapError if another package `plugins` precedes InstanceMap's on the module search path."""
     found = Path([*(plugins.submodule_search_locations or []), str(plugins.origin)][0]).resolve()
     if found != PROJECT_ROOT / "plugins":
         raise InstanceMapError(
-            f"plugins: expected InstanceMap's package at {PROJECT_ROOT / 'plugins'}, got {found}; rename "
-            "it or start Python in another folder"
+            f"plugins: expected InstanceMap's package at {PROJECT_ROOT / 'plugins'}, got {found}; rename the other "
+            "package or start Python in another folder"
         )
 
 

@@ -39,10 +39,10 @@ MAX_EXPONENT = 700.0  # maximum log of a ratio in float64
 class ClassEvidence(NamedTuple):
     """Class evidence of all voxels. The best class of a voxel is in slot 0."""
 
-    unmasked: UInt16  # (B, 512) frames with the voxel under no mask; B as in the grid
+    unmasked: UInt16  # (B, 512) number of frames with the voxel outside all masks; B as in the grid
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
     log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames with the voxel under a mask
-    rest: Float32  # (R, 512) the same sum for each of the unnamed classes
+    rest: Float32  # (R, 512) log_ratio of each unnamed class
     masked: UInt16  # (R, 512) number of frames with the voxel under a mask
     first_frame: Int32  # (R, 512) first frame with the voxel under a mask, -1 = none
     last_frame: Int32  # (R, 512) last frame with the voxel under a mask, -1 = none
@@ -57,7 +57,7 @@ class MaskClasses(NamedTuple):
 
     cluster: Int32  # (H * W,) cluster with the best score over each pixel, -1 = none
     log_ratio: Float32  # (N, C) log P(class) / P(background)
-    unnamed: Float32  # (N,) log ratio of the mean of the unnamed classes of each cluster
+    unnamed: Float32  # (N,) log ratio of the mean P(unnamed class) of each cluster to P(background)
     named_classes: UInt8  # (N, NEW_CLASSES) best classes of each cluster
     named_bit: UInt8  # (N, NO_CLASS + 1) bit m of a cluster's m-th named class, 0 = unnamed
     frame: int  # index of the frame
@@ -93,7 +93,7 @@ class ClassRows:
 
     @property
     def byte_count(self) -> int:
-        """Bytes in use."""
+        """Size of the arrays in use, bytes."""
         return sum(array.nbytes for array in self.saved().values())
 
     def begin(self, classes: int) -> None:
@@ -128,7 +128,7 @@ class ClassRows:
         check_like(arrays, free, len(arrays["rest"]))
         check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
         if len(arrays["rest"]) and not classes:
-            raise DataError(f"rest: expected no rows without classes, got {len(arrays['rest'])}")
+            raise DataError(f"rest: expected 0 rows in a map without classes, got {len(arrays['rest'])}")
         _check_order(arrays["class_ids"], arrays["log_ratio"], arrays["rest"], classes)
         self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
         self.row_count = len(self.evidence.rest)

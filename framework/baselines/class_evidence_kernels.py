@@ -14,7 +14,7 @@ MAX_FRAMES = np.uint16(65535)  # largest frame count of a voxel
 
 @njit(cache=True, nogil=True)
 def best_clusters(offsets, clusters, scores):
-    """Return the cluster (L,) with the best score in each list, -1 = none; ties go to the first."""
+    """Return the clusters (L,) with the best score in each of the lists, -1 = none; ties go to the first."""
     best = np.full(offsets.shape[0] - 1, -1, np.int32)
     for i in range(best.shape[0]):
         for entry in range(offsets[i], offsets[i + 1]):
@@ -56,7 +56,7 @@ def _add_class(labels, sums, label, total):
 
 @device
 def observe_mask(evidence, row, n, masks, k):
-    """Apply the recursion to a voxel seen under cluster k. Returns the number of evictions."""
+    """Apply the recursive update to a voxel seen under cluster k. Returns the number of evictions."""
     labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
     known = 0  # bits of the named classes with a slot
     for s in range(len(labels)):
@@ -97,7 +97,7 @@ def find_blocks_under_masks(grid, seen, cluster, wants_row):
 @njit(cache=True, nogil=True, parallel=True)
 def update_classes(grid, seen, evidence, masks, evicted):
     """Update the near voxels of the seen blocks; evicted (A,) gets the number of evictions of each block."""
-    unmasked = evidence.unmasked  # numba 0.68 loses assignments to an element of a tuple's array within prange
+    unmasked = evidence.unmasked  # numba 0.68 drops assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0
         block = seen.blocks[a]

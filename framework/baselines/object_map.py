@@ -1,11 +1,11 @@
 """Map with one volume per object and a background volume of the whole scene.
 
-Fusion++ (McCormac et al. 2018) gives an object 64^3 voxels of any size and resamples them as the object grows. It
+Fusion++ (McCormac et al. 2018) represents an object by 64^3 voxels, which are resampled as the object grows. It
 integrates every frame that shows the object, corrects object poses by loop closures, and tracks against a coarse
 background. MaskFusion (Runz et al. 2018) has surfels under the masks only, and tracks moving objects.
 
-Here all volumes have voxels of the same size, objects are static, and a volume changes only in frames that detect its
-object.
+Here, all volumes have voxels of the same size, objects are static, and a volume changes only in frames in which its
+object is detected.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class ObjectMap(InstanceTableMap):
         return boxes_in_view(camera, T_world_camera, low, high, float(self.background.sensor.min_depth))
 
     def instances_seen(self, camera: Camera, T_world_camera: Float64, depth: Float32, stride: int) -> Int32:
-        """Return the object (ceil(H / stride), ceil(W / stride)) at each reading of the subsampled depth, 0 = none.
+        """Return the object ids (ceil(H / stride), ceil(W / stride)) at the readings of the subsampled depth, 0 = none.
 
         `depth` is (H, W) m. A reading in several volumes belongs to the object with the highest foreground probability.
         """
@@ -218,7 +218,10 @@ class ObjectMap(InstanceTableMap):
             scene.table = table_of(header.part("table"), len(scene.classes), arrays)
             objects = header.part("objects")
             if objects.values.keys() != {str(key) for key in scene.table.records}:
-                raise DataError(f"header.objects: expected the ids of the table, got {', '.join(objects.values)!s:.60}")
+                raise DataError(
+                    f"header.objects: expected the ids of the table, {', '.join(map(str, scene.table.records))!s:.60}, "
+                    f"got {', '.join(objects.values)!s:.60}"
+                )
             counts = {int(key): objects.whole(key) for key in objects.values}
             check_like(arrays, scene._empty_volume().arrays(), sum(counts.values()), OBJECT)
             if (arrays[OBJECT + "foreground"] > arrays[OBJECT + "observed"]).any():

@@ -2,9 +2,9 @@
 
 After Fusion++ (McCormac et al. 2018), a voxel counts its observations under a mask of the object, and all of its
 observations. Its foreground probability is the mean of Beta(1 + foreground, 1 + background). The object's surface is
-the part with a probability above 1/2. So occasional mask errors are outvoted, but systematic errors are not.
+the part with a probability above 1/2. Therefore, occasional mask errors are outvoted, but systematic errors are not.
 
-Every depth reading in the blocks of the volume is integrated, masked or not. So distances at the outline are as
+Every depth reading in the blocks of the volume is integrated, masked or not. Therefore, distances at the outline are as
 accurate as elsewhere. Blocks are aligned with the blocks of other volumes. Counts take 4 bytes per voxel in addition to
 the 8 bytes of the TSDF.
 """
@@ -116,7 +116,8 @@ def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: F
     left, top, z0 = (center - half).T
     right, bottom, z1 = (center + half).T
     z0, z1 = np.maximum(z0, near), np.maximum(z1, near)
-    # rays diverge: a side projects farthest outwards at its nearest depth, or at its farthest depth across the axis
+    # perspective: a side projects farthest outwards at its minimum depth, or at its maximum depth if that side lies
+    # beyond the optical axis
     first = np.stack([camera.fx * np.minimum(left / z0, left / z1), camera.fy * np.minimum(top / z0, top / z1)])
     last = np.stack([camera.fx * np.maximum(right / z0, right / z1), camera.fy * np.maximum(bottom / z0, bottom / z1)])
     middle, size = np.array([[camera.cx], [camera.cy]]), np.array([[camera.width], [camera.height]])

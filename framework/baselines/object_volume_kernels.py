@@ -18,8 +18,8 @@ from framework.mapping.voxels.voxel_grid_kernels import NO_LOOK_UP, device
 class MaskCounts(NamedTuple):
     """Counts of the observations of each voxel in frames with a mask of the object."""
 
-    foreground: UInt16  # (B, 512) observations under a mask
-    observed: UInt16  # (B, 512) all observations, at most 65535
+    foreground: UInt16  # (B, 512) number of observations under a mask
+    observed: UInt16  # (B, 512) number of all observations, at most 65535
 
 
 @device
@@ -57,7 +57,7 @@ def look_up_object(
     instance_ids: Int32,
     best: Float32,
 ) -> None:
-    """Set instance_ids (h, w) and `best` (h, w) if the object is more probable than `best` at a reading's voxel.
+    """Set instance_ids (h, w) and `best` (h, w) where the object is more probable than `best` at a reading's voxel.
 
     Reads every stride-th depth reading of every stride-th row of `depth` (H, W) m. `window` holds the first row and
     column of (h, w), and the exclusive last row and column. `view` holds T_world_camera.

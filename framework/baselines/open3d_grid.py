@@ -26,7 +26,7 @@ from framework.mapping.voxels.voxel_grid import MAX_BLOCKS
 
 ATTRIBUTES = {  # name: (type, channels) of a voxel; Open3D's `integrate` expects the first three
     "tsdf": (o3d.core.float32, 1),  # in truncation distances
-    "weight": (o3d.core.float32, 1),  # frames
+    "weight": (o3d.core.float32, 1),  # number of frames
     "color": (o3d.core.float32, 3),  # in [0, 255]
     "instance": (o3d.core.int32, 1),  # 0 = no instance
     "votes": (o3d.core.float32, 1),  # votes for the instance minus votes against it
@@ -36,10 +36,10 @@ FIRST_VOXELS = 2**23  # maximum initial capacity, voxels; 0.2 GB
 METERS = 1.0  # Open3D's depth_scale: units of a float image per meter
 TOUCH_STRIDE = 4  # pixel stride of Open3D's block search, px
 NEAR = 0.05  # start depth of rays, m
-RANGE_TILE = 8  # image pixels per pixel of the range map that bounds rays, px; Open3D's default
+RANGE_TILE = 8  # px, side of the image tile with common depth bounds in the range map; Open3D's default
 FRAGMENTS = 2**18  # capacity of the range map; a view of 10,000 blocks has 20,000 fragments
 FRAGMENT = 16 * 16  # range map pixels per fragment
-MAX_RANGE_PIXELS = 2**24  # maximum pixels of the first range map; coarse voxels need fewer fragments
+MAX_RANGE_PIXELS = 2**24  # maximum number of pixels of the first range map; coarse voxels need fewer fragments
 CPU = o3d.core.Device("CPU:0")
 
 
@@ -52,7 +52,7 @@ class BlockGridSettings:
     truncation: float  # truncation distance, in voxels
     min_depth: float  # minimum depth of integrated readings, m
     max_depth: float  # maximum depth of integrated readings, m
-    max_blocks: int
+    max_blocks: int  # block budget
     min_weight: float  # minimum number of observations of a surface voxel
 
     def __post_init__(self) -> None:
@@ -170,9 +170,9 @@ class BlockGrid:
             hashmap.reserve(min(max(needed, 2 * hashmap.capacity()), self.settings.max_blocks))
 
     def voxels_seen(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> tuple[Int64, Int64]:
-        """Return the voxels within `band` voxels of the reading at their pixel, and the pixels, as flat indices (V,).
+        """Return the voxels within `band` voxels of the reading at their pixel, and their pixels, as flat indices (V,).
 
-        Only pixels in `mask` (H, W) count. After integrate_custom.py of Open3D's examples.
+        Only pixels in `mask` (H, W) are used. The method is from integrate_custom.py of Open3D's examples.
         """
         camera = frame.camera
         usable = self._usable(frame.depth)
@@ -195,7 +195,7 @@ class BlockGrid:
         return voxels.numpy().ravel()[inside[near]], pixels[near]
 
     def voxels_at(self, points_world: Float32) -> Int64:
-        """Return the flat index (P,) of the nearest voxel to each point (P, 3) m, -1 = none."""
+        """Return the flat indices (P,) of the voxels nearest to the points (P, 3) m, -1 = none."""
         if not len(points_world) or not self.block_count:
             return np.full(len(points_world), -1)
         r = self.settings.block_resolution
@@ -203,7 +203,7 @@ class BlockGrid:
         blocks = nearest // r
         indices, known = (tensor.numpy() for tensor in self.blocks.hashmap().find(Tensor(blocks)))
         x, y, z = (nearest - r * blocks).T
-        return np.where(known, indices.astype(np.int64) * r**3 + (z * r + y) * r + x, -1)  # x runs fastest
+        return np.where(known, indices.astype(np.int64) * r**3 + (z * r + y) * r + x, -1)  # x varies fastest
 
     def flat(self, attribute: str) -> npt.NDArray[Any]:
         """Return a writable view of one attribute (block capacity * voxels per block,) of all voxels."""
@@ -248,17 +248,18 @@ class BlockGrid:
         return {name: hit[name].numpy()[: camera.height, : camera.width] for name in names}
 
     def _distance(self, corners: Int64, weights: Float32) -> Float32:
-        """Return the trilinear field (P,) m between the voxels `corners` (P, 8), with `weights` (P, 8), 0 if unseen.
+        """Return the interpolated signed distance (P,), m, of the voxels `corners` (P, 8) with `weights` (P, 8).
 
-        Open3D's rays sample the field at voxels, rounded down, and end half a voxel too far along each axis. The field
-        falls by about 1 m per m behind the surface, so adding it is a Newton step.
+        Voxels with weight 0 are unseen. Open3D's rays sample the distance at coordinates rounded down to voxels, and
+        end half a voxel too far along each axis. The distance decreases by about 1 m per m behind the surface, so
+        adding it to the depth is a Newton step.
         """
         total = np.maximum(weights.sum(axis=1), np.float32(1e-6))
         tsdf = (self.flat("tsdf")[corners] * weights).sum(axis=1) / total
         return np.asarray(tsdf * np.float32(self.settings.truncation * self.settings.voxel_size), np.float32)
 
     def _blocks_in_view(self, camera: Camera, T_world_camera: Float64) -> tuple[Int32, float]:
-        """Return the coordinates (B, 3) of the blocks in view, and their maximum depth (m)."""
+        """Return the block coordinates (B, 3) of the blocks in view, and their maximum depth, m."""
         coords = self.block_coords()
         side = self.settings.block_resolution * self.settings.voxel_size
         radius = side * np.sqrt(3) / 2
@@ -296,7 +297,7 @@ class BlockGrid:
     def arrays(self) -> dict[str, Array]:
         """Return the coordinates of the blocks and the attributes of their voxels, in a deterministic order.
 
-        Open3D's `save` terminates the process if the disk is full.
+        Open3D's `save` is not used, because it terminates the process if the disk is full.
         """
         coords = self.block_coords()
         order = np.lexsort(coords.T)
@@ -347,7 +348,7 @@ def _rays(camera: Camera, T_world_camera: Float64) -> Float32:
 
 
 def points_of(surface: SurfaceView) -> Float32:
-    """Return the world points (H, W, 3) m of a surface."""
+    """Return the points (H, W, 3), m, of a surface in the world frame."""
     points = _rays(surface.camera, surface.T_world_camera)
     points *= surface.depth[..., None]
     points += surface.T_world_camera[:3, 3].astype(np.float32)
@@ -363,7 +364,7 @@ def _towards(camera: Camera, T_world_camera: Float64, normals_camera: Float32) -
 
 
 def _in_order(vertices: Float32, triangles: Int32, colors: UInt8) -> tuple[Float32, Int32, UInt8]:
-    """Return the mesh with merged equal vertices in a deterministic order; Open3D's order depends on its threads."""
+    """Merge equal vertices and return the mesh in a deterministic order; Open3D's order depends on its threads."""
     order = np.lexsort(vertices.T)
     sorted_vertices = vertices[order]
     is_new = np.ones(len(order), np.bool_)

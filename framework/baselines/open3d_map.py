@@ -56,8 +56,8 @@ class Open3DMap(InstanceTableMap):
     def vote(self, frame: Frame, T_world_camera: Float64, instance_ids: Int32, band: float) -> None:
         """Vote for instance_ids (H, W), 0 = no vote, in the voxels within `band` voxels of the measured depth.
 
-        A voxel stores one candidate and one counter. They find the majority if there is a majority (Boyer and Moore,
-        "MJRTY - a fast majority vote algorithm", 1981).
+        A voxel stores one candidate and one counter. They find the majority if one exists (Boyer and Moore, "MJRTY - a
+        fast majority vote algorithm", 1981).
         """
         voxels, pixels = self.grid.voxels_seen(frame, T_world_camera, instance_ids > 0, band)
         ids = instance_ids.ravel()[pixels]
@@ -81,12 +81,12 @@ class Open3DMap(InstanceTableMap):
         self.__dict__.pop("_mesh", None)
 
     def instances_at(self, points_world: Float32) -> Int32:
-        """Return the instance (P,) of the nearest voxel to each point (P, 3) m, 0 = none."""
+        """Return the instance ids (P,) of the voxels nearest to the points (P, 3) m, 0 = none."""
         voxels = self.grid.voxels_at(points_world)
         return np.where(voxels >= 0, self.grid.flat("instance")[voxels], 0).astype(np.int32)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """Return the instance at every stride-th depth reading; see `LabeledMap.instances_seen`."""
+        """Return the instance ids at every stride-th depth reading in both directions; see `LabeledMap`."""
         v, u = np.nonzero(frame.depth[::stride, ::stride])
         pixels = np.stack([u * stride, v * stride], axis=1).astype(np.int32)
         points_camera = back_project(frame.camera, pixels, frame.depth[pixels[:, 1], pixels[:, 0]])

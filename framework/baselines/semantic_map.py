@@ -28,7 +28,7 @@ from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.sensors.noise_models import SensorKind
 
 MISSED, AREA, SMOOTHNESS = (1e-6, 1.0), (0.0, 1000.0), (0.0, 1000.0)  # bounds of the parameters; AREA in m^2
-SWEEPS = 20  # maximum sweeps of the regularization
+SWEEPS = 20  # maximum number of sweeps of the regularization
 FORMAT = "semantic 4"  # format of the map file; increment it when the meaning of the contents changes
 
 
@@ -43,7 +43,7 @@ class Elections(NamedTuple):
 class ComponentStatistics(NamedTuple):
     """Statistics of K components by id, over the nearest voxel of each of their vertices; entry 0 is unused."""
 
-    probability_sums: Float64  # (K + 1, C) sums of each class over the vertices; the rest belongs to the background
+    probability_sums: Float64  # (K + 1, C) sums of P(class) over the vertices; the remainder is P(background)
     masked: Int32  # (K + 1,) maximum number of frames with a voxel under a mask
     first_frame: Int32  # (K + 1,) first frame with any voxel under a mask, -1 = none
     last_frame: Int32  # (K + 1,) last frame with any voxel under a mask, -1 = none

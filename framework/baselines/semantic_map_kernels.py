@@ -15,7 +15,7 @@ from framework.refinement.segmentation.union_find import root, unite
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_view(grid, evidence, log_missed, view, depth, class_ids):
-    """Fill class_ids (H, W) with the classes of the nearest voxels to the surface at `depth` (H, W) m."""
+    """Fill class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W) m, -1 = none."""
     for v in prange(depth.shape[0]):
         key, region = NO_LOOK_UP
         for u in range(depth.shape[1]):

@@ -1,7 +1,7 @@
 """Compilation of kernels in advance, in parallel processes and with a progress bar.
 
-numba compiles a kernel at its first call with new argument types, and stores it in its cache. kernels.txt lists these
-calls.
+numba compiles a kernel at its first call with new argument types, and stores it in its cache. kernels.txt lists the
+argument types of these calls.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ log = logging.getLogger(__name__)
 LIST = Path(__file__).with_name("kernels.txt")
 CHECKOUT = Path(__file__).resolve().parents[2]
 DEFAULT, OTHERS = "# a run with the default stages", "# additional kernels of other stages"
-MAX_WORKERS = 4  # each takes 0.5 GB and compiles shared functions again
-SECONDS_EACH = 0.65  # of a core (AMD EPYC, Zen 5), for an estimate of the time
+MAX_WORKERS = 4  # maximum number of processes; each needs 0.5 GB and compiles shared functions again
+SECONDS_EACH = 0.65  # s, compilation time of a kernel on one core (AMD EPYC, Zen 5)
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Kernel:
 
     module: str
     name: str
-    types: str  # as in kernels.txt
+    types: str  # argument types, as in kernels.txt
 
     @property
     def dispatcher(self) -> Any:
@@ -173,7 +173,7 @@ def _worker() -> subprocess.Popen[str]:
 def _feed(
     process: subprocess.Popen[str], waiting: queue.SimpleQueue[list[Kernel]], events: queue.SimpleQueue[tuple[str, str]]
 ) -> None:
-    """Send kernels to a worker, module by module. Add the events `begun` and `done`; an error of "" = success."""
+    """Send kernels to a worker, module by module. Add events (begun, name) and (done, error); error "" = success."""
     assert process.stdin is not None
     assert process.stdout is not None
     with suppress(queue.Empty):
@@ -189,7 +189,7 @@ def _feed(
                 error = (
                     answer.strip()
                     if answer
-                    else f"{kernel.module}.{kernel.name}: expected a result, got the end of its process"
+                    else f"{kernel.module}.{kernel.name}: expected a result, got the end of the worker process"
                 )
                 events.put(("done", error))
 

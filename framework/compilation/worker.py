@@ -1,7 +1,7 @@
 """Worker process for compiling kernels without running them.
 
-numba generates machine code and Python and C wrappers for each function that a kernel calls, although the kernel
-contains a copy. Skipping this step saves a third of the time and results in the same cache.
+For each function that a kernel calls, numba generates machine code and wrappers for Python and C, although the kernel
+contains a copy of the function. Skipping this step saves a third of the time and results in the same cache.
 
 numba also optimizes each function separately, and again as part of each caller. Here, most functions are optimized
 only as part of a kernel, which saves another fifth of the time. The kernels are equally fast. Functions with forced
@@ -20,12 +20,12 @@ from numba.core.caching import NullCache
 from framework.compilation.catalog import DEFAULT, OTHERS, Kernel, called_by, listed
 
 TESTED = ("0.68.1",)
-"""Supported versions of the numba internals that this process replaces. Others compile 1.4 times slower."""
+"""Versions of numba whose internals this process replaces. With other versions, compilation takes 1.4 times as long."""
 
 
 def work() -> None:
     """Read one kernel per line, compile it, and print an error or an empty line."""
-    gc.freeze()  # numba's many permanent objects slow the collector
+    gc.freeze()  # numba's many permanent objects slow the garbage collector
     gc.set_threshold(200_000, 20, 20)
     wanted = {(kernel.module, kernel.name) for kernel in listed(DEFAULT, OTHERS)}
     names = {name for _, name in wanted}
@@ -49,14 +49,15 @@ def work() -> None:
                     dispatcher._cache = NullCache()
             kernel.compile()
         except Exception as error:
-            reason = f"{kernel.module}.{kernel.name}: compilation failed: {type(error).__name__}: {error}"
+            name = f"{kernel.module}.{kernel.name}"
+            reason = f"{name}: expected a compiled kernel, got {type(error).__name__}: {error}"
             print(reason.splitlines()[0], flush=True)
         else:
             print(flush=True)
 
 
 def make_code_only_for(names: set[str]) -> None:
-    """Make numba generate machine code only for functions with these names; it contains all other functions."""
+    """Make numba generate machine code only for functions with these names. The code contains all called functions."""
     from numba.core.codegen import CPUCodeLibrary, JITCPUCodegen
     from numba.core.registry import cpu_target
 

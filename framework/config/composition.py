@@ -134,7 +134,7 @@ class Repository(hydra_api.ConfigRepository):
 
 
 class ConfigLoader(hydra_api.ConfigLoaderImpl):
-    """Loader of our configs and of added folders, without Hydra's process-wide state."""
+    """Loader of InstanceMap's configs and of added folders, without Hydra's process-wide state."""
 
     def __init__(self) -> None:
         path = hydra_api.ConfigSearchPathImpl()
@@ -160,13 +160,13 @@ class ConfigLoader(hydra_api.ConfigLoaderImpl):
 
 @contextmanager
 def config_loader() -> Iterator[ConfigLoader]:
-    """Yield the loader of our configs. Hydra uses their version base inside the context."""
+    """Yield the loader of InstanceMap's configs. Hydra uses their version base inside the context."""
     with hydra_api.version_base("1.3"):
         yield ConfigLoader()
 
 
 def running_loader() -> Any | None:
-    """Return the loader of the running Hydra application if our configs are on its search path."""
+    """Return the loader of the running Hydra application if InstanceMap's configs are on its search path."""
     hydra = hydra_api.running()
     if hydra is None:
         return None
@@ -198,7 +198,7 @@ def _message_of(error: BaseException) -> str:
 
 
 _EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
-"""Extras to install, by Hydra's name of a launcher; our launchers have the names of the extras."""
+"""Extras to install, by Hydra's name of a launcher. InstanceMap's launchers have the names of the extras."""
 
 
 def _no_such_option(error: MissingConfigException) -> str:

@@ -11,9 +11,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.errors import ConfigError, first_line
 
-MAX_DETECTIONS = 1000  # per image, each with a mask of the image size; COCO evaluates 100
-MAX_PROPOSALS = 100_000  # of a network
-LONGEST_SIDE = 2**13  # px, of the input image of a network
+MAX_DETECTIONS = 1000  # maximum number of detections per image; each has a mask of the image size; COCO evaluates 100
+MAX_PROPOSALS = 100_000  # maximum number of proposals of a network per image
+LONGEST_SIDE = 2**13  # px, maximum side of the input image of a network
 
 
 def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from framework.doctor.check_result import Check, Status, anonymous
 
-MIN_DISK_GB = 2.0  # a run writes 20 to 200 MB, a synthetic benchmark several GB
-MIN_MEMORY_GIB = 2.0  # the demo requires 1.2
+MIN_DISK_GB = 2.0  # a run writes 20 to 200 MB; a synthetic benchmark writes several GB
+MIN_MEMORY_GIB = 2.0  # the demo requires 1.2 GiB
 SYSTEM_LIBRARIES = {
     "libGL.so.1": ("libgl1", "Open3D"),
     "libEGL.so.1": ("libegl1", "Open3D"),
@@ -21,7 +21,7 @@ SYSTEM_LIBRARIES = {
     "libusb-1.0.so.0": ("libusb-1.0-0", "Open3D"),
     "libOpenNI2.so.0": ("libopenni2-0", "convert-oni"),
 }
-"""Debian package and user of each library. Open3D is required."""
+"""Debian package of each library, and the component that requires it. Open3D is required by every run."""
 
 PREFIXES = ("HF_", "INSTANCEMAP_", "NUMBA_", "OMP_", "TRANSFORMERS_", "CUDA_VISIBLE", "XDG_CACHE", "PYTHONPATH")
 
@@ -72,6 +72,6 @@ def system_libraries() -> Iterator[Check]:
 
 
 def environment() -> Iterator[Check]:
-    """List the environment variables that change the behavior."""
+    """List the environment variables that affect runs."""
     for name in sorted(name for name in os.environ if name.startswith(PREFIXES)):
         yield Check(name, Status.OK, anonymous(os.environ[name]) or '""')

@@ -19,10 +19,10 @@ from framework.data import Bool, Detections, FrameTruth, Int64
 MIN_PIXELS = 64  # px, minimum area of an evaluated appearance
 FOUND_IOU = 0.3  # minimum IoU of a found appearance, regardless of class
 SIDES = (32.0, 96.0)  # px, square roots of areas: COCO's bounds between small, medium and large
-MIN_APPEARANCES = 5  # minimum appearances of an object for its detection rate
+MIN_APPEARANCES = 5  # minimum number of appearances of an object for its detection rate
 RARE_FRACTION, FREQUENT_FRACTION = 0.25, 0.75  # fractions of an object's appearances
 PART_INSIDE, PART_COVERS = 0.6, 0.05  # minimum fractions of the detection and of the object, for a part of an object
-ON_ONE = 0.6  # minimum fraction of a false detection on one unknown object
+ON_ONE = 0.6  # minimum fraction of a false detection on one object of unknown class
 
 
 class Appearance(NamedTuple):
@@ -43,7 +43,7 @@ class FalseDetection(NamedTuple):
     """A detection with at most half of its pixels on objects of known classes."""
 
     score: float
-    side: float  # px
+    side: float  # px, square root of the area
     on_thing: bool  # True: mostly on one object of unknown class
 
 

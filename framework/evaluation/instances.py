@@ -5,7 +5,7 @@ to ground-truth instances greedily in order of confidence. AP is the area under 
 all-point interpolation (Pascal VOC from 2010 on). It is averaged over the classes with a ground-truth instance.
 
 A ground-truth instance is evaluated if its class is known and it has at least `min_points` points. All other
-ground-truth instances are *ignored*. A prediction without a match is ignored, neither right nor wrong, if
+ground-truth instances are *ignored*. A prediction without a match is ignored (neither right nor wrong) if
 
 1. its best overlap with an ignored instance reaches the IoU threshold, or
 2. more than half of its points lie on ignored instances, or
@@ -29,7 +29,7 @@ from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh
 from framework.errors import DataError
 
 MAX_DISTANCE = 0.05  # m, maximum distance of the nearest neighbor for the label transfer
-MIN_POINTS = 100  # minimum points of an evaluated ground-truth instance
+MIN_POINTS = 100  # minimum number of points of an evaluated ground-truth instance
 IOU_THRESHOLDS = tuple(percent / 100 for percent in range(50, 100, 5))  # averaged by `ap`, as in COCO
 
 
@@ -48,7 +48,7 @@ class PredictedInstances:
     instance_ids: Int32  # (V,), 0 = no instance
     ids: Int64  # (K,) every instance of the map, including instances without points
     confidences: Float64  # (K,) in [0, 1]
-    class_names: tuple[str, ...]  # K, most probable classes
+    class_names: tuple[str, ...]  # (K,) most probable classes
 
     def __post_init__(self) -> None:
         counts = {name: len(getattr(self, name)) for name in ("ids", "confidences", "class_names")}
@@ -96,9 +96,9 @@ class Score:
     ap: float  # area under the precision-recall curve
     true_positives: int
     false_positives: int
-    ignored: int  # ignored predictions
-    truths: int  # evaluated ground-truth instances, at least 1
-    matched_iou: float  # sum over the true positives
+    ignored: int  # number of ignored predictions
+    truths: int  # number of evaluated ground-truth instances, at least 1
+    matched_iou: float  # sum of the IoU over the true positives
 
     @property
     def panoptic_quality(self) -> float:
@@ -113,7 +113,7 @@ class Outcome(Enum):
     RIGHT = "correct"  # matched with a ground-truth instance of its class
     WRONG_CLASS = "wrong class"  # IoU with a ground-truth instance of another class reaches the threshold
     FALSE = "false positive"  # insufficient IoU, or a duplicate of a more confident prediction
-    IGNORED = "ignored"  # unknown ground truth
+    IGNORED = "ignored"  # the ground truth is unknown
 
 
 @dataclass(frozen=True)
@@ -151,8 +151,8 @@ class InstanceEvaluation:
         - `mean_iou`: mean over the ground-truth instances of the best overlap with a prediction of any class.
         - `precision50`, `recall50`, `f1_50`: at IoU 0.5, over all predictions and ground-truth instances.
         - `pq50`: panoptic quality at IoU 0.5, averaged over classes.
-        - `true_count`: evaluated ground-truth instances, also by class.
-        - `ignored_count`: ignored predictions at IoU 0.5.
+        - `true_count`: number of evaluated ground-truth instances, also by class.
+        - `ignored_count`: number of ignored predictions at IoU 0.5.
         """
         if self.overall is None:
             return {}
@@ -224,7 +224,7 @@ def judge(
     return judged, {key: name for key, name, counts in counted if counts and key not in found}
 
 
-IGNORED, NO_MATCH = -2, -1  # in place of the column of a ground-truth instance
+IGNORED, NO_MATCH = -2, -1  # values in place of the column of a ground-truth instance
 
 
 @dataclass(frozen=True)
@@ -332,7 +332,7 @@ def average_precision(hits: Bool, truths: int) -> float:
 
 
 def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distance: float) -> Int32:
-    """Return the label of the nearest point for each target, 0 = no point within `max_distance` m."""
+    """Return the labels (T,) of the points (P, 3) m nearest to targets (T, 3) m, 0 = none within `max_distance` m."""
     if not len(points) or not len(targets):
         return np.zeros(len(targets), np.int32)
     import numba  # imported here to keep commands that only read metrics fast

@@ -24,8 +24,8 @@ class MaskAp:
 
     ap: float  # mean over IoU 0.5, 0.55, ..., 0.95 and over the classes
     ap50: float  # mean over the classes, at IoU 0.5
-    ap50_by_class: Mapping[str, float]
-    objects: int
+    ap50_by_class: Mapping[str, float]  # AP at IoU 0.5, by class
+    objects: int  # number of evaluated ground-truth objects
 
 
 def mask_ap(
@@ -33,10 +33,8 @@ def mask_ap(
 ) -> MaskAp:
     """Return the AP over images, given as ground-truth masks (N, H, W), class names (N,) and detections.
 
-    A class name of None means unknown.
-
-    A detection has its most likely class. Objects of unknown class and objects smaller than `min_pixels` count neither
-    for nor against a detection (COCO's `iscrowd`).
+    A detection has its most likely class. Objects of unknown class (name None) and objects with fewer than `min_pixels`
+    pixels count neither for nor against a detection (COCO's `iscrowd`).
     """
     category = {name: k for k, name in enumerate(classes, start=1)}
     images: list[dict[str, int]] = []

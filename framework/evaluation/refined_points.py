@@ -25,7 +25,7 @@ class Refinement:
     frame: Frame
     before: PointClusters
     after: PointClusters
-    milliseconds: float  # run time of the refiner
+    milliseconds: float  # median run time of the refiner
 
     @classmethod
     def of(cls, refiner: ClusterRefiner, detections: Detections, frame: Frame) -> Refinement:
@@ -47,8 +47,8 @@ class Refinement:
     def origin(self) -> Int32:
         """Original cluster (M,) of each refined cluster, -1 = none.
 
-        Refiners that keep the number of clusters keep their order. Otherwise, a refined cluster is assigned to the
-        original cluster with the most common pixels. Ties go to the first.
+        If the number of clusters is unchanged, their order is unchanged, too. Otherwise, a refined cluster is assigned
+        to the original cluster with which it shares the most pixels. Ties go to the first.
         """
         n, m = len(self.before), len(self.after)
         if n == m or n == 0:
@@ -108,7 +108,7 @@ class TrueFit:
     """The fit of N clusters to their best-fitting ground-truth objects of known class, as seen in the frame."""
 
     iou: Float64  # (N,) intersection over union with the object; 0 for an empty cluster
-    points_inside: Int32  # (N,) points of the cluster on the object
+    points_inside: Int32  # (N,) number of the cluster's points on the object
     unknown: Bool  # (N,) True: an object of unknown class fits better; not evaluated
 
 

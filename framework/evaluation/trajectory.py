@@ -1,4 +1,4 @@
-"""Trajectory errors ATE and RPE, in evo's notation and with evo's values.
+"""Trajectory errors ATE and RPE, in the notation of evo and with the same results.
 
 Q_i and P_i are the ground-truth and the estimated T_world_camera of frame i.
 
@@ -7,7 +7,7 @@ Q_i and P_i are the ground-truth and the estimated T_world_camera of frame i.
 - RPE (relative pose error) with delta = 1 frame: the RMSE of |trans E_i| and of the angle of rot E_i with
   E_i = (Q_i^-1 Q_{i+1})^-1 (P_i^-1 P_{i+1}).
 
-Frames with a lost pose or an unknown ground-truth pose are omitted, and so are their pairs for RPE.
+Frames with a lost pose or an unknown ground-truth pose are omitted, and so are pairs with such a frame for the RPE.
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ def in_map_world(truth: SceneTruth, timestamps: Float64, poses: Float64) -> Scen
 
     Args:
         truth: The ground truth.
-        timestamps: (F,) s, of the map's frames.
-        poses: (F, 4, 4) T_map_camera.
+        timestamps: (F,) timestamps of the map's frames, s.
+        poses: (F, 4, 4) T_map_camera of these frames.
 
     Raises:
         DataError: The two trajectories have no common time.

@@ -22,7 +22,7 @@ from framework.geometry import back_project, project, transform
 
 SIZE_IN, DPI = (15.0, 9.4), 100
 TITLE_PT, TEXT_PT = 10.0, 9.0
-LINE = 180  # maximum characters per line of findings
+LINE = 180  # maximum number of characters per line of findings
 COLORS = {Verdict.FINE: "#1a7f37", Verdict.UNKNOWN: "#787e86", Verdict.NOTE: "#9a6700", Verdict.ERROR: "#cf222e"}
 CHOSEN, OTHER = "#1a7f37", "#b0b6be"
 

@@ -23,7 +23,7 @@ class ClusterMarks:
     colors: UInt8  # (K, 3) RGB
     owner: Int32  # (H, W) smallest cluster with this pixel, -1 = none
     dropped: Bool  # (H, W) True: in a cluster only before refinement
-    added: Bool  # (H, W) True: not in the owner before refinement
+    added: Bool  # (H, W) True: not in the original cluster of the owner
 
     @classmethod
     def before(cls, refinement: Refinement) -> ClusterMarks:

@@ -62,8 +62,8 @@ class Pictured:
             raise DataError(f"{directory}: expected a folder of runs, got no folder")
         if not (directory / SWEEP).exists():
             raise DataError(
-                f"{directory}: expected the folder of an experiment, got no {SWEEP}; run an experiment such as "
-                "experiment=figure4_progress"
+                f"{directory}: expected the folder of an experiment with {SWEEP}, got a folder without it; run an "
+                "experiment such as experiment=figure4_progress"
             )
         sweep = read_yaml(directory / SWEEP)
         if not sweep.get(NAME):
@@ -95,7 +95,7 @@ class Pictured:
         return [record for row in self.rows.values() if row for record in row.records.values()]
 
     def called(self, run: Run) -> str:
-        """Return the name of the run's sequence, with the seed if there are several."""
+        """Return the name of the run's sequence, with the seed if the runs have several seeds."""
         seeds = {other[0] for other in self.runs}
         return run[-1] if len(run) == 1 or len(seeds) == 1 else f"{run[-1]}, seed {run[0]}"
 

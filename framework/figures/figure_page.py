@@ -23,7 +23,7 @@ TEXT_PT, SMALL_PT, NOTE_PT = 7.0, 6.0, 5.0
 INK, FAINT_INK = "#20242a", "#787e86"
 INCH_MM = 25.4
 PNG_DPI = 200
-PDF_DPI = 300  # of raster images
+PDF_DPI = 300  # resolution of raster images in a PDF
 NOTE_LINE_MM = 2.35  # line spacing of the note
 MARGIN_MM = 1.0
 HINTED = 1.03  # maximum ratio of hinted text width in a PNG to the width of the outlines
@@ -57,7 +57,7 @@ class Page:
         png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
         with atomic_write(png) as temporary:
             self.figure.savefig(temporary, dpi=PNG_DPI)
-        with atomic_write(pdf) as temporary, rc_context({"pdf.fonttype": 42}):  # searchable text
+        with atomic_write(pdf) as temporary, rc_context({"pdf.fonttype": 42}):  # keeps the text searchable
             self.figure.savefig(temporary, dpi=PDF_DPI, metadata={"CreationDate": None})
         return [png, pdf]
 
@@ -88,8 +88,8 @@ def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, wi
 
     Args:
         axes: Axes of the image, in pixels.
-        ids: (H, W) object of each pixel, 0 = none.
-        names: Name by object; names without space are omitted.
+        ids: (H, W) object ids of the pixels, 0 = none.
+        names: Name by object id; names that do not fit are omitted.
         size: Font size, pt.
         width_mm: Width of the printed image, mm.
     """

@@ -26,18 +26,18 @@ from framework.figures.figure_page import (
 from framework.figures.map_panels import Panel, PanelLine
 from framework.rendering.camera_path import ProjectedPath
 
-HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # above the columns, below a line, between panels
-LEFT_MM, RIGHT_MM = 3.5, 0.3  # left and right of the panels
-ASPECT = 0.78  # height by width of a panel
+HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # space above the columns, below a line, and between panels
+LEFT_MM, RIGHT_MM = 3.5, 0.3  # space to the left and to the right of the panels
+ASPECT = 0.78  # height of a panel divided by its width
 
 
 @dataclass(frozen=True)
 class CaptionedLine:
     """A line of panels with its name and captions."""
 
-    name: str  # the sequence
+    name: str  # name of the sequence
     panels: PanelLine
-    captions: Sequence[str]  # below each map; the last is for the ground truth
+    captions: Sequence[str]  # caption below each map; the last caption is for the ground truth
 
     @property
     def rows(self) -> int:

@@ -25,14 +25,14 @@ class Panel:
     """An image of one map."""
 
     image: UInt8  # (H, W, 3) RGB
-    objects: Int32  # (H, W) object of each pixel, 0 = none
-    names: Mapping[int, str]  # by object
-    path: ProjectedPath | None = None  # None = identical in all columns
+    objects: Int32  # (H, W) objects of the pixels, 0 = none
+    names: Mapping[int, str]  # class name by object
+    path: ProjectedPath | None = None  # camera path; None = not drawn
 
 
 @dataclass(frozen=True)
 class Window:
-    """A part of an image, px from its upper left corner."""
+    """A part of an image; coordinates in px from the upper left corner of the image."""
 
     left: int
     top: int
@@ -57,8 +57,8 @@ class PanelLine:
 
     maps: Sequence[Panel | None]  # by column; None = no map
     truth: Panel | None  # None = no ground truth
-    true_count: int  # instances of known class in the image of the ground truth
-    window: Window | None = None  # None = no enlarged panels
+    true_count: int  # number of ground-truth instances of known class
+    window: Window | None = None  # window of the enlarged panels; None = no enlarged panels
     zoomed: Sequence[Panel | None] = ()  # enlarged window of the maps and of the ground truth
 
 
@@ -104,9 +104,9 @@ class _Column:
 
     surface: Surface
     colors: UInt8  # (V, 3) RGB
-    objects: Int32  # (V,) 0 = none
-    names: Mapping[int, str]  # by object
-    poses: Float64  # (F, 4, 4)
+    objects: Int32  # (V,) objects of the vertices, 0 = none
+    names: Mapping[int, str]  # class name by object
+    poses: Float64  # (F, 4, 4) T_world_camera
 
     @classmethod
     def of(cls, stored: StoredMap, truth: SceneTruth, colors: ObjectColors) -> _Column:
@@ -132,7 +132,7 @@ def _with_path(column: _Column, camera: Camera, T_world_camera: Float64) -> tupl
     R_world_camera = T_world_camera[:3, :3]
     hits = FrontSides(column.surface, T_world_camera[:3, 3]).seen_by(camera.scaled(FRAMING_SCALE), R_world_camera)
     path = column.poses[:, :3, 3].astype(np.float32)
-    # as many points as the surface, because outliers are not framed
+    # as many path points as surface points, so that `fitted` does not remove the path as outliers
     path = path[np.linspace(0, len(path) - 1, int(hits.seen.sum())).astype(int)]
     return fitted(R_world_camera, np.concatenate([hits.points_world[hits.seen], path]), camera.width, camera.height)
 

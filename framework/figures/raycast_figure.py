@@ -76,19 +76,19 @@ def raycast_page(view: View, names: Mapping[int, str], centers: Mapping[int, Flo
 
 
 def normal_colors(view: View) -> UInt8:
-    """Return the colors (H, W, 3) of normals in the camera frame with reversed y and z."""
+    """Return RGB colors (H, W, 3) of the normals in the camera frame, with reversed y and z axes."""
     normals = view.normals_world @ view.T_world_camera[:3, :3] * (1, -1, -1)
     return np.asarray(np.rint(np.clip(127.5 + 127.5 * normals, 0, 255)), np.uint8)
 
 
 def position_colors(positions: Float64, low: Float64, high: Float64) -> UInt8:
-    """Return the colors (H, W, 3) of positions (H, W, 3) m, from black at `low` (3,) to white at `high`."""
+    """Return RGB colors (H, W, 3) of positions (H, W, 3) m, from black at `low` (3,) to white at `high` (3,)."""
     scaled = (positions - low) / np.maximum(high - low, 1e-9)
     return np.asarray(np.rint(255 * np.clip(scaled, 0, 1)), np.uint8)
 
 
 def index_colors(ids: Int32, centers: Mapping[int, Float64]) -> UInt8:
-    """Return the colors (H, W, 3) of object indices (H, W), 0 = none."""
+    """Return RGB colors (H, W, 3) of object indices (H, W), 0 = none; `centers` (3,) m are given by index."""
     image = np.empty((*ids.shape, 3), np.uint8)
     image[...] = WITHOUT_OBJECT
     for key, color in object_colors(centers, set(centers)).items():

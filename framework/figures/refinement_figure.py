@@ -22,12 +22,12 @@ from framework.rendering.palette import PAPER
 
 DPI = 100
 WIDTH_IN, MARGIN_IN, GAP_IN, HEAD_IN = 16.4, 0.2, 0.16, 0.35  # HEAD_IN above each panel
-PANEL_IN = (WIDTH_IN - 2 * MARGIN_IN - GAP_IN) / 2  # width
-MAX_IMAGE_IN, SIDE_IN, TITLE_IN, ROW_IN = 6.6, 4.6, 0.4, 0.3  # heights
+PANEL_IN = (WIDTH_IN - 2 * MARGIN_IN - GAP_IN) / 2  # width of a panel
+MAX_IMAGE_IN, SIDE_IN, TITLE_IN, ROW_IN = 6.6, 4.6, 0.4, 0.3  # heights of image, side view, title and table row
 TITLE_PT, TEXT_PT, SMALL_PT = 15.0, 12.0, 10.5
-MAX_TITLE, MAX_REFINER, MAX_NAME = 90, 45, 18  # characters
+MAX_TITLE, MAX_REFINER, MAX_NAME = 90, 45, 18  # maximum numbers of characters
 TABLE_COLUMNS, MAX_ROWS = 3, 8
-NAME_AT, POINTS_AT = 0.016, 0.12  # in a column, relative to the width of the table
+NAME_AT, POINTS_AT = 0.016, 0.12  # positions in a column, relative to the width of the table
 BETTER, WORSE = "#188048", "#be2828"
 
 

@@ -17,34 +17,34 @@ from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import looking, upward
 
 AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(75), np.deg2rad(14)  # at 90 degrees, planes would become lines
-MARGIN = 0.09  # around the clusters, relative to the size of the view
+MARGIN = 0.09  # margin around the clusters, relative to the size of the view
 MIN_HEIGHT_M = 0.4  # minimum height of the view
-CELLS = 300  # grid cells across the view for counting visible points
+CELLS = 300  # number of grid cells across the view for counting visible points
 POINT_SIZE = 1.2  # size of a drawn point, relative to the distance between readings
 MIN_POINT_PT, MAX_POINT_PT = 0.7, 2.2
-GRID_CELLS = 120  # grid cells across the coarse surface for estimating the up direction
+GRID_CELLS = 120  # number of grid cells across the coarse surface for estimating the up direction
 LEVEL_RAD = np.deg2rad(6)  # maximum slope of a floor
 PITCHES_RAD = np.deg2rad([0, 30])  # initial downward pitches of the camera in the floor search
 MAX_DEPTH_STEP = 0.1  # maximum difference between readings of one surface, relative to depth
 SCALE_BARS_M = np.array([0.1, 0.2, 0.5, 1.0, 2.0, 5.0])
-SCALE_BAR = 0.15  # approximate length, relative to the width of the view
+SCALE_BAR = 0.15  # approximate length of the scale bar, relative to the width of the view
 
 
 @dataclass(frozen=True)
 class SideView:
     """Orthographic side view of the P depth readings of a frame."""
 
-    rows: Array  # (P,) of the readings in the image
-    columns: Array  # (P,)
-    points: Float32  # (P, 3) m, x right, y down, z forward
-    spacing: Float32  # (P,) m, between neighboring readings
-    center: Float64  # (2,) m, of the view
+    rows: Array  # (P,) image rows of the readings
+    columns: Array  # (P,) image columns of the readings
+    points: Float32  # (P, 3) m, in the frame of the view: x right, y down, z forward
+    spacing: Float32  # (P,) m, distance between neighboring readings
+    center: Float64  # (2,) m, x and y of the center of the view
     size: Float64  # (2,) m, width and height of the view
-    forward: float  # viewing direction of the frame's camera along x
+    forward: float  # x component of the viewing direction of the frame's camera
 
     @classmethod
     def of(cls, frame: Frame, before: ClusterMarks, after: ClusterMarks, aspect: float) -> SideView | None:
-        """Return the view from the left or the right, whichever shows more changed points; None = no depth readings.
+        """Return the view, from the left or the right, that shows more changed points; None = no depth readings.
 
         Args:
             frame: Frame with depth.

@@ -17,7 +17,7 @@ from framework.data import Float64, Int64
 from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, write_message
 from framework.runs.timings_file import StageTimes
 
-WINDOW = 9  # frames, of the running median
+WINDOW = 9  # number of frames of the running median
 COLUMNS = {
     "Mask R-CNN": ("detection",),
     "data association": ("lifting", "association"),
@@ -26,7 +26,7 @@ COLUMNS = {
 }
 """Stages by line, with the names of the paper; the assignment of stages to names is our interpretation."""
 COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # for color-blind readers
-RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # ms per frame
+RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # names of the reference lines, by ms per frame
 PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights of a diagram, its heading and its axis labels
 LEFT_MM, RIGHT_MM = 9.5, 25.5  # margins of the diagram
 PLOT_WIDTH_MM = COLUMN_MM - LEFT_MM - RIGHT_MM
@@ -41,10 +41,10 @@ class MeanTimes:
 
     frames: Int64  # (G,) frame numbers
     mean: Mapping[str, Float64]  # by name in COLUMNS: (G,) ms, NaN = unknown
-    lowest: Mapping[str, Float64]  # of the fastest sequence at each frame
-    highest: Mapping[str, Float64]  # of the slowest sequence at each frame
+    lowest: Mapping[str, Float64]  # (G,) ms, of the fastest sequence at each frame
+    highest: Mapping[str, Float64]  # (G,) ms, of the slowest sequence at each frame
     count: int  # number of sequences
-    longest: int  # last frame of the longest sequence
+    longest: int  # last frame number of the longest sequence
 
     @classmethod
     def of(cls, runs: Sequence[StageTimes]) -> MeanTimes:
@@ -79,7 +79,7 @@ class MeanTimes:
 
 
 def running_median(values: Float64, window: int) -> Float64:
-    """Return the running median (F,) over `window` (odd) values, fewer at the ends. NaN values stay NaN."""
+    """Return the running median (F,) over `window` (odd) values, or fewer at the ends. NaN values stay NaN."""
     half = window // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, constant_values=np.nan), window)
     with warnings.catch_warnings():
@@ -112,7 +112,7 @@ def stage_times_figure(rows: Mapping[str, MeanTimes | None], note: str) -> Page:
 
 
 def _column(run: StageTimes, name: str) -> Float64:
-    """Return the sum (F,) of the stages of a column; NaN if a stage did not run."""
+    """Return the total time (F,), ms, of the stages of a column; NaN if a stage did not run."""
     nothing = np.full(len(run.frames), np.nan)
     return np.asarray(np.sum([run.milliseconds.get(stage, nothing) for stage in COLUMNS[name]], axis=0), np.float64)
 

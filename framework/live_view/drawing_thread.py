@@ -2,7 +2,7 @@
 
 Frames that arrive during drawing are drawn next. Of images and maps, only the newest is drawn. The fuser may write the
 map at any time, so the pipeline's thread takes snapshots between two frames. The time for snapshots and drawing is
-limited to fixed fractions, regardless of the map's size.
+limited to fixed fractions of the run time, regardless of the map's size.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class FrameNote:
     index: int  # Frame.index
     timestamp: float  # s
     pose: Pose
-    stage_ms: Mapping[str, float]  # by stage
+    stage_ms: Mapping[str, float]  # stage times by name, ms
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class MapSnapshot:
     timestamp: float  # s
     mesh: InstanceMesh
     objects: Mapping[int, tuple[int, float]]  # SceneMap.most_likely_classes
-    up: Float64 | None  # (3,), the last estimate
+    up: Float64 | None  # (3,) last estimate of the up direction; None = unknown
 
 
 class Drawing(Protocol):
@@ -89,13 +89,13 @@ class DrawingThread:
     def __init__(self, scene: SceneMap, drawing: Drawing, frame_interval: int, map_interval: float) -> None:
         self._scene, self._drawing, self._frame_interval = scene, drawing, frame_interval
         self._snapshots = Pace(map_interval, SNAPSHOT_FRACTION)
-        self._taken, self._next_up = 0, FIRST_UP  # snapshots
+        self._taken, self._next_up = 0, FIRST_UP  # number of snapshots, and snapshot of the next up estimate
         self._pictures = Pace(0.0, PICTURE_FRACTION, time.thread_time)
         self._maps = Pace(map_interval, MAP_FRACTION, time.thread_time)
         self._frames = 0
         self._up: Float64 | None = None
-        self._last: FrameNote | None = None  # of the integrated frames
-        self._lock = threading.Lock()  # of the pending data
+        self._last: FrameNote | None = None  # note of the last integrated frame
+        self._lock = threading.Lock()  # lock of the pending data
         self._pending = _Pending()
         self._ending = self._failed = False
         self._wanted = threading.Event()

@@ -48,11 +48,11 @@ class InstanceColors:
 
 MAX_POINTS = 8_000  # maximum number of map points projected into a frame
 NEAR = 0.05  # maximum distance between a point and the depth reading, relative to depth
-MIN_FRACTION = 0.3  # minimum fraction of the points under a mask with its instance
+MIN_FRACTION = 0.3  # minimum fraction of the points under a mask that belong to its instance
 
 
 def seen_instances(masks: Bool, frame: Frame, T_world_camera: Float64, mesh: InstanceMesh) -> Int32:
-    """Return the instance (N,) with the most points under each mask (N, H, W); 0 = below MIN_FRACTION of the points.
+    """Return the ids (N,) of the instances with the most points under the masks (N, H, W); 0 = below MIN_FRACTION.
 
     The points are mesh vertices with or without an instance that agree with the frame's depth.
     """

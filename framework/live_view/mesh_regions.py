@@ -18,7 +18,7 @@ Region = tuple[int, int, int]
 class MeshPart:
     """The triangles whose first vertex is in a region, with all of their vertices."""
 
-    vertices: Float32  # (V, 3) m, world
+    vertices: Float32  # (V, 3) m, in the world frame
     triangles: Int32  # (F, 3); no vertices and no triangles = removed part
     colors: UInt8  # (V, 3) RGB
 

@@ -22,16 +22,16 @@ from framework.mapping.instances.instance_list import box_around, vertices_by_id
 if TYPE_CHECKING:
     import rerun as rr
 
-PATH_PIECE = 200  # maximum poses redrawn for a new pose
-MM = 1000  # units of depth images per m
+PATH_PIECE = 200  # maximum number of poses that are redrawn for a new pose
+MM = 1000  # depth image units per m
 UNKNOWN = 65535  # label of masks without an instance of the map
 UNKNOWN_COLOR = np.array([235, 235, 235], np.uint8)
 MASK_OPACITY = 0.5
 PATH_COLOR, LOST_COLOR = (40, 160, 255), (230, 60, 50)
-NAME_RADIUS = 0.005  # m
-PATH_RADIUS = 0.004  # m
+NAME_RADIUS = 0.005  # m, radius of the point of an object name
+PATH_RADIUS = 0.004  # m, radius of the line of the camera path
 FRUSTUM_M = 0.25  # m, distance of the image plane from the camera
-MIN_TURN = 0.01  # minimum change of the up direction (unit vector)
+MIN_TURN = 0.01  # minimum change of a component of the up direction (unit vector) for a redraw
 
 
 class RerunDrawing:
@@ -173,7 +173,7 @@ class RerunDrawing:
         numbers = np.where((ids > 0) & (ids < UNKNOWN), ids, UNKNOWN).astype(np.uint16)
         image = np.zeros(found.masks[:, ::stride, ::stride].shape[1:], np.uint16)
         for mask, number in zip(found.masks[::-1, ::stride, ::stride], numbers[::-1], strict=True):
-            image[mask] = number  # best detection last
+            image[mask] = number  # the best detection is drawn last
         self._recording.log(at.MASKS, self._rr.SegmentationImage(image, opacity=MASK_OPACITY))
         named = np.flatnonzero(found.scores >= self._min_confidence).tolist()
         classes = found.class_probabilities.argmax(axis=1)
@@ -240,12 +240,12 @@ class RerunDrawing:
 
 
 def turned(up: Float64, forward: Float64) -> Float64:
-    """Return R_view_world (3, 3): maps the unit vector `up` (3,) to z and the level part of `forward` (3,) to y."""
+    """Return R_view_world (3, 3), which maps the unit vector `up` (3,) to z and the level part of `forward` to y."""
     across = np.cross(forward, up)
     across = across / np.linalg.norm(across) if across.any() else np.linalg.svd(up[None])[2][1]
     return np.stack([across, np.cross(up, across), up])
 
 
 def _lighter(colors: Sequence[UInt8]) -> UInt8:
-    """Return colors (N, 3) RGB for text on a dark background."""
+    """Return lighter RGB colors (N, 3) for text on a dark background."""
     return (np.array(colors, np.uint16).reshape(-1, 3) // 2 + 115).astype(np.uint8)

@@ -35,7 +35,7 @@ STAGE_COLORS = {
 }
 """RGB by stage, as in a report."""
 
-TIMES_SHOWN = 300  # frames before the current frame
+TIMES_SHOWN = 300  # number of displayed stage times before the current frame, in frames
 EYE_BACK, EYE_ABOVE = 1.2, 0.8  # m, from the first camera to the view's position
 AIM_FORWARD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to the view's target
 
@@ -43,7 +43,7 @@ AIM_FORWARD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to the view's targ
 def layout(T_view_camera: Float64 | None = None) -> rrb.Blueprint:
     """Return the layout: map and stage times on the left, frame and depth on the right.
 
-    The view is behind the first camera at `T_view_camera`, z up; None = unknown.
+    The 3D view starts behind the first camera at `T_view_camera` (4, 4), with z up; None = unknown.
     """
     import rerun.blueprint as rrb
 

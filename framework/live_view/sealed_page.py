@@ -50,7 +50,7 @@ class SealedPage:
             def log_message(self, format: str, *args: object) -> None:
                 """Suppress the request log."""
 
-        self._server = ThreadingHTTPServer((HERE, port), Handler)  # before the download, because the port may be in use
+        self._server = ThreadingHTTPServer((HERE, port), Handler)  # before the download, as the port may be in use
         try:
             files |= page_files()
         except BaseException:

@@ -24,7 +24,7 @@ from framework.interfaces import SceneMap
 LOOKS = 60  # number of evenly spaced poses for rendering the map of a visit
 EYE = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)  # assumed camera of a visit: half the resolution of a Kinect
 SAMPLED = 400  # maximum number of sampled vertices of an object
-MIN_GAP, MIN_GAP_PER_DEPTH = 0.06, 0.02  # m and m per m of depth: minimum distance of a surface behind free space
+MIN_GAP, MIN_GAP_PER_DEPTH = 0.06, 0.02  # m, m per m of depth; minimum distance from free space to the surface behind
 MIN_SEEN = 0.3  # minimum fraction of an object's vertices observed in the other visit
 MAX_DISTANCE = 0.05  # m, maximum distance to a vertex of the other map at the same position
 STAY_PROBABILITY = 0.9  # prior probability that an object stays from one visit to the next
@@ -48,8 +48,8 @@ class Change:
     """One object of the first visit, the second, or both."""
 
     kind: Kind
-    name: str  # of its class
-    probability: float  # of `kind`; for NOT_SEEN, probability that the object exists
+    name: str  # name of its class
+    probability: float  # probability of `kind`; for NOT_SEEN, probability that the object exists
     before: int | None  # id in the first map
     after: int | None  # id in the second map
     place: Float64  # (3,) m, last center in the world frame
@@ -73,7 +73,7 @@ class _Object:
     """An object of one visit, and its observation in the other visit."""
 
     instance: Instance
-    name: str  # of its class
+    name: str  # name of its class
     seen: float  # observed fraction of the surface in the other visit
     gone: float  # probability of absence in the other visit
     match: int | None  # object of the other visit at the same position
@@ -173,7 +173,7 @@ def probability_gone(confidence: float, there: Bool, through: Bool, matched: boo
 
 
 def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
-    """Return the object (P,) of the nearest vertex within MAX_DISTANCE m; 0 = none."""
+    """Return the object ids (P,) of the vertices nearest to points (P, 3) m; 0 = none within MAX_DISTANCE."""
     if not len(mesh.vertices):
         return np.zeros(len(points), np.int32)
     distance, nearest = KDTree(mesh.vertices).query(points, distance_upper_bound=MAX_DISTANCE)
@@ -182,7 +182,7 @@ def _nearest_labels(mesh: InstanceMesh, points: Float32) -> Int32:
 
 
 def _match(labels: Int32) -> int | None:
-    """Return the most frequent object of the labels (M,), None if its fraction is below SAME_THING."""
+    """Return the most frequent object id of the labels (M,); None if its fraction is below SAME_THING."""
     ids, counts = np.unique(labels[labels > 0], return_counts=True)
     if not len(ids) or counts.max() < SAME_THING * len(labels):
         return None

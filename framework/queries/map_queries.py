@@ -64,21 +64,21 @@ class Map:
         return self.classes[int(probabilities.argmax())] if len(probabilities) else "object"
 
     def nearest(self, point: Sequence[float] | Float64, class_: str | None = None) -> Instance | None:
-        """Return the object with the nearest surface to a point.
+        """Return the object whose surface is nearest to a point.
 
         Args:
-            point: (3,) m, world.
+            point: (3,) m, in the world frame.
             class_: Most likely class of the object; None = all classes.
 
         Returns:
-            The object, None without objects.
+            The object; None = no object.
 
         Raises:
             DataError: The point is invalid or the class is unknown.
         """
         target = np.asarray(point, np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():
-            raise DataError(f"point: expected 3 finite numbers in m (world), got {point!r:.60}")
+            raise DataError(f"point: expected 3 finite coordinates in the world frame, m, got {point!r:.60}")
         with self.lock:
             found = self.instances(class_)
             vertices = self.scene.mesh().vertices if found else np.zeros((0, 3), np.float32)
@@ -96,7 +96,7 @@ class Map:
             T_world_camera: (4, 4) pose.
 
         Returns:
-            The view. It contains only ids of `instances`.
+            The view. Its instance ids are those of `instances` only.
         """
         with self.lock:
             view = self.scene.render(camera, T_world_camera)
@@ -117,7 +117,7 @@ class Map:
             T_world_camera: (4, 4) pose.
 
         Returns:
-            The object, None if the pixel has no object.
+            The object; None = no object at the pixel.
 
         Raises:
             DataError: The pixel is outside the image.
@@ -170,7 +170,7 @@ class Map:
             return whole.of(found)
 
     def save(self, path: Path | str) -> None:
-        """Write the map to one file by an atomic write. Read it with `load_map`.
+        """Write the map to one file, atomically. Read it with `load_map`.
 
         Args:
             path: Path of the file.

@@ -18,7 +18,7 @@ from framework.vocabulary.text_queries import object_words
 
 BY = ("embeddings", "names")
 MIN_MATCH = 0.1  # minimum similarity by names
-LONGEST_QUERY = 1000  # maximum characters of a query
+LONGEST_QUERY = 1000  # maximum number of characters of a query
 NAME_IT = "set --model (Python: model=)"
 WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instancemap[transformers])"
 
@@ -49,7 +49,7 @@ class TextQuery:
 
     words: str  # text of 1 to 1000 characters
     by: str | None = None  # embeddings or names; None = embeddings if the map has any or `model` is set, else names
-    model: str | None = None  # embedding model of the query: folder, file or id; None = model of the run's detector
+    model: str | None = None  # embedding model for the text: folder, file or id; None = model of the run's detector
 
     def __post_init__(self) -> None:
         if not isinstance(self.words, str) or not 0 < len(self.words.strip()) <= LONGEST_QUERY:
@@ -127,8 +127,8 @@ def by_names(scene: Map, query: str) -> list[Match]:
             unknown = ", ".join(map(repr, words.unknown or [query]))
             there = ", ".join(sorted({scene.name(instance) for instance in scene.instances().values()}))
             raise DataError(
-                f"query: expected classes of this map or colors, got {unknown}; objects: {there or 'none'}; colors: "
-                f"{', '.join(COLOR_NAMES)}"
+                f"query: expected classes of this map or colors, got {unknown}; use the classes of its objects "
+                f"({there or 'none'}) or the colors {', '.join(COLOR_NAMES)}"
             )
         columns = [scene.classes.index(name) for name in words.classes]
         mesh, matches = scene.mesh(), {}
@@ -147,7 +147,7 @@ def color_fit(mesh: InstanceMesh, instance: Instance, colors: Sequence[str]) -> 
 
 
 def _colors(mesh: InstanceMesh, instance: Instance) -> Float32:
-    """Return the colors (M, 3) sRGB in [0, 1] of an object's vertices."""
+    """Return the sRGB colors (M, 3), in [0, 1], of an object's vertices."""
     return np.asarray(mesh.colors[instance.vertices].astype(np.float32) / np.float32(255), np.float32)
 
 

@@ -13,7 +13,7 @@ from framework.data import Camera, Float32
 from framework.rendering.ambient_occlusion_kernels import RAYS, STEPS, TILE, trace_occlusion
 
 RANGE_M = 0.35  # maximum distance of occluders
-DEPTH = 0.75  # darkening of a fully occluded point
+DEPTH = 0.75  # relative darkening of a fully occluded point
 
 
 def openness(camera: Camera, depth: Float32, normals_camera: Float32) -> Float32:

@@ -7,12 +7,12 @@ from numba import njit
 
 from framework.data import Float32
 
-RAYS = 8  # per pixel; the rays differ within a tile, and tiles are averaged
-STEPS = 4  # samples along a ray
-TILE = 4  # px
+RAYS = 8  # number of rays per pixel; the rays differ within a tile, and tiles are averaged
+STEPS = 4  # number of samples along a ray
+TILE = 4  # side of a tile, px
 SLACK_M = np.float32(2e-3)  # minimum depth behind the surface for a hit
 THICKNESS_M = np.float32(0.15)  # assumed thickness of surfaces; rays farther behind are not occluded
-HALF = np.float32(0.5)  # px, from the border of a pixel to its center
+HALF = np.float32(0.5)  # px, distance from the border of a pixel to its center
 
 
 @njit(cache=True, nogil=True)

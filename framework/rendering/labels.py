@@ -13,18 +13,18 @@ from PIL import Image, ImageDraw, ImageFont
 from framework.data import Bool, Int32
 from framework.rendering.palette import INK, PAPER
 
-MIN_PIXELS = 60  # minimum size of an object with a name
+MIN_PIXELS = 60  # minimum size of an object with a name, px
 ROOM = 0.75  # minimum distance from the name to the border of its object, relative to the height of the name
-NEAREST, FARTHEST, STEP = 24, 160, 8  # px, distances of a name next to its object
-DIRECTIONS = 32
+NEAREST, FARTHEST, STEP = 24, 160, 8  # px, minimum, maximum and step of the distance of a name next to its object
+DIRECTIONS = 32  # number of directions from an object to its name
 ABOUT = 0.9  # minimum distance from the border, relative to the largest distance
 ON_OTHERS = 0.1  # maximum fraction of a name over other objects, for a name on its object
 COVERING = 150.0  # px, cost of a name completely over objects
 CROSSING = 100.0  # px, cost of a line completely over other objects
-SAMPLES = 24  # points of a line
+SAMPLES = 24  # number of sampled points of a line
 DOT = 2.5  # px, radius of a line's end on the object
 AROUND = 3  # px, margin of a name
-HALO = 3  # px
+HALO = 3  # width of the halo of a name, px
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, px
 
@@ -34,16 +34,16 @@ class Label:
     """A name with its position."""
 
     text: str
-    u: float  # px, of the center
-    v: float  # px
+    u: float  # px, column of the center
+    v: float  # px, row of the center
     target: tuple[float, float] | None = None  # u, v, px, end of the line; None = the name is on the object
 
 
 def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tuple[float, float]]) -> list[Label]:
-    """Return the placed `names`, given by id, in an image of `ids` (H, W), 0 = none; large objects come first.
+    """Return the labels with the `names` (by id) for an image of `ids` (H, W), 0 = none; large objects come first.
 
-    Names do not overlap and are inside the image. Names without space are omitted. `size` returns the width and height
-    of a text, px.
+    Labels do not overlap and are inside the image. Names that do not fit are omitted. `size` returns the width and
+    height of a text, px.
     """
     pixels = np.bincount(ids.ravel(), minlength=max([0, *names]) + 1)
     shown = sorted((key for key in names if pixels[key] >= MIN_PIXELS), key=lambda key: (-pixels[key], key))

@@ -12,7 +12,7 @@ from framework.rendering.ambient_occlusion import openness
 from framework.rendering.lit_view_kernels import light_up, paint
 from framework.rendering.surface import FrontSides, Surface
 
-SUPERSAMPLING = 2  # rays per pixel in either direction
+SUPERSAMPLING = 2  # rays per pixel in each direction
 NOTHING = (229, 232, 236)  # RGB of empty pixels; not white, because surfaces may be white
 
 
@@ -23,7 +23,7 @@ class LitView:
         R_world_camera = T_world_camera[:3, :3]
         sides = FrontSides(surface, T_world_camera[:3, 3])
         self._fine = sides.seen_by(camera.scaled(SUPERSAMPLING), R_world_camera)
-        self.hits = self._fine.subsampled(SUPERSAMPLING)  # of camera.shape
+        self.hits = self._fine.subsampled(SUPERSAMPLING)  # at the resolution of `camera`
         normals = self._fine.interpolated(surface.vertex_normals)
         self._light = np.empty(self._fine.depth.shape, np.float32)
         light_up(normals, np.ascontiguousarray(R_world_camera), self._fine.camera.K, self._light)

@@ -7,7 +7,7 @@ from numba import njit
 
 from framework.data import Float32, Float64, Int32
 
-TO_LAMP = np.array([-0.45, -0.75, -0.6])  # camera frame: above and left of the viewer
+TO_LAMP = np.array([-0.45, -0.75, -0.6])  # in the camera frame: above and to the left of the viewer
 LAMP = TO_LAMP / np.linalg.norm(TO_LAMP)
 AMBIENT, DIFFUSE = 0.70, 0.34  # light from all directions and from the lamp
 

@@ -19,7 +19,7 @@ class ObjectColors:
 
     def __init__(self, truth: SceneTruth) -> None:
         ids = np.setdiff1d(truth.instance_ids, [0]).tolist()
-        self.true_objects = {key: k for k, key in enumerate(ids, start=1)}  # by ground-truth instance
+        self.true_objects = {key: k for k, key in enumerate(ids, start=1)}  # object by ground-truth instance
         self.name_of = {k: name for key, k in self.true_objects.items() if (name := truth.class_names.get(key))}
         self.color_of: dict[int, UInt8] = dict.fromkeys(self.true_objects.values(), np.array(UNKNOWN, np.uint8))  # (3,)
         named = [key for key in ids if self.true_objects[key] in self.name_of]
@@ -42,7 +42,7 @@ class ObjectColors:
 
 
 def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
-    """Return the ground-truth instance of each matched instance, from both ids (V,) of the same points; 0 = none.
+    """Return the ground-truth id of each matched instance, from the two ids of each of V points; 0 = none.
 
     The matching maximizes the sum of IoU. Pairs with an IoU below SAME_OBJECT_IOU are omitted.
     """

@@ -12,9 +12,9 @@ from framework.data import Float64, UInt8
 PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)
 
 NEAR_M = 0.8  # distance scale for dissimilar colors
-ALIKE = 22.0  # CIE76 difference of similar colors
+ALIKE = 22.0  # scale of the CIE76 distance between similar colors
 HUES = 18
-CLEAR = ((165, 245), (105, 250), (190, 200))  # saturation and value
+CLEAR = ((165, 245), (105, 250), (190, 200))  # saturation and value of each shade
 DARK = ((130, 95), (60, 125))  # disjoint from CLEAR
 
 
@@ -26,7 +26,7 @@ def candidates(shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
 
 
 def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEAR) -> UInt8:
-    """Return RGB colors (N, 3) for objects at centroids (N, 3) m, greedily chosen dissimilar for nearby objects."""
+    """Return RGB colors (N, 3) for objects at centroids (N, 3) m, chosen greedily and dissimilar for nearby objects."""
     rgb = candidates(shades)
     lab = cv2.cvtColor(rgb[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
     likeness = np.exp(-np.linalg.norm(lab[:, None] - lab[None], axis=2) / ALIKE)  # (K, K)

@@ -38,7 +38,7 @@ class Rasterizer:
     """Rasterizer of a fixed triangle mesh. It is thread-safe."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
-        """Prepare a mesh of vertices (V, 3) m, world, and two-sided triangles (F, 3)."""
+        """Prepare a mesh of vertices (V, 3), m, in the world frame, and two-sided triangles (F, 3)."""
         self._vertices = np.ascontiguousarray(vertices, np.float32)
         # spatial order improves culling and cache locality
         self._order = np.argsort(morton_codes(self._vertices, triangles), kind="stable").astype(np.int32)

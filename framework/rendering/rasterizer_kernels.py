@@ -11,7 +11,7 @@ from framework.data import Float32, Float64, Int32
 NO_TRIANGLE = -1
 CHUNK = 32  # number of triangles culled together
 SLACK = 0.01  # px, margin of bounds against rounding
-CELLS = 1023  # along each axis of the bounding cube
+CELLS = 1023  # number of cells along each axis of the bounding cube
 NEAR = 1e-9  # m, near plane for the bounds of triangles partly behind the camera
 
 
@@ -162,8 +162,9 @@ def _corners(vertices, triangles, f, T_world_camera):
 def _edge_functions(a, b, c):
     """Return the three edge functions of a triangle and the nonnegative triple product of its corners.
 
-    The barycentric weight of a corner is proportional to the product of the pixel's ray and the cross product of the
-    other two corners. For a common edge, neighbors compute the same value except for the sign, which leaves no gap.
+    The barycentric weight of a corner is proportional to the dot product of the pixel's ray with the cross product of
+    the other two corners. At a common edge, both triangles compute the same value with opposite signs, which leaves no
+    gap.
     """
     ea, eb, ec = _cross(b, c), _cross(c, a), _cross(a, b)
     volume = a[0] * ea[0] + a[1] * ea[1] + a[2] * ea[2]
@@ -229,12 +230,12 @@ def _bounds_in_front(a, b, c):
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
     for p, q in ((a, b), (b, c), (c, a)):
         x, y, z = p
-        if z <= NEAR and q[2] > NEAR:  # the edge enters
+        if z <= NEAR and q[2] > NEAR:  # the edge enters the visible side of the near plane
             s = (NEAR - z) / (q[2] - z)
             x, y, z = x + s * (q[0] - x), y + s * (q[1] - y), NEAR
         if z >= NEAR:
             left, right, top, bottom = min(left, x / z), max(right, x / z), min(top, y / z), max(bottom, y / z)
-        if p[2] > NEAR and q[2] <= NEAR:  # the edge leaves
+        if p[2] > NEAR and q[2] <= NEAR:  # the edge leaves the visible side
             s = (NEAR - p[2]) / (q[2] - p[2])
             x, y = (p[0] + s * (q[0] - p[0])) / NEAR, (p[1] + s * (q[1] - p[1])) / NEAR
             left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)

@@ -11,7 +11,7 @@ from framework.data import Bool, Camera, Float32, Float64, Int32
 from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
 from framework.rendering.rasterizer_kernels import NO_TRIANGLE, interpolate
 
-VOTES, VOTERS = 20000, 50  # sampled triangles and cameras for determining the front side
+VOTES, VOTERS = 20000, 50  # numbers of sampled triangles and cameras for determining the front side
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,8 @@ class Hits:
 
     camera: Camera
     buffer: VisibilityBuffer
-    vertices: Float32  # (V, 3) m, world
-    triangles: Int32  # (F, 3), indexed by `buffer`
+    vertices: Float32  # (V, 3) m, in the world frame
+    triangles: Int32  # (F, 3); `buffer` contains their indices
 
     @property
     def depth(self) -> Float32:
@@ -35,11 +35,11 @@ class Hits:
 
     @property
     def points_world(self) -> Float32:
-        """Points (H, W, 3) m, 0 = none."""
+        """Points (H, W, 3), m, in the world frame; 0 = none."""
         return self.interpolated(self.vertices)
 
     def subsampled(self, n: int) -> Hits:
-        """Return every n-th pixel in both directions."""
+        """Return the hits of every n-th pixel in both directions."""
         seen, c = self.buffer, self.camera
         triangle, depth = np.ascontiguousarray(seen.triangle[::n, ::n]), np.ascontiguousarray(seen.depth[::n, ::n])
         height, width = depth.shape

@@ -1,4 +1,4 @@
-"""Viewpoint selection for a map: an oblique view from above into the room with many visible objects."""
+"""Selection of a viewpoint for a map: an oblique view into the room from above, with many visible objects."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from framework.rendering.viewpoint_kernels import draw_fronts, sum_level_normals
 
 FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, for a weak perspective
 ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])
-AZIMUTHS = 16  # candidates around the vertical
+AZIMUTHS = 16  # number of candidates around the vertical
 MARGIN = 1.04  # size of the view relative to its content
 TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, size of candidate images
-TRIAL_POINTS = 60000  # maximum vertices in candidate images
+TRIAL_POINTS = 60000  # approximate maximum number of vertices in candidate images
 LEVEL_CONE_RAD = np.deg2rad(30)  # maximum angle of floor normals to the mean up direction of the cameras
 
 
@@ -88,7 +88,7 @@ def _without_strays(points: Float32) -> Float32:
 
 
 def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
-    """Return the camera and pose as in `fitted`, of all points including outliers."""
+    """Return the camera and pose as in `fitted`, with all points, including outliers, in view."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     x, y, z = R_world_camera.T @ points_world.T
@@ -104,7 +104,7 @@ def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: 
 
 
 def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
-    """Return the nearest front-facing point of each pixel, as indices into the points (P, 3)."""
+    """Return the indices of the visible points (P, 3): the nearest front-facing point of each pixel."""
     nearest = np.full(camera.shape, -1, np.int32)
     points, normals = (
         np.ascontiguousarray(points),

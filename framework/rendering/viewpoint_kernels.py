@@ -10,7 +10,7 @@ from framework.data import Float32, Float64, Int32
 
 @njit(cache=True, nogil=True)
 def sum_level_normals(normals: Float32, up: Float64, cosine: float) -> tuple[Float64, float]:
-    """Return the sum (3,) of the normals (F, 3) within a cone around `up` (3,), and their fraction of the area."""
+    """Return the sum (3,) of the face normals (F, 3) in a cone around `up` (3,), and their fraction of the area."""
     total, inside, area = np.zeros(3), 0.0, 0.0
     for f in range(len(normals)):
         x, y, z = normals[f, 0], normals[f, 1], normals[f, 2]
@@ -26,7 +26,7 @@ def sum_level_normals(normals: Float32, up: Float64, cosine: float) -> tuple[Flo
 def draw_fronts(
     points: Float32, normals: Float32, T: Float64, intrinsics: tuple[float, float, float, float], nearest: Int32
 ) -> None:
-    """Write the index (H, W) of the nearest front-facing point (P, 3) for the camera at T = T_world_camera."""
+    """Write the indices (H, W) of the nearest front-facing points (P, 3) for the camera at T = T_world_camera."""
     fx, fy, cx, cy = intrinsics
     height, width = nearest.shape
     depth = np.full(nearest.shape, np.inf)

@@ -30,7 +30,7 @@ PLAIN = (
     *("instances.count", "trajectory.ate_rmse_m", "frames_lost", "fps"),
     *(f"stage_ms.{stage}.median" for stage in ("refinement", "association", "update", "integration", "fusion")),
 )
-"""Default columns without an experiment, for metrics with values: keys of metrics.json."""
+"""Default columns of a table without an experiment: keys of metrics.json. Columns without values are omitted."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class TableChoice:
     """The block `table` of an experiment.
 
     Each line is a row and each column a metric. Cells are means over the runs that differ only in `average_over`. With
-    `columns_by`, each column is a value of that key, such as a sequence, followed by the mean. With `group_by`, each
-    value has a group of lines.
+    `columns_by`, each column is a value of that key, such as a sequence, and the last column is the mean. With
+    `group_by`, each value of that key has a group of lines.
     """
 
     # config keys for averaging and pairing; runs with the same value of the last key are not independent
@@ -62,7 +62,7 @@ class TableChoice:
                 f"table.columns_by, table.group_by: expected at most one key, got {self.columns_by} and {self.group_by}"
             )
         if self.split_key in self.average_over:
-            raise ConfigError(f"table.average_over: expected keys without table.{self.layout}, got {self.split_key}")
+            raise ConfigError(f"table.average_over: expected keys other than table.{self.layout}, got {self.split_key}")
         if self.columns_by and len(self.columns) > 1:
             raise ConfigError(
                 f"table.columns: expected one metric with table.columns_by, got {len(self.columns)}; set "
@@ -70,8 +70,8 @@ class TableChoice:
             )
         if self.published and read_published(self.published).layout != self.layout:
             raise ConfigError(
-                f"table.published: expected numbers for the layout {self.layout}, got "
-                f"{read_published(self.published).layout} of {self.published}"
+                f"table.published: expected a section for the layout {self.layout}, got {self.published} for the "
+                f"layout {read_published(self.published).layout}"
             )
 
     @property
@@ -88,7 +88,8 @@ class TableChoice:
     def of(cls, node: Any) -> TableChoice:
         """Return the choice of a config's `table`. Raises ConfigError for unknown keys and wrong types."""
         choice = cls(**checked_block(cls, "table", node))
-        return replace(choice, columns=[current_key(key) for key in choice.columns])  # a stored sweep may be older
+        # a stored sweep may have keys of an older version
+        return replace(choice, columns=[current_key(key) for key in choice.columns])
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class ComparisonTable:
 
     @property
     def judged(self) -> bool:
-        """Return True if a metric depends on ground-truth instances, which may have several annotation releases."""
+        """True if a metric depends on ground-truth instances, which may have several annotation releases."""
         annotated = self.choice.split_key or any(record.annotation for record in self.records)
         return bool(annotated) and any(map(is_evaluation, self.choice.columns))
 
@@ -174,7 +175,7 @@ class ComparisonTable:
 
     @property
     def is_of_scenenn(self) -> bool:
-        """Return True if all runs use the original SceneNN data, as for published numbers, not synthetic scenes."""
+        """True if all runs use the original SceneNN data, as the published results do, and no synthetic scenes."""
         datasets = {record.metrics.get(f"{CHOICE}dataset") for record in self.records}
         return datasets == {DATASET} and not any(record.annotation.startswith(SYNTHETIC) for record in self.records)
 
@@ -205,7 +206,7 @@ class ComparisonTable:
 
     @cached_property
     def sequences(self) -> list[str]:
-        """Values of the split key: first of published tables, then of the runs."""
+        """Values of the split key: those of the published table, followed by those of the runs."""
         found = {run[-1] for run in self._runs} if self.choice.split_key else set()
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))
@@ -243,7 +244,7 @@ class SequenceMean:
 
 
 def mean_by_sequence(values: Mapping[Run, float]) -> dict[str, Mean]:
-    """Return the mean of each sequence, the last part of a run."""
+    """Return the mean of each sequence; the sequence is the last part of a run."""
     grouped: dict[str, list[float]] = {}
     for run, value in values.items():
         grouped.setdefault(run[-1], []).append(value)
@@ -262,5 +263,5 @@ def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
 
 
 def mean_difference(differences: Mapping[Run, float]) -> Mean:
-    """Return the mean of paired differences with its standard error over sequences; seeds are not independent."""
+    """Return the mean of paired differences, with its standard error over sequences, as seeds are not independent."""
     return Mean.of(mean.value for mean in mean_by_sequence(differences).values())

@@ -16,7 +16,7 @@ from framework.tables.table_notes import counted, digest, notes
 
 
 def write_tables(directory: Path) -> str:
-    """Write table.md, table.tex and table.csv of the runs below `directory` into it; return the Markdown.
+    """Write table.md, table.tex and table.csv of the runs below `directory` into it, and return the Markdown text.
 
     Raises DataError if no run is complete.
     """
@@ -38,7 +38,7 @@ LAYOUTS: dict[str, tuple[Callable[[ComparisonTable], TextTable], Callable[[Compa
     "columns_by": (across_grid, difference_across_grid),
     "group_by": (by_grid, difference_grid),
 }
-"""TableChoice.layout -> the table of the values, and the table of the differences from the baseline."""
+"""Functions for the table of values and the table of differences from the baseline, by TableChoice.layout."""
 
 
 def _grids(comparison: ComparisonTable) -> Iterator[TextTable]:

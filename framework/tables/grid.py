@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class TextTable:
-    """Cells of text below heads."""
+    """A table of text cells with column headings."""
 
-    heads: list[str]
+    heads: list[str]  # column headings
     body: list[list[str]]
     label_columns: int = 1  # number of left-aligned columns; the remaining columns contain numbers
-    bold: frozenset[tuple[int, int]] = frozenset()  # (line, column)
-    groups: frozenset[int] = frozenset()  # first lines of groups
+    bold: frozenset[tuple[int, int]] = frozenset()  # (line, column) of each bold cell
+    groups: frozenset[int] = frozenset()  # index of the first line of each group
 
 
 def decimals(values: Iterable[float]) -> int:

@@ -1,7 +1,7 @@
 """Layouts of a comparison: a line per row, a column per sequence, or a group of lines per sequence.
 
-In the layouts with sequences, rows with the same pose source are adjacent, and their highest mean is bold. Only means
-over the same number of runs compete.
+In the layouts with sequences, rows with the same pose source are adjacent, and their highest mean is bold. Means over
+fewer runs than the others are not compared.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def head(key: str) -> str:
 
 
 def row_grid(comparison: ComparisonTable) -> TextTable:
-    """Return each row's mean and deviation, and the published rows below."""
+    """Return a table with the mean and deviation of each row, and the published rows below."""
     keys = comparison.choice.columns
     means = {key: [row.mean(key) for row in comparison.rows] for key in keys}
     digits = {key: decimals(mean.value for mean in of_key) for key, of_key in means.items()}
@@ -71,7 +71,7 @@ def row_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def difference_grid(comparison: ComparisonTable) -> TextTable:
-    """Return each row's mean difference from the baseline with its standard error."""
+    """Return a table with each row's mean difference from the baseline and its standard error."""
     keys, compared = comparison.choice.columns, comparison.compared
     means = {key: [mean_difference(row.differences(base, key)) for row, base in compared] for key in keys}
     digits = {key: decimals(mean.value for mean in of_key) for key, of_key in means.items()}
@@ -84,14 +84,14 @@ def difference_grid(comparison: ComparisonTable) -> TextTable:
     return TextTable([f"minus {comparison.base_called}", "pairs", *map(head, keys)], body)
 
 
-_Cell = tuple[str, float]  # text and competing value; NaN = does not compete
+_Cell = tuple[str, float]  # text and compared value; NaN = not compared
 
 
 @dataclass(frozen=True)
 class _Line:
     labels: list[str]
     cells: list[_Cell]
-    variant: tuple[str, ...] = ()  # lines with the same variant compete
+    variant: tuple[str, ...] = ()  # lines with the same variant are compared
 
 
 class _SequenceFigures:
@@ -129,7 +129,7 @@ class _SequenceFigures:
 
 
 def across_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a column per sequence with each row's mean over seeds, and the mean over sequences."""
+    """Return a table with a column per sequence, which contains each row's mean over seeds, and a column of means."""
     [key] = comparison.choice.columns
     figures, sequences = _SequenceFigures(comparison, key), comparison.sequences
     digits = _decimals([figures])
@@ -147,7 +147,7 @@ def across_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def by_grid(comparison: ComparisonTable) -> TextTable:
-    """Return a group of lines per sequence, one line per row with all metrics; the last group contains the means."""
+    """Return a table with a group of lines per sequence, one line per row; the last group contains the means."""
     keys = comparison.choice.columns
     rows = [row for rows in _by_variant(comparison.rows) for row in rows]
     figures = [_SequenceFigures(comparison, key) for key in keys]
@@ -174,7 +174,7 @@ def by_grid(comparison: ComparisonTable) -> TextTable:
 
 
 def difference_across_grid(comparison: ComparisonTable) -> TextTable:
-    """Return the baseline minus each other row, by sequence, and the mean difference with its standard error."""
+    """Return a table of the baseline minus each other row: by sequence, and the mean with its standard error."""
     [key] = comparison.choice.columns
     differences = {row.name: base.differences(row, key) for row, base in comparison.compared}
     paired = {run[-1] for runs in differences.values() for run in runs}
@@ -207,7 +207,7 @@ def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) ->
 
 
 def _highest(section: Sequence[_Line], digits: int) -> Iterator[tuple[int, int]]:
-    """Yield the (line, column) of the highest printed values among competing lines."""
+    """Yield the (line, column) of the highest printed values among the lines of each variant."""
     for k, line in enumerate(section):
         competing = [other.cells for other in section if other.variant == line.variant]
         for column, (_, value) in enumerate(line.cells):

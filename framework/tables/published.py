@@ -1,4 +1,4 @@
-"""Published numbers with their sources, from published.yaml."""
+"""Published results with their sources, from published.yaml."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import yaml
 from framework.errors import ConfigError
 
 FILE = Path(__file__).with_suffix(".yaml")
-DATASET = "scenenn"  # dataset of the numbers
+DATASET = "scenenn"  # dataset of the published results
 SYNTHETIC = "synthetic"  # first word of the annotation release of scenes written by `instancemap synthesize`
 NOT_KNOWN = "not known"  # printed for numbers that were not looked up
 
@@ -22,14 +22,14 @@ Key = tuple[str, ...]  # ("fps",), ("011",) or ("011", "instances.ap50.bed"), de
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """The published numbers of one system."""
+    """The published results of one system."""
 
-    system: str
-    source: str
+    system: str  # name of the system
+    source: str  # publication
     remark: str  # conditions of the measurement
-    poses: str
-    annotation: str  # the release
-    decimals: int  # of the values, in the project's unit
+    poses: str  # source of the poses
+    annotation: str  # release of the annotation
+    decimals: int  # number of known decimals of the values
     values: Mapping[Key, float | None] | None  # in the project's unit; None = not looked up
 
     def knows(self, keys: Iterable[Key]) -> bool:
@@ -43,7 +43,7 @@ class PublishedRow:
 
 @dataclass(frozen=True)
 class Published:
-    """A section of the file."""
+    """A section of published.yaml."""
 
     layout: str  # layout of the table: rows, columns_by or group_by
     sequences: tuple[str, ...]  # in the order of the published table
@@ -55,7 +55,7 @@ NOTHING_PUBLISHED = Published("rows", (), ())
 
 @cache
 def read_published(section: str) -> Published:
-    """Return the numbers of a section. Raises ConfigError for an unknown section."""
+    """Return the published results in a section of published.yaml. Raises ConfigError for an unknown section."""
     sections: dict[str, Any] = yaml.safe_load(FILE.read_text("utf-8"))
     if section not in sections:
         raise ConfigError(f"table.published: expected null or one of {', '.join(sections)}, got {section}")

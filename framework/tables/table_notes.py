@@ -44,7 +44,7 @@ def _averaging(comparison: ComparisonTable) -> Iterator[str]:
     """Yield notes about the means and the comparison of rows."""
     choice, over = comparison.choice, ", ".join(comparison.choice.average_over)
     if others := following(comparison.records, choice.average_over):
-        yield f"Also averaged over keys with the value of {over} in every run: {', '.join(others)}."
+        yield f"Also averaged over keys whose value equals that of {over} in every run: {', '.join(others)}."
     if choice.split_key:
         yield (
             f"Cells: mean ± sample standard deviation over {over}. mean: average of the sequences "
@@ -80,7 +80,7 @@ def _with_needs(columns: Sequence[str]) -> str:
 
 
 def _winners(comparison: ComparisonTable) -> Iterator[str]:
-    """Yield the counts of sequences with a better and a worse baseline, by row."""
+    """Yield, for each row, the numbers of sequences in which the baseline is better and worse."""
     if not comparison.choice.columns_by:
         return
     [key] = comparison.choice.columns
@@ -173,7 +173,7 @@ def machine(record: Record) -> str:
 
 
 def counted(words: Iterable[str]) -> str:
-    """Return the distinct words, with counts for several words."""
+    """Return the distinct words; if there are several, each with its number of runs."""
     counts = Counter(words).most_common()
     if len(counts) == 1:
         return counts[0][0]

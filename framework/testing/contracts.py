@@ -35,7 +35,7 @@ from framework.testing.corner_room import (
 
 
 class OptionContract:
-    """Tests of an option, which builds the plugin as in a run. Use as the first base of a test class."""
+    """Tests of an option. They build the plugin as in a run. Use this class as the first base of a test class."""
 
     stage: str  # set by the contract of the stage
     option: str
@@ -73,7 +73,9 @@ class SequenceContract:
     stage = "dataset"
 
     def plugin(self) -> RGBDSequence:
-        raise NotImplementedError("expected plugin() to return the recording under test, got no override")
+        raise NotImplementedError(
+            "SequenceContract.plugin: expected an override, got none; return the recording under test from plugin()"
+        )
 
     def test_dataset_returns_frames_of_its_camera(self) -> None:
         sequence = self.plugin()
@@ -85,7 +87,7 @@ class SequenceContract:
         assert (frame.depth > 0).any()
         assert same(frame, sequence[0])
 
-    def test_dataset_is_in_order(self) -> None:
+    def test_dataset_frames_are_in_order(self) -> None:
         sequence = self.plugin()
         first, last = sequence[0], sequence[len(sequence) - 1]
         assert len(sequence) == 1 or (last.index > first.index and last.timestamp > first.timestamp)
@@ -97,7 +99,9 @@ class DetectorContract:
     stage = "detector"
 
     def plugin(self) -> Detector:
-        raise NotImplementedError("expected plugin() to return the detector under test, got no override")
+        raise NotImplementedError(
+            "DetectorContract.plugin: expected an override, got none; return the detector under test from plugin()"
+        )
 
     def test_detector_returns_valid_detections(self) -> None:
         detector = self.plugin()
@@ -161,17 +165,19 @@ class TrackerContract:
     stage = "tracker"
 
     def plugin(self) -> PoseTracker:
-        raise NotImplementedError("expected plugin() to return the tracker under test, got no override")
+        raise NotImplementedError(
+            "TrackerContract.plugin: expected an override, got none; return the tracker under test from plugin()"
+        )
 
-    def test_tracker_returns_pose_and_keeps_map(self) -> None:
+    def test_tracker_returns_poses_without_changing_map(self) -> None:
         tracker = self.plugin()
         scene = RoomMap()
         for k in range(6):
             pose = tracker.track(frame_at(k), scene)
-            assert isinstance(pose, Pose)  # which is always rigid
+            assert isinstance(pose, Pose)  # a Pose is always rigid
             assert not pose.lost or pose.reason
 
-    def test_tracker_starts_at_first_true_pose(self) -> None:
+    def test_tracker_first_pose_equals_ground_truth(self) -> None:
         pose = self.plugin().track(frame_at(4), RoomMap())
         np.testing.assert_allclose(pose.T_world_camera, pose_at(4), atol=1e-12)
 
@@ -199,9 +205,11 @@ class RefinerContract:
     stage = "refiner"
 
     def plugin(self) -> ClusterRefiner:
-        raise NotImplementedError("expected plugin() to return the refiner under test, got no override")
+        raise NotImplementedError(
+            "RefinerContract.plugin: expected an override, got none; return the refiner under test from plugin()"
+        )
 
-    def test_refiner_invents_no_points(self) -> None:
+    def test_refiner_returns_only_measured_points(self) -> None:
         frame = frame_at(1)
         clusters = bleeding_clusters(frame)
         before = {name: np.array(value) for name, value in vars(clusters).items()}
@@ -251,7 +259,7 @@ class RefinerContract:
 
 
 def readings(frame: Frame) -> Float64:
-    """Return the points (H, W, 3) of the pixels in the world frame, NaN without depth."""
+    """Return the points (H, W, 3), m, of the pixels in the world frame; NaN where depth is missing."""
     whole = replace(spheres_in(frame), masks=np.ones((2, *CAMERA.shape), np.bool_))
     lifted = lift(whole, frame, Pose(pose_at(frame.index)))
     points = np.full((*CAMERA.shape, 3), np.nan)
@@ -265,9 +273,11 @@ class FuserContract:
     stage = "fuser"
 
     def plugin(self) -> MapFuser:
-        raise NotImplementedError("expected plugin() to return the fuser under test, got no override")
+        raise NotImplementedError(
+            "FuserContract.plugin: expected an override, got none; return the fuser under test from plugin()"
+        )
 
-    def test_fuser_starts_with_an_empty_map(self) -> None:
+    def test_fuser_starts_with_empty_map(self) -> None:
         scene = self.plugin().scene
         view = scene.render(CAMERA, np.eye(4))
         assert not view.depth.any()
@@ -316,7 +326,7 @@ class FuserContract:
         fuser.fuse(blind, pose, nothing_in(blind, pose))
         assert not fuser.scene.instances()
 
-    def test_fuser_ignores_absence_without_detection(self) -> None:
+    def test_fuser_keeps_confidence_without_detection(self) -> None:
         fuser = fused(self.plugin())
         before = fuser.scene.instances()
         frame, pose = frame_at(4), Pose(pose_at(4))
@@ -329,7 +339,7 @@ class FuserContract:
             assert after[key].confidence >= 0.99 * instance.confidence
             assert after[key].observations == instance.observations
 
-    def test_fuser_times_its_stages_one_by_one(self) -> None:
+    def test_fuser_stage_timers_are_not_nested(self) -> None:
         begun: list[str] = []
         ended: list[str] = []
 
@@ -344,7 +354,7 @@ class FuserContract:
         self.plugin().fuse(frame, Pose(pose_at(0)), exact_clusters(frame), timer)
         assert set(begun) <= set(FUSION_STAGES)
 
-    def test_fuser_maps_its_depth_range(self) -> None:
+    def test_fuser_maps_only_depths_in_its_range(self) -> None:
         fuser = self.plugin()
         nearest, farthest = fuser.scene.depth_range
         frame, pose = frame_at(0), Pose(pose_at(0))
@@ -364,7 +374,7 @@ class FuserContract:
         no_camera: Any = CAMERA.K
         assert_data_error(partial(scene.render, no_camera, pose), "camera: expected a Camera, got ndarray")
 
-    def test_fuser_map_survives_saving(self, tmp_path: Path) -> None:
+    def test_fuser_map_is_restored_from_file(self, tmp_path: Path) -> None:
         scene = fused(self.plugin(), frames=3).scene
         path = tmp_path / "map.npz"
         scene.save(path)

@@ -34,13 +34,15 @@ from framework.refinement.lifting import lift
 
 CLASSES = ("chair", "couch")
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
-RATE = 30  # Hz
-PLANES = (((-1.0, 0.0, 0.0), 1.5), ((0.0, -1.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 3.0))  # n . p + d = 0, n into the room
-SPHERES = (((-0.5, 0.7, 2.2), 0.35), ((0.5, 0.6, 2.5), 0.45))  # center, radius: instances 1 and 2
+RATE = 30  # frame rate, Hz
+PLANES = (((-1.0, 0.0, 0.0), 1.5), ((0.0, -1.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 3.0))
+"""Normal n, which points into the room, and offset d, m, of each plane n . p + d = 0."""
+
+SPHERES = (((-0.5, 0.7, 2.2), 0.35), ((0.5, 0.6, 2.5), 0.45))  # centers and radii of instances 1 and 2, m
 
 
 def look(camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float64, UInt8, Int32]:
-    """Return exact depth (H, W), normals (H, W, 3), color (H, W, 3) and instance ids (H, W)."""
+    """Return exact depth (H, W), m, world-frame normals (H, W, 3), color (H, W, 3) and instance ids (H, W)."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
     d = rays @ T_world_camera[:3, :3].T

@@ -17,8 +17,9 @@ from framework.interfaces import Viewer
 from framework.testing.contracts import same
 from framework.testing.corner_room import CAMERA, RoomMap, frame_at, pose_at, spheres_in
 
-FRAMES, LOST, SKIPPED, NOTHING_FOUND, BLIND = 8, 2, 3, 4, 5
-STAGE_MS = {
+FRAMES = 8  # number of frames
+LOST, SKIPPED, NOTHING_FOUND, BLIND = 2, 3, 4, 5  # indices of the special frames; see `show_run`, `frame_with_found`
+STAGE_MS = {  # stage times of a frame, ms
     "reading": 1.0,
     "detection": 20.0,
     "tracking": 5.0,
@@ -32,7 +33,7 @@ STAGE_MS = {
 
 @dataclass(frozen=True)
 class WatchedMap(RoomMap):
-    """A map of one chair (a triangle). Records read accesses outside of viewer calls."""
+    """A map of one chair (a triangle). It records reads outside of viewer calls."""
 
     within_a_call: threading.Event = field(default_factory=threading.Event)
     reads_outside: list[str] = field(default_factory=list)
@@ -76,9 +77,11 @@ class ViewerContract:
     stage = "viewer"
 
     def plugin(self) -> Viewer:
-        raise NotImplementedError("expected plugin() to return the viewer under test, got no override")
+        raise NotImplementedError(
+            "ViewerContract.plugin: expected an override, got none; return the viewer under test from plugin()"
+        )
 
-    def test_viewer_accepts_all_frames_and_keeps_them(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def test_viewer_shows_frames_without_changing_them(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         scene, frames = WatchedMap(), [frame_with_found(k) for k in range(FRAMES)]
         show_run(self.plugin(), scene, frames, tmp_path)
         for k, (frame, found) in enumerate(frames):

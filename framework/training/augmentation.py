@@ -9,11 +9,12 @@ from framework.data import UInt8
 from framework.training.room_pictures import Example
 
 ZOOM = (0.55, 1.0)  # side length of a crop divided by the side length of the image
-ZOOMED = 0.5  # fraction of the images
+ZOOMED = 0.5  # fraction of zoomed images
 MIN_REMAINING = 0.25  # minimum fraction of an object's area inside the crop
 MIN_PIXELS = 40  # px, minimum area of an object
-GAIN, CHANNEL_GAIN, GAMMA = 0.35, 0.12, 0.35  # logarithms of the maximum factors
-BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of the images
+GAIN, CHANNEL_GAIN = 0.35, 0.12  # logarithms of the maximum factors of the image and of each channel
+GAMMA = 0.35  # logarithm of the maximum gamma exponent
+BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of blurred, noisy and gray images
 
 
 def augmented(example: Example, rng: np.random.Generator) -> Example:

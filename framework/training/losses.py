@@ -1,6 +1,7 @@
 """The loss of Mask R-CNN (He et al. 2017) on Faster R-CNN's anchors (Ren et al. 2015).
 
-Boxes are x1 y1 x2 y2 px with extent 0. `own` (N,) contains the object index of each box, or BACKGROUND or IGNORED.
+Boxes are x1 y1 x2 y2, px, with extent 0 (width = x2 - x1). `own` (N,) contains the object index of each box,
+BACKGROUND or IGNORED.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from framework.detection.mask_rcnn.network import DELTA_WEIGHTS, MaskRCNN, propo
 from framework.detection.mask_rcnn.roi_align import roi_align
 
 BETA = 1.0 / 9.0  # error at the transition of the smooth L1 loss from quadratic to linear
-ANCHORS = 256  # sampled anchors per image
+ANCHORS = 256  # number of sampled anchors per image
 ANCHORS_POSITIVE = 0.5  # maximum fraction of anchors with an object
 PROPOSALS_POSITIVE = 0.25  # maximum fraction of proposals with an object
 BACKGROUND, IGNORED = -1, -2
@@ -28,7 +29,7 @@ class Objects:
     """The N objects in one image."""
 
     boxes: Tensor  # (N, 4) px, extent 0
-    labels: Tensor  # (N,) from 1
+    labels: Tensor  # (N,) class labels, from 1
     masks: Tensor  # (N, H, W) bool
 
     def to(self, device: torch.device) -> Objects:
@@ -39,9 +40,9 @@ class Objects:
 class Budget:
     """Limits per image in a training step."""
 
-    before_nms: int = 500  # decoded anchors per level
-    after_nms: int = 300  # proposals after non-maximum suppression
-    proposals: int = 96  # sampled proposals
+    before_nms: int = 500  # maximum number of decoded anchors per level
+    after_nms: int = 300  # maximum number of proposals after non-maximum suppression
+    proposals: int = 96  # maximum number of sampled proposals
 
 
 def losses(

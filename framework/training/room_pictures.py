@@ -35,16 +35,16 @@ from framework.synthetic.room import Room, RoomKind, furnish
 from framework.synthetic.walk import look
 
 STREAM = 0x7261_696E  # differs from the random streams of all datasets
-WIDTH, HEIGHT = 320, 240  # px
-FOCAL = (0.7, 1.0)  # range of the focal length, image widths
+WIDTH, HEIGHT = 320, 240  # size of the images, px
+FOCAL = (0.7, 1.0)  # range of the focal length, in image widths
 EYE_HEIGHT = (0.9, 1.75)  # m, range of the camera height
 CLEAR = 0.35  # m, minimum distance of the camera to furniture and walls
 TINT = 0.5  # logarithm of the maximum factor for the colors of a surface
 TINTED = 0.7  # fraction of the images with changed colors
 STUDIOS = 0.5  # fraction of rooms with all classes, because some classes occur only in studios
-QUALITY = 93  # of the JPEG files
+QUALITY = 93  # JPEG quality of the images
 MIN_PIXELS = 100  # px, minimum area of objects in an image
-TRIES = 20  # candidate views for each image
+TRIES = 20  # maximum number of candidate views for each image
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: in
     missing = [number for number in range(first, first + rooms) if not room_folder(folder, number).is_dir()]
     if not missing:
         return
-    # Processes are spawned, because threads of numba and OpenCV do not survive a fork.
+    # Processes are spawned, because threads of numba and OpenCV do not work after a fork.
     workers = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), numba.set_num_threads, (1,))
     with workers, tqdm(total=len(missing), desc="rendering rooms", unit="room", disable=None) as bar:
         for _ in workers.map(partial(render_room, folder, views), missing):
@@ -137,7 +137,7 @@ def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> F
 
 
 def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the table with colors multiplied by random factors per material, in a fraction TINTED of the calls."""
+    """Multiply the colors of each material by random factors, in a fraction TINTED of the calls; return the table."""
     if rng.uniform() > TINTED:
         return table
     gains = np.exp(rng.uniform(-TINT, TINT, (len(table), 1)) + rng.uniform(-TINT, TINT, (len(table), 3)))
@@ -156,7 +156,7 @@ class RoomPictures:
         for number in range(first, first + rooms):
             room = room_folder(folder, number)
             if not room.is_dir():
-                raise DataError(f"{room}: expected a rendered room, got no folder; render the rooms first")
+                raise DataError(f"{room}: expected a rendered room, got no folder; call render_rooms first")
             self.files += sorted(room.glob("*.jpg"))
             classes = read_json(room / "classes.json")
             self._names[room] = {int(i): str(name) for i, name in classes.items()}

@@ -33,27 +33,27 @@ LARGEST_GRADIENT = 10.0  # maximum norm of the gradient
 class Schedule:
     """Length and optimizer parameters of a training run."""
 
-    steps: int = 8000  # training steps, >= 1
-    batch: int = 4  # images per step, >= 1
+    steps: int = 8000  # number of training steps, >= 1
+    batch: int = 4  # number of images per step, >= 1
     learning_rate: float = 1e-3  # maximum learning rate of AdamW, > 0
     weight_decay: float = 1e-2  # weight decay of AdamW, >= 0
-    warmup: int = 300  # steps of linear warmup, >= 0, followed by a cosine decay of the learning rate to a hundredth
-    ema_decay: float = 0.998  # decay of the moving average of the weights, in [0, 1); the average is saved
-    checkpoint_interval: int = 250  # interval between checkpoints, steps, >= 1
-    bfloat16: bool = False  # matrix products in 16 bits, sums and weights in 32 bits
-    seed: int = 0
-    budget: Budget = field(default_factory=Budget)
+    warmup: int = 300  # number of steps of linear warmup before the cosine decay of the learning rate, >= 0
+    ema_decay: float = 0.998  # decay per step of the saved moving average of the weights, in [0, 1)
+    checkpoint_interval: int = 250  # interval between checkpoints, in steps, >= 1
+    bfloat16: bool = False  # true = compute matrix products in bfloat16, which is faster on GPUs and on CPUs with AMX
+    seed: int = 0  # seed of the order of the images and their augmentation
+    budget: Budget = field(default_factory=Budget)  # limits of the proposals per image
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "checkpoint_interval"):
-            require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+            require(getattr(self, name) >= 1, f"schedule.{name}", getattr(self, name), "at least 1")
         for name in ("weight_decay", "warmup"):
-            require(getattr(self, name) >= 0, name, getattr(self, name), "at least 0")
-        require(self.learning_rate > 0, "learning_rate", self.learning_rate, "a positive value")
-        require(0 <= self.ema_decay < 1, "ema_decay", self.ema_decay, "a value in [0, 1)")
+            require(getattr(self, name) >= 0, f"schedule.{name}", getattr(self, name), "at least 0")
+        require(self.learning_rate > 0, "schedule.learning_rate", self.learning_rate, "a positive value")
+        require(0 <= self.ema_decay < 1, "schedule.ema_decay", self.ema_decay, "a value in [0, 1)")
 
     def rate(self, step: int) -> float:
-        """Return the learning rate of a step."""
+        """Return the learning rate of a step: linear warmup, then a cosine decay to a hundredth of the maximum."""
         if step < self.warmup:
             return self.learning_rate * (step + 1) / self.warmup
         done = (step - self.warmup) / max(1, self.steps - self.warmup)
@@ -114,7 +114,9 @@ class Trainer:
             terms = losses(self.network, images, objects, self.schedule.budget, generator)
         loss = torch.stack(list(terms.values())).sum()
         if not torch.isfinite(loss):
-            raise DataError(f"step {self.step}: expected a finite loss, got {loss.item()}; lower learning_rate")
+            raise DataError(
+                f"step {self.step}: expected a finite loss, got {loss.item()}; set a smaller schedule.learning_rate"
+            )
         for group in self._optimizer.param_groups:
             group["lr"] = self.schedule.rate(self.step)
         self._optimizer.zero_grad(set_to_none=True)

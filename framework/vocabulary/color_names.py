@@ -25,7 +25,7 @@ _SAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
 }  # sRGB, 0..255: samples of each name, saturated, muted and dark
 
 COLOR_NAMES = tuple(_SAMPLES)
-CONFUSED = 12.0  # CIELAB units: distance at which changing light makes two names interchangeable
+CONFUSED = 12.0  # CIELAB distance at which two names are interchangeable under changing light
 OTHER_SPELLINGS = {"grey": "gray", "violet": "purple", "turquoise": "blue", "teal": "blue", "navy": "blue"}
 
 

@@ -43,15 +43,15 @@ MEANINGS: Mapping[str, str | None] = {name: coco for names in _SECTIONS.values()
 class LabelMapping:
     """The mapping from the labels of a detector to COCO names."""
 
-    classes: tuple[str, ...]  # C' COCO names of the labels, in COCO's order
+    classes: tuple[str, ...]  # (C',) COCO names of the labels, in COCO's order
     meaning: Int32  # (C,) index of each label in `classes`; -1 = no object class of COCO
 
     def apply(self, probabilities: Float32) -> tuple[Float32, Bool]:
         """Return the float32 distributions (N, C') over `classes` for `probabilities` (N, C) of labels.
 
-        Labels with the same meaning are added, labels without a meaning are removed, and the result is normalized. Also
-        return a mask (N,) of the rows whose best label has a meaning. A row without any class becomes uniform, and its
-        mask is False. `probabilities` must not be negative.
+        The probabilities of labels with the same meaning are summed, labels without a meaning are removed, and the
+        result is normalized. Also return a mask (N,) of the rows whose best label has a meaning. A row without any
+        class becomes uniform, and its mask is False. `probabilities` must not be negative.
         """
         has_meaning = self.meaning >= 0
         sums = np.zeros((len(probabilities), len(self.classes)))

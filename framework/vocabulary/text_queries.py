@@ -29,7 +29,7 @@ class ObjectWords:
     """Classes, colors and unknown words of a query."""
 
     classes: tuple[str, ...]  # in the order of the query
-    colors: tuple[str, ...]  # of COLOR_NAMES
+    colors: tuple[str, ...]  # names in COLOR_NAMES, in the order of the query
     unknown: tuple[str, ...]  # other words
 
 
@@ -67,7 +67,7 @@ def _color(word: list[str]) -> str:
 
 
 def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, str]:
-    """Return the word count and name of the longest class name that starts at word `at`, or 0 and ""."""
+    """Return the word count and the name of the longest class name that starts at word `at`; 0 and "" = none."""
     for length in range(min(MAX_WORDS, len(words) - at), 0, -1):
         phrase = words[at : at + length]
         for last in _singulars(phrase[-1]):

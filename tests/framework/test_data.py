@@ -56,7 +56,7 @@ def test_camera_and_frame_accept_numpy_scalars() -> None:
 def test_frame_up_must_be_unit_vector() -> None:
     np.testing.assert_array_equal(frame(up=np.array([0.6, -0.8, 0.0])).up, [0.6, -0.8, 0.0])
     for wrong, message in (
-        ([0.0, -9.81, 0.0], "expected a unit vector, got length 9.81"),
+        ([0.0, -9.81, 0.0], "expected a unit vector, got a vector of length 9.81"),
         ([0.0, -1.0], r"shape \(3\)"),
         ([0.0, np.nan, 0.0], "expected finite values"),
     ):
@@ -279,7 +279,7 @@ def test_pose_rigidity_check_tolerates_rounding() -> None:
         Pose(np.round(rounded, 1))
     sheared = rounded.copy()
     sheared[3, 0] = 0.1
-    with pytest.raises(DataError, match=r"expected a rigid transform, got \|R R\^T - I\| = .*, det R ="):
+    with pytest.raises(DataError, match="expected the last row 0 0 0 1, got"):
         Pose(sheared)
 
 

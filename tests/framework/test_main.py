@@ -64,11 +64,11 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
         (f"seed={'x' * 100_000}", ["seed: expected an integer in [", "characters)"]),
         (
             "--experimental-rerun=config.pickle",
-            ["--experimental-rerun: expected overrides, got an option that reads a pickle"],
+            ["--experimental-rerun: expected KEY=VALUE overrides, got a pickle file"],
         ),
         (
             "--experimental-r=config.pickle",
-            ["--experimental-rerun: expected overrides, got an option that reads a pickle"],
+            ["--experimental-rerun: expected KEY=VALUE overrides, got a pickle file"],
         ),
     ],
 )

@@ -166,7 +166,7 @@ def test_build_flattens_parameters_of_parts() -> None:
         ({"threshold": 2.0}, ["threshold: expected a value in [0, 1], got 2.0"]),
         ({"name": "broken"}, ["install instancemap[onnx]"]),
         ({"_target_": f"{HERE}.Undecorated"}, ["@dataclass"]),
-        ({"_target_": f"{HERE}.Abstract"}, ["expected detect of Detector, got none in Abstract"]),
+        ({"_target_": f"{HERE}.Abstract"}, ["expected an implementation of detect of Detector, got none in Abstract"]),
         ({"_partial_": True}, ["got '_partial_'"]),
         ({"_target_": f"{HERE}.OddField"}, ["bool, int, float, str, Path, Enum or list", "ndarray"]),
         ({"_target_": f"{HERE}.Assembled", "nms": 2}, ["Assembled", "nms", "[0, 1]", "got 2"]),
@@ -269,7 +269,7 @@ def test_registry_reports_conflicting_plugins_package(tmp_path: Path) -> None:
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     output = f"plugins: expected InstanceMap's package at {CHECKOUT}/plugins, got {tmp_path}/plugins"
-    assert f"{output}; rename it or start Python in another folder" in done.stderr
+    assert f"{output}; rename the other package or start Python in another folder" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert "imported" not in done.stdout
 

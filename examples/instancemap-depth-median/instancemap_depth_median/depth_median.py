@@ -12,12 +12,12 @@ from instancemap import ClusterRefiner, Frame, PointClusters, check_bounds, keep
 class DepthMedian(ClusterRefiner):
     """Selection of the points of each cluster with a depth near the cluster's median.
 
-    A mask that bleeds over an object's outline includes points of the background, at other depths. If these are fewer
-    than half of the points, the median is a depth of the object. Clusters keep their index.
+    A mask that extends beyond an object's outline includes points of the background, at other depths. If these are
+    fewer than half of the points, the median is a depth of the object. Clusters keep their index.
     """
 
-    reach: float = 0.3  # maximum difference from the median, m, >= 0; half the extent of an object
-    reach_per_depth: float = 0.02  # increase of the difference with depth, m per m, >= 0; for noise
+    reach: float = 0.3  # maximum difference from the cluster's median depth at depth 0, m, >= 0
+    reach_per_depth: float = 0.02  # increase of the maximum difference with depth, m per m, >= 0
 
     def __post_init__(self) -> None:
         check_bounds(self, reach=(0.0, np.inf), reach_per_depth=(0.0, np.inf))

@@ -1,4 +1,4 @@
-"""Contract tests of a refiner, and tests of this one."""
+"""Contract tests of a refiner, and tests of DepthMedian."""
 
 from __future__ import annotations
 

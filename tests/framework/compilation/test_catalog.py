@@ -133,7 +133,7 @@ def test_kernel_index_with_renamed_class_is_deleted(
 
 def test_compile_all_faulty_kernel_raises_with_name(small: Path) -> None:
     good = Kernel("kernel_caller", "small", "int64")
-    with pytest.raises(DataError, match=r"kernel_caller\.faulty: compilation failed: .*:"):
+    with pytest.raises(DataError, match=r"kernel_caller\.faulty: expected a compiled kernel, got .*:"):
         compile_all([Kernel("kernel_caller", "faulty", "int64"), good])
     assert good.is_compiled()
 
@@ -144,7 +144,7 @@ def test_compile_all_ended_worker_raises(small: Path, monkeypatch: pytest.Monkey
         "_worker",
         lambda: subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True),
     )
-    with pytest.raises(DataError, match=r"kernel_caller\.small: expected a result, got the end of its process"):
+    with pytest.raises(DataError, match=r"kernel_caller\.small: expected a result, got the end of the worker process"):
         compile_all([Kernel("kernel_caller", "small", "int64")])
 
 

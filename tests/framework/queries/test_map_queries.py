@@ -67,7 +67,7 @@ def test_map_nearest_returns_object_with_nearest_surface(asked: Map) -> None:
         assert of_class is not None
         assert asked.name(of_class) == asked.name(instance)
     for wrong in ((1.0, 2.0), (np.nan, 0.0, 0.0)):
-        with pytest.raises(DataError, match="point: expected 3 finite numbers"):
+        with pytest.raises(DataError, match="point: expected 3 finite coordinates"):
             asked.nearest(wrong)
 
 

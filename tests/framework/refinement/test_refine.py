@@ -45,7 +45,7 @@ def test_refine_exact_masks_are_unchanged() -> None:
 @pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
 def test_refine_pixel_outside_image_raises(pixel: tuple[int, int]) -> None:
     with pytest.raises(
-        DataError, match=r"clusters: expected pixels in the image of 5x4, got u in \[.*, .*\], v in \[.*, .*\]"
+        DataError, match=r"clusters: expected pixels in the image of 5x4 px, got u in \[.*, .*\], v in \[.*, .*\]"
     ) as caught:
         refine(Moving(pixel), whole_image(), FRAME)
     assert "\n" not in str(caught.value)

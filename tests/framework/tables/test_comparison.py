@@ -32,11 +32,11 @@ from framework.tables.comparison import TableChoice
         ({"published": "table4", "columns": ["fps"]}, r"table\.published: expected null or one"),
         (
             {"published": "table3", "columns": ["fps"]},
-            r"table\.published: expected numbers for the layout rows, got columns_by of",
+            r"table\.published: expected a section for the layout rows, got table3 for the layout columns_by",
         ),
         (
             {"published": "table1", "group_by": "dataset.scene", "columns": ["fps"]},
-            r"table\.published: expected numbers for the layout group_by, got rows of",
+            r"table\.published: expected a section for the layout group_by, got table1 for the layout rows",
         ),
         ({"names": ["ours"], "columns": ["fps"]}, "table: "),
         ({"colums": ["fps"]}, "colums"),

@@ -100,12 +100,12 @@ class Backwards(CornerRoom):
     [
         (DetectorContract, Forgetful(), "test_detector_does_not_depend_on_frame_order"),
         (DetectorContract, Sharing(), "test_detector_does_not_depend_on_thread"),
-        (RefinerContract, Shifting(), "test_refiner_invents_no_points"),
-        (RefinerContract, Dropping(), "test_refiner_invents_no_points"),
-        (TrackerContract, Writing(writes=True), "test_tracker_returns_pose_and_keeps_map"),
-        (TrackerContract, Writing(), "test_tracker_starts_at_first_true_pose"),
+        (RefinerContract, Shifting(), "test_refiner_returns_only_measured_points"),
+        (RefinerContract, Dropping(), "test_refiner_returns_only_measured_points"),
+        (TrackerContract, Writing(writes=True), "test_tracker_returns_poses_without_changing_map"),
+        (TrackerContract, Writing(), "test_tracker_first_pose_equals_ground_truth"),
         (FuserContract, Careless(), "test_fuser_map_rejects_invalid_poses"),
-        (SequenceContract, Backwards(), "test_dataset_is_in_order"),
+        (SequenceContract, Backwards(), "test_dataset_frames_are_in_order"),
     ],
 )
 def test_contract_detects_broken_plugin(contract: type[Any], plugin: object, test: str) -> None:
@@ -139,7 +139,7 @@ class Painting(Viewer):
 @pytest.mark.parametrize(
     ("viewer", "test"),
     [
-        (Painting(), ViewerContract.test_viewer_accepts_all_frames_and_keeps_them),
+        (Painting(), ViewerContract.test_viewer_shows_frames_without_changing_them),
         (Late(), ViewerContract.test_viewer_reads_map_only_in_calls),
         (Late(), ViewerContract.test_viewer_writes_only_to_run_directory),
     ],

@@ -56,7 +56,7 @@ def test_train_writes_network_usable_for_further_training(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ("schedule.steps=0", "steps: expected at least 1"),
+        ("schedule.steps=0", r"schedule\.steps: expected at least 1"),
         (f"network.start_from={ROOMS}", "expected weights of the configured architecture"),
     ],
 )

@@ -54,7 +54,7 @@ def test_chain_link_with_pixels_outside_image_raises() -> None:
 
     frame, clusters = line()
     with pytest.raises(
-        DataError, match=r"clusters: expected pixels in the image of 8x8, got u in \[-9, -9\], v in \[.*, .*\]"
+        DataError, match=r"clusters: expected pixels in the image of 8x8 px, got u in \[-9, -9\], v in \[.*, .*\]"
     ):
         Chain({"first": InvalidPixels(), "second": LargestComponent()}).refine(clusters, frame)
 

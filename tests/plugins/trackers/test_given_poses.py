@@ -108,7 +108,7 @@ def test_given_poses_missing_in_all_frames_raise_one_line_error(
     with pytest.raises(DataError) as caught:
         pipeline(tracker(tmp_path)).run(room)
     assert str(caught.value) == (
-        f"corner_room: expected poses, got none for the 1 frames; the first: {first}; "
+        f"corner_room: expected poses, got none for the 1 frames (first: {first}); "
         "add the poses of the sequence, or estimate them with tracker=voxel_hashing_icp"
     )
     assert not caplog.records
