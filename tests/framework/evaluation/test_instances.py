@@ -328,8 +328,8 @@ def test_evaluate_metrics_by_class_match_manual_result():
 def test_label_transfers_differ_with_vertex_density():
     """The prediction has 80 of 100 points of a chair and 20 of the wall; the map has 3 vertices per chair point.
 
-    IoU to the truth: 80 / (100 + 20) = 2/3, a match at 4 of the 10 thresholds. IoU to the map: 240 / (300 + 20) = 3/4, a
-    match at 6 thresholds.
+    To the truth, the IoU is 80 / (100 + 20) = 2/3, a match at 4 of the 10 thresholds.
+    To the map, the IoU is 240 / (300 + 20) = 3/4, a match at 6 of the 10 thresholds.
     """
     truth = scene([(0, 100), (1, 100)], {1: "chair"})
     once = prediction(truth, [(0, 80), (5, 100), (0, 20)], {5: ("chair", 1.0)})
