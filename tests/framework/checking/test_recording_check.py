@@ -270,14 +270,16 @@ def test_recording_check_reports_defects_of_single_frame() -> None:
 def test_recording_check_reports_unreadable_frames() -> None:
     def unreadable(frame: Frame) -> Frame:
         if frame.index % 3 == 0:
-            raise FrameError("torn")
+            raise FrameError("truncated image")
         return frame
 
     def none(_: Frame) -> Frame:
-        raise FrameError("torn")
+        raise FrameError("truncated image")
 
     assert verdicts(Part(30, unreadable))["frames"] is Verdict.NOTE
-    with pytest.raises(DataError, match="expected readable frames, got none of 8 checked; first error: torn"):
+    with pytest.raises(
+        DataError, match="expected readable frames, got none of 8 checked; first error: truncated image"
+    ):
         check(Part(8, none), FARTHEST)
 
 

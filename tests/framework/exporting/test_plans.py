@@ -225,7 +225,7 @@ def test_relations_cube_is_on_table_and_table_on_floor(room: UprightRoom, low: P
     assert expected(without, 1) == expected(without, 3) == []
 
 
-def test_relations_stacked_object_is_on_upper_object(tmp_path: Path) -> None:
+def test_relations_stacked_object_is_on_object_below(tmp_path: Path) -> None:
     """The top of the lower object is hidden and missing in the mesh."""
     lower, upper = (1.2, 1.2, 0.75, 1.4, 1.4, 0.85), (1.2, 1.2, 0.85, 1.4, 1.4, 0.95)
     room = stored(tmp_path, things={"dining table": TABLE, "book": [lower], "other": [upper]})

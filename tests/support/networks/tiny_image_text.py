@@ -31,7 +31,7 @@ TEXT = {
 
 
 def write_image_text(folder: Path, kind: str = "siglip") -> Path:
-    """Write a model of this `model_type` with its tokenizer and preprocessing, as save_pretrained does."""
+    """Write a model with this `model_type`, its tokenizer and its preprocessing, as save_pretrained does."""
     import transformers
 
     torch.manual_seed(5)

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.acceptance
 
 KILLS = int(os.environ.get("INSTANCEMAP_KILLS", "6"))
 SHORT = ("dataset.frames=20", "fuser.slow_s=0.02", "fuser.slow_save_s=0.3", "fuser.note=note")
-LONGEST_WAIT_S = 1.2  # after a moment below; mapping takes about 0.5 s, saving another 0.5 s
+LONGEST_WAIT_S = 1.2  # maximum wait before a kill; mapping takes about 0.5 s, saving another 0.5 s
 
 
 def whole_files(place: Path) -> set[str]:

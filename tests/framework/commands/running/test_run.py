@@ -100,7 +100,7 @@ def test_run_stage_error_leaves_partial_record(tmp_path: Path, kind: str, messag
     assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
     left = figures(place)
     assert message in str(left["partial"])
-    assert left["frames"] in (3, 4)  # a failing detector stops before the frame counts, invalid masks fail later
+    assert left["frames"] in (3, 4)  # a detector error is before the frame is counted, a mask error after
     assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
 
 

@@ -359,7 +359,7 @@ def test_jobs_at_once_depends_on_threads_and_cores(monkeypatch: pytest.MonkeyPat
     ("launcher", "node"), [("joblib", "n_jobs"), ("slurm", "cpus_per_task"), ("ray", "ray.remote.num_cpus")]
 )
 def test_launcher_config_uses_job_threads(launcher: str, node: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The machine has 12 cores, and threads=0 uses all of them. A job with 0 cores would not count to the limit."""
+    """The machine has 12 cores, and threads=0 uses all of them. A job with 0 cores would not count toward the limit."""
     pytest.importorskip(f"hydra_plugins.hydra_{launcher.replace('slurm', 'submitit')}_launcher")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
     for threads in (3, 0):

@@ -31,7 +31,7 @@ CHAIR, UNKNOWN = 7, 70_000  # instance ids at x < -0.3 m and at x > 0.4 m
 CLASSES = {str(CHAIR): {"name": "arm chair", "class": "chair"}, str(UNKNOWN): {"name": "thing", "class": None}}
 T_RUN_WORLD = exp_se3(
     np.array([1.0, -2.0, 0.5, 0.3, -0.8, 0.4])
-)  # world frame of the recording in the one of a tracked run
+)  # from the world frame of the recording to that of a tracked run
 
 
 def pose(k: int) -> np.ndarray:

@@ -118,7 +118,7 @@ def test_scannet_points_are_mapped_at_their_positions(tmp_path: Path, write: Wri
     depth = frames[1].depth.ravel().astype(np.float32) / 1000
     expected = transform(frames[1].T_world_camera, back_project(DEPTH_CAMERA, pixels, depth))
     distance = np.linalg.norm(points[:, None] - expected[None], axis=-1).min(axis=0)
-    assert distance.max() < 0.1  # m; the points are averaged in cells
+    assert distance.max() < 0.1  # m
 
 
 def test_scannet_invalid_pose_raises_for_its_frame(tmp_path: Path, write: Writer) -> None:
