@@ -1,6 +1,7 @@
-"""Keeps the light of synthetic rooms in .pytest_cache. Import this module before a room is rendered.
+"""Cache of the light of synthetic rooms, in .pytest_cache.
 
-Baking takes four seconds a room; the file name is a hash of the room and of all modules that the light depends on.
+Import this module before a room is rendered. Baking the light takes 4 s per room. The file name is a hash of the room
+and of all modules that affect the light.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ FOLDER = CHECKOUT / ".pytest_cache" / "lights"
 
 
 def bake(surfaces: Surfaces, caster: RayCaster, lamps: list[Lamp]) -> Float32:
-    """Return `lights.bake` of the same arguments, from the cache if it is there."""
+    """Return the result of `lights.bake`, from the cache if it is stored there."""
     content = sha256(_code())
     arrays = [surfaces.vertices, surfaces.normals, surfaces.triangles, surfaces.materials, surfaces.material_table]
     arrays += [surfaces.instance_ids, *(a for lamp in lamps for a in (lamp.points, lamp.normals, np.array(lamp.power)))]

@@ -1,7 +1,7 @@
-"""The cores of test processes: each process of pytest-xdist has its own.
+"""Assignment of CPU cores to test processes: each process of pytest-xdist has its own cores.
 
-Otherwise their parallel kernels wait for each other: tracker tests of 22 s on a core took 72 s with two processes on
-two shared cores.
+On shared cores, the parallel kernels of the processes wait for each other. For example, tracker tests that take 22 s on
+one core took 72 s in two processes on two shared cores.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ ALL = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [
 
 
 def _share_among_processes() -> None:
-    """Set the cores before numba is loaded, which could not add threads later.
+    """Set the cores before numba is loaded, because numba cannot add threads later.
 
-    numba gives the thread that starts its OpenMP threads its own number of threads. Torch uses the same OpenMP and
-    would otherwise use another number in a new thread, where networks would round differently.
+    numba sets the number of OpenMP threads only in the thread that first uses it. Torch uses the same OpenMP. Without
+    these variables, torch would use another number in new threads, and networks would round differently.
     """
     number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))

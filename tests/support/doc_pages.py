@@ -10,11 +10,11 @@ DOCS = CHECKOUT / "docs"
 PAGES = {
     str(path.relative_to(CHECKOUT)): path.read_text() for path in [CHECKOUT / "README.md", *sorted(DOCS.rglob("*.md"))]
 }
-"""Text by path, from the checkout."""
+"""Text of each page by its path in the checkout."""
 
 
 def blocks(language: str, page: str | None = None) -> list[str]:
-    """Return the distinct code blocks of a language on one page, or on all, in their order."""
+    """Return the distinct code blocks of a language on one page, or on all pages, in order."""
     texts = PAGES.values() if page is None else [PAGES[page]]
     return list(
         dict.fromkeys(code for text in texts for code in re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL))
@@ -22,7 +22,7 @@ def blocks(language: str, page: str | None = None) -> list[str]:
 
 
 def block(language: str, containing: str) -> str:
-    """Return the only code block that contains these words."""
+    """Return the only code block of a language that contains this text."""
     [found] = [code for code in blocks(language) if containing in code]
     return found
 
@@ -34,4 +34,4 @@ LINES = list(
         for line in code.splitlines()
     )
 )
-"""Every line of the console blocks, with `python -m framework` for `instancemap`."""
+"""Every line of the console blocks, with `python -m framework` instead of `instancemap`."""

@@ -1,4 +1,4 @@
-"""Commands in processes that are forked from one with the libraries imported, which saves more than a second each."""
+"""Commands in processes forked from one that has imported the libraries, which saves over 1 s per command."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _context.set_forkserver_preload(LIBRARIES)
 
 
 def clean_environment() -> dict[str, str]:
-    """Return the environment of the tests without the variable that asks Hydra for tracebacks."""
+    """Return the environment of the tests without the variable that makes Hydra print tracebacks."""
     return {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
 
 
 class ForkedCommand:
-    """`python -m framework ARGUMENTS` in a process of its own. Its members are those of `subprocess.Popen`.
+    """`python -m framework ARGUMENTS` in a separate process, with the interface of `subprocess.Popen`.
 
     Args:
-        before: Called in the process before the command; a function of a module, because it is pickled.
+        before: Function that the process calls before the command; a module-level function, because it is pickled.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class ForkedCommand:
 
 
 def completed(directory: Path, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-    """Run `python -m framework ARGUMENTS` in a directory, like `subprocess.run`."""
+    """Run `python -m framework ARGUMENTS` in a directory, as `subprocess.run` does."""
     process = ForkedCommand(directory, *arguments)
     try:
         stdout, stderr = process.communicate(timeout)
@@ -104,7 +104,7 @@ def _run(
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(directory)
-    sys.path[:0] = [directory, str(CHECKOUT)]  # as of `python -m` and PYTHONPATH
+    sys.path[:0] = [directory, str(CHECKOUT)]  # as with `python -m` and PYTHONPATH
     sys.argv = [str(CHECKOUT / "framework" / "__main__.py"), *arguments[1:]]
     if before:
         before()

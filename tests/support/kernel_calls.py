@@ -1,10 +1,10 @@
-"""Kernels that the pipelines call, with their types: framework/compilation/kernels.txt.
+"""Kernels that the pipelines call, with their argument types: framework/compilation/kernels.txt.
 
     python -m tests.support.kernel_calls
 
-rewrites it in a minute. It runs every registered refiner, fuser and tracker on the demo's video, and one on a synthetic
-room, and lists each kernel that Python calls for the first time with some types. A test compares the list with the same
-runs.
+rewrites this list in about a minute. It runs every registered refiner, fuser and tracker on the demo's video, and one
+pipeline on a synthetic room. The list contains each kernel that Python calls, with each combination of argument types.
+A test compares the list with the same runs.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FEW = ("dataset=desk", "dataset.stride=3", "dataset.stop=12")
 
 
 class Compiled(event.Listener):
-    """Names of the kernels that are compiled while it is active."""
+    """Listener that collects the names of the compiled kernels."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -48,7 +48,7 @@ class Compiled(event.Listener):
 
 
 class Remembered(Detector):
-    """Detections of the default detector in each frame."""
+    """Detector that stores the detections of another detector by frame."""
 
     def __init__(self, detector: Detector) -> None:
         self.detector = detector
@@ -62,7 +62,7 @@ class Remembered(Detector):
 
 
 def calls() -> list[str]:
-    """Return a list to which called kernels are appended from here on; numba requests each type only once."""
+    """Return a list to which each kernel is appended when it is first called with new argument types."""
     noted: list[str] = []
     compile_for = Dispatcher._compile_for_args
 
@@ -80,14 +80,14 @@ def run_default(directory: Path, *overrides: str) -> None:
 
 
 def run_others() -> None:
-    """Run each registered stage in place of the default one, except detectors, which have no own kernels."""
+    """Run the pipeline with each registered refiner, fuser and tracker. Detectors have no kernels of their own."""
     config = composed(*FEW)
     Settings.of(config).apply()
     detector = Remembered(build(Detector, config.detector))
     video = build(RGBDSequence, config.dataset)
     for stage in ("refiner", "fuser", "tracker"):
         for option in sorted((CHECKOUT / "conf" / stage).glob("*.yaml")):
-            if option.stem == "trajectory_file":  # needs a file, and has no kernels
+            if option.stem == "trajectory_file":  # it needs a file and has no kernels
                 continue
             own = composed(*FEW, f"{stage}={option.stem}")
             pipeline = Pipeline(
@@ -103,7 +103,7 @@ def run_others() -> None:
 
 
 def run_rendered(directory: Path) -> None:
-    """Run a synthetic room: its renderer, and the comparison of a map with its true surface."""
+    """Run a synthetic room, including the renderer and the comparison of the map with the true surface."""
     config = composed(
         "dataset=synthetic", "detector=simulated", "dataset.frames=8", "dataset.width=160", "dataset.height=120"
     )
@@ -111,7 +111,7 @@ def run_rendered(directory: Path) -> None:
 
 
 def sections(whole: bool) -> dict[str, set[str]]:
-    """Return the lines of the list by section; without `whole` a shorter default run with the same calls."""
+    """Return the lines of the list by section. Without `whole`, use a shorter default run with the same calls."""
     noted = calls()
     with tempfile.TemporaryDirectory() as directory:
         run_default(Path(directory), *(() if whole else ("dataset.stride=2", "dataset.stop=24")))
@@ -130,7 +130,7 @@ def record() -> None:
 
 
 def check() -> None:
-    """Print kernels that runs call and the list lacks, and kernels that runs compile."""
+    """Print the called kernels that the list lacks, and the kernels that are compiled."""
     compiled = Compiled()
     event.register("numba:compile", compiled)
     found = sections(whole=False)
@@ -147,7 +147,7 @@ def main() -> None:
         {"--check": check, "--record": record}[sys.argv[1]]()
         return
     LIST.write_text("", encoding="utf-8")
-    for _ in range(2):  # the callees of a kernel compiled here are not requested again: the second call compiles none
+    for _ in range(2):  # callees of a compiled kernel are not listed; the second run compiles no kernels
         subprocess.run([sys.executable, "-m", "tests.support.kernel_calls", "--record"], check=True)
 
 

@@ -1,4 +1,4 @@
-"""Clusters over one pixel, and a voxel that sees it."""
+"""Point clusters that cover one pixel, and the voxel at the surface of this pixel."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from framework.mapping.labels.label_evidence_kernels import Combine
 
 FLOOR = 0.05
 SCORE_SCALE = 1 << 16  # as precise as exact storage
-BARE, COVERED = np.int32(0), np.int32(1)  # numbers of the lists of clusters over the pixel: none, all of a measurement
+BARE, COVERED = np.int32(0), np.int32(1)  # indices of cluster lists: no clusters, all clusters of a measurement
 
 
 def blank() -> Evidence:
-    """Return the evidence of one voxel with slots."""
+    """Return the evidence of one voxel with empty label slots."""
     return Evidence(
         np.zeros((1, 512), np.int32),
         np.zeros((1, INSTANCE_SLOTS), np.int32),
@@ -51,7 +51,7 @@ def measured(
 
 
 def voted(ids: list[int], weights: list[float], classes: list[int], combine: Combine, number: int = 6) -> Measurement:
-    """Return clusters over the only pixel, each for an instance and one class, by a rule that is not Bayesian."""
+    """Return clusters that cover the only pixel, each with an instance and a class, for a non-Bayesian label rule."""
     evidence = np.zeros((len(ids), number))
     evidence[np.arange(len(ids)), classes] = weights
     relative, named, bits = named_classes(evidence, logarithmic=False)

@@ -1,4 +1,4 @@
-"""Small files that a user must provide, so that the contracts run on options that need some."""
+"""Small files for options that require user files, so that the contract tests can run on them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FRAMES = 3
 
 
 def modules(stage: str, name: str) -> dict[str, ModuleType]:
-    """Return fake device libraries that an option needs; empty for other options."""
+    """Return the fake device libraries, by module name, that an option needs; empty for other options."""
     plugged_in = {
         ("dataset", "orbbec"): {"pyorbbecsdk": orbbec_module(FakeCamera())},
         ("dataset", "realsense"): {"pyrealsense2": realsense_module(FakeCamera())},
@@ -32,13 +32,13 @@ def modules(stage: str, name: str) -> dict[str, ModuleType]:
 
 
 def overrides(stage: str, name: str, folder: Path) -> list[str]:
-    """Return the overrides of an option with files made in `folder`; empty for other options."""
+    """Write the files that an option needs to `folder`; return its overrides, empty for other options."""
     write = WRITERS.get((stage, name))
     return write(folder) if write else []
 
 
 def _images(color: str, depth: str, first: int = 0) -> None:
-    """Write the images of the corner room, in millimeters; names contain the frame's number, counted from `first`."""
+    """Write the color and depth (mm) images of the corner room; names contain frame numbers from `first`."""
     for frame in CornerRoom(frames=FRAMES):
         for path, image in (
             (Path(color.format(first + frame.index)), frame.color[..., ::-1]),
@@ -122,7 +122,7 @@ def _mask_rcnn(folder: Path) -> list[str]:
 
 
 def _onnx_boxes(folder: Path) -> list[str]:
-    """Write two boxes of 16 px in an input of 32, in YOLOX's cells: 4 x 4, 2 x 2 and one."""
+    """Write a network that returns two boxes of 16 px in 32 px, in YOLOX cells: 4 x 4, 2 x 2 and 1."""
     pytest.importorskip("onnx")
     from tests.support.networks.tiny_networks import constant_network
 
@@ -134,7 +134,7 @@ def _onnx_boxes(folder: Path) -> list[str]:
 
 
 def _onnx_segmentation(folder: Path) -> list[str]:
-    """Write two boxes whose masks are the left and the lower halves of the image."""
+    """Write a network that returns two boxes, whose masks are the left and the lower half of the image."""
     pytest.importorskip("onnx")
     from tests.support.networks.tiny_networks import constant_network
 

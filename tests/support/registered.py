@@ -18,7 +18,7 @@ OPTIONS = [*OPTION]
 
 
 def names(stage: str, kind: type = object) -> list[str]:
-    """Return the options of one stage, or those whose class is of a kind."""
+    """Return the names of the options of a stage whose class is a subclass of `kind`."""
     return [
         option.name
         for option in OPTION.values()
@@ -39,5 +39,5 @@ def _composed(stage: str, name: str, *overrides: str) -> DictConfig:
 
 
 def built(stage: str, name: str, *overrides: str) -> Any:
-    """Build the option like the command."""
+    """Build the option as the command does."""
     return build(GROUPS[stage], composed(stage, name, *overrides)[stage])

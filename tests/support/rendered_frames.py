@@ -24,7 +24,7 @@ LIBRARIES = ("numpy", "numba", "open3d")
 
 
 def rendered_frames(sequence: Synthetic, indices: Sequence[int] | None = None) -> list[Frame]:
-    """Return frames of a sequence, by default all, from the cache if it has them."""
+    """Return the frames with these indices, by default all frames, from the cache if they are stored there."""
     chosen = list(range(len(sequence)) if indices is None else indices)
     directory = Path(platformdirs.user_cache_dir("instancemap"), "test_frames")
     directory.mkdir(parents=True, exist_ok=True)

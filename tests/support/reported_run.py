@@ -1,4 +1,4 @@
-"""A small run with true instances, for tests of reports."""
+"""A small run with ground-truth instances, for tests of reports."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CONFIG: dict[str, Any] = {
 
 
 def write_run(directory: Path, **dataset: Any) -> Path:
-    """Map the corner of a room with its spheres."""
+    """Map the corner room with its spheres; return the run directory."""
     config = CONFIG | {"dataset": CONFIG["dataset"] | dataset}
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(composition, "_added", [FAKES])
@@ -39,7 +39,7 @@ def write_run(directory: Path, **dataset: Any) -> Path:
 
 
 def rename_class(directory: Path, name: str) -> None:
-    """Rename the class of the first object, e.g., to a hostile name."""
+    """Rename the class of the first object, for example to HTML code."""
     path = directory / "instances.json"
     entries = json.loads(path.read_text())
     entries[0]["class"] = name

@@ -11,11 +11,11 @@ from omegaconf import OmegaConf
 from framework.runs.provenance import config_hash
 
 AP50, IOU = "instances.ap50", "instances.mean_iou"
-Figures = Mapping[str, Sequence[float | None]]  # by row, one for each seed; None = not defined
+Figures = Mapping[str, Sequence[float | None]]  # values by row, one for each seed; None = undefined
 
 
 def experiment(root: Path, figures: Figures, iou: float = 0.5, scenes: Sequence[str] = (), dataset: str = "d") -> Path:
-    """Write records of `dataset` below `root`. With `scenes`, values are of these scenes with seed 0."""
+    """Write run directories of `dataset` below `root`. With `scenes`, the values are one per scene, with seed 0."""
     root.mkdir(parents=True)
     rows = {row: [f"refiner={row}"] for row in figures}
     over = ["seed", "dataset.scene"] if scenes else ["seed"]
@@ -30,7 +30,7 @@ def experiment(root: Path, figures: Figures, iou: float = 0.5, scenes: Sequence[
 def run(
     root: Path, row: str, seed: int, value: float | None, iou: float = 0.5, scene: str = "", dataset: str = "d"
 ) -> None:
-    """Write the record of one run."""
+    """Write the directory of one run."""
     directory = root / f"row={row},seed={seed},{scene}"
     directory.mkdir()
     config = {"row": row, "seed": seed, "dataset": {"scene": scene}, "refiner": {"kind": row}}

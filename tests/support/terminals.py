@@ -16,7 +16,7 @@ import pytest
 
 @contextmanager
 def terminal_stderr(columns: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Connect stderr to a terminal of a width. The list has one element, the text, when the context ends."""
+    """Connect stderr to a terminal of `columns` characters. When the context ends, the list contains the text."""
     shown: list[str] = []
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))

@@ -8,14 +8,14 @@ from framework.refinement.mixtures.mixture_tree import MixtureTree
 
 
 def gaussian_densities(points: np.ndarray, weights: np.ndarray, means: np.ndarray, Sigmas: np.ndarray) -> np.ndarray:
-    """Return (S, K) pi_k N(x_i | mu_k, Sigma_k)."""
+    """Return the weighted densities pi_k N(x_i | mu_k, Sigma_k), (S, K)."""
     whitened = (points - means[:, None]) @ np.linalg.inv(np.linalg.cholesky(Sigmas)).transpose(0, 2, 1)  # (K, S, 3)
     scales = weights / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(Sigmas))
     return (np.exp(-0.5 * (whitened**2).sum(axis=-1)) * scales[:, None]).T
 
 
 def leaves(tree: MixtureTree, depth: int) -> list[tuple[int, np.ndarray]]:
-    """Return the leaves of the trees cut below `depth` levels: for each level its index and its leaves' rows."""
+    """Return the leaves of the trees cut below `depth` levels: the index and the rows of the leaves of each level."""
     rows = []
     for k in range(min(depth, len(tree.levels))):
         last = k + 1 in (depth, len(tree.levels))
@@ -25,7 +25,7 @@ def leaves(tree: MixtureTree, depth: int) -> list[tuple[int, np.ndarray]]:
 
 
 def owners(tree: MixtureTree, k: int) -> np.ndarray:
-    """Return (M,) the tree of each node of level `k`."""
+    """Return the index (M,) of the tree of each node of level `k`."""
     found = tree.levels[0].parents
     for level in tree.levels[1 : k + 1]:
         found = found[level.parents]
@@ -33,10 +33,10 @@ def owners(tree: MixtureTree, k: int) -> np.ndarray:
 
 
 def log_likelihoods(tree: MixtureTree, points: np.ndarray, starts: np.ndarray, depth: int | None = None) -> np.ndarray:
-    """Return (N,) mean log p(x), in nats, of the points of each set under the first `depth` levels, None = all.
+    """Return the mean log p(x) (N,), in nats, of each point set under the first `depth` levels; None = all.
 
-    p is the sum over all leaves and the uniform components, for any branch of a point. A set without points gets 0;
-    points where a tree has no density, -inf.
+    p is the sum over all leaves and uniform components, whatever the branch of a point. The mean is 0 for a set without
+    points, and -inf for a set with a point where the tree has no density.
     """
     depth = len(tree.levels) if depth is None else depth
     means = np.zeros(len(starts) - 1)

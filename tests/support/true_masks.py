@@ -1,4 +1,4 @@
-"""The masks of an analytic scene, and the fuser input of their detections."""
+"""Ground-truth masks of an analytic scene, and their fusion as detections."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from framework.interfaces import MapFuser
 from framework.refinement.lifting import lift
 
 CLASSES = ("chair", "bed")
-PROBABILITIES = (0.7, 0.3)  # of every detection
+PROBABILITIES = (0.7, 0.3)  # class probabilities of every detection
 
 
 def masks_of(frame: Frame) -> list[np.ndarray]:
-    """Return (H, W) for each true instance of the frame."""
+    """Return a mask (H, W) for each ground-truth instance of the frame."""
     assert frame.truth is not None
     return [frame.truth.instance_ids == i for i in frame.truth.class_names]
 
@@ -29,7 +29,7 @@ def fuse_masks(
     embeddings: np.ndarray | None = None,
     space: str = "words@1",
 ) -> None:
-    """Fuse the frame at its true pose with these masks and their class distributions.
+    """Fuse the frame at its ground-truth pose with these masks and their class distributions.
 
     `embeddings` (n, D) are optional.
     """

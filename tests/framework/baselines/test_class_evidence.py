@@ -25,7 +25,7 @@ def one_voxel(classes: int) -> ClassEvidence:
 
 
 def masks_of(log_ratio: np.ndarray, frame: int = 0) -> MaskClasses:
-    """Return masks with these distributions (N, C), next to each other in one row of pixels."""
+    """Return N masks with these log ratios (N, C) of their classes, one pixel each, in one row of pixels."""
     n, c = log_ratio.shape
     clusters = PointClusters(
         np.zeros((n, 3), np.float32),
@@ -44,7 +44,7 @@ def observe(evidence, masks, k):
 
 
 def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
-    """Return the stored sums (C,) of the voxel."""
+    """Return the summed log ratios (C,) of the classes that are stored in the voxel."""
     found = np.full(classes, evidence.rest[0, 0], np.float64)
     for label, value in zip(evidence.class_ids[0, 0], evidence.log_ratio[0, 0], strict=True):
         if label != NO_CLASS:
@@ -63,7 +63,7 @@ def test_class_evidence_few_classes_are_exact() -> None:
 
 
 def test_class_evidence_late_class_includes_earlier_masks() -> None:
-    """Each mask names 8 of 14 classes and gives the others equal probabilities, like a detector's floor."""
+    """Each mask has its own log ratios for 8 of 14 classes and an equal log ratio for the others."""
     rng = np.random.default_rng(1)
     message = np.full((20, 14), -3.0)
     for row in message:
@@ -79,13 +79,13 @@ def test_class_evidence_full_voxel_drops_least_likely_class() -> None:
     masks, evidence = masks_of(message), one_voxel(40)
     assert evidence.class_ids.shape[2] == CLASS_SLOTS
     assert [observe(evidence, masks, k) for k in range(3)] == [0, 0, 8]
-    # classes 0 to 7 have 1 - 5 - 5, 8 to 15 have -5 + 2 - 5, 16 to 23 have -5 - 5 + 9
+    # summed log ratios: classes 0 to 7: 1 - 5 - 5; 8 to 15: -5 + 2 - 5; 16 to 23: -5 - 5 + 9
     assert set(evidence.class_ids[0, 0].tolist()) == set(range(8, 24))
     assert evidence.class_ids[0, 0, 0] == 16
     assert evidence.log_ratio[0, 0, 0] == pytest.approx(-1)
 
 
-def test_class_evidence_tracks_frame_count_first_and_last() -> None:
+def test_class_evidence_stores_count_first_and_last_frame() -> None:
     evidence = one_voxel(2)
     for frame in (4, 7, 9):
         observe(evidence, masks_of(np.zeros((1, 2)), frame), 0)
@@ -93,7 +93,7 @@ def test_class_evidence_tracks_frame_count_first_and_last() -> None:
     assert (evidence.masked[0, 1], evidence.first_frame[0, 1], evidence.last_frame[0, 1]) == (0, -1, -1)
 
 
-def test_mask_classes_pixel_uses_best_scored_mask() -> None:
+def test_mask_classes_pixel_uses_highest_scoring_mask() -> None:
     clusters = PointClusters(
         np.zeros((5, 3), np.float32),
         np.int32([[0, 0], [0, 0], [1, 0], [0, 0], [2, 0]]),

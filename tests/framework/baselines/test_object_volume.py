@@ -1,4 +1,4 @@
-"""Tests of the pixel window of a box, compared with its projected points."""
+"""Tests of the pixel windows of boxes, compared with projected points inside the boxes."""
 
 import numpy as np
 
@@ -27,11 +27,11 @@ def test_box_window_contains_all_visible_points() -> None:
         assert ((u[inside] >= u0) & (u[inside] < u1) & (v[inside] >= v0) & (v[inside] < v1)).all()
         seen += inside.any()
     empty = (windows[:, 0] >= windows[:, 2]) | (windows[:, 1] >= windows[:, 3])
-    assert 20 < seen <= (~empty).sum() < 50, "most of 200 boxes are out of view"
+    assert 20 < seen <= (~empty).sum() < 50, "expected most of the 200 boxes to be out of view"
 
 
 def test_box_window_in_front_is_tight_and_behind_is_empty() -> None:
     low, high = np.array([[-0.1, -0.1, 1.0], [-0.1, -0.1, -2.0]]), np.array([[0.1, 0.1, 2.0], [0.1, 0.1, -1.0]])
     ahead, behind = boxes_in_view(CAMERA, np.eye(4), low, high, NEAR).tolist()
-    assert ahead == [14, 12, 23, 20]  # 18 -+ 3.5 and 15.5 -+ 3.3, rounded outwards
+    assert ahead == [14, 12, 23, 20]  # 18 ± 3.5 px and 15.5 ± 3.3 px, rounded outward
     assert behind[0] >= behind[2]

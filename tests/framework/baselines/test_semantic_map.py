@@ -1,4 +1,4 @@
-"""Tests of connected components on small meshes, compared with manual results and scipy."""
+"""Tests of connected components on small meshes, compared with hand-computed results and SciPy."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from scipy.sparse.csgraph import connected_components as scipy_components
 from framework.baselines.semantic_map import connected_components
 
 STRIP = np.int32([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 6]])
-"""Seven vertices in a row of triangles."""
+"""Triangles (5, 3) of a strip of seven vertices."""
 
 
-def test_semantic_map_components_are_split_by_other_class() -> None:
+def test_semantic_map_components_are_split_by_another_class() -> None:
     assert connected_components(STRIP, np.int32([2, 2, 2, 2, 2, 2, 2]), 1).tolist() == [1] * 7
     assert connected_components(STRIP, np.int32([2, 2, 2, 5, 5, 2, 2]), 1).tolist() == [1, 1, 1, 2, 2, 3, 3]
 

@@ -15,7 +15,7 @@ from tests.framework.tracking.test_color_delay import CAMERA, delayed_frames
 
 
 class Delayed(RGBDSequence):
-    """A sequence with color after depth and given poses."""
+    """A sequence with poses, in which color is captured `delay` s after depth."""
 
     def __init__(self, delay: float, speed: float = 1.0, constant: float | None = None) -> None:
         self.frames = [replace(frame, T_world_camera=pose) for frame, pose in delayed_frames(delay, 60, speed)]
@@ -43,7 +43,7 @@ def test_color_delay_check_reports_estimate(delay: float, corrected: bool) -> No
     assert ("corrected in the run" in finding.text) is corrected
 
 
-def test_color_delay_check_standing_camera_is_unknown() -> None:
+def test_color_delay_check_of_stationary_camera_is_unknown() -> None:
     sequence = Delayed(0.03, speed=0)
     assert check_color_delay(Matcher(sequence)).verdict is Verdict.UNKNOWN
 

@@ -1,4 +1,4 @@
-"""Tests of delay detection between poses and frames, on exact points."""
+"""Tests of the detection of a delay between poses and frames, with exact points."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def trembling_walk() -> list[Float64]:
 
 
 def even_walk() -> list[Float64]:
-    """Return the poses of a camera with constant steps."""
+    """Return the poses of a camera whose velocity is constant."""
     return [exp_se3(k * np.array([0.01, 0.0, 0.005, 0.0, 0.01, 0.0])) for k in range(FRAMES)]
 
 
 def pairs_of(true: Sequence[Float64], stored: Sequence[Float64 | None], noise: float = 0.0) -> list[MatchedPair]:
-    """Return pairs of frames along the walk, each with its stored pose; noise in px."""
+    """Return pairs of frames with their stored poses and matches; `noise` is a standard deviation in px."""
     pairs = []
     for k, step in ((k, step) for k in range(8, FRAMES - 24, 6) for step in (4, 8, 16)):
         chosen = np.random.default_rng(k)
@@ -51,7 +51,7 @@ def pairs_of(true: Sequence[Float64], stored: Sequence[Float64 | None], noise: f
 
 
 def late(poses: Sequence[Float64], frames: int) -> list[Float64 | None]:
-    """Return the stored poses if they are this many frames late."""
+    """Return the poses stored `frames` frames late; None for frames without a pose."""
     return [poses[k - frames] if 0 <= k - frames < len(poses) else None for k in range(len(poses))]
 
 
@@ -102,7 +102,7 @@ def test_pose_delay_skips_pairs_without_neighboring_poses() -> None:
     assert find_delay(pairs, [], AS_IT_IS) is None
 
 
-def test_pose_delay_is_found_in_fitting_axes() -> None:
+def test_pose_delay_is_found_in_best_fitting_axes() -> None:
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     poses = trembling_walk()
     stored = [None if T is None else T @ flip for T in late(poses, 3)]

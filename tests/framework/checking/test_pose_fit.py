@@ -1,4 +1,4 @@
-"""Tests of pose conventions, evaluated on exact points."""
+"""Tests of the detection of pose conventions, with exact points."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_pose_fit_identifies_reading_from_moving_camera(reading: PoseReading) ->
 
 
 def test_pose_fit_reports_ambiguous_axes_of_pan() -> None:
-    """For a rotation about the vertical image axis, an inverted pose and an OpenGL pose rotate equally."""
+    """For rotations about the vertical image axis, inverted poses and poses in OpenGL axes are equivalent."""
     judged = judge(pairs_of(walk(2, pan_only=True), inverse), PoseReading(), 1000.0, 2.0)
     [fault] = judged.findings
     assert fault.verdict is Verdict.ERROR
@@ -111,7 +111,7 @@ def test_pose_fit_in_configured_axes_is_correct() -> None:
 
 
 def test_pose_fit_keeps_configured_unit_in_axes_search() -> None:
-    """The poses are inverted and in millimeters. If the unit is set, only the direction is reported."""
+    """The poses are inverted and in millimeters. If the unit is set, only the inversion is reported."""
 
     def stored(T: Float64) -> Float64:
         inverted = inverse(T)

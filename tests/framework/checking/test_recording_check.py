@@ -32,19 +32,19 @@ from tests.support.recordings.damaged import write_damaged
 
 pytestmark = pytest.mark.integration
 
-FARTHEST = 5.0  # m, that is mapped
+FARTHEST = 5.0  # maximum mapped depth, m
 DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
 
 
 def in_axes(axes: CameraAxes) -> Callable[[Float64], Float64]:
-    """Return a function that converts a pose to one of the same camera in other axes."""
+    """Return a function that converts the pose of a camera to other camera axes."""
     T_axes_camera = np.eye(4)
     T_axes_camera[:3, :3] = axes.R_axes_camera
     return lambda T_world_camera: T_world_camera @ inverse(T_axes_camera)
 
 
 def scalar_first(T: Float64) -> Float64:
-    """Return the pose whose quaternion w x y z is read in the order x y z w."""
+    """Return the pose that results if the quaternion w x y z is read as x y z w."""
     misread = T.copy()
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
     misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()
@@ -119,7 +119,7 @@ def test_recording_check_of_changed_desk_names_setting(tmp_path: Path, damage: M
 
 
 @pytest.mark.acceptance
-def test_recording_check_of_originals_reports_no_error(shared_data: Path) -> None:
+def test_recording_check_of_valid_recordings_reports_no_error(shared_data: Path) -> None:
     originals = shared_data / "originals"
     recordings: list[Recording] = [
         DESK,
@@ -138,7 +138,7 @@ def test_recording_check_of_originals_reports_no_error(shared_data: Path) -> Non
 
 
 def test_recording_check_applies_configured_conventions(tmp_path: Path) -> None:
-    """The named parameter makes the recording valid; a second change makes it invalid again."""
+    """The recording is valid with the correct parameters, and invalid again with other values."""
     place = write_damaged(tmp_path / "damaged", DESK, pose=both, scale=2.0, depth_late=1, poses_late=-2)
     reading = PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL, pose_delay=-2)
     depth = DepthReading(depth_scale=5000, depth_delay=1)
@@ -150,7 +150,7 @@ def test_recording_check_applies_configured_conventions(tmp_path: Path) -> None:
 
 
 def test_recording_check_reports_clock_delay_in_two_units(tmp_path: Path) -> None:
-    """The recording is the desk in TUM's files; its pose timestamps are 0.1 s late."""
+    """The recording is the desk in TUM format; its pose timestamps are 0.1 s late."""
     shutil.copytree(DESK.folder, tmp_path / DESK.name)
     path = tmp_path / DESK.name / "groundtruth.txt"
     words = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
@@ -176,7 +176,7 @@ def test_recording_check_unrelated_poses_fit_in_no_axes(tmp_path: Path) -> None:
 
 @dataclass
 class MovedDepth(RGBDSequence):
-    """The desk with depth moved by an affine map (2, 3), as from a second camera."""
+    """The desk with depth images warped by an affine matrix (2, 3) in px, as if from a second camera."""
 
     moved: Float64
 
@@ -200,12 +200,14 @@ def test_recording_check_reports_unregistered_depth(zoom: float, x: float, y: fl
     assert "not registered" in fault.text
     if zoom == 1:
         found_x, found_y = (float(number) for number in re.findall(r"([+-][0-9.]+) %", fault.text))
-        assert found_x == pytest.approx(-100 * x / 640, abs=0.4)  # % of the width, to move it back
+        assert found_x == pytest.approx(
+            -100 * x / 640, abs=0.4
+        )  # % of the image width; the reported shift is the correction
         assert found_y == pytest.approx(-100 * y / 640, abs=0.4)
 
 
-def test_recording_check_half_frame_color_depth_motion_is_note() -> None:
-    """The desk begins with a turn of 20 px per frame, and a Kinect captures color and depth at different times."""
+def test_recording_check_half_frame_color_offset_is_note() -> None:
+    """The desk begins with a rotation of 20 px per frame. A Kinect captures color and depth at different times."""
     [expected] = [
         finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject == "color and depth"
     ]
@@ -215,7 +217,7 @@ def test_recording_check_half_frame_color_depth_motion_is_note() -> None:
 
 @dataclass
 class Part(RGBDSequence):
-    """Some frames of the desk without poses, with modifications."""
+    """The first `count` frames of the desk without poses; `change` modifies each frame."""
 
     count: int
     change: Callable[[Frame], Frame] = lambda frame: frame
@@ -268,14 +270,16 @@ def test_recording_check_reports_defects_of_single_frame() -> None:
 def test_recording_check_reports_unreadable_frames() -> None:
     def unreadable(frame: Frame) -> Frame:
         if frame.index % 3 == 0:
-            raise FrameError("torn")
+            raise FrameError("truncated image")
         return frame
 
     def none(_: Frame) -> Frame:
-        raise FrameError("torn")
+        raise FrameError("truncated image")
 
     assert verdicts(Part(30, unreadable))["frames"] is Verdict.NOTE
-    with pytest.raises(DataError, match="expected readable frames, got none of 8 checked; first error: torn"):
+    with pytest.raises(
+        DataError, match="expected readable frames, got none of 8 checked; first error: truncated image"
+    ):
         check(Part(8, none), FARTHEST)
 
 

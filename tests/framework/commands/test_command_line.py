@@ -1,4 +1,4 @@
-"""Tests of the directory names of sweeps and of the end of commands."""
+"""Tests of the directory names of sweeps and of the exit of commands."""
 
 from __future__ import annotations
 
@@ -62,5 +62,5 @@ def test_command_with_closed_pipe_ends_silently(command: str) -> None:
     ],
 )
 def test_config_dirs_are_read_from_command_line(words: list[str], folders: list[str]) -> None:
-    """This includes the command without arguments, which maps the desk."""
+    """The command without arguments, which maps the desk, has no config directories."""
     assert _config_dirs(words) == [Path(folder) for folder in folders]

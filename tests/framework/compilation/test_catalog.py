@@ -1,4 +1,4 @@
-"""Tests of kernels.txt, which lists all kernels of a run, so that a run after `compile` compiles nothing."""
+"""Tests of kernels.txt, the list of all kernels of a run. A run after `compile` compiles no kernels."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def test_kernel_signature_text_round_trip_is_exact() -> None:
 
 @pytest.mark.acceptance
 def test_kernel_catalog_contains_all_called_kernels() -> None:
-    """Run the demo, a room, and every other refiner, fuser and tracker.
+    """Run the demo, a synthetic scene, and every other refiner, fuser and tracker.
 
-    `python -m tests.support.kernel_calls` updates it.
+    `python -m tests.support.kernel_calls` updates kernels.txt.
     """
     if missing := [kernel for kernel in listed(DEFAULT, OTHERS) if not kernel.is_compiled()]:
         compile_all(missing)  # like `make test`
@@ -91,7 +91,7 @@ def twice(x):
 
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a folder with two kernel modules that workers can import, and the file of the callee."""
+    """Write two kernel modules that worker processes can import; return the file of the callee."""
     (tmp_path / "kernel_caller.py").write_text(SMALL)
     callee = tmp_path / "kernel_callee.py"
     callee.write_text(CALLEE.format(2))
@@ -138,7 +138,7 @@ def test_compile_all_faulty_kernel_raises_with_name(small: Path) -> None:
     assert good.is_compiled()
 
 
-def test_compile_all_ended_worker_raises(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compile_all_exited_worker_raises(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         catalog,
         "_worker",
@@ -153,7 +153,7 @@ def test_compile_for_run_waits_for_other_process(
 ) -> None:
     kernel = Kernel("kernel_caller", "small", "int64")
     monkeypatch.setattr(catalog, "listed", lambda *_: [kernel])
-    importlib.import_module("kernel_caller")  # as the stages of a run are
+    importlib.import_module("kernel_caller")  # as a run imports the modules of its stages
     lock = FileLock(Path(kernel.dispatcher._cache.cache_path) / "compiling.lock")
     Path(lock.lock_file).parent.mkdir(exist_ok=True)
     caplog.set_level("INFO")

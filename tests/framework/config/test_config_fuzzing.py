@@ -1,6 +1,6 @@
 """Fuzz tests of option YAML files: an option is built or rejected with a one-line error.
 
-`INSTANCEMAP_FUZZ=2000 pytest tests/framework/config/test_config_fuzzing.py` tries 2000 cases.
+`INSTANCEMAP_FUZZ=2000 pytest tests/framework/config/test_config_fuzzing.py` tries 1000 cases.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ TOKENS = (
         b"~: 1\n",
     ),
 )
-SLOWEST = 5.0  # s of CPU time, because other processes may use the machine
+SLOWEST = 5.0  # maximum CPU time, s; elapsed time would depend on other processes
 BOMB = "a0: &a0 [x]\n" + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12))
 
 

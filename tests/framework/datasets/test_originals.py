@@ -1,4 +1,4 @@
-"""Tests of original recordings of publishers, apps and drivers, with exact numbers of each."""
+"""Tests of original recordings from dataset publishers, apps and drivers, with known values."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ from tests.support.scenes.corner_room import GridFuser, KeepAll
 pytestmark = pytest.mark.integration
 
 VGA = (480, 640)
-KINECT = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # OpenNI's
+KINECT = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # default intrinsics of OpenNI
 KITCHEN = "redkitchen/seq-01"
 FREIBURG1_RPY = "rgbd_dataset_freiburg1_rpy"
-GAP = (1305031244.897635, 1305031244.997688)  # s, of the color images that have a depth image and no pose
+GAP = (1305031244.897635, 1305031244.997688)  # times of the color images with depth and without pose, s
 
 
 @pytest.fixture(scope="module")
 def originals(shared_data: Path) -> Path:
     """Return `shared/data/originals`; skip the test if it is missing."""
     if not (shared_data / "originals").is_dir():
-        pytest.skip(f"{shared_data / 'originals'} is not there")
+        pytest.skip(f"{shared_data / 'originals'} does not exist")
     return shared_data / "originals"
 
 
 def readings(depth: np.ndarray) -> tuple[float, float, float]:
-    """Return the smallest and largest depth, and the fraction of valid pixels."""
+    """Return the smallest and largest valid depth in the unit of `depth`, and the fraction of valid pixels."""
     return float(depth[depth > 0].min()), float(depth[depth > 0].max()), float((depth > 0).mean())
 
 
@@ -61,14 +61,14 @@ def raw(path: Path) -> np.ndarray:
 
 
 def run(*overrides: str) -> tuple[RGBDSequence, RunResult]:
-    """Run the default stages without detection."""
+    """Run the default stages without detection; return the sequence and the result."""
     config = composed("detector=none", "fuser.voxel_size=0.02", *overrides)
     sequence = build(RGBDSequence, config.dataset)
     return sequence, begin(config).run(sequence)
 
 
 def check_map_shows_its_frames(sequence: RGBDSequence, result: RunResult) -> None:
-    """Check that the view of the map at the pose of each frame matches its depth to half a voxel."""
+    """Check that depth rendered at the pose of each frame has a median error below half a voxel (0.01 m)."""
     for k, tracked in enumerate(result.tracked):
         frame = sequence[k]
         seen = result.scene.render(frame.camera, tracked.pose.T_world_camera).depth
@@ -116,7 +116,10 @@ def test_openni_1_recording_plays_completely(originals: Path, tmp_path: Path) ->
         assert (frame.depth_mm.shape, frame.depth_mm.dtype) == (VGA, np.uint16)
     assert readings(frames[0].depth_mm) == pytest.approx((628, 4521, 0.764785), abs=1e-6)
     content = (originals / "oni/test.oni").read_bytes()
-    for frame, at, size in ((frames[0], 31288 + 40, 68970), (frames[11], 1950114 + 40, 68663)):  # of the JPEG
+    for frame, at, size in (
+        (frames[0], 31288 + 40, 68970),
+        (frames[11], 1950114 + 40, 68663),
+    ):  # byte offset and size of the JPEG
         decoded = cv2.imdecode(np.frombuffer(content, np.uint8, size, at), cv2.IMREAD_COLOR_RGB)
         np.testing.assert_allclose(frame.color, decoded, atol=4)
 
@@ -154,7 +157,7 @@ def test_seven_scenes_published_frame_matches_files(originals: Path) -> None:
     np.testing.assert_allclose(frame.depth, register(depth_mm) / 1000, rtol=1e-6)
     assert readings(frame.depth) == pytest.approx((0.939, 2.857, 0.72362), abs=1e-5)
     T_world_depthcamera = np.array(
-        [  # as the file has it, with tabs and CRLF
+        [  # values of the file, which has tabs and CRLF
             [7.0352107e-001, 3.1905547e-001, -6.3492483e-001, -9.1287065e-001],
             [-3.7097296e-001, 9.2696339e-001, 5.4754097e-002, -3.4388667e-001],
             [6.0605687e-001, 1.9703214e-001, 7.7053267e-001, 7.5986093e-001],
@@ -163,7 +166,7 @@ def test_seven_scenes_published_frame_matches_files(originals: Path) -> None:
     )
     T_depthcamera_camera = np.eye(4)
     T_depthcamera_camera[0, 3] = BASELINE
-    # the file's axes have length 0.9999
+    # the axes in the file have a length of 0.9999
     np.testing.assert_allclose(frame.T_world_camera, T_world_depthcamera @ T_depthcamera_camera, atol=1e-4)
 
 
@@ -228,7 +231,7 @@ def test_replica_excerpt_skips_frames_with_missing_images(originals: Path, tmp_p
 
 
 def given_poses(tracker: PoseTracker, sequence: RGBDSequence) -> RunResult:
-    """Run with given poses, which costs only reading."""
+    """Run minimal stages with given poses; only reading the frames takes time."""
     return Pipeline(NoDetections(), tracker, KeepAll(), GridFuser(), prefetch=0).run(sequence)
 
 
@@ -250,7 +253,7 @@ def test_tum_excerpt_reads_available_images(originals: Path) -> None:
 
 
 def test_tum_pose_is_interpolated_between_neighbors(originals: Path) -> None:
-    """Lines 689 and 690 of groundtruth.txt are at ...2.8231 and ...2.8332 s; the frame is at 26 % between them."""
+    """Lines 689 and 690 of groundtruth.txt are at ...2.8231 and ...2.8332 s; the frame is 26 % of the way between."""
     T_world_camera = TumRgbd(originals / "tum_rgbd", scene=FREIBURG1_RPY)[99].T_world_camera
     assert T_world_camera is not None
     share = (0.825767 - 0.8231) / (0.8332 - 0.8231)
@@ -277,7 +280,7 @@ def test_tum_is_mapped(originals: Path) -> None:
 
 
 def around_the_gap(originals: Path, folder: Path) -> TumRgbd:
-    """Return the frames around the gap of motion capture with original times and poses; the images are others."""
+    """Return the frames around the gap of motion capture, with their times and poses but other images."""
     source = originals / "tum_rgbd" / FREIBURG1_RPY
     target = folder / FREIBURG1_RPY
     target.mkdir()
@@ -306,7 +309,7 @@ def test_tum_frames_in_motion_capture_gap_are_skipped(
     expected = f"2 of {len(times)} frames skipped because they have no pose; the first: frame {times.index(GAP[0])}"
     assert [message.startswith(expected) for message in output] == [True, True]
     for ours, theirs in zip(results[GroundTruth].tracked, results[TrajectoryFile].tracked, strict=True):
-        # one interpolates, the other takes the nearest, at 0.3 m/s up to 20 ms away
+        # one interpolates; the other uses the nearest pose, up to 20 ms away at 0.3 m/s
         np.testing.assert_allclose(ours.pose.T_world_camera[:3, 3], theirs.pose.T_world_camera[:3, 3], atol=0.01)
 
 
@@ -327,10 +330,10 @@ def test_tum_run_in_motion_capture_gap_raises_one_line_error(originals: Path, tm
 
 
 def test_scannet_first_release_names_are_known(shared_data: Path) -> None:
-    """The annotation has `trashcan` and `dishrack`, the label table `trash can` and `dish rack`; COCO has neither."""
+    """The label table writes `trashcan` and `dishrack` with a space. COCO has neither class."""
     root = shared_data / "scannet_scene0000"
     if not root.is_dir():
-        pytest.skip(f"{root} is not there")
+        pytest.skip(f"{root} does not exist")
     scene = ScanNet(root, "scene0000_00")
     mesh = scene.mesh
     assert mesh is not None
@@ -338,7 +341,7 @@ def test_scannet_first_release_names_are_known(shared_data: Path) -> None:
     assert len(names) == 17
     assert names.count("chair") == 4  # stools
     unknown = [instance for instance, name in mesh.class_names.items() if name is None]
-    assert unknown == [56], "the unlabeled part is one instance more than the 55 objects"
+    assert unknown == [56], "expected the unlabeled part as an instance after the 55 objects"
     groups = read_aggregation(scene.folder / "scene0000_00.aggregation.json")
     segments = json.loads((scene.folder / "scene0000_00_vh_clean_2.0.010000.segs.json").read_text())["segIndices"]
     for label, count in (("trashcan", 3), ("dishrack", 1)):
@@ -346,4 +349,6 @@ def test_scannet_first_release_names_are_known(shared_data: Path) -> None:
         assert len(objects) == count
         of_label = np.isin(segments, np.concatenate(objects))
         assert of_label.sum() > 100
-        assert np.count_nonzero(mesh.instance_ids[of_label]) < 0.1 * of_label.sum()  # a later object may have a segment
+        assert (
+            np.count_nonzero(mesh.instance_ids[of_label]) < 0.1 * of_label.sum()
+        )  # a later object may contain some segments

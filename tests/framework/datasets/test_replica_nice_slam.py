@@ -48,7 +48,7 @@ def root(tmp_path: Path) -> Path:
     return root
 
 
-def test_replica_frame_of_rendered_recording_is_exact(root: Path) -> None:
+def test_replica_frame_sensor_is_exact(root: Path) -> None:
     assert ReplicaNiceSlam(root, "room0")[0].sensor is SensorKind.EXACT
 
 
@@ -58,7 +58,7 @@ def test_replica_frame_matches_files(root: Path) -> None:
     assert sequence.camera == Camera(24, 16, 12.0, 12.0, 11.5, 7.5)
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, pytest.approx(2 / 30))
-    assert np.abs(frame.color.astype(int) - (80, 100, 200)).max() <= 2  # JPEG
+    assert np.abs(frame.color.astype(int) - (80, 100, 200)).max() <= 2  # JPEG compression
     np.testing.assert_allclose(frame.depth, 2, rtol=1e-6)
     np.testing.assert_allclose(frame.T_world_camera, pose_at(2), atol=1e-12)
     assert sequence.scene_truth() is None

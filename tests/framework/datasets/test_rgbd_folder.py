@@ -1,4 +1,4 @@
-"""Tests of RGB-D folders in the exact layout, with valid and invalid files."""
+"""Tests of RGB-D folders with valid and invalid files."""
 
 import json
 import shutil
@@ -68,7 +68,7 @@ def test_rgbd_folder_frame_matches_files(folder):
     assert (frame.index, frame.timestamp) == (2, 0.2)
     np.testing.assert_array_equal(frame.color, picture(2))
     np.testing.assert_array_equal(frame.depth, depth_mm(2).astype(np.float32) / np.float32(1000))
-    # A turn about y with sin(a/2) = 0.6, cos(a/2) = 0.8: cos a = 0.28, sin a = 0.96.
+    # A rotation about y with sin(a/2) = 0.6, cos(a/2) = 0.8: cos a = 0.28, sin a = 0.96.
     expected = [[0.28, 0, 0.96, 0.2], [0, 1, 0, 0], [-0.96, 0, 0.28, -0.5], [0, 0, 0, 1]]
     np.testing.assert_allclose(frame.T_world_camera, expected, atol=1e-12)
     assert frame.truth.class_names == {7: "chair", 300: None}
@@ -142,7 +142,7 @@ def test_rgbd_folder_timestamp_of_unusable_frame_is_ignored(folder, caplog):
     assert not caplog.records
 
 
-def test_rgbd_folder_has_poses_unless_file_has_no_pose_lines(folder):
+def test_rgbd_folder_has_poses_if_pose_file_exists(folder):
     for k in range(FRAMES):
         set_pose_line(folder, k, f"{k} nan nan nan nan nan nan nan")
     assert RgbdFolder(folder).has_poses()  # reading reports the errors
@@ -269,7 +269,7 @@ def test_rgbd_folder_file_name_without_number_raises(folder):
 
 @pytest.mark.parametrize("name", ["poses.txt", "instances.json", "instance"])
 @pytest.mark.parametrize("kind", ["folder", "dangling link"])
-def test_rgbd_folder_unreadable_file_is_not_missing(folder, name, kind):
+def test_rgbd_folder_unreadable_optional_file_raises(folder, name, kind):
     path = folder / name
     if path.is_dir():
         shutil.rmtree(path)
@@ -475,10 +475,10 @@ def test_rgbd_folder_unnamed_instance_raises_for_its_frame(folder):
 )
 def test_rgbd_folder_real_recordings_are_read(scene, frames, shape, labeled):
     if not (SHARED / scene).is_dir():
-        pytest.skip(f"{SHARED / scene} is not there")
+        pytest.skip(f"{SHARED / scene} does not exist")
     sequence = RgbdFolder(SHARED, scene=scene)
     assert len(sequence) == frames
-    frame = sequence[frames - 1]  # Frame itself checks types and that the pose is rigid
+    frame = sequence[frames - 1]  # Frame checks the types and that the pose is rigid
     assert frame.depth.shape == shape
     assert 0.3 < np.median(frame.depth[frame.depth > 0]) < 8
     assert frame.T_world_camera is not None
@@ -487,7 +487,7 @@ def test_rgbd_folder_real_recordings_are_read(scene, frames, shape, labeled):
 
 def test_rgbd_folder_replica_truth_has_plausible_extent():
     if not (SHARED / "replica_floor2").is_dir():
-        pytest.skip(f"{SHARED / 'replica_floor2'} is not there")
+        pytest.skip(f"{SHARED / 'replica_floor2'} does not exist")
     truth = RgbdFolder(SHARED, scene="replica_floor2", stride=12).scene_truth()
     extent = np.ptp(truth.points_world, axis=0)
     assert (extent > 2).all()
@@ -495,7 +495,7 @@ def test_rgbd_folder_replica_truth_has_plausible_extent():
     assert {truth.class_names[i] for i in np.unique(truth.instance_ids) if i} >= {"bed", None}
 
 
-def test_rgbd_folder_lens_is_undistorted_in_all_images(folder):
+def test_rgbd_folder_images_are_undistorted(folder):
     change_camera(folder, distortion=[0.3, 0, 0, 0.01, 0])
     K, lens = np.array([[20.0, 0, 11.5], [0, 21.0, 7.5], [0, 0, 1]]), np.array([0.3, 0, 0, 0.01, 0])
     u, v = cv2.initUndistortRectifyMap(K, lens, None, K, (WIDTH, HEIGHT), cv2.CV_32FC1)

@@ -19,7 +19,7 @@ FRAMES = 3
 
 
 def pose_at(k: int) -> np.ndarray:
-    """Return T_world_depthcamera."""
+    """Return the pose T_world_depthcamera of frame k."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([0, 0.1 * k, 0.05]).as_matrix()
     T[:3, 3] = 0.1 * k, -1, 2
@@ -44,7 +44,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def all_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Return the measured points (P, 3) in camera coordinates."""
+    """Return the measured points (P, 3), m, in the camera frame."""
     v, u = np.nonzero(depth)
     return back_project(camera, np.stack([u, v], 1).astype(np.int32), depth[v, u])
 
@@ -55,7 +55,7 @@ def test_seven_scenes_frame_matches_files(folder: Path) -> None:
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, pytest.approx(2 / 30))
     assert (frame.color == (80, 100, 200)).all()
-    assert set(np.unique(frame.depth)) == {0, 2}  # the border is invisible to the depth camera
+    assert set(np.unique(frame.depth)) == {0, 2}  # the depth camera does not see the border
     assert (frame.depth > 0).mean() == pytest.approx((529 / 585) ** 2, abs=0.02)
     T_depthcamera_camera = inverse(pose_at(2)) @ frame.T_world_camera
     np.testing.assert_allclose(T_depthcamera_camera[:3, :3], np.eye(3), atol=1e-6)
@@ -77,9 +77,9 @@ def test_seven_scenes_recording_is_mapped(folder: Path) -> None:
 
 
 def test_seven_scenes_registered_depth_matches_projection() -> None:
-    """Each measured point, projected into the color camera, is within half a pixel of its new pixel."""
+    """Each measured point, projected into the color camera, is within half a pixel of its registered pixel."""
     raw = np.zeros(DEPTH_CAMERA.shape, np.uint16)
-    raw[20::40, 20::40] = 800 + 10 * np.arange(12 * 16).reshape(12, 16)  # far apart, all different
+    raw[20::40, 20::40] = 800 + 10 * np.arange(12 * 16).reshape(12, 16)  # distant pixels with different depths
     registered = register(raw)
     points = all_points(DEPTH_CAMERA, raw.astype(np.float32) / 1000) - np.float32([BASELINE, 0, 0])
     seen = project(COLOR_CAMERA, points)
@@ -105,7 +105,7 @@ def test_seven_scenes_registration_keeps_nearest_and_holes() -> None:
     near = np.flatnonzero(row == 1000)
     # x = (u - 320) / 585 m at 1 m, seen from 25 mm to the right
     np.testing.assert_allclose(near[[0, -1]], 320 + 529 * ((np.array([300, 339]) - 320) / 585 - 0.025), atol=0.51)
-    # left of the near strip, the far wall is hidden by the parallax of the cameras
+    # parallax moves the near strip over the far wall on the left, and leaves a gap on the right
     assert row[near[0] - 1] == 4000
     gap = np.flatnonzero(row[near[-1] + 1 :] == 4000)[0]
     assert gap == pytest.approx(529 * 0.025 * (1 / 1 - 1 / 4), abs=1.5)

@@ -20,7 +20,7 @@ from framework.sensors.noise_models import SensorKind
 from tests.support.recordings.recordings import fault_of, mapped, opened, write_color, write_depth
 
 START = 1305031102.175304  # s
-DEPTH_DELAY = 0.0151  # s, of each depth image after its color image
+DEPTH_DELAY = 0.0151  # time from each color image to its depth image, s
 FRAMES = 3
 HEADER = "# {}\n# file: 'rgbd_dataset_freiburg1_xyz.bag'\n# timestamp {}\n"
 
@@ -42,7 +42,7 @@ def write_poses(folder: Path, lines: list[str]) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Write a motion of 1 m/s along x in front of a wall at z = 2 m, with motion capture at 100 Hz."""
+    """Return a recording of a wall at z = 2 m: the camera moves at 1 m/s along x, with poses at 100 Hz."""
     folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
     color = [color_time(k) for k in range(FRAMES)]
     depth = [time + DEPTH_DELAY for time in color]
@@ -61,9 +61,9 @@ def test_tum_rgbd_frame_matches_files(folder: Path) -> None:
     assert (frame.index, frame.timestamp) == (2, color_time(2))
     inside = np.s_[40:440, 40:600]  # where the undistorted image is complete
     assert (frame.color[inside] == (20, 20, 30)).all()
-    assert (frame.depth[inside] == 2).all()  # 5000 units a meter
+    assert (frame.depth[inside] == 2).all()  # 5000 units per meter
     assert frame.T_world_camera is not None
-    np.testing.assert_allclose(frame.T_world_camera[:3, 3], [2 / 30, 0, 0], atol=1e-4)  # times have four digits
+    np.testing.assert_allclose(frame.T_world_camera[:3, 3], [2 / 30, 0, 0], atol=1e-4)  # pose times have four decimals
     assert frame.camera == PUBLISHED[Intrinsics.FREIBURG1].camera
 
 
@@ -78,7 +78,7 @@ def test_tum_rgbd_recording_is_mapped(folder: Path) -> None:
 
 
 def test_tum_rgbd_published_distortion_is_removed(folder: Path) -> None:
-    """The corners of a checkerboard are where OpenCV places the pixels of the lens."""
+    """The undistorted image of a checkerboard matches the result of OpenCV."""
     board = np.kron(np.indices((15, 20)).sum(axis=0) % 2, np.full((32, 32), 200)).astype(np.uint8)
     path = next((folder / "rgb").glob("*.png"))
     cv2.imwrite(str(path), np.stack([board] * 3, axis=-1))
@@ -145,7 +145,7 @@ def test_tum_rgbd_published_camera_overrides_camera_json(folder: Path) -> None:
 
 
 def test_tum_rgbd_association_is_closest_first_and_one_to_one() -> None:
-    """Depth 0.015 is nearest to both color images: the closer one gets it, the other one the remaining depth."""
+    """The depth image at 0.015 s is the nearest for both color images, and is paired with the closer one."""
     assert associate([0.0, 0.02], [0.015, 0.19], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, 0.035], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, -0.01], 0.02) == [(0, 1), (1, 0)]
@@ -181,7 +181,7 @@ def test_tum_rgbd_duplicate_image_timestamps_keep_first(folder: Path, caplog: py
     for name in ("rgb", "depth"):
         path = folder / f"{name}.txt"
         path.write_text(path.read_text() + path.read_text().replace(".png", "_again.png") * 1000)
-    sequence = TumRgbd(folder)  # 3 million pairs of these lines are within max_difference
+    sequence = TumRgbd(folder)  # 3 million pairs of these lines are within max_time_difference
     assert [frame.timestamp for frame in sequence] == [color_time(k) for k in range(FRAMES)]
     assert caplog.text.count("rgb.txt: expected unique timestamps, got repeated ones; skipped 3000 images") == 1
     assert caplog.text.count("depth.txt: expected unique timestamps, got repeated ones; skipped 3000 images") == 1
@@ -215,7 +215,7 @@ def test_tum_rgbd_pose_beyond_time_tolerance_is_unknown(folder: Path) -> None:
     sequence = TumRgbd(folder)
     first = sequence[0].T_world_camera
     assert first is not None
-    np.testing.assert_array_equal(first[:3, 3], [5, 0, 0])  # before all poses: the nearest
+    np.testing.assert_array_equal(first[:3, 3], [5, 0, 0])  # before the first pose, the nearest pose is used
     assert sequence[2].T_world_camera is None
 
 
@@ -224,7 +224,7 @@ def test_tum_rgbd_missing_ground_truth_gives_no_pose(folder: Path) -> None:
     assert TumRgbd(folder)[0].T_world_camera is None
 
 
-def test_tum_rgbd_unreadable_ground_truth_is_not_missing(folder: Path) -> None:
+def test_tum_rgbd_unreadable_ground_truth_raises(folder: Path) -> None:
     (folder / "groundtruth.txt").unlink()
     (folder / "groundtruth.txt").symlink_to("nowhere")
     with pytest.raises(DataError, match=r"groundtruth\.txt"):
@@ -247,7 +247,7 @@ def test_tum_rgbd_invalid_pose_raises_for_its_frame(folder: Path) -> None:
     assert "groundtruth.txt, line 5: expected a quaternion" in fault_of(TumRgbd(folder), 1)
 
 
-# Faults
+# Errors
 
 
 @pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])

@@ -1,4 +1,4 @@
-"""Tests of every candidate layout, compared with a slow decoder."""
+"""Tests of every candidate layout, compared with a slow reference decoder."""
 
 import math
 
@@ -9,7 +9,7 @@ from framework.detection.candidates import Candidates, OutputLayout, decode
 from framework.errors import DataError
 
 CLASSES = 3
-SHAPE = (64, 96)  # of the input
+SHAPE = (64, 96)  # height and width of the input, px
 
 
 def yolox_output(rng):
@@ -146,6 +146,6 @@ def test_best_candidates_are_selected_by_class_and_threshold():
     )
     scores = np.array([[0.5, 0.1], [0.9, 0.1], [0.2, 0.6], [0.3, 0.1], [1.0, 0.0], [0.05, 0.2]], "f4")
     candidates = Candidates(boxes, scores)
-    assert candidates.best(0.25, 0.5, 10).tolist() == [1, 2, 3]  # 0 falls to 1; 4 has no area; 5 is too weak
+    assert candidates.best(0.25, 0.5, 10).tolist() == [1, 2, 3]  # 1 suppresses 0; 4 has no area; 5 scores too low
     assert candidates.best(0.25, 0.95, 10).tolist() == [1, 2, 0, 3]
     assert candidates.best(0.25, 0.95, 2).tolist() == [1, 2]

@@ -1,4 +1,4 @@
-"""Tests of the warning of a detector for rendered rooms about images of another domain."""
+"""Tests of the warning for images outside the domain of a detector that was trained on rendered rooms."""
 
 from __future__ import annotations
 
@@ -98,5 +98,5 @@ def test_domain_of_dataset_marks_rendered_images(tmp_path: Path) -> None:
     assert Synthetic.domain == RENDERED_ROOMS
     option_files.overrides("dataset", "scenenn", tmp_path)
     assert SceneNN(tmp_path).domain == ""
-    (tmp_path / MADE_BY).write_text("{}")  # tests/framework/synthetic/test_scene_writers.py: as it is written
+    (tmp_path / MADE_BY).write_text("{}")  # content is tested in tests/framework/synthetic/test_scene_writers.py
     assert SceneNN(tmp_path).domain == RENDERED_ROOMS

@@ -1,4 +1,4 @@
-"""Tests of recurring false positives, which keep their position in all views."""
+"""Tests of recurring false positives, which keep their 3D position in all views."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 
 
 def wall(x: float, names: dict[int, str | None] | None = None, z: float = 3.0) -> Frame:
-    """Return a wall z m away, seen from x m along it; its left half is instance 1."""
+    """Return a view of a wall at distance z, m, from position x, m; the left half is instance 1."""
     pose = np.eye(4)
     pose[0, 3] = x
     ids = np.zeros((120, 160), np.int32)
@@ -43,7 +43,7 @@ def test_false_positive_cells_are_distinct() -> None:
         assert len(cells) == len(places)
 
 
-def test_false_positive_cells_skip_known_objects_and_no_pose() -> None:
+def test_false_positive_cells_require_unknown_surface_and_pose() -> None:
     assert all(place.u >= 80 for place in false_positive_cells(wall(0.0, {1: "bed"}), 0, 99))
     assert any(place.u < 80 for place in false_positive_cells(wall(0.0, {1: None}), 0, 99))
     lost = wall(0.0)

@@ -7,13 +7,13 @@ from framework.detection.runtimes.onnx_network import ExportMetadata
 from framework.detection.segmentation_output import BoxKind, detect_layout
 from framework.errors import DataError
 
-SHAPE = (64, 96)  # of the input
+SHAPE = (64, 96)  # height and width of the input, px
 CLASSES, MASKS = 3, 4
 ULTRALYTICS = ExportMetadata(author="Ultralytics")
 
 
 def cells():
-    """Return the boxes of all cells of the strides 8, 16 and 32: center x, y, width, height, px."""
+    """Return the boxes (K, 4), px, of all cells of the strides 8, 16 and 32: center x, y, width, height."""
     rng = np.random.default_rng(0)
     rows = []
     for stride in (8, 16, 32):
@@ -31,14 +31,14 @@ def as_unit(boxes):
 
 
 def dense(boxes, classes=CLASSES, objectness=False):
-    """Return the table (1, 4 + C + M, K)."""
+    """Return a table (1, 4 + C + M, K) of boxes, class scores and mask coefficients, one column per cell."""
     rng = np.random.default_rng(1)
     numbers = classes + MASKS + objectness
     return np.concatenate([boxes, rng.uniform(1e-6, 0.1, (len(boxes), numbers))], axis=1).T[None].astype(np.float32)
 
 
 def detections(boxes, score, label):
-    """Return the table (1, K, 6 + M)."""
+    """Return a table (1, K, 6 + M) after suppression: boxes, score, label and mask coefficients."""
     rest = np.full((len(boxes), MASKS), 0.5)
     return np.concatenate([boxes, np.full((len(boxes), 1), score), np.full((len(boxes), 1), label), rest], 1)[None]
 
@@ -49,7 +49,7 @@ def prototypes(channels_last=False):
 
 
 def seen(table, maps=None, **given):
-    """Return the layout and the outputs in it."""
+    """Return the detected layout and the outputs that are read with it."""
     outputs = {"output0": np.asarray(table, np.float32), "output1": prototypes() if maps is None else maps}
     arguments = {
         "classes": CLASSES,
@@ -119,12 +119,12 @@ def test_detect_layout_inverted_corners_raise():
         seen(detections(boxes, 0.9, 1))
     _, output = seen(detections(boxes, 0.9, 1), boxes=BoxKind.CENTER)
     np.testing.assert_allclose(output.candidates.boxes, as_corners(boxes), atol=1e-4)
-    layout, _ = seen(detections(cells(), 0.9, 1))  # enough boxes show it
+    layout, _ = seen(detections(cells(), 0.9, 1))  # with enough boxes, the format is detected
     assert layout.boxes is BoxKind.CENTER
 
 
 def test_detect_layout_tables_of_equal_width_are_distinguished():
-    """4 + 2 + M = 6 + M: only labels are integers, and only cells have the count of cells."""
+    """With 2 classes, both tables have 6 + M columns. Only labels are integers; only dense tables have all cells."""
     layout, _ = seen(dense(cells(), classes=2).transpose(0, 2, 1), classes=2)
     assert not layout.suppressed
     layout, _ = seen(detections(as_corners(cells())[50:60], 0.7, 1), classes=2)
@@ -134,7 +134,7 @@ def test_detect_layout_tables_of_equal_width_are_distinguished():
     assert layout.suppressed
     assert output.candidates.class_scores.sum() == 0
     quantized = dense(cells(), classes=2)
-    quantized[:, 4:6] = 0  # cells, where 8 bits have no smaller number
+    quantized[:, 4:6] = 0  # scores of cells that are rounded to 0 in 8 bits
     layout, _ = seen(quantized.transpose(0, 2, 1), classes=2)
     assert not layout.suppressed
 

@@ -1,4 +1,4 @@
-"""Tests of the command `doctor` on this machine and on simulated broken ones."""
+"""Tests of the command `doctor` on this machine and on simulated machines with errors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def broken_library(folder: Path, name: str, text: str) -> None:
 
 
 def test_doctor_broken_libraries_are_one_line_errors(tmp_path: Path) -> None:
-    """One library raises, and one ends the importing process."""
+    """One library raises an error, and one ends the importing process."""
     broken_library(tmp_path, "torch", "raise ImportError('libtorch.so: no such\\nfile')")
     broken_library(tmp_path, "open3d", "import os, signal\nos.kill(os.getpid(), signal.SIGILL)")
     done = doctor(tmp_path, PYTHONPATH=str(tmp_path), HOME=str(tmp_path))
@@ -59,7 +59,7 @@ def test_doctor_broken_libraries_are_one_line_errors(tmp_path: Path) -> None:
     assert str(tmp_path) not in done.stdout.replace("~", "")
     assert done.stdout.isascii()
     written = {path.name for path in tmp_path.iterdir()} - {"torch", "open3d"}
-    assert written <= {".config", ".cache"}, "logged by matplotlib when it is imported"
+    assert written <= {".config", ".cache"}, "expected only the folders that matplotlib creates when it is imported"
 
 
 def test_doctor_json_lists_every_section(tmp_path: Path) -> None:
@@ -135,7 +135,7 @@ def test_doctor_missing_library_and_network_have_fixes(tmp_path: Path, monkeypat
     assert (missing.name, missing.status, missing.fix) == ("libnone9", Status.ERROR, "apt-get install libnone9")
     monkeypatch.setattr(networks, "PROJECT_ROOT", tmp_path)
     errors = [check.name for check in networks.included_and_hub() if check.status is Status.ERROR]
-    assert errors == ["maskrcnn2go"], "the default detector"
+    assert errors == ["maskrcnn2go"], "expected an error for the default detector only"
 
 
 def test_doctor_networks_list_every_option_with_weights() -> None:

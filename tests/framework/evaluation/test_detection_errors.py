@@ -1,4 +1,4 @@
-"""Tests of detection statistics on rectangles with manual results."""
+"""Tests of detection statistics on rectangles with hand-computed results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SHAPE = (60, 80)
 IDS = np.zeros(SHAPE, np.int32)
 IDS[0:20, 0:20] = 3  # a chair
 IDS[30:60, 0:40] = 4  # a bed
-IDS[0:20, 40:60] = 7  # a thing
+IDS[0:20, 40:60] = 7  # an object without a class
 IDS[0:2, 70:72] = 9  # a chair that is too small to count
 TRUTH = FrameTruth(IDS, {3: "chair", 4: "bed", 7: None, 9: "chair"})
 
@@ -43,7 +43,7 @@ def counted(*frames: Detections) -> dict[str, float]:
     return faults.table()
 
 
-def test_detection_faults_of_ground_truth_are_zero() -> None:
+def test_detection_errors_of_ground_truth_are_zero() -> None:
     table = counted(detections((CHAIR, 0, 0.8), (BED, 1, 0.6)))
     for name in (
         "found",
@@ -60,8 +60,8 @@ def test_detection_faults_of_ground_truth_are_zero() -> None:
     assert table["score, standard deviation"] == pytest.approx(0.1)
 
 
-def test_detection_faults_of_oversized_mask_lower_iou() -> None:
-    """The chair has 400 px, of which 300 are in a mask of 500: IoU 300 / 600."""
+def test_detection_errors_of_oversized_mask_lower_iou() -> None:
+    """A mask of 500 px covers 300 px of the chair, which has 400 px. The IoU is 300 / 600."""
     table = counted(detections((block(5, 0, 25, 20), 0, 0.8), (BED, 0, 0.6)))
     assert table["mask IoU"] == pytest.approx((300 / 600 + 1) / 2)
     assert table["fraction of the mask on the object"] == pytest.approx((300 / 500 + 1) / 2)
@@ -69,7 +69,7 @@ def test_detection_faults_of_oversized_mask_lower_iou() -> None:
     assert table["correct class"] == 0.5
 
 
-def test_detection_faults_split_object_is_not_false_detection() -> None:
+def test_detection_errors_split_object_is_no_false_detection() -> None:
     halves = detections((CHAIR, 0, 0.8), (block(0, 30, 20, 30), 1, 0.7), (block(20, 30, 20, 30), 1, 0.6))
     table = counted(halves)
     assert table["objects with several detections"] == 0.5
@@ -77,7 +77,7 @@ def test_detection_faults_split_object_is_not_false_detection() -> None:
     assert table["found"] == 1
 
 
-def test_detection_faults_count_false_detections() -> None:
+def test_detection_errors_count_false_detections() -> None:
     table = counted(detections((block(40, 0, 20, 20), 0, 0.5), (block(50, 40, 10, 10), 1, 0.2)), detections())
     assert table["false detections per image"] == 1
     assert table["false detections on an unknown object"] == 0.5
@@ -86,7 +86,7 @@ def test_detection_faults_count_false_detections() -> None:
     assert table["found"] == 0
 
 
-def test_detection_faults_summarize_objects_over_frames() -> None:
+def test_detection_errors_summarize_objects_over_frames() -> None:
     """The chair is always detected, once as another class; the bed is detected once in eight frames."""
     frames = [detections((CHAIR, int(k == 3), 0.5), *([(BED, 1, 0.5)] if k == 0 else [])) for k in range(8)]
     table = counted(*frames)
@@ -96,7 +96,7 @@ def test_detection_faults_summarize_objects_over_frames() -> None:
     assert table["correct class"] == pytest.approx(8 / 9)
 
 
-def test_detection_faults_overlaps_match_whole_image_counts() -> None:
+def test_detection_errors_overlaps_match_whole_image_counts() -> None:
     rng = np.random.default_rng(0)
     ids = rng.integers(0, 5, SHAPE).astype(np.int32) * 7
     masks = rng.random((4, *SHAPE)) < 0.3

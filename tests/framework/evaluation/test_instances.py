@@ -1,4 +1,4 @@
-"""Tests of instance AP on cases with manual results."""
+"""Tests of instance AP on scenes with hand-computed results."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from framework.data import SceneTruth
 from framework.errors import DataError
 from framework.evaluation.instances import Outcome, PredictedInstances, Transfer, average_precision, evaluate, judge
 
-SPACING = 0.2  # m between the points of a scene, more than twice the transfer distance, so that points do not mix
+SPACING = 0.2  # between points, m; more than twice the transfer distance, so that labels do not mix
 
 
 def line(count: int, offset: float = 0.0) -> np.ndarray:
-    """Return points (count, 3) along x."""
+    """Return points (count, 3), m, along x."""
     points = np.zeros((count, 3), np.float32)
     points[:, 0] = SPACING * np.arange(count)
     points[:, 1] = offset
@@ -24,7 +24,7 @@ def line(count: int, offset: float = 0.0) -> np.ndarray:
 
 
 def scene(runs: Sequence[tuple[int, int]], class_names: Mapping[int, str | None]) -> SceneTruth:
-    """Return points on a line, labeled by runs of (instance id, points)."""
+    """Return points on a line, labeled by runs of (instance id, number of points)."""
     ids = np.repeat([k for k, _ in runs], [n for _, n in runs]).astype(np.int32)
     return SceneTruth(line(len(ids)), ids, class_names)
 
@@ -32,7 +32,7 @@ def scene(runs: Sequence[tuple[int, int]], class_names: Mapping[int, str | None]
 def prediction(
     truth: SceneTruth, runs: Sequence[tuple[int, int]], claims: Mapping[int, tuple[str, float]]
 ) -> PredictedInstances:
-    """Return the truth's points with new labels; `claims` are class and confidence of each predicted id."""
+    """Return the true points with new labels; `claims` gives the class and confidence of each predicted id."""
     ids = np.repeat([k for k, _ in runs], [n for _, n in runs]).astype(np.int32)
     return PredictedInstances(
         truth.points_world[: len(ids)],
@@ -59,13 +59,16 @@ def test_iou_counts_points_outside_true_instance():
     half = evaluate(prediction(truth, [(5, 200)], {5: ("chair", 1.0)}), truth)
     assert half.best_ious == {1: 0.5}
     assert half.best_ids == {1: 5}
-    assert half.by_class[0.5]["chair"].ap == 1.0, "IoU equal to the threshold is a match"
+    assert half.by_class[0.5]["chair"].ap == 1.0, "expected a match at an IoU equal to the threshold"
     assert half.by_class[0.55]["chair"].ap == 0.0
     assert half.metrics()["instances.ap"] == pytest.approx(0.1)
 
 
 def test_average_precision_matches_manual_result():
-    """Ranked hits 1 0 1 1 0 of 5 truths: precision 1, 1/2, 2/3, 3/4, 3/5; envelope at the hits 1, 3/4, 3/4."""
+    """The ranked matches are 1 0 1 1 0, for 5 true instances.
+
+    The precision is 1, 1/2, 2/3, 3/4, 3/5. Its envelope at the matches is 1, 3/4, 3/4.
+    """
     assert average_precision(np.array([1, 0, 1, 1, 0], bool), 5) == pytest.approx((1 + 0.75 + 0.75) / 5)
     assert average_precision(np.zeros(0, bool), 3) == 0.0
     with pytest.raises(ValueError, match="average precision: expected at least one ground-truth instance, got none"):
@@ -93,14 +96,14 @@ def test_evaluate_matches_each_true_instance_once():
     result = evaluate(prediction(truth, [(5, 50), (6, 50)], {5: ("chair", 0.5), 6: ("chair", 0.6)}), truth)
     score = result.by_class[0.5]["chair"]
     assert (score.true_positives, score.false_positives, score.ap) == (1, 1, 1.0)
-    assert result.best_ids == {1: 6}, "of equal overlaps the more confident one"
+    assert result.best_ids == {1: 6}, "expected the more confident one of equal overlaps"
 
 
 def test_ap_requires_class_match_except_agnostic_ap():
     truth = scene([(1, 100), (2, 100)], {1: "chair", 2: "bed"})
     result = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("bed", 0.9), 6: ("bed", 0.8)}), truth)
     assert result.by_class[0.5]["chair"].ap == 0.0
-    assert result.by_class[0.5]["bed"].ap == pytest.approx(0.5), "the chair called a bed comes first"
+    assert result.by_class[0.5]["bed"].ap == pytest.approx(0.5), "expected the chair predicted as a bed to rank first"
     assert result.ap(0.5) == pytest.approx(0.25)
     assert result.agnostic[0.5].ap == 1.0
     assert result.metrics()["instances.mean_iou"] == 1.0
@@ -129,18 +132,18 @@ def test_evaluate_does_not_count_match_with_ignored_instance(class_name, points)
 
 
 def test_evaluate_ignores_prediction_on_unknown_instances():
-    """The prediction covers several unknown instances with IoU 0.2 each, and nothing else."""
+    """The prediction covers six unknown instances with an IoU of 1/6 each, and nothing else."""
     runs = [(1, 100)] + [(k, 120) for k in range(2, 8)]
     truth = scene(runs, {1: "chair"} | dict.fromkeys(range(2, 8)))
     covered = prediction(truth, [(5, 100), (6, 720)], {5: ("chair", 0.5), 6: ("chair", 0.9)})
     assert evaluate(covered, truth).overall.ignored == 1
     known = replace(truth, instance_ids=np.where(truth.instance_ids >= 5, 0, truth.instance_ids).astype(np.int32))
     score = evaluate(covered, known).overall
-    assert (score.ignored, score.false_positives) == (0, 1), "exactly half is unknown: false positive"
+    assert (score.ignored, score.false_positives) == (0, 1), "expected a false positive if exactly half is unknown"
 
 
 def test_evaluate_ignores_prediction_of_unannotated_class():
-    """The chair is correct, and keyboards are not annotated; the wrong bed is a false positive."""
+    """The chair is correct, keyboards are not annotated, and the bed is a false positive."""
     truth = replace(scene([(1, 100), (0, 300)], {1: "chair"}), classes=("chair", "bed"))
     found = [(1, 100), (2, 100), (0, 100), (3, 100)]
     claims = {1: ("chair", 0.8), 2: ("keyboard", 0.9), 3: ("bed", 0.7)}
@@ -149,11 +152,13 @@ def test_evaluate_ignores_prediction_of_unannotated_class():
     assert result.metrics()["instances.ap50_agnostic"] == 1.0
     assert evaluate(prediction(truth, found, claims), replace(truth, classes=None)).overall.false_positives == 2
     called_otherwise = evaluate(prediction(truth, [(1, 100)], {1: ("bench", 0.8)}), truth)
-    assert called_otherwise.metrics()["instances.ap50_agnostic"] == 1.0, "the object is found with any class"
+    assert called_otherwise.metrics()["instances.ap50_agnostic"] == 1.0, (
+        "expected a class-agnostic match with any class"
+    )
 
 
 def test_evaluate_keeps_prediction_with_evaluated_match():
-    """At IoU 0.25 the prediction matches its truth although more of it is on an unknown instance."""
+    """At IoU 0.25, the prediction matches the chair although most of it is on an unknown instance."""
     truth = scene([(1, 100), (2, 150)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 250)], {5: ("chair", 0.5)}), truth)
     assert result.by_class[0.25]["chair"].ap == 1.0
@@ -193,7 +198,7 @@ def test_label_transfer_uses_nearest_background_vertex():
 
 
 def test_label_transfer_to_map_counts_map_vertices():
-    """Ten points of background are under the instance; the map has two vertices at each of them."""
+    """The prediction contains ten background points. The map has two vertices at each of them."""
     truth = scene([(1, 100), (0, 100)], {1: "chair"})
     dense = prediction(truth, [(5, 110)], {5: ("chair", 1.0)})
     twice = replace(
@@ -227,7 +232,7 @@ def test_evaluate_inconsistent_predictions_raise():
 
 
 def test_label_transfer_tie_is_independent_of_order():
-    """Each true point is exactly between two map vertices of different instances."""
+    """Each true point is midway between two map vertices of different instances."""
     truth = scene([(1, 100)], {1: "chair"})
     up = np.float32([0, 0.03125, 0])
     both = PredictedInstances(
@@ -246,7 +251,7 @@ def test_label_transfer_tie_is_independent_of_order():
 
 
 def test_evaluate_ignores_unknown_match_only_above_threshold():
-    """Of its 100 points, 40 are on an unknown instance of 40: IoU 0.4, enough at 0.25 but not at 0.5."""
+    """The prediction has an IoU of 0.4 with an unknown instance, which is a match at 0.25 but not at 0.5."""
     truth = scene([(1, 100), (2, 40), (0, 60)], {1: "chair", 2: None})
     result = evaluate(prediction(truth, [(5, 100), (6, 100)], {5: ("chair", 0.5), 6: ("chair", 0.9)}), truth)
     assert result.by_class[0.25]["chair"].ignored == 1
@@ -254,11 +259,12 @@ def test_evaluate_ignores_unknown_match_only_above_threshold():
 
 
 def test_evaluate_three_predictions_match_manual_result():
-    """Equal confidences: 11 with 70 of 120 points (IoU 7/12), 12 with the other 50 (5/12), 13 with the second chair.
+    """Three predictions have equal confidences.
 
+    11 has 70 of the 120 points of a chair (IoU 7/12), 12 has the other 50 (IoU 5/12), and 13 has the second chair.
     At 0.5: right, wrong, right; precision 1, 1/2, 2/3; AP (1 + 2/3) / 2 = 5/6; F1 4/5; PQ (7/12 + 1) / 2.5 = 19/30.
-    From 0.6 on: wrong, wrong, right; AP (1/3) / 2. Over the thresholds: (2 * 5/6 + 8 * 1/6) / 10 = 3/10. At 0.25 the
-    second prediction matches a chair that is already matched, as at 0.5.
+    From 0.6 on: wrong, wrong, right; AP (1/3) / 2. Mean over the thresholds: (2 * 5/6 + 8 * 1/6) / 10 = 3/10.
+    At 0.25, 12 is also wrong, because its chair is already matched.
     """
     truth = scene([(1, 120), (2, 100)], {1: "chair", 2: "chair"})
     claims = {11: ("chair", 0.9), 12: ("chair", 0.9), 13: ("chair", 0.9)}
@@ -270,9 +276,9 @@ def test_evaluate_three_predictions_match_manual_result():
 
 
 def test_evaluate_ranks_equal_confidences_by_id():
-    """The scene has three predictions on two chairs, with ids 11 and 12 exchanged.
+    """Three predictions on two chairs have equal confidences; the one with the smallest id has 50 of 120 points.
 
-    At 0.5: wrong, right, right; AP 2/3. At 0.25 the small piece matches the chair: AP 5/6.
+    At 0.5: wrong, right, right; AP 2/3. At 0.25, the prediction with 50 points matches the chair; AP 5/6.
     """
     truth = scene([(1, 120), (2, 100)], {1: "chair", 2: "chair"})
     claims = {11: ("chair", 0.9), 12: ("chair", 0.9), 13: ("chair", 0.9)}
@@ -282,9 +288,9 @@ def test_evaluate_ranks_equal_confidences_by_id():
 
 
 def test_evaluate_metrics_by_class_match_manual_result():
-    """One of two chairs has IoU 3/4, the other is missed.
+    """One of two chairs is found with IoU 3/4, and the other one is missed.
 
-    A bed with 3/5 ranks after a wrong one. The table is missed.
+    A bed with IoU 3/5 ranks after a false bed. The table is missed.
     """
     truth = scene(
         [(1, 100), (2, 100), (3, 150), (4, 100), (0, 200)], {1: "chair", 2: "chair", 3: "bed", 4: "dining table"}
@@ -320,9 +326,10 @@ def test_evaluate_metrics_by_class_match_manual_result():
 
 
 def test_label_transfers_differ_with_vertex_density():
-    """The prediction has 80 of the chair's 100 points and 20 of the wall; the map has 3 vertices per chair point.
+    """The prediction has 80 of 100 points of a chair and 20 of the wall; the map has 3 vertices per chair point.
 
-    To the truth: 80 / (100 + 20) = 2/3, a match at 4 of the 10 thresholds. To the map: 240 / (300 + 20) = 3/4, at 6.
+    To the truth, the IoU is 80 / (100 + 20) = 2/3, a match at 4 of the 10 thresholds.
+    To the map, the IoU is 240 / (300 + 20) = 3/4, a match at 6 of the 10 thresholds.
     """
     truth = scene([(0, 100), (1, 100)], {1: "chair"})
     once = prediction(truth, [(0, 80), (5, 100), (0, 20)], {5: ("chair", 1.0)})
@@ -342,7 +349,7 @@ def test_label_transfers_differ_with_vertex_density():
 
 @pytest.mark.parametrize("transfer", Transfer)
 def test_label_transfer_distance_limit_is_inclusive(transfer):
-    """The distance is exact in floating point: 5/64 m as the hypotenuse of 3/64 and 4/64."""
+    """The distance of 5/64 m is exact in floating point; it is the hypotenuse of 3/64 m and 4/64 m."""
     truth = scene([(1, 100)], {1: "chair"})
     moved = prediction(truth, [(5, 100)], {5: ("chair", 1.0)})
     moved = replace(moved, points_world=moved.points_world + np.float32([0, 3 / 64, 4 / 64]))
@@ -352,7 +359,7 @@ def test_label_transfer_distance_limit_is_inclusive(transfer):
 
 
 def test_evaluate_judge_outcomes_match_counts():
-    """The predictions are correct, of another class, a duplicate, on nothing, and on an unknown instance."""
+    """The predictions are correct, a duplicate, of another class, on an unknown instance, and on no instance."""
     names = {1: "chair", 2: "bed", 3: "chair", 4: None, 5: "book"}
     truth = scene([(1, 120), (2, 100), (3, 100), (4, 100), (5, 100), (0, 100)], names)
     runs = [(11, 80), (12, 40), (13, 100), (0, 100), (14, 100), (0, 100), (15, 100)]

@@ -1,4 +1,4 @@
-"""Invariants of instance AP in random scenes, and a slow reference."""
+"""Tests of the invariances of instance AP in random scenes, and comparison with a slow reference."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from framework.evaluation.instances import (
 )
 from tests.support.slow_evaluation import slow_metrics
 
-MIN_POINTS = 12  # of a true instance: scenes are small
+MIN_POINTS = 12  # of a true instance; the scenes are small
 CLASSES = ("chair", "bed", "couch")
-CLEAR = 1e-5  # m, margin of every nearest neighbor, larger than rounding
+CLEAR = 1e-5  # margin of nearest-neighbor distances, m; larger than rounding errors
 
 examples = settings(derandomize=True, deadline=None, max_examples=30)
 
 
 @dataclass
 class Drawn:
-    """A truth of slabs along x with other borders in the map, some classes unknown, and the map's points."""
+    """A scene of slabs along x and a map of it with other slab borders; some classes are unknown."""
 
     truth: SceneTruth
     predictions: PredictedInstances
@@ -52,7 +52,7 @@ def scenes(draw: st.DrawFn, unknown: bool = True) -> Drawn:
     seen = points[rng.uniform(size=len(points)) < 0.9]
     seen = np.concatenate([seen, rng.uniform(0, 1.5, (20, 3))]) + rng.normal(0, 0.015, (len(seen) + 20, 3))
     ids = rng.permutation([0, 1, 4, 6, 9, 10, 13])
-    claims = {20: "chair"}  # has no point
+    claims = {20: "chair"}  # a prediction without points
     for k, true_id in zip(ids.tolist(), true_ids.tolist(), strict=True):
         right = rng.uniform() < 0.8
         claims[k] = (class_names.get(true_id) if right else None) or str(rng.choice([*CLASSES, "tv"]))
@@ -75,7 +75,7 @@ def _slabs(points: np.ndarray, ids: np.ndarray, borders: np.ndarray) -> np.ndarr
 
 
 def clear(points: np.ndarray, targets: np.ndarray) -> bool:
-    """Return True where the nearest point and its distance limit do not depend on rounding."""
+    """Return True if the nearest points (m) and the distance limit do not depend on rounding."""
     distances = np.sort(np.linalg.norm(points[None].astype(np.float64) - targets[:, None], axis=2), axis=1)
     return bool(
         (distances[:, 1] - distances[:, 0] > CLEAR).all() and (np.abs(distances[:, 0] - MAX_DISTANCE) > CLEAR).all()
@@ -147,7 +147,7 @@ def test_instance_metrics_are_invariant_to_rigid_motion(transfer: Transfer, draw
 @examples
 @given(drawn=scenes())
 def test_instance_metrics_are_invariant_to_source_density(drawn: Drawn) -> None:
-    """Repeated points change nothing; doubling all counted points changes no fraction."""
+    """Repeated map points change nothing. Doubling all true points changes no fraction."""
     truth, predictions = drawn.truth, drawn.predictions
     again = drawn.rng.choice(len(predictions.points_world), 60)
     denser_map = replace(
@@ -205,8 +205,8 @@ def test_instance_metrics_are_within_bounds(transfer: Transfer, drawn: Drawn) ->
 @pytest.mark.parametrize("transfer", Transfer)
 @examples
 @given(drawn=scenes(unknown=False))
-def test_instance_ap_falls_with_threshold_without_unknown(transfer: Transfer, drawn: Drawn) -> None:
-    """With ignored instances, a loose match of an otherwise ignored prediction can replace another match."""
+def test_instance_ap_decreases_with_threshold_if_all_are_known(transfer: Transfer, drawn: Drawn) -> None:
+    """If instances are ignored, a match at a low threshold can replace another match."""
     found = drawn.evaluate(transfer, min_points=1)
     agnostic = [found.agnostic[threshold].ap for threshold in (0.25, *IOU_THRESHOLDS)]
     by_class = [found.ap(threshold) for threshold in (0.25, *IOU_THRESHOLDS)]

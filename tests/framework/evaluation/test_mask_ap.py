@@ -1,4 +1,4 @@
-"""Tests of mask AP on cases with manual results."""
+"""Tests of mask AP on masks with hand-computed results."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_mask_ap_small_and_other_class_objects_are_ignored() -> None:
 
 
 @pytest.mark.parametrize(("name", "ap50"), [(None, 1.0), ("tv", 0.5)])
-def test_mask_ap_detection_on_unknown_class_is_ignored(name: str | None, ap50: float) -> None:
+def test_mask_ap_only_detections_on_unknown_class_are_ignored(name: str | None, ap50: float) -> None:
     masks = np.array([block(0, 0), block(30, 20)])
     found = detections([block(30, 20), block(0, 0)], (0, 0), (0.9, 0.4))
     result = mask_ap([(masks, ("chair", name), found)], CLASSES)

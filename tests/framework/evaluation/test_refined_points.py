@@ -1,4 +1,4 @@
-"""Tests of the evaluation of refiners, on frames with manual results."""
+"""Tests of the evaluation of refiners, on frames with hand-computed results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SIZE = 10  # px
 
 
 def frame(instance_ids: np.ndarray | None = None, names: dict[int, str | None] | None = None) -> Frame:
-    """Return a wall 2 m away; without names, every object is a chair."""
+    """Return a frame of a wall 2 m away; without `names`, every instance is a chair."""
     truth = None
     if instance_ids is not None:
         truth = FrameTruth(instance_ids, names or {int(i): "chair" for i in np.unique(instance_ids) if i})
@@ -41,7 +41,7 @@ def clusters(*masks: np.ndarray) -> PointClusters:
 
 
 def rows(first: int, last: int) -> np.ndarray:
-    """Return some rows of the image."""
+    """Return a mask (SIZE, SIZE) of the rows from `first` to `last` - 1."""
     mask = np.zeros((SIZE, SIZE), np.bool_)
     mask[first:last] = True
     return mask
@@ -55,7 +55,7 @@ def ids(*objects: np.ndarray) -> np.ndarray:
 
 
 def test_true_fit_uses_object_with_best_iou() -> None:
-    # rows 2 to 7 cover 2 of 4 rows of the first object and 4 of 4 of the second: 20/80 and 40/60
+    # rows 2 to 7 cover 2 of 4 rows of the first object and 4 of 4 of the second: IoU 20/80 and 40/60
     seen = frame(ids(rows(0, 4), rows(4, 8)))
     fit = true_fit(clusters(rows(2, 8), rows(9, 10), rows(0, 0)), seen, seen.truth)  # type: ignore[arg-type]
     np.testing.assert_allclose(fit.iou, [40 / 60, 0, 0])
@@ -78,7 +78,9 @@ def test_refinement_clusters_of_unknown_class_are_not_judged() -> None:
     np.testing.assert_array_equal(refined.fit_before.unknown, [True, False])
     np.testing.assert_allclose(refined.fit_before.iou, [10 / 80, 40 / 50])  # with the chair
     np.testing.assert_array_equal(refined.judged_before, [False, True])
-    np.testing.assert_array_equal(refined.judged_after, [False, True])  # the first still does not, though on the chair
+    np.testing.assert_array_equal(
+        refined.judged_after, [False, True]
+    )  # the first is not judged, although it is now on the chair
 
 
 def test_refinement_without_truth_is_not_judged() -> None:
@@ -114,7 +116,7 @@ def test_refinement_assigns_parts_by_largest_overlap() -> None:
 
 @dataclass
 class Counting(ClusterRefiner):
-    """Removes every second point, and counts its calls."""
+    """Refiner that removes every second point and counts its calls."""
 
     def __post_init__(self) -> None:
         self.calls = 0
@@ -144,4 +146,4 @@ def test_refinement_times_refiner_on_lifted_detections(truth: bool) -> None:
     assert len(refined.after.cluster) == -(-len(refined.before.cluster) // 2)
     depth = refined.before.points_world[:, 2]
     read = seen.depth[refined.before.pixels[:, 1], refined.before.pixels[:, 0]]
-    assert np.array_equal(depth, read) is not truth  # without a pose the camera's own frame
+    assert np.array_equal(depth, read) is not truth  # without a pose, the points are in the camera frame

@@ -1,4 +1,4 @@
-"""Tests of the alignment of a ground truth to maps in known worlds."""
+"""Tests of the alignment of ground truth to maps with known world frames."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def truth(given: bool, poses: np.ndarray) -> SceneTruth:
 
 @pytest.mark.parametrize("turns_only", [False, True])
 def test_align_returns_motion_between_trajectories(turns_only: bool) -> None:
-    """This includes a camera that rotates in place, whose positions do not determine the rotation."""
+    """If the camera only rotates in place, its positions do not determine the rotation."""
     poses = path(turns_only)
     np.testing.assert_allclose(align(poses, T_MAP_TRUTH @ poses), T_MAP_TRUTH, atol=1e-12)
     np.testing.assert_allclose(align(poses[:1], T_MAP_TRUTH @ poses[:1]), T_MAP_TRUTH, atol=1e-12)
 
 
 def test_align_is_least_squares_solution() -> None:
-    """No nearby motion reduces the distances of positions and axis points."""
+    """No nearby transform has a smaller sum of squared distances of positions and axis points."""
     P, rng = path(), np.random.default_rng(3)
     Q = np.array([T_MAP_TRUTH @ pose @ exp_se3(rng.normal(0, 0.05, 6)) for pose in P])
     corners = np.array([[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1]], np.float64)

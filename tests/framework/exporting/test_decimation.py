@@ -13,7 +13,7 @@ from framework.exporting.decimation import clustered, decimated, with_finer_obje
 
 
 def wavy_plane(n: int = 120) -> InstanceMesh:
-    """Return a plane of 1 m by 1 m, half red and half blue; a square in the middle is an object."""
+    """Return a wavy surface of 1 m by 1 m, half red and half blue; a square in the middle is an object."""
     x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
     vertices = np.stack([x, y, 0.02 * np.sin(12 * x) * np.cos(9 * y)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
@@ -30,7 +30,7 @@ def areas(vertices: np.ndarray, triangles: Int32) -> np.ndarray:
     return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
-@pytest.mark.parametrize(("n", "most"), [(120, 8000), (120, 300), (420, 9000)])  # the last is clustered before
+@pytest.mark.parametrize(("n", "most"), [(120, 8000), (120, 300), (420, 9000)])  # the last mesh is clustered first
 def test_decimation_keeps_surface_colors_and_labels(n: int, most: int) -> None:
     mesh = wavy_plane(n)
     light = with_finer_objects(mesh, most)
@@ -82,7 +82,7 @@ def test_decimation_clustered_reduces_soup_to_size_limit() -> None:
 
 
 def test_decimation_of_flat_surface_keeps_color_pattern() -> None:
-    """The plane has a checkerboard: for geometry alone two triangles suffice, with 0.85 of the area correct."""
+    """The plane is a checkerboard. Decimation by geometry alone would color only 0.85 of the area correctly."""
     mesh = wavy_plane(101)
     x, y, _ = mesh.vertices.T
     white = (np.floor(5 * x) + np.floor(5 * y)) % 2 == 0
@@ -98,7 +98,7 @@ def test_decimation_of_flat_surface_keeps_color_pattern() -> None:
     u, v = 5 * centers[:, :2].T
     true = (np.floor(u) + np.floor(v)) % 2 == 0
     assert sizes[shown == true].sum() > 0.93
-    assert (light.vertices[:, 2] == 0).all(), "the relief is gone"
+    assert (light.vertices[:, 2] == 0).all(), "expected a flat surface"
 
 
 @pytest.mark.parametrize("asked", [1, 4, 12])

@@ -34,7 +34,7 @@ TABLE_SIZE, CUBE_SIZE = (1.2, 0.8, 0.75), (0.2, 0.2, 0.2)
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run in a world with y up and its origin above the floor."""
+    """Return a run whose world frame has y up and its origin above the floor."""
     return TURNED.write(tmp_path_factory.mktemp("runs") / "turned")
 
 
@@ -154,7 +154,7 @@ def test_glb_colors_are_linear_with_16_bits(room: UprightRoom) -> None:
     np.testing.assert_allclose(color, (0.715694, 0.012983, 0.012983, 1), atol=2e-5)
     every = linear(np.arange(256, dtype=np.uint8))
     assert (every[0], every[255]) == (0, 1)
-    assert len(np.unique(np.rint(every * 65535))) == 256  # none is lost
+    assert len(np.unique(np.rint(every * 65535))) == 256  # all are distinct
 
 
 @pytest.mark.parametrize("coloring", [Coloring.INSTANCE, Coloring.CLASS])
@@ -169,7 +169,7 @@ def test_export_colors_one_object_uniformly(coloring: Coloring, tmp_path: Path) 
     colors = [np.unique(mesh.colors[mesh.instance_ids == key], axis=0) for key in (0, 1, 2)]
     assert [len(each) for each in colors] == [1, 1, 1]
     assert (colors[1] == colors[2]).all() == (coloring is Coloring.CLASS)
-    assert "extensionsUsed" not in header((tmp_path / "scene.glb").read_bytes())  # lit
+    assert "extensionsUsed" not in header((tmp_path / "scene.glb").read_bytes())  # the materials are lit
     assert sorted(path.stem for path in (tmp_path / "objects").glob("*.glb")) == ["cube_1", "cube_2"]
 
 
@@ -250,7 +250,7 @@ def test_convex_hull_faces_outward() -> None:
 
 
 def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom) -> None:
-    """Triangles without area have unit normals, which Khronos' validator requires."""
+    """The Khronos glTF validator requires unit normals for triangles without area, too."""
     mesh = replace(room.mesh, vertices=room.mesh.vertices.copy())
     own = room.objects[1].vertices
     mesh.vertices[own[:50]] = mesh.vertices[own[0]]
@@ -264,7 +264,7 @@ def test_glb_normals_of_degenerate_triangles_have_unit_length(room: UprightRoom)
 
 
 def test_export_small_fragments_belong_to_room_not_object(tmp_path: Path) -> None:
-    """Labels leak at depth edges; a table leg is larger than such fragments."""
+    """Wrong labels at depth edges are small fragments; a table leg is larger."""
     table = [(0.8, 1.0, 0.7, 2.0, 1.8, 0.75), (0.8, 1.0, 0, 0.85, 1.05, 0.65)]
     speck = (3.5, 2.5, 0.9, 3.51, 2.51, 0.91)
     run = ExportedRoom(things={"dining table": [*table, speck]}).write(tmp_path / "run")
@@ -333,7 +333,7 @@ def test_export_escapes_invalid_unicode_class_names(tmp_path: Path) -> None:
 
 
 def test_exported_instance_colors_match_overview(tmp_path: Path) -> None:
-    """The color is the same in its own file and if another object is unlikely or not exported."""
+    """An object has the same color in each file, also if another object is unlikely or not exported."""
     run = ExportedRoom().write(tmp_path / "run")
     entries = json.loads((run / "instances.json").read_text())
     entries[0]["confidence"] = 0.1

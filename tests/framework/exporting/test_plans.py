@@ -1,4 +1,4 @@
-"""Tests of floor plans, ROS maps and scene graphs on exact rooms."""
+"""Tests of floor plans, ROS maps and scene graphs of rooms with exact geometry."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.scenes.exported_room import CUBE, TABLE, Y_UP, Block, Exporte
 
 SCHEMA = json.loads((Path(scene_graph.__file__).parent / "scene_graph.schema.json").read_text())
 RESOLUTION = 0.1
-OFF = 0.05  # m, by which the room is moved along x and y, so that no wall stands between two cells
+OFF = 0.05  # m, shift of the room along x and y, so that no wall is on a cell border
 
 
 def stored(tmp_path: Path, **scene: object) -> UprightRoom:
@@ -53,7 +53,7 @@ def high(room: UprightRoom) -> Plan:
 
 
 def at(found: Plan, x: float, y: float) -> tuple[bool, bool]:
-    """Return if a position is occupied, and if it is free."""
+    """Return whether the position x, y (m) is occupied, and whether it is free."""
     [[row, column]] = found.cells(np.array([[x + OFF, y + OFF]]))
     return bool(found.occupied[row, column]), bool(found.free[row, column])
 
@@ -92,7 +92,7 @@ def test_plan_cells_are_occupied_at_object_footprints(low: Plan, high: Plan) -> 
     assert all(at(low, *leg)[0] for leg in legs)
     assert 4 <= low.occupied[inside].sum() <= 16  # a leg of 5 cm is in one to four cells
     table = high.occupied[inside].sum() * RESOLUTION**2
-    assert 1.2 * 0.8 <= table <= 1.4 * 1.0  # and cells that its edges touch
+    assert 1.2 * 0.8 <= table <= 1.4 * 1.0  # including the cells at its edges
     assert low.occupied[1, 1:-1].all()
     assert not low.occupied[0].any()
 
@@ -132,7 +132,13 @@ def test_plan_looked_through_excludes_occluded_points(room: UprightRoom) -> None
     pose[:3, 3] = (0.4, 1.35, 0.85)
     places = np.array([(0.8, 1.35, 0.85), (1.15, 1.35, 0.85), (1.35, 1.35, 0.85), (1.8, 1.35, 0.85), (0.2, 1.35, 0.85)])
     seen = looked_through(replace(room, poses=pose[None]), places)
-    assert seen.tolist() == [True, True, False, False, False]  # before the cube; in it, behind it, behind the camera
+    assert seen.tolist() == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]  # two in front of the cube; in it, behind it, behind the camera
 
 
 def test_ros_map_matches_map_server_thresholds(run: Path, low: Plan, tmp_path: Path) -> None:
@@ -152,7 +158,7 @@ def test_ros_map_matches_map_server_thresholds(run: Path, low: Plan, tmp_path: P
     }
     assert (p[gray == OCCUPIED] > message["occupied_thresh"]).all()
     assert (p[gray == UNKNOWN] < message["occupied_thresh"]).all()
-    # the pixel of a leg, by the origin of the lower left corner
+    # the pixel of a table leg, from the origin at the lower left corner
     x, y, turn = message["origin"]
     assert turn == 0
     column, row = int((0.825 + OFF - x) / message["resolution"]), int((1.025 + OFF - y) / message["resolution"])
@@ -182,7 +188,7 @@ def test_floor_plan_image_is_deterministic_and_not_blank(run: Path, tmp_path: Pa
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     image = np.asarray(Image.open(tmp_path / "a" / "floor_plan.png").convert("RGB"))
     assert image.shape[1] > 1200
-    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50  # tones, objects, letters
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50  # shades, objects and text
 
 
 @pytest.mark.filterwarnings("error")
@@ -219,7 +225,7 @@ def test_relations_cube_is_on_table_and_table_on_floor(room: UprightRoom, low: P
     assert expected(without, 1) == expected(without, 3) == []
 
 
-def test_relations_stacked_object_is_on_upper_object(tmp_path: Path) -> None:
+def test_relations_stacked_object_is_on_object_below(tmp_path: Path) -> None:
     """The top of the lower object is hidden and missing in the mesh."""
     lower, upper = (1.2, 1.2, 0.75, 1.4, 1.4, 0.85), (1.2, 1.2, 0.85, 1.4, 1.4, 0.95)
     room = stored(tmp_path, things={"dining table": TABLE, "book": [lower], "other": [upper]})
@@ -278,7 +284,7 @@ ARMS: list[Block] = [(1.0, 1.0, 0.4, 1.1, 1.7, 0.7), (1.9, 1.0, 0.4, 2.0, 1.7, 0
 
 @pytest.mark.parametrize("seat", [SEAT, SEAT + ARMS])
 def test_relations_pillow_is_on_couch(seat: list[Block], tmp_path: Path) -> None:
-    """The top of the couch is its back instead of its seat."""
+    """The highest part of the couch is its back, not its seat."""
     things = {"couch": seat, "pillow": [(1.3, 1.3, 0.4, 1.7, 1.6, 0.6)]}
     assert expected(relations(stored(tmp_path, things=things), None), 2) == [("on", 1)]
 
@@ -305,7 +311,7 @@ def test_scene_graph_matches_schema(run: Path, tmp_path: Path) -> None:
 
 
 def divided(door: float) -> list[Block]:
-    """Return two rooms of 4 x 3 m, as seen from inside, with a door of some width between them."""
+    """Return a wall with a door of this width, m, which divides the floor into two rooms of 4 x 3 m."""
     low, high = 1.5 - door / 2, 1.5 + door / 2
     return [(4.0, 0.0, 0.0, 4.1, low, 2.5), (4.0, high, 0.0, 4.1, 3.0, 2.5)]
 

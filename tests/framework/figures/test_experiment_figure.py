@@ -137,7 +137,7 @@ def test_map_figure_omits_damaged_maps_and_missing_truth(maps: Path, caplog: pyt
     message = [record.getMessage() for record in caplog.records]
     assert len(message) == 2
     assert "mesh.ply" in message[0]
-    assert message[1].endswith("the scene is gone")
+    assert message[1].endswith("expected an existing scene, got none")
 
 
 @pytest.mark.parametrize("vertices", [[1538], [1538, 7]])

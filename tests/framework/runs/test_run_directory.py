@@ -194,7 +194,7 @@ def test_record_of_stopped_run_has_partial_metrics(record: RunRecord, room: Corn
     record.write(room, result)
     assert not (record.directory / "metrics.json").exists()
     metrics = metrics_of(record, "metrics.partial.json")
-    assert metrics["partial"] == "the map holds 2 frames: raise fuser.capacity"
+    assert metrics["partial"] == "fuser.capacity: expected at most 2 frames, got more; increase fuser.capacity"
     assert metrics["frames"] == 3
 
 

@@ -100,7 +100,7 @@ def test_live_frames_raise_video_error_after_last_frame() -> None:
     with LiveFrames(video, lambda: False) as stream:
         assert isinstance(taken(stream), Frame)
         for _ in range(2):
-            with pytest.raises(DataError, match="the cable is out"):
+            with pytest.raises(DataError, match="expected a connected camera, got none"):
                 stream.take()
     assert video.closed
 
@@ -226,7 +226,7 @@ def test_live_video_failure_keeps_partial_map() -> None:
     result = pipeline().run_to_any_end(LiveRoom(fails_after=3))
     assert isinstance(result.stopped_by, DataError)
     assert result.frames == 3
-    with pytest.raises(DataError, match="the cable is out"):
+    with pytest.raises(DataError, match="expected a connected camera, got none"):
         pipeline().run_to_any_end(LiveRoom(fails_after=0))
 
 

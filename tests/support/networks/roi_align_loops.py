@@ -1,4 +1,4 @@
-"""RoIAlign sample by sample, as in Detectron and torchvision; a slow reference."""
+"""Slow reference for RoIAlign, sample by sample as in Detectron and torchvision."""
 
 import math
 
@@ -19,7 +19,7 @@ def bilinear(plane, y, x):
 
 
 def roi_align_loops(plane, boxes, bins, scale, ratio, half_pixel):
-    """Return (N, C, bins, bins) of a plane (C, H, W)."""
+    """Return the pooled values (N, C, bins, bins) of a plane (C, H, W) in boxes (N, 4), px."""
     pooled = np.zeros((len(boxes), plane.shape[0], bins, bins))
     offset = 0.5 if half_pixel else 0.0
     for n, box in enumerate(boxes):

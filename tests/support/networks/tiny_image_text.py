@@ -31,7 +31,7 @@ TEXT = {
 
 
 def write_image_text(folder: Path, kind: str = "siglip") -> Path:
-    """Write a model of this `model_type` with its tokenizer and preprocessing, like save_pretrained."""
+    """Write a model with this `model_type`, its tokenizer and its preprocessing, as save_pretrained does."""
     import transformers
 
     torch.manual_seed(5)
@@ -54,7 +54,7 @@ def write_image_text(folder: Path, kind: str = "siglip") -> Path:
 
 
 def write_tokenizer(folder: Path) -> None:
-    """Write a tokenizer of WORDS."""
+    """Write a tokenizer with the vocabulary WORDS."""
     import transformers
     from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors
 

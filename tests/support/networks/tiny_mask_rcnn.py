@@ -1,4 +1,4 @@
-"""A tiny random Mask R-CNN that runs in milliseconds; its results are meaningless, its computation is complete."""
+"""A tiny Mask R-CNN with random weights, which runs all operations in milliseconds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TINY = Architecture(
 
 
 def tiny_network(architecture: Architecture = TINY, seed: int = 0) -> MaskRCNN:
-    """Return the network with random normalization statistics, so that no operation is neutral."""
+    """Return the network with random normalization statistics, so that every operation has an effect."""
     generator = torch.Generator().manual_seed(seed)
     network = MaskRCNN(architecture).eval()
     for name, tensor in network.state_dict().items():
@@ -37,7 +37,7 @@ def tiny_network(architecture: Architecture = TINY, seed: int = 0) -> MaskRCNN:
 
 
 def tiny_network_file(folder: Path) -> Path:
-    """Write the network to a file in `folder`."""
+    """Write the network to a file in `folder`; return its path."""
     path = folder / "tiny_mask_rcnn.safetensors"
     save_network(tiny_network(), path, {"data": "none: the weights are random"})
     return path

@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 
 def save(path: Path, nodes: list[Any], inputs: list[Any], outputs: list[Any], constants: list[Any]) -> Path:
-    """Write a network of these nodes to `path`."""
+    """Write a network of these nodes to `path`; return the path."""
     graph = helper.make_graph(nodes, "tiny", inputs, outputs, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
     onnx.checker.check_model(model)
@@ -21,7 +21,7 @@ def save(path: Path, nodes: list[Any], inputs: list[Any], outputs: list[Any], co
 
 
 def constant_network(path: Path, shape: tuple[int | str, ...], outputs: Mapping[str, np.ndarray[Any, Any]]) -> Path:
-    """Write a network of an image of `shape` with constant `outputs`; the image's maximum times 0 is added."""
+    """Write a network with an image input of `shape` and constant `outputs`, to which 0 times the image is added."""
     nodes = [
         helper.make_node("ReduceMax", ["images"], ["largest"], keepdims=0),
         helper.make_node("Mul", ["largest", "zero"], ["nothing"]),
@@ -36,7 +36,7 @@ def constant_network(path: Path, shape: tuple[int | str, ...], outputs: Mapping[
 
 
 def doubling_network(path: Path, shape: tuple[int | str, ...], element: int = TensorProto.FLOAT) -> Path:
-    """Write a network that returns twice the image, in float."""
+    """Write a network that returns twice the image as float32."""
     nodes = [
         helper.make_node("Cast", ["images"], ["real"], to=TensorProto.FLOAT),
         helper.make_node("Mul", ["real", "two"], ["doubled"]),

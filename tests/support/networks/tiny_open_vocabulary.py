@@ -55,7 +55,7 @@ def write_owlv2(folder: Path) -> Path:
 
 
 def write_sam(folder: Path, kind: str) -> Path:
-    """Write a SAM or a SAM 2."""
+    """Write a SAM model if `kind` is "sam", and a SAM 2 model otherwise."""
     import transformers
 
     torch.manual_seed(2)

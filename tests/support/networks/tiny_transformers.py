@@ -114,7 +114,7 @@ PREPROCESSING: dict[str, dict[str, Any]] = {
 
 
 def write_network(folder: Path, kind: str, labels: Mapping[int, str] | None = None) -> Path:
-    """Write a network of a family, whose classes and masks differ by query; the classes are LABELS by default."""
+    """Write a network of a family, whose classes and masks differ by query. By default, the classes are LABELS."""
     import transformers
 
     name, parameters = MODELS[kind]

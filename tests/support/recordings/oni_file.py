@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-DEPTH, COLOR = 2, 3  # the format's types of nodes
+DEPTH, COLOR = 2, 3  # node types of the format
 NAMES = {DEPTH: "Depth", COLOR: "Image"}
 DEPTH_1_MM, RGB888, YUV422 = 100, 200, 201
 GRAY16, RGB24 = 4, 1  # pixel formats of OpenNI 1
@@ -25,7 +25,7 @@ def jpeg(image):
 
 
 def with_table(image):
-    """Return OpenNI's 16zT encoding without short forms: the values, the index of the first, 0xff and each index."""
+    """Return the 16zT encoding of OpenNI without short forms: values, first index, then 0xff and each other index."""
     values, places = np.unique(image, return_inverse=True)
     table = struct.pack("<H", len(values)) + values.astype("<u2").tobytes()
     first, *others = places.ravel()
@@ -37,13 +37,13 @@ CODECS = {b"NONE": uncompressed, b"JPEG": jpeg, b"16zT": with_table}
 
 @dataclass
 class Node:
-    """A stream of images: (H, W) uint16 of depth or (H, W, 3) uint8 RGB."""
+    """A stream of depth images (H, W), uint16, or of color images (H, W, 3), uint8 RGB."""
 
     type: int
     images: list[np.ndarray]
-    times: list[int]  # us
+    times: list[int]  # time of each image, us
     codec: bytes = b"NONE"
-    pixel_format: int | None = None  # OpenNI 2's; None = as OpenNI 1 writes it
+    pixel_format: int | None = None  # pixel format of OpenNI 2; None = omitted, as by OpenNI 1
     positions: list[int] = field(default_factory=list)
 
 
@@ -51,7 +51,7 @@ class Node:
 class OniFile:
     nodes: list[Node]
     wide: bool = True  # 64-bit positions since version 1.0.1.0; otherwise 1.0.0.5 without seek tables
-    end_node: int = 0  # in the end record; OpenNI 1 writes OPENNI_1_END_NODE
+    end_node: int = 0  # node in the end record; OpenNI 1 writes OPENNI_1_END_NODE
 
     def write(self, path: Path) -> Path:
         content = self._content([0] * len(self.nodes))

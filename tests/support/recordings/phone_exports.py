@@ -18,8 +18,8 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.sensors.noise_models import SensorKind
 from tests.support.scenes.corner_room import look, pose_at
 
-LIDAR = (192, 256)  # (h, w) px of ARKit's depth
-ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # its camera has y up and z backward
+LIDAR = (192, 256)  # (h, w) of ARKit depth images, px
+ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # ARKit's camera axes: y up and z backward
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class PhoneFrame:
     """One frame of a phone."""
 
     timestamp: float  # s
-    camera: Camera  # of color
+    camera: Camera  # camera of the color image
     color: UInt8  # (H, W, 3) RGB
     depth_mm: UInt16  # (h, w)
     confidence: UInt8  # (h, w), 0 to 2
-    T_world_camera: Float64  # (4, 4), in our axes
+    T_world_camera: Float64  # (4, 4), in the camera axes of this project
 
     @property
     def T_world_arkit(self) -> Float64:
@@ -39,7 +39,7 @@ class PhoneFrame:
 
 
 def seen_by_phone(frames: Sequence[Frame], shape: tuple[int, int] = LIDAR) -> Iterator[PhoneFrame]:
-    """Return frames with depth reduced to a phone's, and low confidence next to depth steps."""
+    """Yield frames with depth at the resolution of a phone, and low confidence next to depth steps."""
     for frame in frames:
         assert frame.T_world_camera is not None
         v, u = (
@@ -103,13 +103,13 @@ def write_stray_scanner(folder: Path, frames: Sequence[PhoneFrame], own_intrinsi
 
 
 ROOM = Camera(320, 240, 300.0, 301.0, 157.0, 118.0)
-T_COLOR_DEPTH = np.eye(4)  # as of a RealSense D435i
+T_COLOR_DEPTH = np.eye(4)  # values of a RealSense D435i
 T_COLOR_DEPTH[:3, :3] = Rotation.from_quat([0.001509, 0.001900, 0.006073, 0.999979]).as_matrix()
 T_COLOR_DEPTH[:3, 3] = 0.015014, 0.000251, 0.000425
 
 
 def room_frames(count: int = 4) -> list[PhoneFrame]:
-    """Return a walk in a small room with exact depth; the focal length changes from frame to frame."""
+    """Return frames of a small room with exact depth and a focal length that changes from frame to frame."""
     frames = []
     for k in range(count):
         camera = replace(ROOM, fx=ROOM.fx - 2 * k, fy=ROOM.fy - 2 * k)
@@ -135,7 +135,7 @@ def check_imported(
         assert seen.timestamp == pytest.approx(frame.timestamp, abs=1e-6)
         np.testing.assert_allclose(seen.T_world_camera, frame.T_world_camera, atol=1e-6)
         if tells_up:
-            np.testing.assert_allclose(frame.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)  # ARKit's
+            np.testing.assert_allclose(frame.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)  # y is up in ARKit
         depth, _, color, ids = look(sequence.camera, frame.T_world_camera)
         rows = 240 * scale * np.array([0, 10, 20]) / 60
         unsure = np.zeros(depth.shape, bool)
@@ -151,7 +151,7 @@ def check_imported(
 
 
 def record3d_metadata(frames: Sequence[PhoneFrame], own_intrinsics: bool = True) -> dict[str, object]:
-    """Return metadata.json as in a real export; newer versions have intrinsics of each frame."""
+    """Return the content of metadata.json, as in a real export; newer versions have per-frame intrinsics."""
     (dh, dw), camera = frames[0].depth_mm.shape, frames[0].camera
     poses = [[*Rotation.from_matrix(T[:3, :3]).as_quat(), *T[:3, 3]] for T in (frame.T_world_arkit for frame in frames)]
     metadata = {
@@ -178,7 +178,7 @@ def write_record3d_exr(folder: Path, frames: Sequence[PhoneFrame]) -> None:
     for k, frame in enumerate(frames):
         write_jpeg(folder / f"rgb/{k}.jpg", frame.color)
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        depth = np.ascontiguousarray(frame.depth_mm / 1000, np.float16)  # OpenEXR writes memory as it lies
+        depth = np.ascontiguousarray(frame.depth_mm / 1000, np.float16)  # OpenEXR requires contiguous memory
         OpenEXR.File(header, {"R": depth}).write(str(folder / f"depth/{k}.exr"))
 
 
@@ -196,7 +196,7 @@ def write_r3d(path: Path, frames: Sequence[PhoneFrame], confident: bool = True) 
 
 
 def write_scanner_app(folder: Path, frames: Sequence[PhoneFrame]) -> None:
-    """Write "All Data" of a low resolution scan: every frame has depth and a pose, some have color."""
+    """Write the "All Data" export of a low-resolution scan. Every frame has depth, a pose and color."""
     for k, frame in enumerate(frames):
         write_png(folder / f"depth_{k:05d}.png", frame.depth_mm)
         write_png(folder / f"conf_{k:05d}.png", frame.confidence)

@@ -1,4 +1,4 @@
-"""Functions that the tests of several readers share."""
+"""Functions shared by the tests of several dataset readers."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ def write_color(path: Path, rgb: tuple[int, int, int], shape: tuple[int, int] = 
 
 
 def write_depth(path: Path, value: int | np.ndarray, shape: tuple[int, int] = (480, 640)) -> None:
-    """Write a uint16 image of one value or of the given ones."""
+    """Write a uint16 image of one value or of the given values (H, W)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), np.broadcast_to(value, shape).astype(np.uint16))
 
 
 def mapped(sequence: RGBDSequence) -> tuple[RunResult, np.ndarray]:
-    """Run all frames with true poses; return the result and the mapped points (P, 3) in the world."""
+    """Map all frames with ground-truth poses; return the result and the points (P, 3), m, in the world frame."""
     fuser = GridFuser()
     result = Pipeline(NoDetections(), GroundTruth(), KeepAll(), fuser, prefetch=0).run(sequence)
     return result, fuser.scene.mesh().vertices
 
 
 def opened(option: str, *overrides: str) -> RGBDSequence:
-    """Open the recording like `python -m framework dataset=OPTION ...`."""
+    """Open the recording as `python -m framework dataset=OPTION ...` does."""
     sequence: RGBDSequence = registered.built("dataset", option, *overrides)
     return sequence
 
@@ -52,4 +52,4 @@ def fault_of(sequence: RGBDSequence, bad: int) -> str:
     except FrameError as error:
         assert "\n" not in str(error)
         return str(error)
-    raise AssertionError(f"frame {bad} has no fault")
+    raise AssertionError(f"frame {bad}: expected a FrameError, got none")

@@ -1,4 +1,4 @@
-"""A network file converted to the layouts of other exporters by graph changes."""
+"""Conversion of a network file to the output layouts of other exporters."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-MOST = 300  # detections of networks with internal suppression
+MOST = 300  # maximum detections of networks with internal suppression
 
 
 class Surgery:
-    """Appends nodes to both outputs of a YOLO segmentation network; boxes are center and size in px."""
+    """Editor that appends nodes to both outputs of a YOLO segmentation network; boxes are center and size, px."""
 
     def __init__(self, source: Path) -> None:
         self.model = onnx.load(source)
@@ -32,11 +32,11 @@ class Surgery:
         return made[0] if outputs == 1 else made
 
     def columns_of(self, start: int, stop: int) -> str:
-        """Return some rows of the table (1, columns, K)."""
+        """Add a node that slices the table (1, columns, K) from `start` to `stop` - 1; return its output."""
         return self.add("Slice", self.table, np.array([start]), np.array([stop]), np.array([1]))
 
     def save(self, path: Path) -> Path:
-        """Save with the current table and prototypes as outputs, of any shape."""
+        """Save the network with the current table and prototypes as outputs of dynamic shape."""
         del self.graph.output[:]
         for name, axes in ((self.table, 3), (self.prototypes, 4)):
             shape = [f"{name}_{k}" for k in range(axes)]
@@ -90,14 +90,16 @@ def best_rows(net: Surgery) -> None:
 
 
 def suppressed(net: Surgery) -> None:
-    """Suppress within the best class with the detector's threshold; pad with rows of zeros up to MOST."""
+    """Suppress duplicates within the best class at the detector's threshold; pad with zero rows up to MOST."""
     corners(net)
     scores = net.columns_of(4, net.columns - 32)
     best = net.add("ReduceMax", scores, axes=[1], keepdims=1)
     own = net.add("Cast", net.add("Equal", scores, best), to=TensorProto.FLOAT)
     boxes = net.add("Transpose", net.columns_of(0, 4), perm=[0, 2, 1])
     limits = np.array([MOST]), np.array([0.45], np.float32), np.array([0.1], np.float32)
-    chosen = net.add("NonMaxSuppression", boxes, net.add("Mul", scores, own), *limits)  # (n, 3), the last is the row
+    chosen = net.add(
+        "NonMaxSuppression", boxes, net.add("Mul", scores, own), *limits
+    )  # (n, 3), the last column is the row
     _finish(net, scores, net.add("Gather", chosen, np.array(2), axis=1))
     padded = net.add("Concat", net.table, np.zeros((1, MOST, 38), np.float32), axis=1)
     net.table = net.add("Slice", padded, np.array([0]), np.array([MOST]), np.array([1]))
@@ -114,7 +116,7 @@ def _finish(net: Surgery, scores: str, index: str) -> None:
 
 
 def unit_rows(net: Surgery) -> None:
-    """Convert the boxes of the detections to units of the image."""
+    """Convert the boxes of the detections from px to fractions of the image size."""
     scale = np.ones((1, 1, 38), np.float32)
     scale[..., :4] = 1 / net.side
     net.table = net.add("Mul", net.table, scale)

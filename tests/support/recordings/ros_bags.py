@@ -24,19 +24,19 @@ from tests.support.scenes.corner_room import look, pose_at
 START = 1_600_000_000  # s
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 COUNT = 4
-DEPTH_LATE = 0.004  # s, of each depth image after its color image
+DEPTH_LATE = 0.004  # time from each color image to its depth image, s
 
 
 @dataclass
 class BagWriter:
-    """Collects messages and writes them as one kind of bag."""
+    """Collector of messages that writes them as a ROS 1 or ROS 2 bag."""
 
     ros1: bool = False
-    messages: list[tuple[float, str, str, Any]] = field(default_factory=list)  # s, topic, type, message
+    messages: list[tuple[float, str, str, Any]] = field(default_factory=list)  # (time in s, topic, type, message)
 
     def __post_init__(self) -> None:
         self.types = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
-        if self.ros1:  # tf2_msgs is in no distribution's store
+        if self.ros1:  # the stores of all distributions lack tf2_msgs
             self.types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
 
     def made(self, name: str, **fields: Any) -> Any:
@@ -135,7 +135,7 @@ class BagWriter:
         self.add(START, topic, "geometry_msgs/msg/Transform", **self.transform(T))
 
     def add_static(self, *transforms: tuple[str, str, Float64]) -> None:
-        """Add parent, child and T_parent_child of each transform."""
+        """Add static transforms, each given as (parent, child, T_parent_child)."""
         stamped = [
             self.made(
                 "geometry_msgs/msg/TransformStamped",
@@ -163,7 +163,7 @@ class BagWriter:
         )
 
     def write(self, path: Path) -> Path:
-        """Write a ROS 1 bag, or a ROS 2 folder with .mcap or .db3 by its name."""
+        """Write a ROS 1 bag or a ROS 2 folder, with an .mcap file if `path` contains "mcap", else a .db3 file."""
         if self.ros1:
             writer: Any = Writer1(path)
             serialize: Callable[..., Any] = self.types.serialize_ros1
@@ -185,7 +185,7 @@ def time_of(k: int) -> float:
 
 
 def seen(k: int, camera: Camera = ROOM) -> tuple[np.ndarray, np.ndarray]:
-    """Return color and exact depth (m) of frame k."""
+    """Return the color (H, W, 3) and exact depth (H, W), m, of frame k."""
     depth, _, color, _ = look(camera, pose_at(k))
     return color, depth
 
@@ -195,8 +195,8 @@ def png(image: np.ndarray) -> bytes:
 
 
 def compressed_depth(depth: np.ndarray) -> tuple[bytes, str]:
-    """Encode floats like compressed_depth_image_transport: inverse depth, quantized."""
-    a, b = 100.0 * 101.0, 1.0 - 100.0 * 101.0 / 10.0  # its formula, for a quantization of 100 and a range of 10 m
+    """Return depth (m) as quantized inverse depth of compressed_depth_image_transport, and the format name."""
+    a, b = 100.0 * 101.0, 1.0 - 100.0 * 101.0 / 10.0  # for a quantization of 100 and a range of 10 m
     stored = np.where(depth > 0, np.rint(a / np.where(depth > 0, depth, 1) + b), 0).astype(np.uint16)
     return struct.pack("<iff", 0, a, b) + png(stored), "32FC1; compressedDepth png"
 
@@ -216,7 +216,7 @@ def add_camera_of_ros(bag: BagWriter, depth: str = "aligned_depth_to_color") -> 
 
 
 def add_realsense(bag: BagWriter, depth_camera: Camera, unit: float = 0.0001) -> None:
-    """Add topics of RealSense's own recorder, with depth of the depth camera."""
+    """Add topics of the RealSense recorder, with depth in `unit` (m) from the view of the depth camera."""
     color_topic, depth_topic = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
     bag.add_camera(START, f"{color_topic}/info/camera_info", ROOM)
     bag.add_camera(START, f"{depth_topic}/info/camera_info", depth_camera, "Brown Conrady")
@@ -231,6 +231,6 @@ def add_realsense(bag: BagWriter, depth_camera: Camera, unit: float = 0.0001) ->
         bag.add_image(time_of(k) + DEPTH_LATE, f"{depth_topic}/image/data", stored, "mono16")
 
 
-T_CAMERA_ROS = np.eye(4)  # a camera whose x is forward and z up
+T_CAMERA_ROS = np.eye(4)  # from camera axes with x forward and z up
 T_CAMERA_ROS[:3, :3] = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 assert np.allclose(inverse(T_CAMERA_ROS)[:3, :3] @ [0, 0, 1], [1, 0, 0])

@@ -1,4 +1,4 @@
-"""ScanNet's files as published: `.sens` files written field by field, and folders of its SensReader."""
+"""ScanNet files as published: `.sens` files written field by field, and folders exported by SensReader."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Shot:
 
 
 def shots(count: int = 3) -> list[Shot]:
-    """Return smooth colors, slanted depth, and a camera that moves by 5 cm per frame along x."""
+    """Return frames with smooth colors and slanted depth; the camera moves by 5 cm per frame along x."""
     u, v = np.meshgrid(np.arange(COLOR_CAMERA.width), np.arange(COLOR_CAMERA.height))
     x, y = np.meshgrid(np.arange(DEPTH_CAMERA.width), np.arange(DEPTH_CAMERA.height))
     made = []

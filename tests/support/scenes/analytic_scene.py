@@ -24,14 +24,14 @@ NOTHING = PointClusters(  # a frame without detections
 
 @dataclass
 class Scene:
-    """Planes n . x = d (n towards the camera) and spheres; each surface is one instance, numbered from 1."""
+    """Planes n . x = d (m), with n toward the camera, and spheres; the surfaces are numbered from 1."""
 
     planes: list[tuple[np.ndarray, float]] = field(default_factory=list)
     spheres: list[tuple[np.ndarray, float]] = field(default_factory=list)
     contrast: float = 0.5  # of the texture, in [0, 1]
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return depth m (H, W) float32, color (H, W, 3) uint8 and surface number (H, W) int32, 0 = nothing."""
+        """Return depth (H, W), m, float32; color (H, W, 3), uint8; and surface number (H, W), int32, 0 = nothing."""
         v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         directions = rays @ T_world_camera[:3, :3].T
@@ -83,7 +83,7 @@ class Scene:
 
 
 def room() -> Scene:
-    """Return a room corner with three spheres, in which every motion is determined."""
+    """Return a room corner with three spheres, whose geometry determines every camera motion."""
     return Scene(
         planes=[
             (np.array([0.0, 0.0, -1.0]), -2.5),
@@ -108,7 +108,7 @@ def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, rotvec: tuple[float, fl
 
 
 def walk(frames: int) -> list[np.ndarray]:
-    """Return a smooth hand-held motion: about 10 mm and 0.5 degrees per frame."""
+    """Return the poses of a smooth hand-held motion of about 10 mm and 0.5 degrees per frame."""
     t = np.linspace(0, 1, frames) * frames / 60
     return [
         pose(

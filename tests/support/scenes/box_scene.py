@@ -1,4 +1,4 @@
-"""Furniture of exact boxes on a floor in front of a wall, with exact views and configurable mask errors."""
+"""Furniture made of boxes on a floor in front of a wall, with exact views and configurable mask errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Box = tuple[float, float, float, float, float, float]  # x0 y0 z0 x1 y1 z1 m; z 
 
 @dataclass
 class BoxScene:
-    """Objects, each a list of boxes, numbered from 1; `room` belongs to none."""
+    """Objects, each a list of boxes, numbered from 1; `room` belongs to no object."""
 
     objects: list[list[Box]]
     room: tuple[Box, ...] = ROOM
@@ -48,7 +48,7 @@ class BoxScene:
         return Frame(index, index / 30, color, depth, CAMERA, T_world_camera, truth)
 
     def owners(self, points: np.ndarray, tolerance: float) -> np.ndarray:
-        """Return (P,) the object within `tolerance` m of each point; 0 = room, -1 = several."""
+        """Return the object (P,) within `tolerance` m of each point; 0 = room, -1 = no object or several."""
         near = np.stack([_distance(points, parts) <= tolerance for parts in [list(self.room), *self.objects]], axis=1)
         return np.where(near.sum(axis=1) == 1, near.argmax(axis=1), -1)
 
@@ -66,13 +66,13 @@ def look_from(x: float, y: float, z: float, at: tuple[float, float, float]) -> n
 
 
 def bled(mask: np.ndarray, px: int) -> np.ndarray:
-    """Return the mask, `px` larger on all sides."""
+    """Return the mask, dilated by `px` pixels."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * px + 1, 2 * px + 1))
     return cv2.dilate(mask.astype(np.uint8), kernel) > 0
 
 
 def detected(masks: list[np.ndarray], class_ids: list[int]) -> Detections:
-    """Return masks with score 0.8, and 0.6 for the named class, 0.2 for each of the others."""
+    """Return detections with score 0.8 and probability 0.6 of their class, 0.2 of each other class."""
     n = len(masks)
     probabilities = np.full((n, len(CLASSES)), 0.2, np.float32)
     probabilities[np.arange(n), class_ids] = 0.6
@@ -86,7 +86,7 @@ def detected(masks: list[np.ndarray], class_ids: list[int]) -> Detections:
 
 
 def table(x: float, y: float, width: float = 1.4, depth: float = 0.8, height: float = 0.74) -> list[Box]:
-    """Return a top of 4 cm on four legs of 6 cm, centered at (x, y)."""
+    """Return the boxes of a table at (x, y), m, with a top of 4 cm on four legs of 6 cm."""
     half = width / 2, depth / 2
     legs = [
         (x + i * (half[0] - 0.06) - 0.03, y + j * (half[1] - 0.06) - 0.03, 0.0,
@@ -97,7 +97,7 @@ def table(x: float, y: float, width: float = 1.4, depth: float = 0.8, height: fl
 
 
 def chair(x: float, y: float) -> list[Box]:
-    """Return a seat of 45 cm with a back towards +y, on four legs, centered at (x, y)."""
+    """Return the boxes of a chair at (x, y), m, with a seat of 45 cm, a back toward +y and four legs."""
     legs = [(x + i * 0.19 - 0.02, y + j * 0.19 - 0.02, 0.0, x + i * 0.19 + 0.02, y + j * 0.19 + 0.02, 0.42)
             for i in (-1, 1) for j in (-1, 1)]  # fmt: skip
     return [(x - 0.225, y - 0.225, 0.42, x + 0.225, y + 0.225, 0.47),
@@ -111,13 +111,13 @@ BOX_TRIANGLES = np.array(
 
 
 def _corners(box: Box) -> np.ndarray:
-    """Return the corners (8, 3), x fastest."""
+    """Return the corners (8, 3), m; x varies fastest."""
     x, y, z = (box[0], box[3]), (box[1], box[4]), (box[2], box[5])
     return np.array([(x[i], y[j], z[k]) for k in (0, 1) for j in (0, 1) for i in (0, 1)])
 
 
 def _distance(points: np.ndarray, boxes: list[Box]) -> np.ndarray:
-    """Return (P,) m to the surface of the nearest box; 0 inside."""
+    """Return the distances (P,), m, of points (P, 3) to the nearest box; 0 inside a box."""
     distances = [
         np.linalg.norm(np.maximum(np.maximum(np.array(box[:3]) - points, points - np.array(box[3:])), 0), axis=1)
         for box in boxes

@@ -1,4 +1,4 @@
-"""The contracts' room as videos with configurable errors, and minimal plugins that can map it."""
+"""The room of the contract tests as videos with configurable errors, and minimal plugins that map it."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ from framework.testing.corner_room import CAMERA, CLASSES, frame_at, look, pose_
 class CornerRoom(RGBDSequence):
     """The room as a video."""
 
-    frames: int = 6
-    unreadable: int = -1  # this frame raises FrameError; -1 = none
-    truth: bool = True  # True if poses and instances are known
-    unposed: tuple[int, ...] = ()  # frames whose true pose is not known
-    slow_s: float = 0.0  # s to read a frame
-    scene: str = ""  # any name: all are the same room
-    start: int = 0
-    stop: int = -1  # -1 = to the end
-    stride: int = 1
+    frames: int = 6  # number of frames
+    unreadable: int = -1  # index of the frame that raises FrameError; -1 = none
+    truth: bool = True  # ground-truth poses and instances
+    unposed: tuple[int, ...] = ()  # indices of the frames without a ground-truth pose
+    slow_s: float = 0.0  # time to read a frame, s
+    scene: str = ""  # sequence name; all names give the same room
+    start: int = 0  # first frame
+    stop: int = -1  # one past the last frame; -1 = all frames
+    stride: int = 1  # step between frames
 
     def __post_init__(self) -> None:
         self.camera, self.name = CAMERA, "corner_room"
@@ -81,12 +81,12 @@ class CornerRoom(RGBDSequence):
 
 @dataclass
 class LiveRoom(LiveVideo):
-    """The room as live video, with true poses."""
+    """The room as live video, with ground-truth poses."""
 
-    frames_sent: int = 6  # number of frames
-    period_s: float = -1.0  # s between frames; -1 = each comes after the previous one was read, so that none is dropped
-    unreadable: int = -1  # reading this frame raises FrameError; -1 = none
-    fails_after: int = -1  # number of frames before a failure; -1 = never
+    frames_sent: int = 6  # number of frames that are sent
+    period_s: float = -1.0  # time between frames, s; -1 = each frame is sent when the previous one has been read
+    unreadable: int = -1  # index of the frame that raises FrameError; -1 = none
+    fails_after: int = -1  # number of frames before the source fails; -1 = never
 
     def __post_init__(self) -> None:
         self.name = "live_room"
@@ -102,7 +102,7 @@ class LiveRoom(LiveVideo):
             yield None
             for k in range(self.frames_sent):
                 if k == self.fails_after:
-                    raise DataError("live_room: the cable is out")
+                    raise DataError("live_room: expected a connected camera, got none")
                 due = time.monotonic() + self.period_s
                 while time.monotonic() < due or (self.period_s < 0 and self.read < k):
                     time.sleep(0.001)
@@ -119,38 +119,40 @@ class LiveRoom(LiveVideo):
 
 @dataclass
 class SphereDetector(Detector):
-    """Detects both spheres exactly, in several frames at once."""
+    """Detector of both spheres with exact masks, which supports concurrent calls."""
 
     concurrent = True
-    broken_at: int = -1  # raises FrameError at this frame
+    broken_at: int = -1  # index of the frame that raises FrameError; -1 = none
 
     def __post_init__(self) -> None:
         self.classes = CLASSES
 
     def detect(self, frame: Frame) -> Detections:
         if frame.index == self.broken_at:
-            raise FrameError(f"frame {frame.index}: the detector cannot use it")
+            raise FrameError(f"frame {frame.index}: expected a usable frame, got an unusable one")
         return spheres_in(frame)
 
 
 @dataclass
 class GivenPose(PoseTracker):
-    """Returns the true pose, except for the frames in [lost_from, lost_to)."""
+    """Tracker that returns the ground-truth pose; the frames in [lost_from, lost_to) are lost."""
 
     pose_source = "ground_truth"
-    lost_from: int = 0
-    lost_to: int = 0
+    lost_from: int = 0  # first lost frame
+    lost_to: int = 0  # one past the last lost frame
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         if frame.T_world_camera is None:
-            raise DataError(f"frame {frame.index} has no true pose: choose a tracker that needs none")
+            raise DataError(
+                f"frame {frame.index}: expected a ground-truth pose, got none; use a tracker that estimates poses"
+            )
         lost = self.lost_from <= frame.index < self.lost_to
         return Pose(frame.T_world_camera, lost, "too few points associate" if lost else "")
 
 
 @dataclass
 class KeepAll(ClusterRefiner):
-    """Keeps all points."""
+    """Refiner that keeps all points."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return clusters
@@ -158,7 +160,7 @@ class KeepAll(ClusterRefiner):
 
 @dataclass
 class GridMap(SceneMap):
-    """Each fused frame as a separate grid of triangles."""
+    """Map with a separate grid of triangles for each fused frame."""
 
     vertices: list[np.ndarray] = field(default_factory=list)
     colors: list[np.ndarray] = field(default_factory=list)
@@ -173,7 +175,7 @@ class GridMap(SceneMap):
         return MapStatistics(voxels, bytes=28 * voxels)
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
-        depth, normals, color, ids = look(camera, T_world_camera)  # like a perfect map
+        depth, normals, color, ids = look(camera, T_world_camera)  # as from a perfect map
         return View(camera, T_world_camera, depth, normals.astype(np.float32), color, ids, ids - 1)
 
     def mesh(self) -> InstanceMesh:
@@ -219,12 +221,12 @@ class GridMap(SceneMap):
 
 @dataclass
 class GridFuser(MapFuser):
-    """Appends each frame; cluster k is instance k + 1."""
+    """Fuser that appends each frame; cluster k is instance k + 1."""
 
-    capacity: int = 100  # frames
-    slow_s: float = 0.0  # s to fuse a frame
-    slow_save_s: float = 0.0  # s to save the map
-    note: str = ""  # a file that is created once a frame is in the map; "" = none
+    capacity: int = 100  # maximum number of frames in the map
+    slow_s: float = 0.0  # time to fuse a frame, s
+    slow_save_s: float = 0.0  # time to save the map, s
+    note: str = ""  # path of a file that is written when a frame is in the map; "" = none
 
     def __post_init__(self) -> None:
         self.scene: GridMap = GridMap(slow_save_s=self.slow_save_s)
@@ -233,7 +235,9 @@ class GridFuser(MapFuser):
         time.sleep(self.slow_s)
         scene = self.scene
         if len(scene.vertices) >= self.capacity:
-            raise MapFullError(f"the map holds {self.capacity} frames: raise fuser.capacity")
+            raise MapFullError(
+                f"fuser.capacity: expected at most {self.capacity} frames, got more; increase fuser.capacity"
+            )
         height, width = frame.camera.shape
         v, u = np.divmod(np.arange(height * width), width)
         points = back_project(frame.camera, np.stack([u, v], 1).astype(np.int32), frame.depth.ravel())
@@ -253,7 +257,7 @@ class GridFuser(MapFuser):
 
 
 def fault(kind: str) -> BaseException:
-    """Return an exception that a stage may raise, by name."""
+    """Return an example of an exception that a stage can raise, by name."""
     faults: dict[str, BaseException] = {
         "OSError": OSError(5, "Input/output error", "weights.bin"),
         "ValueError": ValueError("operands could not be broadcast together"),
@@ -265,10 +269,10 @@ def fault(kind: str) -> BaseException:
 
 @dataclass
 class FaultyDetector(SphereDetector):
-    """Fails at one frame with an exception of `fault`, or with masks of a wrong size."""
+    """Detector that fails at one frame with an exception of `fault`, or returns masks of a wrong size."""
 
-    at: int = 3
-    kind: str = "OSError"
+    at: int = 3  # index of the frame at which the detector fails
+    kind: str = "OSError"  # failure: OSError, ValueError, MemoryError, SystemExit or masks (invalid masks)
 
     def detect(self, frame: Frame) -> Detections:
         found = super().detect(frame)

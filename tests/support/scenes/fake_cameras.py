@@ -1,6 +1,7 @@
-"""Fake libraries of depth cameras with a camera in the corner room. They contain only what the readers use.
+"""Fake vendor libraries of depth cameras, with a camera in the corner room.
 
-Names, arguments and return values are those of pyrealsense2 2.59 and of pyorbbecsdk2 2.1.
+They contain only what the readers use. Names, arguments and return values are those of pyrealsense2 2.59 and of
+pyorbbecsdk2 2.1.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from tests.support.scenes.corner_room import CAMERA, CornerRoom
 
-UNIT = 0.00025  # m, of the stored depth
+UNIT = 0.00025  # unit of the stored depth, m
 SERIAL = "0123456789"
 DEPTH_AFTER_COLOR_US = 4000  # time from the color to the depth image, microseconds
 
@@ -24,15 +25,15 @@ class FakeCamera:
     """The connected camera and its configured errors."""
 
     plugged_in: bool = True
-    coeffs: tuple[float, ...] = (0.0,) * 5  # of its lens: k1, k2, p1, p2, k3
-    model: str = "inverse"  # of the lens; brown = ours
+    coeffs: tuple[float, ...] = (0.0,) * 5  # lens distortion: k1, k2, p1, p2, k3
+    model: str = "inverse"  # lens model; brown = supported
     name: str = "a camera"  # name of the device
-    frames: int = 4  # number of frames before it stops sending
-    unplugged_at: int = -1  # frame at which the library raises; -1 = never
-    without_depth: int = -1  # this frame has no depth; -1 = none
+    frames: int = 4  # number of frames before the camera stops sending
+    unplugged_at: int = -1  # index of the frame at which the library raises; -1 = never
+    without_depth: int = -1  # index of the frame without depth; -1 = none
     running: bool = False
     started: list[dict[str, Any]] = field(default_factory=list)  # request of each start
-    registered: int = 0  # pairs of images
+    registered: int = 0  # number of registered image pairs
 
     def start(self, asked: dict[str, Any]) -> None:
         assert not self.running
@@ -80,7 +81,7 @@ class _Images:
 
 
 def _image(pixels: np.ndarray, shift: int = 0, time_us: int = 0) -> SimpleNamespace:
-    """Return an image, shifted by pixels if it is of another camera than the color."""
+    """Return an image of both libraries; `shift`, px, simulates depth that is not registered to color."""
     pixels = np.roll(pixels, shift, axis=1)
     pixels.setflags(write=False)  # owned by the library
     height, width = pixels.shape[:2]

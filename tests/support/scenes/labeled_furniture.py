@@ -1,4 +1,4 @@
-"""The nine classes of SceneNN under COCO's names, each with a maker of random pieces."""
+"""The nine classes of SceneNN by COCO name, each with a function that makes random furniture."""
 
 from __future__ import annotations
 

@@ -10,13 +10,13 @@ import numpy as np
 from framework.data import Camera, Frame
 
 CAMERA = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
-HALF = np.array([2.0, 1.2, 2.5])  # m, half the room's size
-RESOLUTION = 160  # px a meter
+HALF = np.array([2.0, 1.2, 2.5])  # half the size of the room, m
+RESOLUTION = 160  # px per meter
 
 
 @cache
 def wallpaper(paper: int, wall: int) -> np.ndarray:
-    """Return a random pattern of several sizes, (H, W, 3) uint8."""
+    """Return an image (H, W, 3), uint8, of a random pattern with several spatial scales."""
     rng = np.random.default_rng([paper, wall])
     side = int(2 * HALF.max() * RESOLUTION) + 2
     pattern = np.zeros((side, side, 3), np.float32)
@@ -49,7 +49,7 @@ def papered_frame(T_world_camera: np.ndarray, index: int = 0, paper: int = 0, ca
 
 
 def _sampled(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return bilinear samples (P, 3); in rows, because OpenCV's remap takes at most 32767 of them."""
+    """Return bilinear samples (P, 3). OpenCV's remap accepts at most 32767 samples per row, so rows of 256 are used."""
     pad = -len(x) % 256
     grid_x, grid_y = (np.pad(c, (0, pad)).reshape(-1, 256) for c in (x, y))
     return cv2.remap(image, grid_x, grid_y, cv2.INTER_LINEAR).reshape(-1, 3)[: len(x)]

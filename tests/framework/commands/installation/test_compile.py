@@ -34,10 +34,10 @@ def test_compile_second_call_compiles_no_kernels(tmp_path: Path) -> None:
     assert second == "all 2 kernels are already compiled\n"
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
-def test_compile_ctrl_c_ends_in_one_line(tmp_path: Path) -> None:
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows cannot send SIGINT to a single process")
+def test_compile_ctrl_c_prints_one_line(tmp_path: Path) -> None:
     process = compiling(tmp_path)
-    time.sleep(3)  # it is working, or about to start
+    time.sleep(3)  # compilation is running or about to start
     process.send_signal(signal.SIGINT)
     asked = time.monotonic()
     _, message = process.communicate(timeout=10)

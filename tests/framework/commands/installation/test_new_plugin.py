@@ -1,4 +1,4 @@
-"""Tests of the command `new-plugin`: its repositories are built, installed and tested outside of the checkout."""
+"""Tests of the command `new-plugin`. The generated repositories are installed and tested outside the checkout."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def test_new_plugin_output_matches_example_plugin() -> None:
     assert left == set(map(Path, written))
     for path, text in written.items():
         assert (EXAMPLE / path).read_text() == text, (
-            f"{path}: remove {EXAMPLE.name}, and create it again with new-plugin"
+            f"{path}: expected the output of new-plugin, got other text; regenerate {EXAMPLE.name} with new-plugin"
         )
 
 
 @pytest.mark.parametrize("name", ["x", "a" * LONGEST_NAME])
 @pytest.mark.parametrize("stage", GROUPS)
 def test_new_plugin_files_pass_ruff(stage: str, name: str, tmp_path: Path) -> None:
-    """Undefined names and invalid Python in a template also fail."""
+    """Ruff also detects undefined names and invalid Python in a template."""
     made = write_repository(stage, name, tmp_path)
     for line in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
         done = subprocess.run(
@@ -103,9 +103,9 @@ def test_new_plugin_failure_keeps_existing_files(tmp_path: Path, monkeypatch: py
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a plugin repository per group, and `env`, in which all are installed from wheels.
+    """Return a folder with one plugin repository per group and the virtual environment `env`.
 
-    The libraries are those of this environment; InstanceMap is installed separately, without the checkout.
+    The plugins and InstanceMap are installed in `env` from wheels. The libraries are those of the current environment.
     """
     folder = tmp_path_factory.mktemp("stranger")
     (folder / "wheels").mkdir()
@@ -128,18 +128,18 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def copy_kernels(site: Path) -> None:
-    """Copy numba's cache of the checkout for the installed files; numba checks their times and sizes."""
+    """Copy the numba cache of the checkout to the installed files, with the file times that numba checks."""
     for path in (CHECKOUT / "framework").rglob("*.py"):
         shutil.copystat(path, site / path.relative_to(CHECKOUT))
     for path in (CHECKOUT / "framework").rglob("*.nb[ic]"):
         copied = site / path.relative_to(CHECKOUT)
-        if copied.parents[1].is_dir():  # otherwise the cache of a removed package is used
+        if copied.parents[1].is_dir():  # false for the outdated cache of a removed package
             copied.parent.mkdir(exist_ok=True)
             shutil.copy2(path, copied)
 
 
 def run(place: Path, *line: str) -> str:
-    """Return the output of a program of the new environment."""
+    """Run a program of the new environment; return its output."""
     alone = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "HYDRA_FULL_ERROR")}
     program = str(place / "env" / "bin" / line[0])
     done = subprocess.run([program, *line[1:]], cwd=place, env=alone, capture_output=True, text=True, timeout=300)
@@ -195,7 +195,7 @@ def test_installed_package_runs_doctor_and_new_plugin(place: Path) -> None:
 
 @pytest.mark.acceptance
 def test_installed_package_maps_the_desk(place: Path) -> None:
-    """Run the command without a dataset and the Python example of the README, each on a few frames."""
+    """Run the command with its default dataset, and the Python example of the README, on a few frames each."""
     assert run(place, "instancemap", "--version") == f"instancemap {framework.__version__}\n"
     run(place, "instancemap", "dataset.stop=3", "hydra.run.dir=desk")
     assert json.loads((place / "desk" / "metrics.json").read_text())["frames"] == 3

@@ -42,7 +42,7 @@ PACKAGE = {
         class Everything(Detector):
             """The whole image is one object.
 
-            More that a listing leaves out.
+            This paragraph is omitted from the listing.
             """
 
             score: float = 0.5
@@ -79,10 +79,10 @@ PACKAGE = {
     """,
     "acme/conf/detector/acme_everything.yaml": """
         _target_: acme.everything.Everything
-        score: 0.75 # in [0, 1], of the one object
+        score: 0.75 # score of the object, in [0, 1]
     """,
     "acme/conf/detector/acme_certain.yaml": """
-        # acme_everything without doubt
+        # acme_everything with a score of 1
         defaults: [acme_everything, _self_]
         score: 1.0
     """,
@@ -97,7 +97,7 @@ PACKAGE = {
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return an environment with the package installed."""
+    """Return environment variables that make the installed package importable."""
     import textwrap
 
     source, site = tmp_path_factory.mktemp("acme"), tmp_path_factory.mktemp("site")
@@ -123,13 +123,13 @@ def test_plugins_lists_options_of_installed_package(environment: dict[str, str],
     at = lines.index("  acme_everything  [from acme-detectors]")
     assert lines[at + 1 : at + 4] == [
         "      The whole image is one object.",
-        "      score: float = 0.75  # in [0, 1], of the one object",
+        "      score: float = 0.75  # score of the object, in [0, 1]",
         "",
     ]
     at = lines.index("  acme_certain  [from acme-detectors]")
     assert lines[at + 1 : at + 4] == [
-        "      The whole image is one object. Here: acme_everything without doubt.",
-        "      score: float = 1.0  # in [0, 1], of the one object",
+        "      The whole image is one object. Here: acme_everything with a score of 1.",
+        "      score: float = 1.0  # score of the object, in [0, 1]",
         "",
     ]
     assert "unusable: detector acme.missing.Detector: expected an existing module, got acme.missing" in done.stdout
@@ -216,7 +216,7 @@ def test_describe_option_accepts_every_registered_option() -> None:
 
 
 def test_plugins_listing_does_not_import_open3d(tmp_path: Path) -> None:
-    """The import takes 0.5 s and 170 MB, and the default stages do not need it."""
+    """The import takes 0.5 s and 170 MB. The default stages do not need Open3D."""
     code = (
         "import sys; from framework.commands.installation.plugins import *; "
         "registered(*GROUPS); print('open3d' in sys.modules)"

@@ -1,4 +1,4 @@
-"""Tests of the command `check`: its output, and that its suggested setting corrects the recording."""
+"""Tests of the command `check`: output, errors, and the correction by the suggested setting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the command `convert-oni`: its output files, also after errors."""
+"""Tests of the command `convert-oni`: its output files, including those written before an error."""
 
 import sys
 
@@ -29,7 +29,7 @@ def command(monkeypatch, *arguments):
 
 
 def deliver(monkeypatch, count, fault=None):
-    """Deliver `count` frames in place of OpenNI 2, which may not be installed."""
+    """Replace OpenNI 2, which may not be installed, with a reader of `count` frames that can raise `fault`."""
 
     def read_frames(contents, scratch):
         yield from FRAMES[:count]

@@ -1,4 +1,4 @@
-"""Tests of the command `import`, from a phone's export of a kitchen to the map."""
+"""Tests of the command `import`: output, errors, and the mapping of an imported phone recording."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ def test_import_prints_written_frames_and_next_commands(
     assert RgbdFolder(tmp_path / "out").camera.width == 160
 
 
-def test_import_turned_images_have_turned_poses(
+def test_import_rotated_images_have_rotated_poses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In the room y points down, in ARKit up, so that these images are upside down for a phone."""
+    """The y axis points down in the room and up in ARKit, so the images are upside down for a phone."""
     frames = room_frames()
     write_stray_scanner(tmp_path / "export", frames)
     command(monkeypatch, tmp_path / "export", tmp_path / "out", "--rotate", "180", "--confidence", "0")
@@ -77,7 +77,7 @@ def test_import_existing_output_raises_before_reading(
 def test_import_of_phone_recording_is_mappable(
     shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The export of a real kitchen has 256x192 depth, a video and ARKit poses; no frame is lost."""
+    """The export of a real kitchen contains 256x192 depth, a video and ARKit poses. All frames are tracked."""
     kitchen = RgbdFolder(shared_data / "redkitchen", stride=3, stop=180)
     write_stray_scanner(tmp_path / "export", list(seen_by_phone(list(kitchen))))
     command(monkeypatch, tmp_path / "export", tmp_path / "out")

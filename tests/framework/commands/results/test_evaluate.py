@@ -34,7 +34,7 @@ CODE = {"evaluation.git_commit": "abcdef0", "evaluation.git_dirty": False}
 
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the run directory of a real run without its picture."""
+    """Return the directory of a mapped run whose overview image is a placeholder."""
     directory = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
@@ -45,14 +45,14 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a copy of the run, and set a known commit of the evaluating code."""
+    """Return a copy of the run directory; set a known commit of the evaluation code."""
     monkeypatch.setattr(reevaluation, "code_version", lambda: {"git_commit": "abcdef0", "git_dirty": False})
     return Path(shutil.copytree(mapped, tmp_path / "runs" / "first"))
 
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Run the command in this process; return its status, stdout and stderr."""
+    """Return a function that runs the command in this process and returns its status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["evaluate", *map(str, arguments)])
@@ -84,7 +84,9 @@ def test_evaluate_unchanged_run_keeps_exact_metrics(stored: Path, command) -> No
     after = metrics_of(stored)
     assert after == before | CODE
     assert [key for key in after if key not in CODE] == list(before)
-    assert (stored / "metrics.json").stat().st_mtime_ns == time, "tables take the latest record of a run"
+    assert (stored / "metrics.json").stat().st_mtime_ns == time, (
+        "expected an unchanged modification time: tables use the latest record of a run"
+    )
     assert command(stored) == (0, f"{stored}: unchanged\n", "")
     assert metrics_of(stored) == after
 
@@ -118,7 +120,7 @@ def test_evaluate_tiny_difference_prints_all_digits(stored: Path, command) -> No
 
 @pytest.mark.parametrize("option", ["--allow-changed-ground-truth", "--other-truth"])
 def test_evaluate_changed_ground_truth_requires_option(stored: Path, command, option: str) -> None:
-    """A relative dataset.root is another folder elsewhere, whose ground truth does not belong to this run."""
+    """In another working directory, a relative dataset.root can name a folder with other ground truth."""
     true = metrics_of(stored)
     write_metrics(stored, true | {"truth_sha256": "0" * 64})
     status, out, err = command(stored)
@@ -201,7 +203,7 @@ def _truncated_mesh(directory: Path) -> None:
         (lambda directory: _with_dataset(directory, colour=1), "got 'colour'"),
     ],
 )
-def test_evaluate_unusable_run_is_refused_and_others_continue(
+def test_evaluate_refuses_unusable_run_and_evaluates_others(
     stored: Path, command, spoil: Callable[[Path], None], message: str
 ) -> None:
     spoilt = Path(shutil.copytree(stored, stored.parent / "a spoilt one"))
@@ -235,7 +237,9 @@ def test_evaluate_runs_with_same_truth_load_it_once(stored: Path, command, monke
     assert sorted(made) == [3, 4]
 
 
-def test_evaluate_run_restarted_meanwhile_is_unchanged(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluate_run_restarted_during_evaluation_is_unchanged(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def begins_again(self: CornerRoom) -> None:
         (stored / "metrics.json").unlink()
         return scene_truth(self)
@@ -287,7 +291,7 @@ def test_evaluate_locked_run_is_unchanged(stored: Path, command) -> None:
 
 @pytest.mark.parametrize("started", [["-m", "framework"], ["-P", "-m", "framework"]])
 def test_evaluate_does_not_execute_code_in_record(started: list[str], stored: Path) -> None:
-    """Modules in a received run directory are neither imported nor found."""
+    """Modules in an untrusted run directory are not imported."""
     (stored / "brought.py").write_text(
         "print('runs')\nfrom tests.support.scenes.corner_room import CornerRoom as Brought\n"
     )

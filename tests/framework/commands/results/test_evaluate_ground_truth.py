@@ -30,7 +30,7 @@ FRAMES = 6
 
 
 def write_folder(root: Path) -> None:
-    """Write the corner of the room as an RGB-D folder without poses and annotation."""
+    """Write the corner of the room as an RGB-D folder without poses or annotation."""
     for name in ("color", "depth"):
         (root / name).mkdir(parents=True)
     camera = {key: getattr(CAMERA, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
@@ -43,7 +43,7 @@ def write_folder(root: Path) -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with `reference`, a run with true masks and poses, and its recordings `posed` and `unposed`."""
+    """Return a folder with the run `reference`, mapped with true masks and poses, and two recordings of its frames."""
     place = tmp_path_factory.mktemp("truth")
     reported_run.write_run(place / "reference")
     for name in ("posed", "unposed"):
@@ -77,13 +77,13 @@ def evaluated(directory: Path, ground_truth: Path | None) -> int:
 
 
 def tracker(made: Path) -> dict[str, str]:
-    """Return a tracker with poses in the world of the first frame."""
+    """Return the config of a tracker that reads the poses of the reference run."""
     path = made / "reference" / "trajectory.txt"
     return {"_target_": "plugins.trackers.trajectory_file.TrajectoryFile", "path": str(path)}
 
 
 @pytest.mark.parametrize("name", ["posed", "unposed"])
-def test_ground_truth_of_another_run_is_compared(made: Path, tmp_path: Path, name: str) -> None:
+def test_ground_truth_of_another_run_gives_metrics(made: Path, tmp_path: Path, name: str) -> None:
     named = {"ground_truth": str(made / "reference")}
     changes = {"tracker": tracker(made)} if name == "unposed" else {}
     metrics = mapped(tmp_path / "run", made / name, dataset=named, **changes)
@@ -93,7 +93,7 @@ def test_ground_truth_of_another_run_is_compared(made: Path, tmp_path: Path, nam
 
 
 def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None:
-    """The world of the reference is shifted by 0.5 m."""
+    """The world frame of the reference is shifted by 0.5 m along x."""
     reference = tmp_path / "reference"
     reference.mkdir()
     for file in (made / "reference").iterdir():
@@ -114,7 +114,7 @@ def test_ground_truth_run_aligns_unposed_map(made: Path, tmp_path: Path) -> None
 def test_evaluate_changes_ground_truth_of_finished_run(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Later evaluations, reports and figures keep it."""
+    """Later evaluations, reports and figures use the same ground truth."""
     fake = {"_target_": "plugins.detectors.none.NoDetections"}
     directory = tmp_path / "run"
     assert "instances.ap50" not in mapped(directory, made / "posed", detector=fake)
@@ -157,7 +157,7 @@ def test_evaluate_again_gives_identical_metrics(made: Path, tmp_path: Path) -> N
     assert {key: value for key, value in after.items() if not key.startswith("evaluation.")} == before
 
 
-def test_inputs_contain_files_of_ground_truth(made: Path, tmp_path: Path) -> None:
+def test_inputs_hash_includes_ground_truth_files(made: Path, tmp_path: Path) -> None:
     mesh, names = tmp_path / "mesh.ply", tmp_path / "instances.json"
     mesh.write_text("a mesh")
     names.write_text("{}")

@@ -88,7 +88,7 @@ def test_export_invalid_arguments_exit_with_status_2(
         (("--to", "floorplan", "--floor=-1e300"), "expected a floor height in [-10000, 10000] m"),
     ],
 )
-def test_export_impossible_request_is_one_line_error(
+def test_export_invalid_request_is_one_line_error(
     words: tuple[str, ...], message: str, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:

@@ -30,7 +30,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stored(mapped: Path, tmp_path: Path) -> Path:
-    """Return a run whose third frame is lost."""
+    """Return the directory of a run in which tracking is lost in frame 2."""
     run = Path(shutil.copytree(mapped, tmp_path / "run"))
     timestamps, poses = read_tum(run / "trajectory.txt")
     write_tum(run / "trajectory.txt", np.delete(timestamps, 2), np.delete(poses, 2, axis=0))
@@ -43,7 +43,7 @@ def stored(mapped: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Run the command in this process; return its status, stdout and stderr."""
+    """Return a function that runs the command in this process and returns its status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["raycast", *map(str, arguments)])
@@ -60,7 +60,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 @pytest.fixture
 def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[View, str]]:
-    """Return the drawn views with their notes."""
+    """Return a list that receives each drawn view with its note."""
     drawn: list[tuple[View, str]] = []
     write = raycast_figure.write_raycast
 
@@ -72,19 +72,19 @@ def views(monkeypatch: pytest.MonkeyPatch) -> list[tuple[View, str]]:
     return drawn
 
 
-def test_raycast_draws_the_middle_frame(stored: Path, command: Command, views: list[tuple[View, str]]) -> None:
+def test_raycast_draws_middle_frame_by_default(stored: Path, command: Command, views: list[tuple[View, str]]) -> None:
     status, out, err = command(stored)
     assert (status, err) == (0, "")
     assert out == f"{stored / 'raycast.png'}\n"
     assert (stored / "raycast.png").read_bytes()[1:4] == b"PNG"
     [(view, note)] = views
-    assert "frame 3," in note, "of 0, 1, 3, 4, 5"
+    assert "frame 3," in note, "expected the middle one of the mapped frames 0, 1, 3, 4 and 5"
     np.testing.assert_allclose(view.T_world_camera, read_tum(stored / "trajectory.txt")[1][2])
     assert (view.depth > 0).mean() > 0.5
     assert view.instance_ids.any()
 
 
-def test_raycast_draws_a_chosen_frame_and_pose(
+def test_raycast_draws_chosen_frame_or_pose(
     stored: Path, command: Command, views: list[tuple[View, str]], tmp_path: Path
 ) -> None:
     assert command(stored, "--frame", 4, "--out", tmp_path / "frame.png")[0] == 0
@@ -97,7 +97,7 @@ def test_raycast_draws_a_chosen_frame_and_pose(
     assert not (stored / "raycast.png").exists()
 
 
-def test_raycast_without_the_sequence_uses_another_camera(
+def test_raycast_without_sequence_uses_kinect_camera(
     stored: Path,
     command: Command,
     views: list[tuple[View, str]],

@@ -34,7 +34,7 @@ def stored(mapped: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Run the command in this process; return its status, stdout and stderr."""
+    """Return a function that runs the command in this process and returns its status, stdout and stderr."""
 
     def start(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
@@ -50,7 +50,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
 
 def texts(page: str) -> str:
-    """Return the visible texts of a page."""
+    """Return the visible text of an HTML page, with single spaces."""
     body = page[page.index("<body>") : page.index('<script type="application/json"')]
     return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", body))
 
@@ -70,7 +70,7 @@ def test_report_of_run_is_one_reproducible_page(stored: Path, command) -> None:
     assert f"likely, of {metrics['instances.count']}" in message
     for heading in ("Map", "Objects", "Ground truth", "Trajectory", "Mapping progress", "Stage times", "Provenance"):
         assert heading in message
-    assert before.count(b"data:image/webp") > 3, "objects, growth and overview.png"
+    assert before.count(b"data:image/webp") > 3, "expected images of objects, mapping progress and overview.png"
     assert not re.search(rb'(src|href)="(?!data:|#)', before)
 
 
@@ -83,7 +83,7 @@ def test_report_escapes_html_in_class_names(stored: Path, command) -> None:
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
 
 
-def test_report_without_recording_shows_map_images(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_report_without_sequence_shows_map_images(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(composition, "_added", [])
     assert command(stored)[0] == 0
     page = (stored / "report.html").read_text()
@@ -93,9 +93,9 @@ def test_report_without_recording_shows_map_images(stored: Path, command, monkey
     assert "Individual objects cannot be compared" in texts(page)
 
 
-def test_report_top_view_alone_omits_enlarged_path(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(composition, "_added", [])  # no recording, so no true path
-    monkeypatch.setattr(run_page, "SMALL_PATH", 0.0)  # the path is large enough between the objects
+def test_report_with_large_path_omits_enlarged_path(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(composition, "_added", [])  # without the sequence there is no ground-truth path
+    monkeypatch.setattr(run_page, "SMALL_PATH", 0.0)  # every path is large enough in the top view
     assert command(stored)[0] == 0
     page = (stored / "report.html").read_text()
     assert "Camera path, top view" in page
@@ -103,7 +103,7 @@ def test_report_top_view_alone_omits_enlarged_path(stored: Path, command, monkey
     assert '<div class="column">' not in page
 
 
-def test_report_other_recording_is_detected(stored: Path, command, tmp_path: Path) -> None:
+def test_report_different_sequence_is_detected(stored: Path, command, tmp_path: Path) -> None:
     lines = (stored / "trajectory.txt").read_text().splitlines()
     moved = [f"{float(line.split()[0]) + 5:.9f} {line.partition(' ')[2]}" for line in lines]
     (stored / "trajectory.txt").write_text("\n".join(moved) + "\n")
@@ -118,7 +118,7 @@ def test_report_invalid_unicode_names_are_escaped(stored: Path, command) -> None
 
 
 def test_report_object_without_class_is_listed(stored: Path, command) -> None:
-    """A fuser without classes writes such maps."""
+    """Fusers without classes write such maps."""
     entries = json.loads((stored / "instances.json").read_text())
     entries[0] |= {"class": None, "class_probabilities": {}}
     (stored / "instances.json").write_text(json.dumps(entries))
@@ -178,7 +178,7 @@ def test_report_of_empty_run_is_written(stored: Path, command) -> None:
         ("config.yaml", "seed: 9\n", "expected the config_hash of config.yaml, "),
     ],
 )
-def test_report_damaged_record_is_one_line_error(stored: Path, command, name: str, content: str, message: str) -> None:
+def test_report_damaged_file_is_one_line_error(stored: Path, command, name: str, content: str, message: str) -> None:
     (stored / name).write_text(content)
     status, out, err = command(stored)
     assert (status, out, len(err.splitlines())) == (1, "", 1), err

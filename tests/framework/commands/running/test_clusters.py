@@ -1,4 +1,4 @@
-"""Tests of sweeps on clusters that preempt jobs and remove nodes; the resumed table is identical."""
+"""Tests of sweeps on clusters that preempt jobs and remove nodes. The tables of a resumed sweep are identical."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.framework.commands.running.test_sweep import CHECKOUT, PLACE, begin, 
 
 pytestmark = pytest.mark.acceptance
 
-THREE = ("row=half", "seed=1,2,3", "dataset.slow_s=0.7")  # of four frames each
+THREE = ("row=half", "seed=1,2,3", "dataset.slow_s=0.7")  # three runs of four frames each
 TABLES = ("table.md", "table.tex", "table.csv")
 
 
@@ -23,7 +23,7 @@ def tables(directory: Path) -> dict[str, bytes]:
 
 
 def mapping(directory: Path) -> dict[int, str]:
-    """Return the active runs by the process that holds the lock of their directory."""
+    """Return the names of the active runs by the id of the process that holds the lock of the run directory."""
     holders = {}
     for name in begun(directory):
         words = (directory / PLACE / name / ".lock_holder").read_text().split()
@@ -33,7 +33,7 @@ def mapping(directory: Path) -> dict[int, str]:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """Return the tables of the sweep without interruption, run by run."""
+    """Return the tables of an uninterrupted sweep whose runs are executed one after another."""
     directory = tmp_path_factory.mktemp("undisturbed")
     done = end(begin(directory, *THREE, "threads=1"))
     assert done.returncode == 0, done.stderr
@@ -41,14 +41,14 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
-    """Use submitit's queue, the signal that SLURM sends before it preempts a job, and `kill -9`."""
+    """Use submitit's local queue, the signal that SLURM sends before it preempts a job, and SIGKILL."""
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     arguments = ("launcher=submitit_local", *THREE)
     first = begin(tmp_path, *arguments)
     wait_until(lambda: len(mapping(tmp_path)) == 3, first)
     preempted, killed, _ = map(psutil.Process, mapping(tmp_path))
     preempted.send_signal(signal.SIGUSR2)
-    for process in (*killed.parents()[:1], killed):  # the queue's process for this job, which would end it normally
+    for process in (*killed.parents()[:1], killed):  # first the queue's process, which would end the job normally
         process.kill()
     done = end(first)
     assert done.returncode == 1
@@ -66,7 +66,7 @@ def test_slurm_sweep_resumes_preempted_and_killed_jobs(tmp_path: Path, undisturb
 
 @pytest.fixture
 def ray_cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
-    """Start a head without jobs and two nodes with one core each."""
+    """Start a Ray cluster whose head node runs no jobs."""
     pytest.importorskip("hydra_plugins.hydra_ray_launcher")
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
@@ -77,7 +77,9 @@ def ray_cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     cluster.shutdown()
 
 
-def test_ray_sweep_replaces_dead_node(tmp_path: Path, undisturbed: dict[str, bytes], ray_cluster: object) -> None:
+def test_ray_sweep_restarts_run_of_removed_node(
+    tmp_path: Path, undisturbed: dict[str, bytes], ray_cluster: object
+) -> None:
     nodes = [ray_cluster.add_node(num_cpus=1) for _ in range(2)]
     sweep = begin(tmp_path, "launcher=ray", f"hydra.launcher.ray.init.address={ray_cluster.address}", *THREE)
     wait_until(lambda: len(mapping(tmp_path)) == 2, sweep)
@@ -87,7 +89,9 @@ def test_ray_sweep_replaces_dead_node(tmp_path: Path, undisturbed: dict[str, byt
     assert done.returncode == 0, done.stderr
     assert len(recorded(tmp_path)) == 3
     assert tables(tmp_path) == undisturbed
-    assert not all(psutil.pid_exists(pid) for pid in at_work), "one run was restarted"
+    assert not all(psutil.pid_exists(pid) for pid in at_work), (
+        "expected one process to be gone, because its run was restarted"
+    )
 
 
 def test_ray_sweep_restarted_after_failure_resumes(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:

@@ -103,7 +103,7 @@ def test_detect_without_detections_writes_valid_file(tmp_path: Path) -> None:
 
 @dataclass
 class PartlyTrueRoom(CornerRoom):
-    """A room whose frame 2 has no pose, so that its true instances cannot be rendered."""
+    """A room whose frame 2 has no pose, so that its ground-truth instances cannot be rendered."""
 
     def __getitem__(self, k: int) -> Frame:
         frame = super().__getitem__(k)

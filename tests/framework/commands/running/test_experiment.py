@@ -29,7 +29,7 @@ CHECKOUT = Path(__file__).resolve().parents[4]
 FAKES = CHECKOUT / "tests" / "support" / "fake_conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 PRESETS = sorted(path.stem for path in (CONF / "preset").glob("*.yaml"))
-ONLY_THE_USER_KNOWS = ("++dataset.root=somewhere",)
+USER_SETTINGS = ("++dataset.root=somewhere",)
 
 
 def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -47,10 +47,10 @@ def figures(line: dict[str, str], column: str) -> list[float | None]:
 
 
 def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
-    """The values are in the comment of the experiment: all 8 frames or 4 of them; `seed` frames are lost."""
+    """The rows `all` and `half` map 8 and 4 frames, of which `seed` frames are lost. The row `broken` fails."""
     first = start(tmp_path)
     out = tmp_path / "outputs" / "fake_ablation"
-    assert first.returncode == 1, "the runs of the broken row failed"
+    assert first.returncode == 1, "expected the status of failed runs, from the row `broken`"
     assert first.stderr.count("ERROR") == 2
     assert "Traceback" not in first.stderr
     metrics = {path.parent.name: path for path in out.glob("*/metrics.json")}
@@ -60,7 +60,14 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
     assert list(lines) == ["all", "half"]
     assert figures(lines["all"], "frames") == [8, 0, 2, 0, 0, 2]
     assert figures(lines["all"], "frames_lost") == [2, pytest.approx(2**0.5), 2, 0, 0, 2]
-    assert figures(lines["half"], "frames_lost") == [2, pytest.approx(2**0.5), 2, 0, 0, 2]  # cancels in each pair
+    assert figures(lines["half"], "frames_lost") == [
+        2,
+        pytest.approx(2**0.5),
+        2,
+        0,
+        0,
+        2,
+    ]  # the difference is 0 for each seed
     assert figures(lines["half"], "frames") == [4, 0, 2, -4, 0, 2]
     text = (out / "table.md").read_text()
     assert text in first.stdout
@@ -77,7 +84,7 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
     assert json.loads(metrics["row=half,seed=3"].read_text())["choice.refiner"] == "identity"
 
     written = {name: path.stat().st_mtime_ns for name, path in metrics.items()}
-    metrics["row=half,seed=3"].unlink()  # as after a kill: the last files are missing
+    metrics["row=half,seed=3"].unlink()  # as if the run had been killed before its last file was written
     again = start(tmp_path, "row=all,half", "table.columns=[frames]")
     assert again.returncode == 0, again.stderr
     assert again.stderr.count("skipped: the completed run in") == 3
@@ -89,7 +96,7 @@ def test_experiment_runs_missing_rows_and_writes_table(tmp_path: Path) -> None:
 
 
 def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
-    """Names with leading zeros stay names. Directory names do not contain table settings."""
+    """Sequence names keep leading zeros. Directory names do not contain table settings."""
     done = start(tmp_path, "experiment=fake_scenes", "table.average_over=[seed]")
     assert done.returncode == 0, done.stderr
     lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
@@ -104,7 +111,7 @@ def test_experiment_table_has_one_column_per_sequence(tmp_path: Path) -> None:
 
 
 def composed(overrides: list[str], *directories: Path) -> tuple[DictConfig, Any]:
-    """Return a job's config and Hydra's own config, as in a job of a sweep."""
+    """Return the config and the choices by group of a job, as in a sweep."""
     with initialize_config_dir(str(directories[0] if directories else CONF), version_base="1.3"):
         config = compose("config", overrides=overrides, return_hydra_config=True)
         HydraConfig.instance().set_config(config)
@@ -124,16 +131,16 @@ def test_experiment_row_name_may_be_number() -> None:
     [(None, False), ("paper", False), *(pytest.param(p, True, marks=pytest.mark.acceptance) for p in [None, *PRESETS])],
 )
 def test_experiment_rows_compose_with_every_preset(experiment: str, preset: str | None, all_rows: bool) -> None:
-    """Rows are composed as by the command, and their stages are built. The last rows are without `all_rows`."""
+    """Compose rows as the command does, and build their stages. Without `all_rows`, use only the last rows."""
     hashes: dict[str, str] = {}
-    asked = [f"experiment={experiment}", "seed=1", *ONLY_THE_USER_KNOWS] + ([f"preset={preset}"] if preset else [])
+    asked = [f"experiment={experiment}", "seed=1", *USER_SETTINGS] + ([f"preset={preset}"] if preset else [])
     with initialize_config_dir(str(CONF), version_base="1.3"):
         rows = compose("config", overrides=asked).rows
     for row in rows if all_rows else list(rows)[-1 if preset else -2 :]:
         config, choices = composed([*asked, f"row={row}"])
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
-        if list(rows[row]) != ["preset=default"]:  # may equal a row without a tracker
+        if list(rows[row]) != ["preset=default"]:  # this row may equal a row without a tracker
             hashes[row] = config_hash({str(key): value for key, value in resolved.items()})
         for interface in (PoseTracker, ClusterRefiner, MapFuser):
             build(interface, config[stage_of(interface)])
@@ -143,7 +150,7 @@ def test_experiment_rows_compose_with_every_preset(experiment: str, preset: str 
         assert choices["experiment"] == experiment
         assert config.dataset.seed == 1
         assert config.row == row
-    assert preset or len(set(hashes.values())) == len(hashes), "two rows are the same"
+    assert preset or len(set(hashes.values())) == len(hashes), "expected a different config for each row"
 
 
 def build_detector(node: DictConfig) -> None:
@@ -171,8 +178,8 @@ def test_sequences_choose_data_detector_and_pose_source() -> None:
 
 
 @pytest.mark.parametrize("sequences", sorted(path.stem for path in (CONF / "sequences").glob("*.yaml")))
-def test_sequences_with_given_poses_track_nothing(sequences: str) -> None:
-    """The pose source of sequences takes precedence over the tracker of a preset, and the command line over both."""
+def test_sequences_with_given_poses_use_ground_truth_tracker(sequences: str) -> None:
+    """The tracker of `sequences` overrides the tracker of `preset`; the command line overrides both."""
     given = sequences.endswith("_given_poses")
     own = {preset: chosen(preset=preset)["tracker"] for preset in PRESETS}
     for preset in PRESETS:
@@ -182,7 +189,7 @@ def test_sequences_with_given_poses_track_nothing(sequences: str) -> None:
 
 
 def chosen(**choices: str) -> dict[str, str]:
-    """Return the choices of Hydra by group."""
+    """Return the option that Hydra chooses for each config group."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", [f"{group}={name}" for group, name in choices.items()], return_hydra_config=True)
     return {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
@@ -194,7 +201,7 @@ def test_preset_default_changes_nothing() -> None:
 
 @pytest.mark.parametrize("experiment", ["table1_runtime", "table2_class_ap", "table3_map", "figure3_stage_times"])
 def test_sequences_of_scenenn_select_real_data_settings(experiment: str) -> None:
-    """They select a network for real images, no rendered truth, the paper's sequences and a separate folder."""
+    """The settings are a network for real images, no rendered ground truth, the paper's sequences and a new folder."""
     overrides = [f"experiment={experiment}", "sequences=scenenn", "dataset.root=DIR"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose("config", overrides=overrides, return_hydra_config=True)
@@ -210,7 +217,7 @@ def test_sequences_of_scenenn_select_real_data_settings(experiment: str) -> None
 
 
 @pytest.mark.parametrize("experiment", ["table3_map", "figure4_progress", "figure5_refinement", "ablation_overlap"])
-def test_experiment_on_rooms_uses_simulated_detector(experiment: str) -> None:
+def test_experiment_on_synthetic_scenes_simulates_detector(experiment: str) -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=[f"experiment={experiment}"], return_hydra_config=True)
     assert (config.hydra.runtime.choices.detector, config.dataset.frame_ground_truth) == ("simulated_yolo11n", True)
@@ -225,7 +232,7 @@ def test_experiment_progress_stop_depends_on_sequence_length(sequences: str, sto
     assert config.dataset.stop == stop
 
 
-def test_experiment_ranks_folder_has_sequences_and_detector() -> None:
+def test_experiment_ranks_folder_names_sequences_and_detector() -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         asked = compose(
             "config",

@@ -1,5 +1,6 @@
-"""A run killed at a random time leaves a complete, partial or no record, and the next run succeeds.
+"""Tests of runs that are killed at random times.
 
+Each killed run leaves complete, partial or no outputs, and the next run succeeds. To test 30 kills, run
 INSTANCEMAP_KILLS=30 python -m pytest tests/framework/commands/running/test_random_kills.py
 """
 
@@ -27,11 +28,11 @@ pytestmark = pytest.mark.acceptance
 
 KILLS = int(os.environ.get("INSTANCEMAP_KILLS", "6"))
 SHORT = ("dataset.frames=20", "fuser.slow_s=0.02", "fuser.slow_save_s=0.3", "fuser.note=note")
-LONGEST_WAIT_S = 1.2  # from any of the times below; mapping takes 0.5 s here, and saving another 0.5 s
+LONGEST_WAIT_S = 1.2  # maximum wait before a kill; mapping takes about 0.5 s, saving another 0.5 s
 
 
 def whole_files(place: Path) -> set[str]:
-    """Return the names of the files of a record. Raises DataError for a truncated file."""
+    """Return the names of the output files in a run directory. Raises DataError for a truncated file."""
     read = {
         "trajectory.txt": read_tum,
         "timings.csv": read_timings,
@@ -47,7 +48,7 @@ def whole_files(place: Path) -> set[str]:
     return there
 
 
-def test_run_record_truncated_file_is_detected(tmp_path: Path) -> None:
+def test_run_truncated_output_file_is_detected(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text('{"frames": 2')
     with pytest.raises(DataError):
         whole_files(tmp_path)

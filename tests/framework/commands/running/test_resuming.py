@@ -1,4 +1,4 @@
-"""Tests of resumed maps, which are byte-identical to an uninterrupted run."""
+"""Tests of resumed maps and of localization in a stored map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
 
 
 def stored_files(mapper: Mapper, place: Path) -> Path:
-    """Return the stored files of a run's map."""
+    """Write the map and the keyframes of a mapper to the new folder `place`; return the folder."""
     place.mkdir()
     mapper.scene.save(place / "map.npz")
     if keyframes := mapper.pipeline.tracker.keyframes():
@@ -54,7 +54,7 @@ def test_resumed_map_is_identical_to_single_run(tmp_path: Path, room: CornerRoom
 
 
 def test_resumed_map_continues_frame_numbers(tmp_path: Path, room: CornerRoom) -> None:
-    """Both recordings number their frames from 0. An object in both counts the frames of both."""
+    """Both recordings number their frames from 0. An object in both is observed in the frames of both."""
     first, _ = mapped(room, *GIVEN)
     again, _ = mapped(room, *GIVEN, f"resume_from={stored_files(first, tmp_path / 'first')}")
     for key, instance in first.instances().items():
@@ -68,7 +68,7 @@ def ate_mm(recording: Recording, poses: list[Pose]) -> float:
 
 
 def check_halves(tmp_path: Path, recording: Recording) -> None:
-    """Check that the tracking of the resumed second half is identical to that of a single run."""
+    """Check that mapping in two halves has an ATE at most 5 mm above that of a single run, and a similar map."""
     half = len(recording) // 2
     whole, poses = mapped(recording, *TRACKED)
     first, in_first = mapped([recording[k] for k in range(half)], *TRACKED)
@@ -91,7 +91,7 @@ def test_resumed_kitchen_tracking_matches_single_run(tmp_path: Path, shared_data
 
 
 @pytest.mark.parametrize("tracker", ["voxel_hashing_icp", "pycolmap_pnp"])
-def test_resume_in_other_place_leaves_map_unchanged(tmp_path: Path, shared_data: Path, tracker: str) -> None:
+def test_resume_in_another_room_leaves_map_unchanged(tmp_path: Path, shared_data: Path, tracker: str) -> None:
     stages = (*TRACKED, f"tracker={tracker}")
     desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *stages)
     before = stored_files(desk, tmp_path / "desk")
@@ -181,7 +181,7 @@ def test_resumed_map_of_two_recordings_round_trips(tmp_path: Path, room: CornerR
 
 
 def test_localize_in_places_new_map_in_stored_world(tmp_path: Path) -> None:
-    """Without true poses, the second recording gets poses in the world of the first one."""
+    """Without ground-truth poses, the second recording is tracked in the world frame of the first one."""
     unposed = [replace(DESK[k], T_world_camera=None) for k in range(40)]
     first, poses = mapped(unposed[:25], *TRACKED)
     own, in_its_world = mapped(unposed[20:], *TRACKED, f"localize_in={stored_files(first, tmp_path / 'first')}")

@@ -1,4 +1,4 @@
-"""Tests of the end of a run (complete, partial or without result) and of its directory."""
+"""Tests of complete, partial and failed runs, and of the run directory."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ PATIENCE_S = 120
 
 
 def begin(directory: Path, *arguments: str, before: Callable[[], object] | None = None) -> ForkedCommand:
-    """Start a run of fake stages in `directory`; `before` is called in its process."""
+    """Start a run with fake stages in `directory`; its process calls `before` first."""
     return ForkedCommand(directory, "--config-dir", str(FAKE_CONF), *FAKES, *arguments, before=before)
 
 
 def end(process: ForkedCommand) -> tuple[int | None, str]:
-    """Return the exit status and stderr."""
+    """Wait for the process; return its exit status and stderr."""
     try:
         _, stderr = process.communicate(timeout=PATIENCE_S)
     except subprocess.TimeoutExpired:
@@ -56,7 +56,7 @@ def figures(directory: Path, name: str = "metrics.partial.json") -> dict[str, ob
 
 
 def limit_file_size() -> None:
-    """Limit files to 64 KiB. The kernel then responds as on a full disk."""
+    """Limit the size of files to 64 KiB. Larger writes fail as on a full disk."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))
 
 
@@ -67,7 +67,7 @@ def ignore_ctrl_c() -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("background", [False, True])
 def test_run_signal_leaves_partial_record(tmp_path: Path, number: signal.Signals, background: bool) -> None:
-    """This includes runs that a script starts in the background, which ignore Ctrl-C."""
+    """Runs that a script starts in the background ignore Ctrl-C."""
     place = tmp_path / "run"
     process = begin(tmp_path, *ENDLESS, f"hydra.run.dir={place}", before=ignore_ctrl_c if background else None)
     wait_for(tmp_path / "note", process)
@@ -100,7 +100,7 @@ def test_run_stage_error_leaves_partial_record(tmp_path: Path, kind: str, messag
     assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
     left = figures(place)
     assert message in str(left["partial"])
-    assert left["frames"] in (3, 4)  # the detector fails before the frame is taken, masks when they are lifted
+    assert left["frames"] in (3, 4)  # a detector error is before the frame is counted, a mask error after
     assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
 
 
@@ -123,7 +123,7 @@ def test_run_error_before_first_frame_leaves_no_record(tmp_path: Path) -> None:
 
 
 def test_run_stage_system_exit_leaves_partial_record(tmp_path: Path) -> None:
-    """A preempted job of submitit exits like this."""
+    """A preempted submitit job raises SystemExit."""
     place = tmp_path / "run"
     status, _ = end(begin(tmp_path, "detector=faulty", "detector.kind=SystemExit", f"hydra.run.dir={place}"))
     assert status == 7
@@ -202,7 +202,7 @@ def test_live_run_second_signal_leaves_partial_record(tmp_path: Path) -> None:
     place = tmp_path / "run"
     process = begin(tmp_path, *LIVE, "fuser.slow_s=2", f"hydra.run.dir={place}")
     wait_for(tmp_path / "note", process)
-    time.sleep(0.5)  # in the middle of the second frame
+    time.sleep(0.5)  # during the second frame
     for number in (signal.SIGTERM, signal.SIGTERM):
         process.send_signal(number)
         time.sleep(0.05)
@@ -215,7 +215,7 @@ def test_live_run_source_failure_leaves_partial_record(tmp_path: Path) -> None:
     place = tmp_path / "run"
     status, stderr = end(begin(tmp_path, "dataset=live", "dataset.fails_after=3", f"hydra.run.dir={place}"))
     assert status == 3
-    assert "the cable is out" in stderr.splitlines()[-1]
+    assert "expected a connected camera, got none" in stderr.splitlines()[-1]
     assert figures(place)["frames"] == 3
 
 

@@ -58,7 +58,7 @@ def test_show_refinement_errors_are_one_line(tmp_path: Path, overrides: list[str
 
 
 class FoundOnlyIn(SphereDetector):
-    """Detects both spheres in one frame and nothing in the others."""
+    """Detector of both spheres in one frame and of nothing in the other frames."""
 
     def __init__(self, index: int) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ def test_show_refinement_default_frame_has_most_detections() -> None:
     position, frame, found = detected(CornerRoom(), FoundOnlyIn(4), None)
     assert (position, frame.index, len(found)) == (4, 4, 2)
     position, _, _ = detected(CornerRoom(), SphereDetector(), None)
-    assert position == 0, "the first of equals"
+    assert position == 0, "expected the first of the frames with equally many detections"
     position, frame, found = detected(CornerRoom(frames=60, start=2, stride=2), FoundOnlyIn(2), None)
     assert (position, frame.index, len(found)) == (0, 2, 2)
 
@@ -105,7 +105,7 @@ def test_show_refinement_tries_few_frames_of_long_video() -> None:
     assert Counted.calls == CANDIDATES
 
 
-def test_show_refinement_called_has_refiner_overrides() -> None:
+def test_show_refinement_called_returns_refiner_overrides() -> None:
     overrides = ["refiner=chain", "refiner.links.gmm_em=null", "refiner@refiner.links.x=kmeans", "frame=3", "seed=1"]
     assert called("chain", overrides) == "refiner=chain refiner.links.gmm_em=null refiner@refiner.links.x=kmeans"
     added = "+refiner@refiner.links.last=largest_component"

@@ -1,4 +1,4 @@
-"""Tests of sweeps with every launcher, killed and started twice."""
+"""Tests of sweeps with every launcher, including sweeps that are killed and started again."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ FAILED = "error: a run failed: dataset tests.support.scenes.corner_room.CornerRo
 PLACE = Path("outputs") / "fake_ablation"
 BY_JOBLIB = ("launcher=joblib", "hydra.launcher.n_jobs=2")
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
-SLOW = "dataset.slow_s=0.1"  # so that a killed worker is in the middle of a run instead of returning its result
-SIX = ("row=half,broken", "seed=1,2,3", SLOW)  # runs of the broken row fail
+SLOW = "dataset.slow_s=0.1"  # so that workers are killed in the middle of a run
+SIX = ("row=half,broken", "seed=1,2,3", SLOW)  # six runs; those of the row `broken` fail
 RUNS = {f"{SLOW},row=half,seed={seed}" for seed in (1, 2, 3)}
 PATIENCE_S = 180
 
 
 def begin(directory: Path, *arguments: str, sweep: str = "experiment=fake_ablation") -> subprocess.Popen[str]:
-    """Start the fake experiment or another sweep in its own process group, like a terminal."""
+    """Start the fake experiment or another sweep in its own process group, as a terminal does."""
     fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), sweep]
     clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
     environment = clean | {
@@ -86,7 +86,7 @@ def begun(directory: Path) -> dict[str, int]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
-    """Return an uninterrupted joblib sweep with a row whose runs fail, and its folder."""
+    """Return the folder and the ended process of an uninterrupted joblib sweep; the runs of one row fail."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     directory = tmp_path_factory.mktemp("whole")
     return directory, end(begin(directory, *BY_JOBLIB, *SIX))
@@ -98,7 +98,7 @@ def test_sweep_by_joblib_continues_after_failed_runs(
     directory, done = whole
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert done.stderr.count("ERROR") == 3, "each failed run is logged once"
+    assert done.stderr.count("ERROR") == 3, "expected one log line per failed run"
     assert "ERROR   #4 dataset" in done.stderr
     assert done.stderr.splitlines()[-1].startswith(
         "error: a run failed: dataset tests.support.scenes.corner_room.CornerRoom: frames"
@@ -107,7 +107,7 @@ def test_sweep_by_joblib_continues_after_failed_runs(
     text = (directory / PLACE / "table.md").read_text()
     assert text in done.stdout
     assert f"Incomplete: {SLOW},row=broken,seed=1: failed: dataset" in text
-    assert "threads=1" in text, "it affects the speed of the runs"
+    assert "threads=1" in text, "expected the number of threads, which affects the speed of the runs"
 
 
 def test_sweep_with_other_launcher_keeps_completed_runs(
@@ -122,7 +122,7 @@ def test_sweep_with_other_launcher_keeps_completed_runs(
 
 
 @pytest.mark.acceptance
-def test_sweep_after_kill_resumes_to_same_table(
+def test_sweep_resumed_after_kill_writes_same_table(
     whole: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
     """First one worker is killed, then the whole sweep."""
@@ -156,7 +156,7 @@ def test_sweep_after_kill_resumes_to_same_table(
 
 
 def test_sweep_without_experiment_reports_failures(tmp_path: Path) -> None:
-    """The folder is named after the start time, which workers must not determine again."""
+    """The folder is named after the start time of the sweep, also in worker processes."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     done = end(begin(tmp_path, *FAKES, "dataset.frames=few,many", "launcher=joblib", sweep="-m"))
     assert done.returncode == 1
@@ -169,7 +169,7 @@ def test_sweep_without_experiment_reports_failures(tmp_path: Path) -> None:
 
 
 def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, int]]:
-    """Run a sweep without an experiment in one folder; return the completion times by the end of the run's name."""
+    """Run a sweep without an experiment in one folder; return the process and the completion times."""
     done = end(begin(directory, *FAKES, "dataset.frames=3", "hydra.sweep.dir=s", *arguments, sweep="-m"))
     assert done.returncode == 0, done.stderr
     runs = (directory / "s").glob("*/metrics.json")
@@ -195,7 +195,7 @@ def test_sweep_without_experiment_is_resumed(tmp_path: Path) -> None:
 
 @pytest.mark.acceptance
 def test_sweep_over_neutral_settings_has_separate_folders(tmp_path: Path) -> None:
-    """A sweep that times these settings needs them; workers use the same names."""
+    """A sweep that times these settings needs them in its directory names. Workers use the same names."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     _, first = swept(tmp_path, "threads=1,2", "prefetch=0")
     assert set(first) == {"threads=1,tracker=fake", "threads=2,tracker=fake"}
@@ -235,7 +235,7 @@ ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=10000
 def test_sweep_signal_leaves_partial_record_of_active_runs(
     tmp_path: Path, signal_sent: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
 ) -> None:
-    """A terminal sends Ctrl-C to the workers as well; `kill` does not."""
+    """A terminal sends Ctrl-C to the workers as well; `kill` signals only the main process."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     by_joblib = (*BY_JOBLIB, f"hydra.launcher.n_jobs={n_jobs}")
     process = begin(tmp_path, *by_joblib, "row=all", f"seed={seeds}", *ENDLESS, "fuser.note=${seed}.note")
@@ -286,7 +286,7 @@ def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
     wait_until(lambda: len(begun(tmp_path)) == 2, first)
     workers = psutil.Process(first.pid).children(recursive=True)
     for worker in workers:
-        worker.suspend()  # until others wait for it, on a machine of any speed
+        worker.suspend()  # until the second sweep waits, on a machine of any speed
     first.kill()
     again = begin(tmp_path, *arguments)
     logs = (tmp_path / PLACE).glob
@@ -295,7 +295,7 @@ def test_sweep_waits_for_runs_of_killed_sweep(tmp_path: Path) -> None:
         worker.resume()
     done = end(again)
     for worker in workers:
-        worker.kill()  # idle workers, for some minutes
+        worker.kill()  # otherwise, idle workers stay for some minutes
     first.communicate()
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("in use by process") == 2
@@ -341,7 +341,7 @@ def test_cluster_launchers_run_locally(tmp_path: Path, package: str, arguments: 
     assert (tmp_path / PLACE / "table.md").read_text() in done.stdout
 
 
-# Without a process
+# Tests without a process
 
 
 def test_launcher_missing_error_names_extra() -> None:
@@ -359,7 +359,7 @@ def test_jobs_at_once_depends_on_threads_and_cores(monkeypatch: pytest.MonkeyPat
     ("launcher", "node"), [("joblib", "n_jobs"), ("slurm", "cpus_per_task"), ("ray", "ray.remote.num_cpus")]
 )
 def test_launcher_config_uses_job_threads(launcher: str, node: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """There are twelve cores, and threads=0 uses all. A job without cores would never reach the limit."""
+    """The machine has 12 cores, and threads=0 uses all of them. A job with 0 cores would not count toward the limit."""
     pytest.importorskip(f"hydra_plugins.hydra_{launcher.replace('slurm', 'submitit')}_launcher")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
     for threads in (3, 0):

@@ -14,7 +14,7 @@ DEPTH = Camera(640 // 8, 480 // 8, 577.9 / 8, 576.5 / 8, 39.6, 29.4)
 
 
 def ramp(camera: Camera) -> np.ndarray:
-    """Return the viewing direction of each pixel as color: x / z and y / z, scaled."""
+    """Return an image (H, W, 3) that encodes the viewing direction of each pixel: scaled x / z and y / z."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     return np.stack([128 + 200 * x, 128 + 200 * y, np.full_like(x, 77)], axis=-1)
@@ -23,7 +23,9 @@ def ramp(camera: Camera) -> np.ndarray:
 def test_color_registration_matches_viewing_direction() -> None:
     image, registration = np.round(ramp(COLOR)).astype(np.uint8), ColorRegistration(COLOR, DEPTH)
     found, negative = registration.apply(image), registration.apply(255 - image)
-    assert np.abs(found[2:-2, 2:-2] - ramp(DEPTH)[2:-2, 2:-2]).max() < 1.2  # of 255; a shift by one pixel is 2.8
+    assert (
+        np.abs(found[2:-2, 2:-2] - ramp(DEPTH)[2:-2, 2:-2]).max() < 1.2
+    )  # of 255; a shift of one pixel changes colors by 2.8
     both = (found + (255.0 - negative)) / 2  # OpenCV rounds halves up, which cancels here
     assert np.abs((both - ramp(DEPTH))[2:-2, 2:-2].mean(axis=(0, 1))).max() < 0.02
 

@@ -15,7 +15,7 @@ from framework.errors import DataError
 from framework.geometry import exp_se3
 from tests.support.scenes.analytic_scene import CAMERA, room
 
-LENS = Distortion(k1=0.2624, k2=-0.9531, p1=-0.0054, p2=0.0026, k3=1.1633)  # freiburg1's
+LENS = Distortion(k1=0.2624, k2=-0.9531, p1=-0.0054, p2=0.0026, k3=1.1633)  # lens of freiburg1
 
 
 @pytest.mark.parametrize("intrinsics", [Intrinsics.FREIBURG1, Intrinsics.FREIBURG2])
@@ -30,7 +30,7 @@ def test_distorted_matches_opencv(intrinsics: Intrinsics) -> None:
 
 
 def recorded(camera: Camera, lens: Distortion, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (depth, color) as recorded with this lens; the ray of each pixel inverts the lens model."""
+    """Return the depth (H, W), m, and color (H, W, 3) seen through the lens, from the inverted lens model."""
     wide = Camera(3 * camera.width, 3 * camera.height, 2 * camera.fx, 2 * camera.fy, 239.5, 179.5)
     depth, color, _ = room().render(wide, T_world_camera)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)
@@ -47,7 +47,12 @@ def test_undistortion_view_matches_pinhole_view() -> None:
     depth, color = recorded(CAMERA, LENS, T)
     true_depth, true_color, surface = room().render(CAMERA, T)
     inside = np.ones(CAMERA.shape, bool)
-    inside[:6], inside[-6:], inside[:, :6], inside[:, -6:] = False, False, False, False  # the lens covers less there
+    inside[:6], inside[-6:], inside[:, :6], inside[:, -6:] = (
+        False,
+        False,
+        False,
+        False,
+    )  # the distorted image does not cover the border
     edges = cv2.dilate(cv2.Laplacian(surface.astype(np.float32), cv2.CV_32F), np.ones((7, 7))) != 0
     kept = inside & ~edges & (true_depth > 0)
     undistortion = Undistortion(CAMERA, LENS)
@@ -55,7 +60,7 @@ def test_undistortion_view_matches_pinhole_view() -> None:
     after = np.abs(undistortion.smooth(color).astype(int) - true_color)[kept].mean()
     assert after < 1 < before
     off, was = (np.abs(z - true_depth)[kept] for z in (undistortion.exact(depth), depth))
-    assert np.percentile(off, 90) < np.percentile(was, 90) / 4  # the nearest pixel is half a pixel off
+    assert np.percentile(off, 90) < np.percentile(was, 90) / 4  # the nearest pixel can be half a pixel off
 
 
 def test_undistortion_exact_mode_does_not_mix_labels() -> None:

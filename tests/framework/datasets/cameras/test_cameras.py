@@ -33,14 +33,14 @@ from tests.support.scenes.fake_cameras import (
 
 @dataclass(frozen=True)
 class Brand:
-    """A reader and a fake of its library."""
+    """A camera reader and the fake of its vendor library."""
 
     name: str
     reader: type[RealSense] | type[Orbbec]
     library: str
     module: Callable[[FakeCamera], ModuleType]
-    depth_size: tuple[int, int]  # requested rate; 0 = any
-    nothing_there: str  # expected error
+    depth_size: tuple[int, int]  # requested width and height, px; 0 = any
+    nothing_there: str  # expected error without a connected device
 
     def video(self, **parameters: object) -> LiveVideo:
         size = {"width": CAMERA.width, "height": CAMERA.height}
@@ -86,7 +86,7 @@ def test_camera_frames_are_registered_to_color(brand: Brand, device: FakeCamera)
 def test_camera_stream_request_matches_parameters(brand: Brand, device: FakeCamera) -> None:
     video = brand.video(serial=SERIAL, fps=60)
     assert video.name == f"{brand.name}_{SERIAL}"
-    assert not device.started, "nothing is logged before the first frame is requested"
+    assert not device.started, "expected no started stream before the first frame is requested"
     assert len(list(sent(video, 1))) == len(list(sent(video, 1))) == 1
     for asked in device.started:
         assert asked["color"] == (96, 72, "rgb", 60)
@@ -101,7 +101,7 @@ def test_camera_depth_beyond_max_depth_is_invalid(brand: Brand, device: FakeCame
     assert whole.depth.max() > 2.9
 
 
-def test_camera_lens_is_undistorted_only_for_supported_model(
+def test_camera_images_are_undistorted_for_supported_model_only(
     brand: Brand, device: FakeCamera, caplog: pytest.LogCaptureFixture
 ) -> None:
     device.coeffs = (0.1, -0.05, 0.01, 0.02, 0.001)
@@ -187,7 +187,7 @@ def test_camera_missing_depth_raises_for_its_frame_only(brand: Brand, device: Fa
 
 
 def test_orbbec_waits_for_first_depth_frame(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The depth unit is known from this frame on."""
+    """The first depth frame contains the depth unit."""
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", orbbec_module(FakeCamera(without_depth=0)))
     [frame] = sent(BRANDS[1].video(), 1)
     np.testing.assert_allclose(frame.depth, CornerRoom()[1].depth, atol=UNIT)

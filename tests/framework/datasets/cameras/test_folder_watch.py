@@ -56,14 +56,14 @@ def folder(tmp_path: Path) -> Path:
 
 
 class Watched:
-    """A watched folder with the messages since the last call."""
+    """A watched folder that is scanned on request."""
 
     def __init__(self, folder: Path, **parameters: Any) -> None:
         self.over = False
         self._frames = FolderWatch(folder, poll_interval=0.001, **parameters).frames()
 
     def readers(self) -> Iterator[FrameReader]:
-        """Return the readers of one scan, up to the first None."""
+        """Yield the frame readers of one scan, up to the first None."""
         while (reader := next(self._frames, self)) is not None:
             if isinstance(reader, Watched):
                 self.over = True
@@ -71,7 +71,7 @@ class Watched:
             yield reader
 
     def look(self) -> list[int | str]:
-        """Return the numbers of the readable frames and the messages about the others."""
+        """Scan the folder; return the indices of the readable frames and the error messages of the others."""
         return [outcome(reader) for reader in self.readers()]
 
 
@@ -124,7 +124,7 @@ def test_folder_watch_emits_frame_once_both_files_are_complete(folder: Path, lat
     assert watched.look() == []
 
 
-def test_folder_watch_reports_overtaken_incomplete_frame_once(folder: Path) -> None:
+def test_folder_watch_reports_earlier_incomplete_frame_once(folder: Path) -> None:
     watched, files = Watched(folder), encoded(1)
     color, depth = files
     write(folder, 0)
@@ -174,7 +174,7 @@ def test_folder_watch_continues_after_files_are_removed(folder: Path) -> None:
     assert watched.look() == [2]
 
 
-def test_folder_watch_ambiguous_but_not_unrelated_names_raise(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_folder_watch_raises_for_ambiguous_names_only(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     watched = Watched(folder)
     for name in (".000000.jpg", "000000.jpg.part", "preview.jpg", f"{2**53}.jpg"):
         (folder / "color" / name).write_bytes(b"?")
@@ -261,14 +261,14 @@ def test_folder_watch_parameter_out_of_range_raises(folder: Path, parameter: dic
 
 @dataclass
 class Known(PoseTracker):
-    """Returns detections by frame number."""
+    """Tracker that returns the ground-truth pose of each frame."""
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         return Pose(pose_at(frame.index))
 
 
-def test_folder_watch_maps_folder_while_it_is_written(folder: Path) -> None:
-    """The writer is slow, writes its files in place, and ends."""
+def test_folder_watch_folder_is_mapped_while_written(folder: Path) -> None:
+    """The writer is slow, writes its files in place, and at the end creates the file `end`."""
 
     def writer() -> None:
         for k in range(len(ROOM)):

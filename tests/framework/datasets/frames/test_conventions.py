@@ -1,4 +1,4 @@
-"""Tests of configurable conventions: poses, units and image pairs that differ from the format."""
+"""Tests of configurable conventions for poses, units and image pairs that differ from the dataset format."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_pose_reading_recovers_original_pose(seed: int) -> None:
 
 
 def test_camera_axes_match_system_conventions() -> None:
-    """The directions forward, right and down in the image, in the axes of each system."""
+    """The expected values are the directions right, down and forward of the image in the axes of each system."""
     right, below, ahead = np.eye(3)
     for axes, expected in {
         CameraAxes.OPENCV: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -64,7 +64,7 @@ def test_camera_axes_match_system_conventions() -> None:
         ({"depth_delay": 1001}, "delay"),
     ],
 )
-def test_pose_reading_invalid_parameter_raises(wrong: dict[str, float], message: str) -> None:
+def test_conventions_invalid_parameter_raises(wrong: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         DepthReading(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="pose_unit"):
@@ -74,7 +74,7 @@ def test_pose_reading_invalid_parameter_raises(wrong: dict[str, float], message:
 
 
 def images(k: int) -> StoredImages:
-    """Return images that contain their number."""
+    """Return 2x2 images whose pixels have the value k."""
     color, depth = np.full((2, 2, 3), k, np.uint8), np.full((2, 2), k, np.uint16)
     return StoredImages(f"color {k}", f"depth {k}", lambda: color, lambda: depth)
 

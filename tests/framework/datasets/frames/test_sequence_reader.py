@@ -28,16 +28,16 @@ def test_frame_selection_past_end_error_gives_frame_count():
 
 def test_frame_fraction_is_seeded_ordered_subset():
     first = choose_frames(100, 10, 90, 2, frame_fraction=0.85, seed=3)
-    assert len(first) == 34  # of 40
+    assert len(first) == 34  # 85 % of 40
     assert list(first) == sorted(set(first))
     assert set(first) < set(range(10, 90, 2))
     assert first == choose_frames(100, 10, 90, 2, frame_fraction=0.85, seed=3)
     assert first != choose_frames(100, 10, 90, 2, frame_fraction=0.85, seed=4)
-    assert all(type(index) is int for index in first)  # frame numbers go into JSON
+    assert all(type(index) is int for index in first)  # frame numbers are written to JSON
 
 
 def test_frame_fraction_sampling_is_uniform():
-    """Each of 20 frames is in half of the subsets: 500 +- 5 standard deviations of 1000."""
+    """Each of 20 frames is in 500 ± 80 (5 standard deviations) of 1000 subsets."""
     taken = [index for seed in range(1000) for index in choose_frames(20, 0, -1, 1, frame_fraction=0.5, seed=seed)]
     counts = [taken.count(index) for index in range(20)]
     assert min(counts) > 420

@@ -1,4 +1,4 @@
-"""Tests of a ground truth chosen by the user, on a labeled wall in front of a camera."""
+"""Tests of ground truth that the user selects, with a labeled wall in front of a camera."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ from tests.support.recordings.recordings import opened
 
 CAMERA = Camera(48, 32, 40.0, 41.0, 23.5, 15.5)
 FRAMES = 4
-WALL = 2.0  # m, its distance from the cameras
-CELL = 0.05  # m, between its vertices
-CHAIR, UNKNOWN = 7, 70_000  # instances: x < -0.3 m, and x > 0.4 m
+WALL = 2.0  # z of the wall in the world frame, m
+CELL = 0.05  # distance between the vertices of the wall, m
+CHAIR, UNKNOWN = 7, 70_000  # instance ids at x < -0.3 m and at x > 0.4 m
 CLASSES = {str(CHAIR): {"name": "arm chair", "class": "chair"}, str(UNKNOWN): {"name": "thing", "class": None}}
-T_RUN_WORLD = exp_se3(np.array([1.0, -2.0, 0.5, 0.3, -0.8, 0.4]))  # the world of a tracked run
+T_RUN_WORLD = exp_se3(
+    np.array([1.0, -2.0, 0.5, 0.3, -0.8, 0.4])
+)  # from the world frame of the recording to that of a tracked run
 
 
 def pose(k: int) -> np.ndarray:
@@ -41,7 +43,7 @@ def label_at(x: np.ndarray) -> np.ndarray:
 
 
 def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray) -> None:
-    """Write a wall of 4 x 4 m, moved by T; by default with labels."""
+    """Write the mesh of a wall of 4 x 4 m, transformed by T. By default, it has labels."""
     side = np.arange(-2.0, 2.0 + CELL / 2, CELL)
     x, y = np.meshgrid(side, side)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -57,7 +59,7 @@ def write_wall(path: Path, T: np.ndarray | None = None, **properties: np.ndarray
 
 
 def seen_labels(k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the label of each pixel's point on the wall, and the pixels away from label borders."""
+    """Return the labels (H, W) of frame k on the wall, and a mask (H, W) of the pixels away from label borders."""
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(CAMERA.shape)], axis=-1)
     T = pose(k)
@@ -68,7 +70,7 @@ def seen_labels(k: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a recording with poses and no annotation."""
+    """Return the folder of a recording with poses and without annotation."""
     root = tmp_path / "room"
     for name in ("color", "depth"):
         (root / name).mkdir(parents=True)
@@ -92,7 +94,7 @@ def mesh(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tracked_run(tmp_path: Path) -> Path:
-    """Return a run of the recording in its own world; instance UNKNOWN is tentative, without an entry."""
+    """Return a run of the recording in its own world frame. UNKNOWN is tentative and not in instances.json."""
     run = tmp_path / "run"
     run.mkdir()
     write_wall(run / "mesh.ply", T_RUN_WORLD)
@@ -154,7 +156,7 @@ def test_named_truth_of_frame_without_pose_is_not_rendered(folder: Path, tracked
     frame = RgbdFolder(folder, ground_truth=tracked_run)[2]
     with pytest.raises(NoPoseError, match="frame 2: expected a pose to render ground-truth instances"):
         GroundTruthDetector().detect(frame)
-    assert frame_hash(frame, ("color", "truth")), "a stored detection is found without rendering"
+    assert frame_hash(frame, ("color", "truth")), "expected a hash without rendering, as stored detections need it"
 
 
 def test_named_truth_mesh_without_given_poses_raises(folder: Path, mesh: Path) -> None:
@@ -177,7 +179,9 @@ def test_named_truth_tracked_run_is_aligned_to_map(folder: Path, tracked_run: Pa
     video = RgbdFolder(folder, ground_truth=tracked_run)
     expected, clear = seen_labels(3)
     np.testing.assert_array_equal(
-        video[3].truth.instance_ids[clear], np.where(expected == CHAIR, CHAIR, 0)[clear], "by the poses of the run"
+        video[3].truth.instance_ids[clear],
+        np.where(expected == CHAIR, CHAIR, 0)[clear],
+        "expected masks at the poses of the run",
     )
     truth = video.scene_truth()
     np.testing.assert_array_equal(np.unique(truth.instance_ids), [0, CHAIR])
@@ -190,7 +194,7 @@ def test_named_truth_tracked_run_is_aligned_to_map(folder: Path, tracked_run: Pa
 
 
 def test_named_truth_run_with_given_poses_is_not_aligned(folder: Path, tracked_run: Path) -> None:
-    """The map begins at the given pose and drifts; its drift is part of the error."""
+    """The map begins at the given pose and drifts. The drift is part of the error."""
     (tracked_run / "metrics.json").write_text('{"pose_source": "ground_truth"}')
     times, poses = read_tum(tracked_run / "trajectory.txt")
     truth = RgbdFolder(folder, ground_truth=tracked_run).scene_truth()
@@ -283,7 +287,7 @@ def test_named_truth_masks_agree_with_annotated_images(shared_data: Path, name: 
 def test_named_truth_applies_to_every_dataset(
     shared_data: Path, mesh: Path, option: str, root: str, scene: str
 ) -> None:
-    """The mesh is a wall in front of the first camera with a pose."""
+    """The mesh is a wall in front of the camera of the first frame with a pose."""
     place = (f"dataset.root={shared_data / root}", f"dataset.scene={scene}")
     first = next(frame for frame in opened(option, *place) if frame.T_world_camera is not None)
     write_wall(mesh, first.T_world_camera)

@@ -1,4 +1,4 @@
-"""Tests of the voxel votes on small scenes with exact results, compared with a slow reference."""
+"""Tests of voxel voting on small scenes, compared with exact results and a slow reference implementation."""
 
 from collections import Counter, defaultdict
 
@@ -52,7 +52,7 @@ def test_scene_truth_matches_per_pixel_reference():
     truth = fuse_scene_truth(random_views(30, 3), {1: "chair"}, voxel)
     expected = reference(random_views(30, 3), voxel)
     assert len(truth.points_world) == len(expected)
-    # Dictionaries keep the order of insertion: the order of first sight.
+    # Points and dictionary keys are in the order in which their voxels are first observed.
     for point, instance, (best, mean) in zip(truth.points_world, truth.instance_ids, expected.values(), strict=True):
         assert instance == best
         np.testing.assert_allclose(point, mean, atol=1e-6)
@@ -63,13 +63,13 @@ def test_scene_truth_wall_gives_one_point_per_voxel():
     truth = fuse_scene_truth(
         [view(np.full(camera.shape, 2.0), np.full(camera.shape, 5), camera=camera)], {5: "tv"}, 0.05
     )
-    # Pixels are 2 cm apart: they cover 4.00 x 3.00 m about the axis, less a pixel.
+    # Pixels are 2 cm apart. They cover 4.00 x 3.00 m around the optical axis, minus one pixel.
     assert len(truth.points_world) == 80 * 60
     np.testing.assert_allclose(truth.points_world[:, 2], 2.0, atol=1e-6)
     assert (truth.instance_ids == 5).all()
 
 
-def test_scene_truth_majority_wins_and_tie_takes_smaller_id():
+def test_scene_truth_uses_majority_and_smaller_id_on_tie():
     depth = np.zeros(CAMERA.shape)
     depth[2, 2] = 1.0
     frames = [view(depth, np.full(CAMERA.shape, i)) for i in (3, 2, 3, 2, 9)]
@@ -84,7 +84,7 @@ def test_scene_truth_hash_table_growth_keeps_voxels_unique():
     again = fuse_scene_truth(random_views(6, 1, camera), {}, 0.001)
     np.testing.assert_array_equal(truth.points_world, again.points_world)
     keys = np.floor(truth.points_world.astype(np.float64) / 0.001).astype(int)
-    assert len(np.unique(keys, axis=0)) > 0.99 * len(keys)  # a mean may be rounded across a voxel's border
+    assert len(np.unique(keys, axis=0)) > 0.99 * len(keys)  # a mean may be rounded into the next voxel
 
 
 def test_scene_truth_empty_depth_gives_no_points():

@@ -32,7 +32,7 @@ from tests.support.recordings.scannet_files import (
 )
 
 SCENE = "scene0000_00"
-CHAIR, WALL, UNTOLD = 1, 0, 3
+CHAIR, WALL, UNLABELED = 1, 0, 3
 Writer = Callable[[Path, list[Shot]], None]
 
 
@@ -47,7 +47,7 @@ def write(request: pytest.FixtureRequest) -> Writer:
 
 
 def write_labels(scene: Path) -> None:
-    """Write a wall 2 m in front of the first camera: a chair left of x = 0, unlabeled right of x = 0.3."""
+    """Write a wall 2 m in front of the first camera: a chair at x < 0, and no label at x > 0.3 m."""
     x, y = np.meshgrid(np.linspace(-1.5, 1.5, 31), np.linspace(-1.5, 1.5, 31))
     vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(30)[:, None] * 31 + np.arange(30)).ravel()
@@ -118,7 +118,7 @@ def test_scannet_points_are_mapped_at_their_positions(tmp_path: Path, write: Wri
     depth = frames[1].depth.ravel().astype(np.float32) / 1000
     expected = transform(frames[1].T_world_camera, back_project(DEPTH_CAMERA, pixels, depth))
     distance = np.linalg.norm(points[:, None] - expected[None], axis=-1).min(axis=0)
-    assert distance.max() < 0.1  # the grid's cells
+    assert distance.max() < 0.1  # m
 
 
 def test_scannet_invalid_pose_raises_for_its_frame(tmp_path: Path, write: Writer) -> None:
@@ -235,19 +235,19 @@ def test_scannet_truth_matches_labeled_mesh(tmp_path: Path, write: Writer) -> No
     assert sequence.annotation == "ScanNet v2"
     truth = sequence.scene_truth()
     assert truth is not None
-    assert truth.class_names == {CHAIR: "chair", UNTOLD: None}
+    assert truth.class_names == {CHAIR: "chair", UNLABELED: None}
     x = truth.points_world[:, 0]
-    np.testing.assert_array_equal(truth.instance_ids, np.where(x < -0.01, CHAIR, np.where(x > 0.31, UNTOLD, WALL)))
+    np.testing.assert_array_equal(truth.instance_ids, np.where(x < -0.01, CHAIR, np.where(x > 0.31, UNLABELED, WALL)))
     seen = sequence[1].truth
     assert seen is not None
     ray = (np.arange(32) - DEPTH_CAMERA.cx) / DEPTH_CAMERA.fx * 2 + 0.05
-    sure = (np.abs(ray + 0.05) > 0.06) & (np.abs(ray - 0.35) > 0.06)  # from the borders between vertices
-    expected = np.where(ray < -0.05, CHAIR, np.where(ray > 0.35, UNTOLD, WALL))
+    sure = (np.abs(ray + 0.05) > 0.06) & (np.abs(ray - 0.35) > 0.06)  # away from label borders
+    expected = np.where(ray < -0.05, CHAIR, np.where(ray > 0.35, UNLABELED, WALL))
     np.testing.assert_array_equal(seen.instance_ids[12, sure], expected[sure])
 
 
 def test_scannet_missing_label_table_changes_annotation_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The same map has other metrics without the table, so tables must not mix both."""
+    """Without the table, the same map has other metrics. Result tables must keep both apart."""
     as_sens(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     (tmp_path / "scannetv2-labels.combined.tsv").unlink()
@@ -256,10 +256,10 @@ def test_scannet_missing_label_table_changes_annotation_name(tmp_path: Path, cap
     assert f"{tmp_path / 'scannetv2-labels.combined.tsv'}: expected a label table" in caplog.text
     truth = sequence.scene_truth()
     assert truth is not None
-    assert set(truth.class_names.values()) == {None}, "other tables have no folding chair"
+    assert set(truth.class_names.values()) == {None}, "expected no class for 'folding chair' without the label table"
 
 
-def test_scannet_first_release_names_are_resolved_by_its_table(tmp_path: Path) -> None:
+def test_scannet_first_release_names_use_first_release_table(tmp_path: Path) -> None:
     as_sens(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
     table = tmp_path / "scannetv2-labels.combined.tsv"
@@ -332,7 +332,7 @@ def test_scannet_fuzzed_file_is_read_or_raises_one_line_error(tmp_path: Path, na
     path = scene / name if (scene / name).exists() else tmp_path / name
     content = path.read_bytes()
     for other in (MESH,) if name.endswith(".sens") else ():
-        (scene / other).unlink()  # it is slow, and other tests read it
+        (scene / other).unlink()  # reading the mesh is slow; other tests cover it
     read, tokens = FUZZED[name]
 
     @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))

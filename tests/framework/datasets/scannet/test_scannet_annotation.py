@@ -20,7 +20,7 @@ from framework.errors import DataError
 from framework.files.ply import write_ply
 from framework.vocabulary.label_spaces import MEANINGS
 
-SEGMENTS = [3, 3, 70, 70, 5, 5, 9, 9, 11, 12]  # of ten vertices in a row
+SEGMENTS = [3, 3, 70, 70, 5, 5, 9, 9, 11, 12]  # segment ids of ten vertices in a row
 TABLE = """id\traw_category\tcategory\tnyu40class
 1\tRecliner chair \trecliner\tchair
 2\tgizmo\tgizmo\totherprop
@@ -46,7 +46,7 @@ def read(folder: Path, groups: list[dict[str, Any]], segments: list[int] | None 
 
 def test_scannet_annotation_maps_segments_to_instances(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "office chair", 70, 9), group(4, "couch", 5), group(1, "wall", 3)])
-    # the wall is no instance; the unlabeled part is one more instance without a class
+    # the wall is not an instance; the unlabeled part is an additional instance without a class
     np.testing.assert_array_equal(mesh.instance_ids, [0, 0, 1, 1, 5, 5, 1, 1, 6, 6])
     assert mesh.class_names == {1: "chair", 5: "couch", 6: None}
     assert mesh.instance_ids.dtype == np.int32
@@ -127,7 +127,7 @@ def test_scannet_label_table_name_spellings_are_equivalent() -> None:
     assert all(len(meant) == 1 for meant in meanings.values())
 
 
-def test_scannet_annotation_shared_segment_is_of_later_object(tmp_path: Path) -> None:
+def test_scannet_annotation_later_object_gets_shared_segment(tmp_path: Path) -> None:
     mesh = read(tmp_path, [group(0, "bed", 3, 70), group(1, "pillow", 70), group(2, "chair", 3)])
     np.testing.assert_array_equal(mesh.instance_ids[:4], [3, 3, 0, 0])
 

@@ -1,4 +1,4 @@
-"""Tests of `.sens` files, written field by field: valid, truncated and with every field wrong."""
+"""Tests of valid and truncated `.sens` files, and of files with one invalid field."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.recordings.scannet_files import (
     shots,
 )
 
-SIZES = 12 + 15 + 4 * 64  # byte of the header's part after the name and the matrices
+SIZES = 12 + 15 + 4 * 64  # byte offset of the header fields after the name and the matrices
 HEADER = SIZES + 36
 
 
@@ -187,7 +187,7 @@ def test_sens_file_raw_image_length_mismatch_raises(path: Path) -> None:
         frame.depth()
 
 
-def test_sens_file_deleted_raises_on_frame_read(path: Path) -> None:
+def test_sens_file_frame_of_deleted_file_raises(path: Path) -> None:
     [frame] = opened(path, sens(shots(1))).frames
     path.unlink()
     with pytest.raises(FrameError, match="expected a readable file, got No such file"):
@@ -197,5 +197,5 @@ def test_sens_file_deleted_raises_on_frame_read(path: Path) -> None:
 
 
 def starts(path: Path, content: bytes) -> list[int]:
-    """Return the position of each frame."""
+    """Return the byte offset of each frame."""
     return [frame.byte - FRAME.size for frame in opened(path, content).frames]

@@ -129,7 +129,7 @@ def times_of(frames):
 
 
 def play_back(color_times, depth_times):
-    """Pair frames like SceneNN's PlaybackSync: read one of each, then the earlier stream until both are close."""
+    """Pair frames as SceneNN's PlaybackSync does: advance the earlier stream until both times are close."""
     paired, color_reader, depth_reader = [], iter(color_times), iter(depth_times)
     try:
         while True:

@@ -83,7 +83,7 @@ def test_oni_records_truncated_file_is_repaired(tmp_path, wide, end_node):
             assert positions == [0, 0] if wide else positions == []
         assert not any(scratch.iterdir())
     assert counts == {2, 3, 4, 5}
-    assert path.read_bytes() == content[:size]  # the recording itself is not touched
+    assert path.read_bytes() == content[:size]  # the recording itself is unchanged
 
 
 def test_oni_records_missing_largest_node_is_repaired(tmp_path):

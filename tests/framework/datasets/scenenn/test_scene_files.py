@@ -26,7 +26,7 @@ LOST = """1259 1259 1260
 0 0 0 3.15572
 0 0 0 -1.4815
 0.000000 0.000000 0.000000 1.000000
-"""  # sequence 092, from issue 4
+"""  # lost frame of sequence 092, from issue 4
 
 
 def printed(rows):

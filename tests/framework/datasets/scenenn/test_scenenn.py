@@ -1,4 +1,4 @@
-"""Tests of SceneNN folders: the exact layout, and known omissions of real copies."""
+"""Tests of SceneNN folders in the documented layout, and of folders with missing or invalid files."""
 
 from __future__ import annotations
 
@@ -19,17 +19,20 @@ from framework.sensors.noise_models import SensorKind
 CAMERA = Camera(32, 24, 30.0, 30.0, 15.0, 11.0)
 FRAMES = 4
 CHAIR, NAMELESS, CABINET, UNLISTED, SOFA = 934338, 12, 7, 55, 3
-WALL = 2.0  # m, where the mesh lies in front of the first camera
+WALL = 2.0  # distance of the mesh from the first camera, m
 
 
 def labels() -> list[Annotated]:
-    """Return the labels in random order, as in the dataset."""
+    """Return the labels, unsorted as in the dataset."""
     named = ((CHAIR, "chair1", "chair"), (NAMELESS, "thing", ""), (CABINET, "cabinet", "cabinet"), (SOFA, "s", "Sofa"))
     return [Annotated(i, text, nyu, (10, 20, 30), None, None) for i, text, nyu in named]
 
 
 def striped_wall() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a wall from x = -1 to 1 of vertical stripes 0.25 m wide, one label each; vertices every 5 cm."""
+    """Return the vertices (V, 3), m, triangles (T, 3) and labels (V,) of a wall of vertical stripes.
+
+    The wall extends from x = -1 to 1 m, with a vertex every 5 cm. Each stripe is 0.25 m wide and has one label.
+    """
     x, y = np.meshgrid(np.arange(-20, 21) * 0.05, np.arange(-20, 21) * 0.05)
     vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
     corner = (np.arange(40)[:, None] * 41 + np.arange(40)).ravel()
@@ -79,7 +82,9 @@ def test_scenenn_frame_matches_files(root: Path) -> None:
     assert (frame.depth == np.float32(2.002)).all()
     assert frame.T_world_camera is not None
     np.testing.assert_allclose(frame.T_world_camera, pose(2), atol=1e-9)
-    assert frame.truth is None, "it is slow, and only some detectors need it"
+    assert frame.truth is None, (
+        "expected no ground-truth masks by default: rendering is slow and few detectors need them"
+    )
 
 
 def test_scenenn_labels_map_to_instances_of_nine_classes(root: Path) -> None:
@@ -129,7 +134,7 @@ def test_scenenn_true_masks_match_mesh_at_true_pose(root: Path) -> None:
     frame = SceneNN(root, "016", frame_ground_truth=True)[1]
     assert frame.truth is not None
     u = np.arange(CAMERA.width)
-    x = (u - CAMERA.cx) / CAMERA.fx * WALL + 0.1  # in the world, on the wall
+    x = (u - CAMERA.cx) / CAMERA.fx * WALL + 0.1  # on the wall, in the world frame, m
     nearest = np.round(x / 0.05).astype(int) + 20  # column of the nearest vertex
     _, _, vertex_labels = striped_wall()
     row = vertex_labels.reshape(41, 41)[0]

@@ -1,4 +1,4 @@
-"""Tests of detectron2 checkpoints: the pickle executes no code, and the network equals detectron2's.
+"""Tests of detectron2 checkpoints: the pickle executes no code, and the network outputs equal detectron2's.
 
 The reference follows detectron2's definitions and names, in double precision and without the project's network code.
 """
@@ -42,7 +42,7 @@ def synthetic_state(network="resnet50", classes=80):
         state[f"{name}.norm.running_var"] = rng.uniform(0.5, 1.5, shape[0])
 
     normalized("backbone.bottom_up.stem.conv1", STEM, 3, 7, 7)
-    state["backbone.bottom_up.stem.conv1.weight"] /= 60  # images are 0..255
+    state["backbone.bottom_up.stem.conv1.weight"] /= 60  # image values are 0 to 255
     before = STEM
     for stage, blocks in enumerate(BLOCKS[network], start=2):
         inside, out = STEM * 2 ** (stage - 2), 4 * STEM * 2 ** (stage - 2)
@@ -72,7 +72,7 @@ def synthetic_state(network="resnet50", classes=80):
 
 
 class Detectron2:
-    """Its inference, step by step (modeling/backbone, proposal_generator, roi_heads)."""
+    """Reference for the inference of detectron2 (modeling/backbone, proposal_generator, roi_heads)."""
 
     def __init__(self, state):
         self.state = {name: torch.from_numpy(value).double() for name, value in state.items()}
@@ -113,7 +113,7 @@ class Detectron2:
         return [*levels, functional.max_pool2d(levels[-1], 1, 2)]
 
     def anchors(self, pyramid):
-        """Return anchors (A, 4), centered at the cells' corners (OFFSET 0), sizes and ratios unrounded."""
+        """Return the anchors (A, 4), px, centered at the corners of the cells (OFFSET 0), with unrounded sizes."""
         anchors = []
         for level, stride, side in zip(pyramid, (4, 8, 16, 32, 64), (32, 64, 128, 256, 512), strict=True):
             for y in range(level.shape[2]):
@@ -125,7 +125,7 @@ class Detectron2:
         return np.array(anchors)
 
     def proposals(self, pyramid):
-        """Return (scores (A,), boxes (A, 4)) of all anchors, before any is dropped."""
+        """Return the scores (A,) and boxes (A, 4), px, of all anchors, before the selection."""
         scores, deltas = [], []
         for level in pyramid:
             x = self.layer("proposal_generator.rpn_head.conv", level, padding=1).relu()
@@ -143,7 +143,7 @@ class Detectron2:
         return torch.from_numpy(np.concatenate(rows))
 
     def boxes(self, pyramid, boxes):
-        """Return (probabilities (N, K + 1), the background last; boxes (N, K, 4))."""
+        """Return the class probabilities (N, K + 1), background last, and the boxes (N, K, 4), px."""
         x = self.pooled(pyramid, boxes, 7).flatten(1)
         x = self.layer("roi_heads.box_head.fc1", x, functional.linear).relu()
         x = self.layer("roi_heads.box_head.fc2", x, functional.linear).relu()
@@ -164,7 +164,7 @@ class Detectron2:
 
 
 def moved(boxes, deltas, weights):
-    """Apply deltas like Box2BoxTransform.apply_deltas."""
+    """Return the boxes after Box2BoxTransform.apply_deltas."""
     widths, heights = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
     x, y = boxes[:, 0] + 0.5 * widths, boxes[:, 1] + 0.5 * heights
     dx, dy, dw, dh = (deltas[:, k] / weights[k] for k in range(4))
@@ -244,11 +244,11 @@ def test_detectron2_unsupported_networks_raise():
     assert from_detectron2(nine, "here", COCO[:9]).architecture.classes == COCO[:9]
 
 
-# The pickle
+# Pickle files
 
 
 class Runs:
-    """Executes code when it is unpickled."""
+    """Object that executes code when it is unpickled."""
 
     def __init__(self, path):
         self.path = path
@@ -283,7 +283,7 @@ def test_pickle_with_code_raises_without_execution(tmp_path):
         read_pickle(path)
     assert "\n" not in str(caught.value)
     assert not touched.exists()
-    pickle.loads(path.read_bytes())  # the standard reader executes it
+    pickle.loads(path.read_bytes())  # the standard unpickler executes the code
     assert touched.exists()
 
 

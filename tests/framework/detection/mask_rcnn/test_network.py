@@ -28,7 +28,7 @@ def test_network_best_first_equals_stable_sort(count, decimals):
     np.testing.assert_array_equal(best_first(scores, count), np.argsort(-scores, kind="stable")[:count])
 
 
-def test_anchors_follow_pyramid_shapes():
+def test_anchor_counts_match_pyramid_shapes():
     network = tiny_network()
     counts = []
     for height in (64, 64, 128, 64):

@@ -13,7 +13,7 @@ from tests.support.networks.tiny_mask_rcnn import TINY, tiny_network, tiny_netwo
 
 
 def rewritten(path, tensors=None, **metadata):
-    """Return the file with other tensors or metadata, as from another writer."""
+    """Rewrite the file with other tensors or metadata, as another program could; return the path."""
     from safetensors import safe_open
 
     with safe_open(path, framework="pt") as file:
@@ -51,7 +51,7 @@ def test_network_file_round_trip_keeps_weights_and_card(tmp_path):
 
 def test_network_file_half_precision_keeps_float32_statistics(tmp_path):
     network, path = tiny_network(), tmp_path / "half.safetensors"
-    network.backbone.body.bn1.running_var.fill_(1e6)  # float16 ends at 65504
+    network.backbone.body.bn1.running_var.fill_(1e6)  # the largest float16 value is 65504
     save_network(network, path, {}, half=True)
     loaded = weights(load_network(path))
     assert loaded["backbone.body.bn1.running_var"][0] == 1e6

@@ -13,10 +13,10 @@ from tests.support.networks.roi_align_loops import roi_align_loops
 
 @pytest.fixture(params=["products", "sums"])
 def path(request, monkeypatch):
-    """Force one of the two implementations."""
+    """Force one of the two implementations; return its name."""
     monkeypatch.setattr(module, "PRODUCT_SPEED", {"products": math.inf, "sums": 0.0}[request.param])
     other = {"products": "_sums", "sums": "_products"}[request.param]
-    monkeypatch.setattr(module, other, lambda *_: pytest.fail("the other implementation was used"))
+    monkeypatch.setattr(module, other, lambda *_: pytest.fail("expected only the forced implementation"))
     return request.param
 
 
@@ -61,7 +61,7 @@ def test_roi_align_chunks_keep_box_order(monkeypatch):
 
 @pytest.mark.parametrize("ratio", [0, 2])
 def test_roi_align_gradient_matches_cell_contributions(path, ratio):
-    """Pooling is linear: the gradient of the sum at a cell is the pooled sum of a unit at that cell."""
+    """Pooling is linear, so the gradient at a cell is the pooled sum of a map that is 1 only at this cell."""
     rng = np.random.default_rng(6)
     boxes = rng.uniform(0, 60, (4, 2))
     boxes = np.hstack([boxes, boxes + rng.uniform(4, 50, (4, 2))]).astype(np.float32)
@@ -74,13 +74,15 @@ def test_roi_align_gradient_matches_cell_contributions(path, ratio):
 
 
 def test_roi_align_large_map_with_small_boxes_uses_sums(monkeypatch):
-    monkeypatch.setattr(module, "_products", lambda *_: pytest.fail("this takes seconds"))
+    monkeypatch.setattr(
+        module, "_products", lambda *_: pytest.fail("expected sums; products take seconds for this map")
+    )
     boxes = torch.rand(50, 2).repeat(1, 2) * 600 + torch.tensor([0.0, 0.0, 60.0, 40.0])
     assert roi_align(torch.zeros(1, 8, 200, 336), boxes, 7, 1 / 4, 2).shape == (50, 8, 7, 7)
 
 
 def test_roi_align_small_map_with_large_boxes_uses_products(monkeypatch):
-    monkeypatch.setattr(module, "_sums", lambda *_: pytest.fail("the products are faster here"))
+    monkeypatch.setattr(module, "_sums", lambda *_: pytest.fail("expected products, which are faster for this map"))
     boxes = torch.tensor([[0.0, 0.0, 200.0, 200.0]])
     assert roi_align(torch.zeros(1, 8, 13, 13), boxes, 7, 1 / 16).shape == (1, 8, 7, 7)
 

@@ -42,7 +42,7 @@ def test_paste_masks_matches_per_pixel_interpolation(borders):
     grid = rng.uniform(0, 1, (24, 24)).astype(np.float32)
     (mask,) = paste_masks(grid[None], np.array([borders], np.float32), (40, 60), 0.5)
     expected = paste_by_pixel(grid, np.float64(np.float32(borders)), (40, 60), 0.5)
-    assert (mask != expected).sum() <= 2  # float32 compared with float64, at the threshold
+    assert (mask != expected).sum() <= 2  # float32 and float64 can differ at the threshold
 
 
 def test_paste_masks_full_grid_fills_box_exactly():
@@ -70,7 +70,7 @@ def test_tight_boxes_span_first_to_last_pixel():
 
 
 def test_mask_overlaps_count_shared_pixels():
-    """The masks fill the image, lie in a corner, meet in a row or column, or are empty."""
+    """The masks fill the image or a rectangle, overlap in one pixel, or are empty."""
     rng = np.random.default_rng(6)
     masks = rng.random((12, 40, 300)) > 0.5
     for mask in masks[2:]:
@@ -129,7 +129,7 @@ def test_masks_from_prototypes_match_definition(placement, threshold):
 
 
 def test_masks_from_prototypes_keep_edge_position():
-    """A prototype linear in x crosses zero at u = 20.3: the mask begins with pixel 21."""
+    """A prototype that is linear in x crosses zero at u = 20.3 px, so the mask begins at pixel 21."""
     letterbox = Letterbox.fit((48, 48), (96, 96), Placement.center)
     cell_centers = (np.arange(24) + 0.5) * 4 / 2 - 0.5  # in px of the image
     prototypes = np.tile((cell_centers - 20.3).astype("f4"), (1, 24, 1))

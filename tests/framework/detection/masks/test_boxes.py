@@ -34,7 +34,7 @@ def test_box_decode_matches_formula(extent):
     np.testing.assert_allclose(decode(boxes, deltas, extent), expected, rtol=1e-4, atol=1e-3)
 
 
-def test_box_decode_of_zero_deltas_is_identity_huge_are_finite():
+def test_box_decode_is_identity_at_zero_and_finite_if_huge():
     box = np.array([[10, 20, 29, 59]], np.float32)
     np.testing.assert_allclose(decode(box, np.zeros((1, 4), np.float32)), box)
     huge = decode(box, np.full((1, 4), 1000, np.float32))
@@ -58,7 +58,7 @@ def test_anchor_grid_order_is_rows_columns_anchors():
 def test_to_original_image_maps_pixel_box_exactly():
     borders = to_original_image(np.array([[3, 5, 3, 5]], np.float32), resized=(240, 320), original=(480, 640))
     np.testing.assert_allclose(borders, [[5.5, 9.5, 7.5, 11.5]])  # columns 6 and 7, rows 10 and 11
-    same = np.array([[3, 5, 4, 6]], np.float32)  # in the newer convention
+    same = np.array([[3, 5, 4, 6]], np.float32)  # the same box in the convention with extent 0
     np.testing.assert_allclose(to_original_image(same, (240, 320), (480, 640), extent=0.0), borders)
 
 

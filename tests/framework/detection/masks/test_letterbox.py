@@ -24,7 +24,7 @@ def test_letterbox_placement_sets_size_and_offsets(image, placement, resized, to
 
 @pytest.mark.parametrize("placement", Placement)
 def test_letterbox_image_borders_round_trip_exactly(placement):
-    """This includes rounded sizes: the image spans -0.5 to W - 0.5."""
+    """The image spans -0.5 to W - 0.5 px, also if its size in the input is rounded."""
     letterbox = Letterbox.fit((333, 217), (416, 320), placement)
     height, width = letterbox.resized
     corners = [letterbox.left, letterbox.top, letterbox.left + width, letterbox.top + height]
@@ -34,7 +34,7 @@ def test_letterbox_image_borders_round_trip_exactly(placement):
 
 @pytest.mark.parametrize("placement", Placement)
 def test_letterbox_blob_position_round_trips(placement):
-    """OpenCV's resizing and the inverse mapping agree to a small fraction of a pixel."""
+    """OpenCV's resizing and the inverse mapping agree within 0.05 px."""
     v, u = np.indices((120, 160))
     blob = 250 * np.exp(-((u - 101.0) ** 2 + (v - 37.0) ** 2) / (2 * 6.0**2))
     letterbox = Letterbox.fit((120, 160), (416, 416), placement)

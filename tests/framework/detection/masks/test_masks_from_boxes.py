@@ -12,7 +12,7 @@ from framework.sensors.noise_models import SensorKind
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 SIGNIFICANCE, SLANT, READINGS = 0.4, 85.0, 0.1
 NOISE = SensorKind.KINECT_V1.noise
-BOX = np.array([[39.5, 19.5, 99.5, 79.5]], np.float32)  # the pixels 40..99 x 20..79
+BOX = np.array([[39.5, 19.5, 99.5, 79.5]], np.float32)  # pixels u = 40 to 99, v = 20 to 79
 V, U = np.indices((120, 160))
 
 
@@ -44,17 +44,17 @@ def test_masks_in_boxes_mask_is_clipped_to_box():
 
 def test_masks_in_boxes_thin_occluder_is_excluded():
     depth = np.where(disk(28), np.float32(1.5), wall())
-    depth[:, 66:70] = 0.8  # a pole in front of it
+    depth[:, 66:70] = 0.8  # a pole in front of the disk
     mask = mask_of(depth)
     assert not mask[:, 66:70].any()
     halves = disk(28) & ((U < 66) | (U > 69))
     assert not (mask & ~halves).any()
-    assert mask.sum() > 0.45 * halves.sum(), "one of the two halves"
+    assert mask.sum() > 0.45 * halves.sum(), "expected most of one of the two halves"
     # without a required foreground fraction, the pole is the foreground
     assert mask_of(depth, significance=0.0)[50, 66:70].all()
 
 
-def test_masks_in_boxes_without_significant_mode_use_heaviest():
+def test_masks_in_boxes_without_significant_mode_use_largest():
     depth = np.choose((U // 10) % 3, [1.0, 2.0, 4.0]).astype(np.float32)
     mask = mask_of(depth, significance=0.99)
     assert mask.any()
@@ -68,7 +68,7 @@ def test_masks_in_boxes_equal_depths_select_central_object():
 
 @pytest.mark.parametrize(("slant", "whole"), [(75.0, True), (84.0, False)])
 def test_masks_in_boxes_slanted_plane_is_whole_below_limit(slant, whole):
-    """The plane is z = 3 + tan(slant) x m; above 80 degrees it is split."""
+    """The plane is z = 3 m + tan(slant) x. Planes with a slant above 80 degrees are split."""
     direction = (U - 69.5) / CAMERA.fx
     depth = np.clip(3 / (1 - np.tan(np.radians(slant)) * direction), 0, None).astype(np.float32)
     narrow = np.array([[63.5, 19.5, 75.5, 79.5]], np.float32)
@@ -82,7 +82,7 @@ def test_masks_in_boxes_grow_joins_pixels_below_largest_step():
         assert limit == pytest.approx(z * np.tan(np.radians(80)) / 150 + 3 * (0.0012 + 0.0019 * (z - 0.4) ** 2))
         for step, joined in ((0.95 * limit, True), (1.05 * limit, False)):
             depth = np.where(U < 70, np.float32(z), np.float32(z + step))
-            # over the whole range, so that only the connection decides
+            # all depths are in range, so that only the depth step matters
             mask = np.zeros((120, 160), np.bool_)
             ones = np.ones(160)
             step_limit = np.tan(np.radians(80)) / 150
@@ -113,7 +113,7 @@ def test_masks_in_boxes_grow_and_hole_closing_match_labeling():
         np.testing.assert_array_equal(mask, expected)
 
 
-def test_masks_in_boxes_holes_close_by_readings_and_size():
+def test_masks_in_boxes_small_or_unmeasured_holes_are_closed():
     solid = disk(28)
     depth = np.where(solid, np.float32(1.5), wall())
     depth[disk(15)] = 0
@@ -130,7 +130,12 @@ def test_masks_in_boxes_without_depth_reports_no_mask():
     depth = np.where(U < 70, np.float32(0), wall())
     depth[V < 70] = 0
     masks, found = masks_in_boxes(boxes, depth, CAMERA, SIGNIFICANCE, SLANT, READINGS)
-    assert found.tolist() == [False, True, False, False]  # 300 of 3600, 2400 of 2400 in the image, 0, 0
+    assert found.tolist() == [
+        False,
+        True,
+        False,
+        False,
+    ]  # pixels with depth: 300 of 3600, 2400 of 2400 in the image, 0, 0
     assert masks.any(axis=(1, 2)).tolist() == found.tolist()
     masks, found = masks_in_boxes(boxes, depth, CAMERA, SIGNIFICANCE, SLANT, 0.08)
     assert found.tolist() == [True, True, False, False]
@@ -150,7 +155,7 @@ def test_masks_in_boxes_noise_keeps_surface_whole():
 
 
 @pytest.mark.parametrize(("sensor", "whole"), [(SensorKind.KINECT_V1, False), (SensorKind.PHONE_LIDAR, True)])
-def test_masks_in_boxes_step_limit_follows_sensor_noise(sensor, whole):
+def test_masks_in_boxes_step_limit_depends_on_sensor_noise(sensor, whole):
     depth = np.where(U < 70, np.float32(1.5), np.float32(1.53))
     masks, _ = masks_in_boxes(BOX, depth, CAMERA, SIGNIFICANCE, 45.0, READINGS, sensor)
     assert (masks.sum() == 60 * 60) == whole

@@ -1,4 +1,4 @@
-"""Tests of COCO's run lengths, compared with pycocotools; strings that it would misread raise."""
+"""Tests of COCO run lengths, compared with pycocotools, and of strings that pycocotools misreads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from framework.errors import DataError
 
 
 def random_masks(seed: int, n: int, shape: tuple[int, int]) -> np.ndarray:
-    """Return blobs, noise, full and empty masks."""
+    """Return n random masks of different densities; the first is empty and the last is full."""
     random = np.random.default_rng(seed)
     masks = random.random((n, *shape)) < random.random((n, 1, 1))
     masks[0], masks[-1] = False, True
@@ -19,7 +19,7 @@ def random_masks(seed: int, n: int, shape: tuple[int, int]) -> np.ndarray:
 
 
 def lengths_of(mask: np.ndarray) -> list[int]:
-    """Return run lengths pixel by pixel and column by column; the first run is of zeros."""
+    """Return the run lengths, counted by pixel in column-major order; the first run is of zeros."""
     lengths, value = [0], False
     for pixel in mask.T.ravel().tolist():
         if pixel != value:
@@ -45,7 +45,7 @@ def test_run_length_round_trip_matches_pycocotools(shape: tuple[int, int]) -> No
 
 
 def test_run_length_unpack_reads_long_runs() -> None:
-    """The runs have several characters and differences of either sign."""
+    """The encoded runs have several characters, and their differences have either sign."""
     mask = np.zeros((480, 640), np.bool_)
     mask[100:400, 3], mask[5, 4:600], mask[200:, 630] = True, True, True
     assert unpack(encode(mask[None])[0]).tolist() == lengths_of(mask)
@@ -75,7 +75,7 @@ def test_run_length_malformed_string_raises(counts: bytes, message: str) -> None
 
 def test_run_length_of_other_image_size_raises() -> None:
     counts = encode(np.ones((1, 4, 6), np.bool_))[0]
-    check(counts, (6, 4))  # as many pixels: the stored size must differ
+    check(counts, (6, 4))  # the number of pixels is the same, so only the stored size can differ
     with pytest.raises(DataError, match="run lengths: expected 5x4 = 20 px, got 24 px"):
         check(counts, (4, 5))
 

@@ -1,4 +1,4 @@
-"""Tests of 8-bit networks: each operator compared with its definition, in float and in integers."""
+"""Tests of 8-bit networks: operators compared with their definitions, in float and in integers."""
 
 import os
 import subprocess
@@ -98,10 +98,10 @@ def test_caffe2_network_runs_only_operators_for_outputs():
         network_between(graph, tensors, ("x",), ("elsewhere",))
 
 
-# In integers
+# Integer arithmetic
 
 IMAGE = {"type": "Int8Quantize", "inputs": ["image"], "outputs": ["x"], "args": {"Y_scale": 0.02, "Y_zero_point": 110}}
-LAST = {  # outputs are computed in float from the integers before, here from "y"
+LAST = {  # outputs are computed in float from the preceding integers, here from "y"
     "type": "Int8Relu", "inputs": ["y"], "outputs": ["z"], "args": {"Y_scale": 1.0, "Y_zero_point": 0}
 }  # fmt: skip
 
@@ -121,7 +121,7 @@ def integer_network(kind, args, weight, weight_scale, bias):
 @pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
 def test_caffe2_quantize_rounds_half_to_even(memory_format):
     quantization = Quantization(0.25, 100)
-    steps = torch.arange(-1000, 1000).reshape(1, 5, 20, 20) / 2  # halves of steps, beyond both ends
+    steps = torch.arange(-1000, 1000).reshape(1, 5, 20, 20) / 2  # half steps, from below to above the range
     found = quantization.quantize((steps * 0.25).contiguous(memory_format=memory_format))
     assert found.dtype == torch.uint8
     np.testing.assert_array_equal(found, np.clip(np.rint(steps.numpy() + 100), 0, 255))
@@ -148,14 +148,14 @@ def test_caffe2_integer_convolution_is_exact_and_rounded_once(kind, stride, pad,
         first = out // (6 // group) * (6 // group)
         window = padded[0, first : first + 6 // group, i * stride : i * stride + 3, j * stride : j * stride + 3]
         y = int((window.transpose(1, 2, 0) * (weight[out].astype(int) - 120)).sum()) * 0.02 * 0.001 + bias[out]
-        if kind == "Int8ConvRelu" or group > 1:  # the others are unchanged
+        if kind == "Int8ConvRelu" or group > 1:  # the other results are not rounded
             y = (np.clip(np.rint(y / result.scale) + result.zero_point, 0, 255) - result.zero_point) * result.scale
         assert z[0, out, i, j] == pytest.approx(max(y, 0), abs=1e-4), (out, i, j)
 
 
 @in_integers
 def test_caffe2_int8_kernels_with_overflow_are_detected():
-    """Without VNNI, oneDNN adds pairs of products in 16 bits. It reads the variable when it is loaded."""
+    """Without VNNI, oneDNN adds pairs of products in 16 bits. It reads ONEDNN_MAX_CPU_ISA when it is loaded."""
     asked = "from framework.detection.runtimes.caffe2_network import has_int8_kernels; print(has_int8_kernels())"
     for instructions, expected in (("AVX2", "False"), ("DEFAULT", "True")):
         environment = {**os.environ, "ONEDNN_MAX_CPU_ISA": instructions}
@@ -183,7 +183,7 @@ def test_caffe2_int8_weight_overflow_rounds_only_its_channel():
 
 @in_integers
 def test_caffe2_blob_is_rounded_for_convolution_but_not_for_sum():
-    """In y = x + linear(relu(x)), the sum uses x before the ReLU."""
+    """In y = x + linear(relu(linear(x))), the sum uses x before it is rounded."""
     one = {"Y_scale": 0.02, "Y_zero_point": 100}
     convolution = {"kernel": 1, "stride": 1, "pad": 0, **one}
     rectified = convolution | {"Y_zero_point": 0}

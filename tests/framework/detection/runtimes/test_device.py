@@ -10,7 +10,7 @@ PATIENCE_S = 10.0
 
 
 def test_one_torch_thread_overlapping_uses_restore_count():
-    """Torch gives the last count to threads that have not used it before."""
+    """A thread that uses torch for the first time gets the last count that any thread has set."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     first_is_in, second_is_in = threading.Event(), threading.Event()

@@ -20,7 +20,7 @@ from tests.support.networks.tiny_networks import constant_network, doubling_netw
         ((1, 4, 6, 3), TensorProto.UINT8, np.uint8),
     ],
 )
-def test_onnx_network_image_arrives_unchanged(tmp_path, shape, element, dtype):
+def test_onnx_network_receives_unchanged_image(tmp_path, shape, element, dtype):
     network = OnnxNetwork(doubling_network(tmp_path / "n.onnx", shape, element), "", "cpu", 0)
     image = np.random.default_rng(1).integers(0, 256, (4, 6, 3)).astype(dtype)
     assert network.shape == (4, 6)
@@ -83,7 +83,7 @@ def test_onnx_network_cuda_unavailable_raises(tmp_path):
     import onnxruntime
 
     if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
-        pytest.skip("onnxruntime has CUDA here")
+        pytest.skip("onnxruntime with CUDA is installed")
     path = doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8))
     with pytest.raises(
         ConfigError, match=r"detector\.device: expected cpu or auto without onnxruntime-gpu and a GPU, got cuda"
@@ -149,7 +149,7 @@ def test_onnx_network_input_type_unsupported_raises(tmp_path):
 
 
 def test_onnx_network_weights_listed_as_inputs_are_ignored(tmp_path):
-    """This was required before version 4 of the format."""
+    """Before version 4, the format required weights to be listed as inputs."""
     image, weight = (helper.make_tensor_value_info(n, TensorProto.FLOAT, (1, 3, 4, 4)) for n in ("images", "weight"))
     path = save(
         tmp_path / "n.onnx",

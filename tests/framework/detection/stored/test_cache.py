@@ -49,7 +49,7 @@ FIELDS = ("masks", "boxes", "scores", "class_probabilities")
 
 @dataclass
 class Noise(Detector):
-    """Random detections from the colors and the parameter; counts its calls."""
+    """Detector of random masks that depend on the colors and the parameter; counts its calls."""
 
     strength: float = 1.0
     broken_at: int = -1
@@ -86,7 +86,7 @@ def random_detections(seed: int, shape: tuple[int, int], n: int = 7) -> Detectio
 
 
 def assert_same(a: Detections, b: Detections) -> None:
-    """Check that the arrays are byte-identical and equally usable."""
+    """Check that the arrays are byte-identical and have the same flags."""
     assert (a.classes, a.exact) == (b.classes, b.exact)
     for name in FIELDS:
         x, y = getattr(a, name), getattr(b, name)
@@ -130,7 +130,7 @@ def test_cache_second_run_does_not_call_detector(room: CornerRoom, tmp_path: Pat
     assert isinstance(second.detector, Noise)
     assert second.detector.asked == 0
     assert cache_metrics(second) == {"detection_cache.hits": 6, "detection_cache.misses": 0}
-    assert not list(tmp_path.rglob(".*")), "no temporary files are left"
+    assert not list(tmp_path.rglob(".*")), "expected no temporary files"
 
 
 @pytest.mark.parametrize("changed", [Noise(strength=2.0), SphereDetector()], ids=["parameter", "class"])
@@ -143,7 +143,7 @@ def test_cache_with_other_detector_misses(room: CornerRoom, tmp_path: Path, chan
 
 @dataclass
 class Named(Noise):
-    """Resolves its weights by name."""
+    """Detector that resolves its weights by name."""
 
     revision: str = "main"
 
@@ -153,14 +153,14 @@ class Named(Noise):
 
 @dataclass
 class OldNamed(Noise):
-    """Written when Detector itself had a fingerprint."""
+    """Detector for an older interface, in which Detector had a fingerprint."""
 
     def fingerprint(self) -> str:
         return f"{super().fingerprint()} main"  # type: ignore[misc]
 
 
 def test_cache_identity_uses_detector_fingerprint(tmp_path: Path) -> None:
-    """The cache is not part of the contract: a detector may declare its identity and the fields that it reads."""
+    """A detector may declare its identity and the frame fields that it reads, but does not have to."""
     assert not {"reads", "fingerprint"} & set(dir(Detector))
     silent = SphereDetector()
     assert identity_of(silent) == fingerprint(silent)
@@ -184,7 +184,7 @@ def test_cache_with_other_weights_misses(room: CornerRoom, tmp_path: Path) -> No
 
 @dataclass
 class Weighted(Noise):
-    """A detector with a file."""
+    """Detector with a weights file."""
 
     weights: Path = Path()
 
@@ -205,7 +205,7 @@ def test_frame_hash_covers_fields_read_by_detector(room: CornerRoom) -> None:
         "camera": replace(frame, camera=replace(CAMERA, fx=90.0001)),
         "T_world_camera": replace(frame, T_world_camera=None),
         "truth": replace(frame, truth=FrameTruth(ids, frame.truth.class_names)),
-        "expected the classes of the ground truth": replace(
+        "class names of the ground truth": replace(
             frame, truth=FrameTruth(frame.truth.instance_ids, {1: None, 2: "couch"})
         ),
         "no truth": replace(frame, truth=None),
@@ -248,7 +248,7 @@ def test_cache_mesh_truth_hit_skips_rendering(
     labeled = replace(frame, truth=truths[0])
     expected = CachedDetector(detector, tmp_path).detect(labeled)
     assert_same(expected, detector.detect(replace(frame, truth=FrameTruth(truths[0].instance_ids, {5: "chair"}))))
-    monkeypatch.setattr(Rasterizer, "draw", lambda *_: pytest.fail("rendered"))
+    monkeypatch.setattr(Rasterizer, "draw", lambda *_: pytest.fail("expected a hit without rendering"))
     cached = CachedDetector(detector, tmp_path)
     assert_same(expected, cached.detect(replace(frame, truth=mesh().seen_by(CAMERA, T))))
     assert cached.hits == 1
@@ -266,7 +266,7 @@ def test_cache_unknown_read_field_raises(tmp_path: Path) -> None:
 def test_detectors_read_only_declared_frame_fields(
     name: str, ready: Callable[..., Detector], room: CornerRoom, tmp_path: Path
 ) -> None:
-    """Otherwise the cache could return the detections of another frame."""
+    """With undeclared fields, the cache could return the detections of another frame."""
     detector = ready("detector", name)
     frame = room[1]
     others = {
@@ -376,7 +376,7 @@ folder = Path(sys.argv[1])
 (folder / sys.argv[2]).touch()
 while len(list(folder.glob("ready*"))) < 2:
     time.sleep(0.001)
-for k in range(9):  # an entry is removed sometimes, so that both write again, except at the end
+for k in range(9):  # remove some entries so that both processes write again, except in the last round
     detector = CachedDetector(SphereDetector(), folder / "cache")
     for frame in CornerRoom():
         detector.detect(frame)
@@ -404,7 +404,7 @@ def test_cache_folder_is_shared_by_two_processes(tmp_path: Path) -> None:
     assert not list(tmp_path.rglob(".*"))
 
 
-# Chosen by the config
+# Selection by the config
 
 
 def config(*overrides: str) -> DictConfig:
@@ -448,7 +448,7 @@ def test_cache_default_folder_is_user_cache(monkeypatch: pytest.MonkeyPatch, tmp
 @pytest.mark.usefixtures("fakes_registered")
 @pytest.mark.usefixtures("fakes_registered")
 def test_run_with_cache_is_identical_to_run_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All outputs except times are compared: without cache, with an empty one, and with a full one."""
+    """All outputs except times are equal without a cache, with an empty cache and with a full cache."""
     asked: list[int] = []
     detect = SphereDetector.detect
     monkeypatch.setattr(SphereDetector, "detect", lambda self, frame: asked.append(frame.index) or detect(self, frame))
@@ -470,7 +470,7 @@ def test_run_with_cache_is_identical_to_run_without(tmp_path: Path, monkeypatch:
 
 
 def test_cache_seeded_detector_is_keyed_by_frame_index(room: CornerRoom, tmp_path: Path) -> None:
-    """The simulated detector draws by frame number, so that the same image at another number is another entry."""
+    """The simulated detector is seeded with the frame index, so each index of an image has its own entry."""
     detector = CachedDetector(SimulatedDetector(min_pixels=1), tmp_path)
     frame = room[0]
     for index in (0, 1, 0):

@@ -111,7 +111,7 @@ def test_fingerprint_without_source_file_raises() -> None:
         fingerprint(dataclass(notebook)())
 
 
-def test_fingerprint_auto_device_includes_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fingerprint_auto_device_includes_device_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     on_cpu = fingerprint(Network(device="auto"))
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
