@@ -8,7 +8,7 @@ from numba import njit, prange
 DEPTH_STEP = 0.05  # fraction of the depth; a larger step is an edge
 REACH = 4  # px, maximum width of the missing depth at an edge
 DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # (u, v) of the searched neighbors
-ROWS = 4  # step between the searched rows, px
+SEARCHED_ROWS = 120  # number of searched rows of an image
 
 
 @njit(cache=True, nogil=True)
@@ -16,7 +16,7 @@ def find_edges(depth, edges):
     """Write (u, v, z) of the pixels on the nearer side of depth steps to edges (N, 3). Return their number, <= N."""
     height, width = depth.shape
     count = 0
-    for v in range(REACH, height - REACH, ROWS):
+    for v in range(REACH, height - REACH, max(height // SEARCHED_ROWS, 1)):
         for u in range(REACH, width - REACH):
             z = depth[v, u]
             if z <= np.float32(0.0):
