@@ -81,7 +81,9 @@ def measure(chosen: Measurement) -> list[str]:
 def run(names: Sequence[str]) -> bool:
     """Run the named measurements, or all that are missing or outdated. Return True if all meet their bounds."""
     rows = read_rows()
-    for name in names or [k for k, known in MEASUREMENTS.items() if k not in rows or not is_current(rows[k], known.paths)]:
+    for name in names or [
+        k for k, known in MEASUREMENTS.items() if k not in rows or not is_current(rows[k], known.paths)
+    ]:
         rows[name] = measure(MEASUREMENTS[name])
         write_rows({known: row for known, row in rows.items() if known in MEASUREMENTS})
         print(" | ".join(rows[name]), flush=True)
