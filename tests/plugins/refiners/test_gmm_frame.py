@@ -32,7 +32,7 @@ def clusters_of(points: Float32, masks: Int32, scores: tuple[float, ...], pixels
 
 
 def three_objects(seed: int, bleed: float = 0.15) -> tuple[Float32, Int32, Int32]:
-    """Return the points (S, 3), m, of three curved objects, their masks (S,), some of them wrong, and the truth (S,)."""
+    """Return the points (S, 3), m, of three curved objects, their masks (S,), some wrong, and the true objects (S,)."""
     rng = np.random.default_rng(seed)
     centers = np.array([[0.0, 0.0, 2.0], [0.5, 0.1, 2.2], [0.1, 0.6, 1.7]])
     truth = np.sort(rng.integers(0, 3, 900))
