@@ -184,9 +184,7 @@ def test_cuda_slam_speed(benchmark: BenchmarkFixture, shared: Path, tables: list
         f"Loop compared with Open3D {o3d.__version__}, redkitchen, 1 cm voxels, median ms per frame",
         ["step", "ours, CPU", *(f"Open3D, {name}" for name in theirs)],
         [[row, *(ms(of_steps[k]) for of_steps in medians.values())] for k, row in enumerate(rows)],
-        [
-            f"Frames {FIRST} to {LAST - 1}. Our loop fuses labels and renders during tracking. Image copies are excluded."
-        ],
+        [f"Frames {FIRST} to {LAST - 1}. Ours has labels and renders during tracking. Image copies are excluded."],
     )
     tables.append(table)
 

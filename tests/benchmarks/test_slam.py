@@ -185,8 +185,8 @@ def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
         [
             f"The slowest frame is {WARM + int(np.argmax(spent['long'][WARM:]))}; one frame in 1000 takes "
             f"{percentile / usual:.2f} times the median or more. Other load on the machine also delays frames.",
-            f"On the way back through the last room the map grew by {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels "
-            f"and {100 * (after[0] / at_2000[0] - 1):.1f} % in bytes.",
+            f"Map growth on the way back through the last room: {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
+            f"{100 * (after[0] / at_2000[0] - 1):.1f} % in bytes.",
             f"Lost: {lost} of {WALK}, and {long.lost - lost} on the way back. Drift after "
             f"{LENGTH * WALK / FRAMES_A_ROOM:.0f} m: {1e3 * drift:.0f} mm. {len(scene.instance_ids())} instances.",
         ],
