@@ -185,7 +185,7 @@ def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
         [
             f"The slowest frame is {WARM + int(np.argmax(spent['long'][WARM:]))}; one frame in 1000 takes "
             f"{percentile / usual:.2f} times the median or more. Other load on the machine also delays frames.",
-            f"Map growth on the way back through the last room: {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
+            f"Map growth on the way back in the last room: {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
             f"{100 * (after[0] / at_2000[0] - 1):.1f} % in bytes.",
             f"Lost: {lost} of {WALK}, and {long.lost - lost} on the way back. Drift after "
             f"{LENGTH * WALK / FRAMES_A_ROOM:.0f} m: {1e3 * drift:.0f} mm. {len(scene.instance_ids())} instances.",
@@ -264,9 +264,8 @@ class Duel:
         self.recording = recording
         self.ours = ours
         self.theirs = theirs
-        self._measured: dict[str, list[tuple[float, float]]] = defaultdict(
-            list
-        )  # s, of ours and of Open3D in each frame
+        # s, of ours and of Open3D in each frame
+        self._measured: dict[str, list[tuple[float, float]]] = defaultdict(list)
         self._lifting: list[float] = []
         self._their_seconds: list[dict[str, float]] = []  # s, of the steps of each frame
         self._frame = -1

@@ -210,9 +210,8 @@ FAULTY = {
 }
 
 
-@pytest.mark.parametrize(
-    "command", sorted(COMMANDS.keys() - {"doctor"})
-)  # failed checks of doctor are not errors of the command
+# Failed checks of doctor are not errors of the command.
+@pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"doctor"}))
 def test_command_debug_shows_traceback(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

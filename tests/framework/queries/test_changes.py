@@ -134,7 +134,7 @@ def test_probability_gone_depends_on_evidence() -> None:
     assert gone(0, 10, False) > gone(5, 5, False) > gone(10, 0, False)
     assert gone(8, 2, False) > gone(8, 2, True)
     assert gone(0, 10, False, confidence=0.1) < gone(0, 10, False, confidence=0.9), (
-        "an uncertain object is less likely gone"
+        "an uncertain object is less likely to be gone"
     )
 
 

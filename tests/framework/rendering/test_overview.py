@@ -59,9 +59,8 @@ def test_front_sides_ignore_back_faces_of_walls_and_ceiling() -> None:
     mesh = furnished()
     camera, R = Camera(9, 9, 60.0, 60.0, 4.0, 4.0), looking(np.array([0.0, 0.1, -1.0]), np.array([0.0, 0, 1]))
     hits = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([0.0, -0.5, 5.0])).seen_by(camera, R)
-    np.testing.assert_allclose(
-        hits.points_world[..., 2], 0, atol=1e-4
-    )  # the floor is visible through the ceiling at 2.5 m
+    # The floor is visible through the ceiling at 2.5 m.
+    np.testing.assert_allclose(hits.points_world[..., 2], 0, atol=1e-4)
 
 
 def test_openness_near_objects_is_below_open_floor() -> None:

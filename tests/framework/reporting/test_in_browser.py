@@ -167,9 +167,8 @@ def test_report_table_is_sorted_searched_and_selected_by_keys(pages: list[Path],
     chosen = rows.nth(1).get_attribute("data-id")
     assert rows.nth(1).get_attribute("aria-selected") == "true"
     assert page.locator("#panel h3").inner_text().endswith(str(chosen))
-    while page.evaluate(
-        "Boolean(window.report.viewer.flight)"
-    ):  # wait_for_function uses eval, which the policy forbids
+    # wait_for_function uses eval, which the policy forbids.
+    while page.evaluate("Boolean(window.report.viewer.flight)"):
         page.wait_for_timeout(50)
     after = page.evaluate("window.report.viewer.camera.position.toArray()")
     assert np.linalg.norm(np.subtract(after, before)) > 0.05, "the camera does not move"

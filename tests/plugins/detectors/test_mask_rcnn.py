@@ -148,9 +148,8 @@ def test_mask_rcnn_resize_keeps_ramp_position(path, short_side):
     ramp = np.repeat(np.tile(5 * np.arange(50, dtype=np.uint8), (40, 1))[..., None], 3, axis=2)
     image = MaskRCNNDetector(weights=path, device="cpu", short_side=short_side, long_side=400)._resize(picture(ramp))
     places = (np.arange(image.shape[3]) + 0.5) * 40 / short_side - 0.5
-    np.testing.assert_allclose(
-        image[0, 0, 5, 2:-2].numpy(), 5 * places[2:-2], atol=0.51
-    )  # values are rounded to integers
+    # Values are rounded to integers.
+    np.testing.assert_allclose(image[0, 0, 5, 2:-2].numpy(), 5 * places[2:-2], atol=0.51)
 
 
 def test_mask_rcnn_overflow_raises(tmp_path):

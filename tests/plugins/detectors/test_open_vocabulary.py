@@ -47,9 +47,8 @@ class Saying:
     dtype = torch.float32
 
     def __init__(self, shape: tuple[int, int], boxes: list[list[float]], probabilities: list[list[float]]) -> None:
-        shares = (torch.tensor(boxes) + 0.5) / max(
-            shape
-        )  # fractions of the square that has the image at its upper left
+        # Fractions of the square that has the image at its upper left.
+        shares = (torch.tensor(boxes) + 0.5) / max(shape)
         centers = (shares[:, :2] + shares[:, 2:]) / 2
         self.boxes = torch.cat([centers, shares[:, 2:] - shares[:, :2]], dim=1)[None]
         self.logits = torch.logit(torch.tensor(probabilities))[None]

@@ -181,9 +181,8 @@ def test_transformers_decoding_agrees_with_eomt(folders):
     ],
 )
 def test_transformers_preprocessing_agrees_with_library(name, numbers, shape):
-    color = np.random.default_rng(0).integers(
-        64, 192, (*shape, 3), np.uint8
-    )  # bicubic resampling stays within 0 to 255
+    # Bicubic resampling of these values stays within 0 to 255.
+    color = np.random.default_rng(0).integers(64, 192, (*shape, 3), np.uint8)
     processor = getattr(transformers, name)(**numbers)
     expected = processor(images=color, return_tensors="pt")["pixel_values"][0].numpy()
     content = {"image_processor_type": name, **numbers}

@@ -43,7 +43,7 @@ def true_mask(frame: Frame, *objects: int) -> np.ndarray:
 
 
 def assert_one_each(scene: BoxScene, fuser: MapFuser, least: float) -> None:
-    """Check that one instance covers more than the fraction `least` of each object, and that none covers the room."""
+    """Check that one instance covers more than the fraction `least` of each object, and that the room has none."""
     found = shares(scene, fuser)
     assert found.shape[1] == scene.count, f"{scene.count - 1} objects became {found.shape[1] - 1} instances"
     assert sorted(found[1:, 1:].argmax(axis=1)) == list(range(scene.count - 1))

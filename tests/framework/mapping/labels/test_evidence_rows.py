@@ -140,9 +140,8 @@ def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
             clusters=np.array([k for clusters in lists for k in clusters], np.int32),
             absence=np.float32(-0.2),
         )
-        message = message._replace(
-            class_scores=message.class_scores.astype(np.int32), max_score=MAX_SCORE
-        )  # the types and limits of compact storage
+        # The types and limits of compact storage.
+        message = message._replace(class_scores=message.class_scores.astype(np.int32), max_score=MAX_SCORE)
         blocks = rng.permutation(block_count)[1:].astype(np.int32)
         pixels = rng.integers(-1, 10, (len(blocks), 512)).astype(np.int32)
         pixels[rng.random(pixels.shape) > 4 / block_count] = -1

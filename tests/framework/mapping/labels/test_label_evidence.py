@@ -137,7 +137,7 @@ SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2
 @pytest.mark.parametrize(
     ("combine", "weighed", "instance", "label"),
     [
-        (Combine.SUM, False, 2, 2),  # instance 2 has most counts; classes 2 and 3 tie, and the smaller id is used
+        (Combine.SUM, False, 2, 2),  # instance 2 has the most counts; classes 2 and 3 tie, and the smaller id is used
         (Combine.LARGEST, True, 1, 2),
         (Combine.LATEST, False, 3, 2),
     ],
