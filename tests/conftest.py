@@ -22,12 +22,12 @@ import tests.support.cached_lights  # noqa: E402, F401
 from framework.config import composition  # noqa: E402
 from tests.support.scenes.corner_room import CornerRoom  # noqa: E402
 
-os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # tests never download 180 MB
+os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # tests never download weights, 180 MB
 hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)  # a busy machine must not fail a test
 hypothesis.settings.load_profile("tests")
 CHECKOUT = Path(__file__).resolve().parent.parent
 
-# tests started in the background ignore Ctrl-C and pass this to their processes; nohup ignores a closed terminal
+# processes inherit ignored signals: SIGINT of background jobs, and SIGHUP of nohup
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
@@ -68,7 +68,7 @@ def shared() -> Path:
     """Return the directory `shared` next to the checkout, with data and weights; skip the test if it is missing."""
     directory = CHECKOUT.parent / "shared"
     if not directory.is_dir():
-        pytest.skip(f"{directory} with its data and weights is not there")
+        pytest.skip(f"{directory} with data and weights does not exist")
     return directory
 
 
@@ -76,13 +76,13 @@ def shared() -> Path:
 def shared_data(shared: Path) -> Path:
     """Return `shared/data`, which contains RGB-D folders."""
     if not (shared / "data").is_dir():
-        pytest.skip(f"{shared / 'data'} is not there")
+        pytest.skip(f"{shared / 'data'} does not exist")
     return shared / "data"
 
 
 @pytest.fixture(scope="session")
 def ready(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]:
-    """Build an option with generated user files. Skip only if a package is missing."""
+    """Return a function that builds an option with generated user files, or skips if a package is missing."""
     from tests.support import option_files, registered
 
     made = functools.cache(lambda *option: option_files.overrides(*option, tmp_path_factory.mktemp(option[1])))
@@ -95,7 +95,7 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]
 
 @pytest.fixture
 def room() -> CornerRoom:
-    """Return a video of six frames with exact ground truth."""
+    """Return a sequence of six frames with exact ground truth."""
     return CornerRoom()
 
 

@@ -1,4 +1,4 @@
-"""Compare the results of two folders of run directories, byte for byte, for changes that must not change any result.
+"""Compare the results of two folders of run directories, byte by byte, for changes that must not change any result.
 
     python -m tests.same_results BEFORE AFTER
 

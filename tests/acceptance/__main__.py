@@ -1,4 +1,4 @@
-"""Measure acceptance measurements: `python -m tests.acceptance [MEASUREMENT ...]`."""
+"""Run acceptance measurements: `python -m tests.acceptance [MEASUREMENT ...]`."""
 
 from __future__ import annotations
 

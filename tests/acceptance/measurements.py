@@ -1,4 +1,4 @@
-"""The acceptance measurements. Each function returns its value and if the value is within the bound."""
+"""The acceptance measurements. Each function returns its value, and True if the value is within the bound."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
 
 @functools.cache
 def mapped(*overrides: str) -> dict[str, Any]:
-    """Map a sequence and return its metrics. Measurements that share a run in one process map it once."""
+    """Map a sequence and return its metrics. Measurements in one process share equal runs."""
     with tempfile.TemporaryDirectory() as directory:
         command = [sys.executable, "-m", "framework", *overrides, f"hydra.run.dir={directory}/run"]
         subprocess.run(command, cwd=CHECKOUT, check=True)
@@ -57,7 +57,7 @@ def ap50(bound: float, scene: str) -> Measured:
     return value, value >= bound
 
 
-@measurement("ATE <= 25 mm, 300 frames", *PIPELINE)  # the reference, KinectFusion, is off by 10 to 20 mm
+@measurement("ATE <= 25 mm, 300 frames", *PIPELINE)  # errors of the reference, KinectFusion, are 10 to 20 mm
 def kitchen_ate() -> Measured:
     return ate_mm(25, *folder("redkitchen"), "detector=none")
 
@@ -131,7 +131,7 @@ def wheel() -> Measured:
         alone = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         commands = (
             ["instancemap", "--version"],
-            ["instancemap"],  # without arguments: the desk
+            ["instancemap"],  # maps the demo
             ["instancemap", "hydra.run.dir=outputs/desk"],
             ["instancemap", "report", "outputs/desk"],
             ["python", "-c", example],

@@ -19,7 +19,7 @@ HEADER = """# Acceptance
 `make acceptance MEASUREMENT=NAME` runs one. `tests/acceptance/measurements.py` defines them.
 
 """
-Measured = tuple[float, bool]  # the value, and if it is within the bound
+Measured = tuple[float, bool]  # the value, and True if it is within the bound
 
 
 @dataclass(frozen=True)

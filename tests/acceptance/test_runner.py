@@ -1,4 +1,4 @@
-"""Tests of the acceptance page: rows are kept, and outdated lines are detected."""
+"""Tests of the acceptance page: rows are kept, and outdated rows are detected."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ NOTHING = "-"  # a cell without a number: not measured, or not defined
 
 @dataclass
 class Table:
-    """A title, columns and rows of text. The notes state how the values were measured."""
+    """Table of text with a title; the notes state how the values were measured."""
 
     title: str
     columns: Sequence[str]
@@ -18,7 +18,7 @@ class Table:
     notes: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
-        """Return the table as aligned Markdown: text to the left, numbers to the right."""
+        """Return the lines of the table in Markdown; text is aligned left, and numbers are aligned right."""
         table = [list(self.columns), *map(list, self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         numbers = [all(_is_number(row[k]) for row in self.rows) for k in range(len(self.columns))]

@@ -15,7 +15,7 @@ from framework.datasets.frames.numbered_images import numbered_images
 
 
 def feed(source: Path, target: Path, frames: int, hz: float) -> None:
-    """Write camera.json, each frame at its time, and `end`."""
+    """Write camera.json, each frame at its time, and finally the file `end`."""
     color = list(numbered_images(source / "color", (".jpg", ".png")).values())
     depth = list(numbered_images(source / "depth", (".png",)).values())
     there = []

@@ -9,8 +9,8 @@ from framework.data import Detections, Float64, Frame, Pose
 
 Method = o3d.t.pipelines.odometry.Method
 
-DEPTH_SCALE = 1000.0  # units per meter: depth goes in as uint16 millimeters
-MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; the latter is that of our fuser
+DEPTH_SCALE = 1000.0  # depth units per meter; depth is passed in mm as uint16
+MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; MAX_DEPTH equals that of our fuser
 MAX_DEPTH_DIFFERENCE = 0.07  # m, the default
 TRUNCATION = 8.0  # voxels, the default
 BLOCK = 16  # voxels per side, as in the example
@@ -18,7 +18,7 @@ BLOCKS = {0.01: 16_000, 0.02: 4_000}  # by voxel size, m: capacity for all bench
 
 
 class Open3DSlam:
-    """One map and one camera. The steps of a frame are separate, so that each can be timed. There are no labels."""
+    """SLAM of one camera without labels. The steps of a frame are separate methods, so that each can be timed."""
 
     def __init__(
         self, first: Frame, voxel_size: float, method: Method = Method.PointToPlane, device: str = "CPU:0"
@@ -74,7 +74,7 @@ class Open3DSlam:
         self._frames += 1
 
     def render(self) -> None:
-        """Render what the tracker needs: the depth of the full image, and color if the method uses it."""
+        """Render the inputs of the tracker: the depth of the full image, and color if the method uses it."""
         self._model.synthesize_model_frame(self._view, DEPTH_SCALE, MIN_DEPTH, MAX_DEPTH, TRUNCATION, self._color)
 
     def render_all(self) -> None:

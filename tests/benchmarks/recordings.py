@@ -28,7 +28,7 @@ def red_kitchen(shared: Path, frames: int) -> Recording:
 
 
 def furnished_room(frames: int) -> Recording:
-    """Return a synthetic room with dense, noisy Kinect depth and masks with the errors of a real detector."""
+    """Return a synthetic room with dense, noisy Kinect depth and masks with simulated detector errors."""
     return _recorded("synthetic room", Synthetic(frames=240, stop=frames), SimulatedDetector())
 
 

@@ -1,6 +1,6 @@
-"""A walk through a row of identical furnished rooms. Every frame shows the same amount of new surface.
+"""Camera path through a row of identical, furnished rooms. Every frame shows the same amount of new surface.
 
-World: x along the row, y to the left, z up. The walk is periodic with the rooms. Two segments that are a whole number
+World: x along the row, y to the left, z up. The path is periodic with the rooms. Two segments that are a whole number
 of rooms apart show the same images of different places, so any extra cost of the second one is due to the map.
 """
 
@@ -14,16 +14,16 @@ from numba import njit, prange
 from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, UInt8
 from framework.interfaces import RGBDSequence
 
-FRAMES_A_ROOM = 260  # 1.5 cm a frame
+FRAMES_A_ROOM = 260  # 1.5 cm per frame
 LENGTH, HALF_WIDTH, HEIGHT = 3.9, 2.0, 2.6  # m, of a room
 WALL = 0.06  # m, half the thickness of the wall between two rooms
-DOOR = (0.6, 2.1)  # m, half its width, and its height
+DOOR = (0.6, 2.1)  # m, half the width and the height
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 EYE = 1.4  # m, height of the camera
-PAN = np.deg2rad(35.0)  # how far the camera looks to the left and to the right
-PITCH = np.deg2rad(12.0)  # how far down
+PAN = np.deg2rad(35.0)  # rad, maximum angle to the left and to the right
+PITCH = np.deg2rad(12.0)  # rad, mean downward angle
 
-# Boxes of a room: lower corner, upper corner (m, x from the room's beginning), class; None = a part of the building.
+# Boxes of a room: lower corner, upper corner (m, x from the start of the room), class; None = a part of the building.
 FURNITURE = (
     ((-WALL, -HALF_WIDTH, 0.0), (WALL, -DOOR[0], HEIGHT), None),
     ((-WALL, DOOR[0], 0.0), (WALL, HALF_WIDTH, HEIGHT), None),
@@ -43,13 +43,13 @@ FURNITURE = (
     ((2.9, -1.77, 0.5), (3.0, -1.72, 0.6), None),
 )
 BOXES = np.array([(*low, *high) for low, high, _ in FURNITURE], np.float32)
-OBJECTS = ("dining table", "microwave", "book", "couch", "refrigerator", "chair", "tv")  # one instance of each a room
+OBJECTS = ("dining table", "microwave", "book", "couch", "refrigerator", "chair", "tv")  # one instance of each per room
 OBJECT_OF_BOX = np.array([OBJECTS.index(name) + 1 if name else 0 for *_, name in FURNITURE], np.int32)
 
 
 @dataclass
 class RoomRow(RGBDSequence):
-    """Frames of the walk without noise, with exact poses and instances."""
+    """Sequence of frames along the path, without noise and with exact poses and instances."""
 
     frames: int = 2000
 
@@ -71,7 +71,7 @@ class RoomRow(RGBDSequence):
 
 
 def pose_at(k: int) -> Float64:
-    """Return T_world_camera of frame k: straight through the doors, looking left and right in turn."""
+    """Return T_world_camera of frame k; the path leads through the doors, and the camera turns left and right."""
     phase = 2 * np.pi * k / FRAMES_A_ROOM
     yaw, pitch = PAN * np.sin(phase), -PITCH + np.deg2rad(2.0) * np.sin(3 * phase)
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
@@ -136,7 +136,7 @@ def _render(
 
 @njit(cache=True, nogil=True)
 def _entry(box, begin, ox, oy, oz, dx, dy, dz):
-    """Return where a ray enters the box of a room that begins at x = `begin`; infinite if it does not."""
+    """Return the ray parameter where a ray enters a box of the room that starts at x = `begin`; infinite = missed."""
     near, far = np.float32(1e-3), np.float32(np.inf)
     for axis in range(3):
         o = ox - begin if axis == 0 else (oy if axis == 1 else oz)
@@ -152,7 +152,7 @@ def _entry(box, begin, ox, oy, oz, dx, dy, dz):
 
 @njit(cache=True, nogil=True)
 def _paint(x, y, z, box, out):
-    """Paint a solid texture of a few wavelengths, equal in all rooms, with a different tone for each box."""
+    """Write the color of a periodic solid texture, which is equal in all rooms and differs between boxes."""
     x -= LENGTH * np.floor(x / LENGTH)  # a room contains a whole number of waves along x
     turn = np.float32(2 * np.pi / LENGTH)
     one = np.sin(6 * turn * x + 5 * y + 3 * z + box)

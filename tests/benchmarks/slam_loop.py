@@ -10,7 +10,7 @@ from framework.data import Detections, Frame, Pose
 from framework.interfaces import MapFuser, PoseTracker
 from framework.refinement.lifting import lift
 
-RENDERING = "render for tracking"  # a part of track
+RENDERING = "render for tracking"  # included in track
 
 
 def seconds(step: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
@@ -21,12 +21,12 @@ def seconds(step: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
 
 
 class SlamLoop:
-    """Track, lift and fuse. Only public interfaces are used, so that any tracker and fuser can be measured."""
+    """Loop of tracking, lifting and fusion. It uses only public interfaces, so it can measure any tracker and fuser."""
 
     def __init__(self, tracker: PoseTracker, fuser: MapFuser) -> None:
         self.tracker = tracker
         self.fuser = fuser
-        self.seconds: dict[str, float] = {}  # of the last frame's steps
+        self.seconds: dict[str, float] = {}  # s, of the steps of the last frame
         self.poses: list[Pose] = []
         self._rendering = 0.0
         self._watch_rendering()

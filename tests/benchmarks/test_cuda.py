@@ -1,6 +1,6 @@
 """Detectors and the loop on CUDA, compared with the CPU: `python -m pytest tests/benchmarks -k cuda` prints the tables.
 
-docs/results/cuda.md has the results. Nothing asserts a time.
+docs/results/cuda.md has the results. No time is asserted.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ IMAGES, WARM_UP = 40, 10  # per detector and device
 LONGEST = 6.0  # s per detector and device; the warm-up takes at most a quarter of it
 MATCH = 0.5  # lowest mask IoU of two detections of one object
 VOXEL_SIZE = 0.01  # m
-TURN, FIRST, LAST = 10, 20, 80  # frames in turns; frames in [FIRST, LAST) count
+TURN, FIRST, LAST = 10, 20, 80  # frames per turn; frames in [FIRST, LAST) are evaluated
 WEIGHTS = {"onnx_segmentation": "yolo11n_seg/yolo11n_seg.onnx", "onnx_boxes": "yolox_nano/yolox_nano.onnx"}
 NAMES = ["maskrcnn2go", "mask_rcnn_rooms", *WEIGHTS, *RANDOM]
 
-pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU with CUDA")
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="requires CUDA")
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """The matching detections of a detector on two devices, over all images."""
+    """Matching detections of a detector on two devices, over all images."""
 
-    found: tuple[int, int]  # detections of the reference, of the other
+    found: tuple[int, int]  # number of detections of the reference, and of the other device
     overlaps: list[float]  # mask IoU of each match
     score_differences: list[float]  # absolute, of each match
     same_class: float  # fraction of the matches
 
     @classmethod
     def of(cls, reference: Sequence[Detections], other: Sequence[Detections]) -> Agreement:
-        """Match each detection of the reference, best first, with the free one of the largest mask IoU."""
+        """Match each reference detection, best first, with the unmatched detection of the largest mask IoU."""
         overlaps, differences, same = [], [], []
         for a, b in zip(reference, other, strict=True):
             flat_a, flat_b = (d.masks.reshape(len(d), -1).astype(np.float32) for d in (a, b))
@@ -82,7 +82,7 @@ class Agreement:
 
 @pytest.fixture(scope="module")
 def images(shared: Path) -> Callable[[str], list[Frame]]:
-    """Return the images for a detector: real ones, or rendered rooms for the network trained on rooms."""
+    """Return the images for a detector: real images, or rendered rooms for the network trained on rooms."""
     kitchen = list(RgbdFolder(shared / "data" / "redkitchen", stop=5 * IMAGES, stride=5))
     rooms = list(Synthetic(frames=240, stride=240 // IMAGES))
     return lambda name: rooms if name == "mask_rcnn_rooms" else kitchen
@@ -112,7 +112,7 @@ def settings(option: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def run(detector: Any, frames: Sequence[Frame]) -> tuple[list[float], list[Detections]]:
-    """Return the seconds of each image, and its detections. They are on the CPU, so CUDA is synchronized."""
+    """Return the times, s, and the detections of all images. Detections are on the CPU, so CUDA is synchronized."""
     began = time.perf_counter()
     for frame in frames[:WARM_UP]:
         detector.detect(frame)
@@ -160,7 +160,7 @@ def test_cuda_detector_speed_and_agreement(
 
 
 def test_cuda_slam_speed(benchmark: BenchmarkFixture, shared: Path, tables: list[Table]) -> None:
-    """Our loop runs on the CPU and Open3D's on both devices, in turns on the same frames."""
+    """Our loop runs on the CPU and Open3D's on both devices, alternating on the same frames."""
     kitchen = red_kitchen(shared, LAST)
     ours = SlamLoop(VoxelHashingIcp(), assemble(BayesianTsdf, voxel_size=VOXEL_SIZE))
     theirs = {device: Open3DSlam(kitchen.frames[0], VOXEL_SIZE, device=device) for device in ("CPU:0", "CUDA:0")}
@@ -181,16 +181,16 @@ def test_cuda_slam_speed(benchmark: BenchmarkFixture, shared: Path, tables: list
     medians: dict[str, Float64] = {name: np.median(rows[FIRST:], axis=0) for name, rows in spent.items()}
     rows = ["whole loop", "copy the images", "track", "integrate", "render for tracking", "render full image"]
     table = Table(
-        f"Loop next to Open3D {o3d.__version__}, redkitchen, 1 cm voxels, median ms per frame",
+        f"Loop compared with Open3D {o3d.__version__}, redkitchen, 1 cm voxels, median ms per frame",
         ["step", "ours, CPU", *(f"Open3D, {name}" for name in theirs)],
         [[row, *(ms(of_steps[k]) for of_steps in medians.values())] for k, row in enumerate(rows)],
-        [f"Frames {FIRST} to {LAST - 1}. Ours has labels, and renders while it tracks. The loop does not copy images."],
+        [f"Frames {FIRST} to {LAST - 1}. Ours has labels and renders during tracking. Image copies are excluded."],
     )
     tables.append(table)
 
 
 def steps(slam: Open3DSlam, frame: Frame) -> list[float]:
-    """Return the seconds of Open3D's whole loop and of each step."""
+    """Return the times, s, of Open3D's whole loop and of each step."""
     calls = [partial(slam.load, frame), slam.track, slam.integrate, slam.render, slam.render_all]
     load, track, integrate, render, full = (seconds(synchronized, call)[0] for call in calls)
     return [track + integrate + render, load, track, integrate, render, full]

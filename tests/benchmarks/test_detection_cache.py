@@ -29,7 +29,7 @@ def noise() -> Frame:
 
 
 def ellipses() -> Detections:
-    """Return objects of 60 to 260 px."""
+    """Return detections of ellipses of 60 to 260 px."""
     random = np.random.default_rng(0)
     v, u = np.ogrid[:480, :640]
     half, center = random.uniform(30, 130, (OBJECTS, 2)), random.uniform(0, (640, 480), (OBJECTS, 2))
@@ -55,10 +55,10 @@ def test_detection_cache_second_run_detects_nothing(benchmark: BenchmarkFixture,
     """A network runs on a real video; a second run reads all detections from the cache."""
     data = shared / "data" / "redkitchen"
     if not data.is_dir():
-        pytest.skip(f"{data} is not there")
+        pytest.skip(f"{data} does not exist")
     frames = list(RgbdFolder(data, stop=FRAMES))
     detector = MaskRCNN2Go(device="cpu")
-    detector.detect(frames[0])  # warm
+    detector.detect(frames[0])  # warm-up
     first = CachedDetector(detector, tmp_path)
     started = time.perf_counter()
     for frame in frames:
@@ -69,4 +69,4 @@ def test_detection_cache_second_run_detects_nothing(benchmark: BenchmarkFixture,
     assert second.misses == 0
     share = benchmark.stats.stats.median / took
     benchmark.extra_info.update(first_run_ms_a_frame=round(1e3 * took / FRAMES, 1), second_run_share=round(share, 4))
-    print(f"\nfirst run {1e3 * took / FRAMES:.1f} ms a frame, the second {100 * share:.1f} % of it")
+    print(f"\nfirst run: {1e3 * took / FRAMES:.1f} ms per frame; second run: {100 * share:.1f} % of this time")

@@ -1,7 +1,7 @@
 """Time and memory of every available detector at 640x480: `python -m pytest tests/benchmarks -k detectors`.
 
-Each detector runs in its own process, so that its peak memory is measured alone. Networks without local weights get
-random weights: their time is correct, and their output is fixed to MASKS objects per image.
+Each detector runs in its own process, so that its peak memory is measured separately. Networks without local weights
+get random weights: their times are representative, and they output MASKS objects per image.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from tests.support import registered
 
 THREADS = 2
 FRAMES = 8
-ROUNDS = 3  # over the frames
-WARM_UP = 2  # images that are not counted
+ROUNDS = 3  # passes over the frames
+WARM_UP = 2  # images that are not timed
 LONGEST = 20.0  # s, after which a slow detector is stopped
 MASKS = 20  # detections that random networks return
 
@@ -74,7 +74,7 @@ MASK2FORMER = partial(
 
 
 def rf_detr_seg(side: int, windows: int) -> Callable[[Path], list[str]]:
-    """Return the published settings of Nano (312 px, one window) or Small (384 px, two windows)."""
+    """Return the writer of a network with the settings of Nano (312 px, one window) or Small (384 px, two windows)."""
     backbone = {
         "model_type": "rf_detr_dinov2", "hidden_size": 384, "num_attention_heads": 6, "image_size": side,
         "patch_size": 12, "num_windows": windows, "out_features": ["stage3", "stage6", "stage9", "stage12"],
@@ -97,9 +97,9 @@ RANDOM: dict[str, tuple[str, Callable[[Path], list[str]]]] = {
 class Measured:
     """Measured values of a detector."""
 
-    seconds: list[float]  # an image
-    detections: float  # an image
-    mib: float  # peak increase of the process
+    seconds: list[float]  # per image
+    detections: float  # mean per image
+    mib: float  # increase of the peak memory of the process
     fault: str = ""  # reason if it cannot run
 
 
@@ -141,10 +141,10 @@ def frames() -> list[Frame]:
 def table(tables: list[Table]) -> Table:
     table = Table(
         "Detectors, synthetic room at 640x480",
-        ["detector", "ms", "images a second", "peak memory, MiB", "detections"],
+        ["detector", "ms", "images per second", "peak memory, MiB", "detections"],
         notes=[
-            f"Medians over {FRAMES * ROUNDS} images, or what {LONGEST:.0f} s allow; {THREADS} threads.",
-            "Memory: what the process grew by. Where a network is named, its weights are random.",
+            f"Medians over {FRAMES * ROUNDS} images, or over those of {LONGEST:.0f} s; {THREADS} threads.",
+            "Memory: increase of the process. Named networks have random weights.",
         ],
     )
     tables.append(table)

@@ -24,7 +24,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 FRAMES = int(os.environ.get("INSTANCEMAP_LIVE_FRAMES", "300"))
 HZ = 15.0
 PATIENCE_S = 120.0
-WARM_S = 10.0  # after these frames, kernels are loaded and caches are warm
+WARM_S = 10.0  # after this time, kernels are loaded and caches are warm
 
 
 def resident(process: subprocess.Popen[str]) -> int:
@@ -33,13 +33,13 @@ def resident(process: subprocess.Popen[str]) -> int:
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux for the memory of a process")
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="requires /proc")
 def test_live_folder_latency_and_drops(
     benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, tables: list[Table]
 ) -> None:
     source, watched, place = shared / "data" / "redkitchen", tmp_path / "watched", tmp_path / "run"
     if not source.is_dir():
-        pytest.skip(f"{source} is not there")
+        pytest.skip(f"{source} does not exist")
     watched.mkdir()
     memory: list[int] = []
 
@@ -73,20 +73,20 @@ def test_live_folder_latency_and_drops(
             f"Live: redkitchen in a folder at {HZ:g} Hz, {FRAMES} frames, 1 cm voxels, {os.cpu_count()} cores",
             ["", "measured", "target"],
             [
-                ["latency, ms, median: from when a frame was noticed to when it was fused",
+                ["latency from noticing a frame to its fusion, ms, median",
                  f"{metrics['latency_ms']:.0f}", "< 200"],
-                ["the same, 95 %", f"{metrics['latency_ms.p95']:.0f}", NOTHING],
-                ["from when its files were there to when it was noticed, ms, median", f"{unnoticed:.1f}", NOTHING],
-                ["frames a second, median", f"{metrics['fps_median']:.1f}", NOTHING],
+                ["latency from noticing a frame to its fusion, ms, 95 %", f"{metrics['latency_ms.p95']:.0f}", NOTHING],
+                ["delay from writing a frame to noticing it, ms, median", f"{unnoticed:.1f}", NOTHING],
+                ["frames per second, median", f"{metrics['fps_median']:.1f}", NOTHING],
                 ["frames mapped", f"{metrics['frames']}", NOTHING],
                 ["frames dropped", f"{metrics['frames_dropped']}", NOTHING],
-                [f"of these after the first {WARM_S:g} s, of {len(late)} frames", f"{late_dropped}", NOTHING],
+                [f"frames dropped after the first {WARM_S:g} s, of {len(late)}", f"{late_dropped}", NOTHING],
                 ["frames lost", f"{metrics['frames_lost']}", NOTHING],
                 ["detection, ms, median", f"{metrics['stage_ms.detection.median']:.0f}", NOTHING],
                 ["map, MiB", mib(metrics["map.bytes"]), NOTHING],
                 *([f"resident, MiB, quarter {k}", mib(size), NOTHING] for k, size in enumerate(quarters, start=1)),
             ],
-            ["In the first second kernels are loaded. Dropped is what comes while another one waits."],
+            ["Kernels are loaded in the first second. A frame is dropped if a newer one arrives before mapping."],
         )
     )  # fmt: skip
     benchmark.extra_info.update(

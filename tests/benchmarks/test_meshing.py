@@ -37,7 +37,7 @@ def fuse(fuser: BayesianTsdf, frame: Frame) -> None:
 def kitchen() -> tuple[BayesianTsdf, Iterator[Frame]]:
     """Return the map of all frames except the last UPDATES, and these frames."""
     if not KITCHEN.is_dir():
-        pytest.skip(f"{KITCHEN} is absent")
+        pytest.skip(f"{KITCHEN} does not exist")
     frames = iter(RgbdFolder(root=KITCHEN, stop=FRAMES))
     fuser = assemble(BayesianTsdf, voxel_size=0.01)
     for _ in range(FRAMES - UPDATES):

@@ -36,7 +36,7 @@ CAMERA = Camera(640, 480, 540.0, 540.0, 319.5, 239.5)
 
 
 def ten_masks() -> tuple[PointClusters, Frame]:
-    """Return ten ellipsoids of 30 to 100 px in front of a slanted wall; masks bleed by 8 px, depth has Kinect noise."""
+    """Return the clusters and the noisy frame of ten ellipsoids of 30 to 100 px; masks bleed by 8 px onto a wall."""
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:480, :640]
     depth = 2.5 + 0.001 * u

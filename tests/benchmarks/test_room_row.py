@@ -1,4 +1,4 @@
-"""Tests of the walk of the long benchmark, whose rooms must be identical."""
+"""Tests of the camera path of the long benchmark, whose rooms must be identical."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ def test_room_row_frames_repeat_after_one_room() -> None:
 
 
 def test_room_row_nearby_frames_show_same_surface() -> None:
-    """Points measured in one frame lie on the surface of the next one, except hidden points."""
+    """Points of one frame lie on the surface of the next frame, except occluded points."""
     walk = RoomRow(100)
     one, other = walk[60], walk[64]
     v, u = (x.ravel() for x in np.mgrid[: CAMERA.height, : CAMERA.width])

@@ -31,15 +31,15 @@ from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
 
 VOXEL_SIZES = (0.01, 0.02)  # m
 TURN = 10  # frames
-FIRST, LAST = 20, 80  # frames in [FIRST, LAST) count: before, the map is small and caches are cold
-TARGETS = {  # times as fast as Open3D ...
+FIRST, LAST = 20, 80  # frames in [FIRST, LAST) are evaluated; before, caches are cold
+TARGETS = {  # speedup over Open3D
     "redkitchen": {"whole loop": ">= 6", "integrate": ">= 3.5", "render full image": ">= 3"},
     "synthetic room": {"whole loop": ">= 5", "integrate": ">= 4", "render full image": ">= 3"},
 }
-TARGETS_AT = 0.01  # m, ... at this voxel size
+TARGETS_AT = 0.01  # m, voxel size of the targets
 WALK = 2000  # frames
-WARM = 10  # number of frames after which none may be late
-EARLY, LATE = (WARM, 700), (WARM + 1300, WALK)  # compared frames: a third each, whole rooms apart
+WARM = 10  # number of warm-up frames
+EARLY, LATE = (WARM, 700), (WARM + 1300, WALK)  # compared frames: a third each, a whole number of rooms apart
 SECOND_START = LATE[0] - EARLY[0]
 assert SECOND_START % FRAMES_A_ROOM == 0, "both views show the same images"
 
@@ -75,7 +75,7 @@ def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: st
     scene, theirs = duel.ours.fuser.scene, duel.theirs
     table = Table(
         f"{name}, {100 * voxel_size:.0f} cm voxels",
-        ["milliseconds a frame, median", "ours", "Open3D", "times as fast", "target", "of the quickest tenths"],
+        ["median, ms per frame", "ours", "Open3D", "speedup", "target", "speedup at the 10th percentile"],
         [
             [
                 row,
@@ -88,17 +88,18 @@ def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: st
             for (row, (o, t)), (quick_o, quick_t) in zip(medians.items(), duel.quantiles(0.1).values(), strict=True)
         ],
         [
-            f"Frames {FIRST} to {LAST - 1} of {LAST}, {TURN} each in turns in one process; lost: {duel.ours.lost}. "
-            f"Open3D without labels, ours with {np.mean([len(d) for d in recording.detections]):.1f} masks a frame.",
-            "The last column is the ratio of the 10th percentiles, which a busy machine disturbs less than medians.",
-            f"The whole loop leaves out lifting the masks to points, {ms(duel.lifting())} ms of ours; detection and "
-            "refinement are other stages.",
+            f"Frames {FIRST} to {LAST - 1} of {LAST}; both alternate every {TURN} frames in one process. "
+            f"Open3D has no labels, ours has {np.mean([len(d) for d in recording.detections]):.1f} masks per frame. "
+            f"Lost frames of ours: {duel.ours.lost}.",
+            "Other load on the machine affects the 10th percentiles less than the medians.",
+            f"The whole loop excludes lifting of masks to points, {ms(duel.lifting())} ms in ours, and detection and "
+            "refinement, which are other stages.",
         ],
     )
     tables.append(table)
     tables.append(
         Table(
-            f"Memory of that map: {name}, {100 * voxel_size:.0f} cm voxels",
+            f"Memory of the map: {name}, {100 * voxel_size:.0f} cm voxels",
             ["MiB", "ours", "Open3D"],
             [
                 ["used, without labels", mib(scene.volume.voxels.byte_count), mib(theirs.bytes_used)],
@@ -106,8 +107,8 @@ def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: st
                 ["allocated", mib(scene.statistics.bytes), mib(theirs.bytes_allocated)],
             ],
             [
-                "Ours: byte_count, the arrays as they are. Open3D: the blocks in its hash map (used) and its capacity "
-                "(allocated), times the bytes of their voxels."
+                "Ours: size of the arrays. Open3D: bytes of the blocks in the hash map (used) and of its capacity "
+                "(allocated)."
             ],
         )
     )
@@ -121,15 +122,15 @@ def test_slam_speed_compared_with_open3d(benchmark, recordings, tables, name: st
 
 
 def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
-    """Map 2,000 frames in eight identical rooms: the last third takes as long as the first; no frame is late.
+    """Map 2,000 frames in eight identical rooms, and compare the times of early and late frames.
 
-    From frame 1300 on, five rooms from the start, a second loop begins the walk in alternation with the first one. It
-    sees the same images at the same time with a small map. pytest-benchmark times the first loop.
+    From frame 1300 on, five rooms from the start, a second loop maps the start of the path in alternation with the
+    first loop. It gets the same images at the same time and has a small map. pytest-benchmark times the first loop.
     """
     walk, detector = RoomRow(WALK), GroundTruthDetector()
     long, short = (SlamLoop(VoxelHashingIcp(), BayesianTsdf()) for _ in range(2))
     spent: dict[str, list[float]] = {"long": [], "short": []}  # s, of track and fuse in each frame
-    size = []  # bytes and voxels of the long walk's map after each frame, and of its labels alone
+    size = []  # bytes and voxels of the long map after each frame, and of its labels
     scene = long.fuser.scene
 
     def keep_books() -> None:
@@ -148,7 +149,7 @@ def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
             spent["short"].append(short.seconds["track"] + short.seconds["fuse"])
         return (frame := walk[k], detector.detect(frame)), {}
 
-    with frozen_garbage_collector():  # as a run does
+    with frozen_garbage_collector():  # as in a run
         benchmark.pedantic(long, setup=begin_frame, rounds=WALK)
     keep_books()
     drift = np.linalg.norm((inverse(walk[WALK - 1].T_world_camera) @ long.poses[-1].T_world_camera)[:3, 3])
@@ -166,24 +167,25 @@ def test_slam_long_walk_has_constant_speed(benchmark, tables) -> None:
     worst = [max(spent["long"][slice(*window)]) for window in (EARLY, LATE, (WARM, WALK))]
     percentile = float(np.quantile(spent["long"][WARM:], 0.999))
     table = Table(
-        f"Long walk: {WALK} frames, {WALK / FRAMES_A_ROOM:.1f} rooms, 640x480, 1 cm voxels",
+        f"Long path: {WALK} frames, {WALK / FRAMES_A_ROOM:.1f} rooms, 640x480, 1 cm voxels",
         ["", *(f"frames {begin} to {end}" for begin, end in (EARLY, LATE)), "ratio", "target"],
         [
-            ["track + fuse, ms, median; in turns", ms(small_map), ms(late), f"{late / small_map:.2f}", "<= 1.05"],
-            ["track + fuse, ms, median; one after the other", ms(early), ms(late), f"{late / early:.2f}", "<= 1.05"],
-            ["worst frame, ms; of all, over the median", ms(worst[0]), ms(worst[1]), f"{worst[2] / usual:.2f}",
-             "<= 2.5"],
-            ["new voxels a frame", f"{grown[0]:.0f}", f"{grown[1]:.0f}", f"{grown[1] / grown[0]:.2f}", NOTHING],
+            ["track + fuse, ms, median; alternating with a small map", ms(small_map), ms(late),
+             f"{late / small_map:.2f}", "<= 1.05"],
+            ["track + fuse, ms, median; early and late frames", ms(early), ms(late), f"{late / early:.2f}", "<= 1.05"],
+            ["slowest frame, ms; ratio: slowest of all to median", ms(worst[0]), ms(worst[1]),
+             f"{worst[2] / usual:.2f}", "<= 2.5"],
+            ["new voxels per frame", f"{grown[0]:.0f}", f"{grown[1]:.0f}", f"{grown[1] / grown[0]:.2f}", NOTHING],
             ["map at the end, MiB", mib(at_700[0]), mib(at_2000[0]), NOTHING, NOTHING],
-            ["map at the end, bytes a voxel", *(f"{b / n:.1f}" for b, n, *_ in (at_700, at_2000)),
+            ["map at the end, bytes per voxel", *(f"{b / n:.1f}" for b, n, *_ in (at_700, at_2000)),
              f"{at_2000[0] / at_2000[1] / (at_700[0] / at_700[1]):.2f}", NOTHING],
-            ["its labels, bytes a labeled voxel", *(f"{b / n:.1f}" for *_, b, n in (at_700, at_2000)),
+            ["labels at the end, bytes per labeled voxel", *(f"{b / n:.1f}" for *_, b, n in (at_700, at_2000)),
              f"{at_2000[2] / at_2000[3] / (at_700[2] / at_700[3]):.2f}", NOTHING],
         ],
         [
-            f"The worst frame is {WARM + int(np.argmax(spent['long'][WARM:]))}; one in a thousand takes "
-            f"{percentile / usual:.2f} times the median or more. What else the machine does makes frames late, too.",
-            f"Back through the last room the map grew by {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
+            f"The slowest frame is {WARM + int(np.argmax(spent['long'][WARM:]))}; one frame in 1000 takes "
+            f"{percentile / usual:.2f} times the median or more. Other load on the machine also delays frames.",
+            f"Map growth on the way back in the last room: {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
             f"{100 * (after[0] / at_2000[0] - 1):.1f} % in bytes.",
             f"Lost: {lost} of {WALK}, and {long.lost - lost} on the way back. Drift after "
             f"{LENGTH * WALK / FRAMES_A_ROOM:.0f} m: {1e3 * drift:.0f} mm. {len(scene.instance_ids())} instances.",
@@ -210,10 +212,10 @@ def walks(shared: Path) -> dict[str, list[Frame]]:
 @pytest.fixture(scope="module")
 def trajectories(tables) -> Table:
     table = Table(
-        "Trajectories, 1 cm voxels", ["video", "tracker", "ATE, mm", "end, mm off", "lost", "target"], notes=[
+        "Trajectories, 1 cm voxels", ["video", "tracker", "ATE, mm", "end error, mm", "lost", "target"], notes=[
             "ATE: RMSE after rigid alignment. End: distance of the last pose from the true one, without alignment; the "
             "first pose is given.",
-            "The true poses of redkitchen are KinectFusion's, good to a centimeter or two.",
+            "The true poses of redkitchen are from KinectFusion, with errors of 1 to 2 cm.",
         ]
     )  # fmt: skip
     tables.append(table)
@@ -253,18 +255,19 @@ def test_slam_trajectory_error(benchmark, walks, trajectories, video: str, track
 
 
 class Duel:
-    """Run both systems on the same frames, alternating every TURN frames.
+    """Comparison of both systems on the same frames, alternating every TURN frames.
 
-    Other load on the machine affects both equally, and each system mostly finds warm caches.
+    Other load on the machine affects both equally, and caches are mostly warm for each system.
     """
 
     def __init__(self, recording: Recording, ours: SlamLoop, theirs: Open3DSlam) -> None:
         self.recording = recording
         self.ours = ours
         self.theirs = theirs
-        self._measured: dict[str, list[tuple[float, float]]] = defaultdict(list)  # s, ours and theirs, frame by frame
+        # s, of ours and of Open3D in each frame
+        self._measured: dict[str, list[tuple[float, float]]] = defaultdict(list)
         self._lifting: list[float] = []
-        self._their_seconds: list[dict[str, float]] = []  # of each frame's steps
+        self._their_seconds: list[dict[str, float]] = []  # s, of the steps of each frame
         self._frame = -1
 
     def begin_frame(self) -> tuple[tuple[Frame, Detections], dict[str, Any]]:
@@ -297,9 +300,9 @@ class Duel:
         self._lifting.append(o["lift"])
 
     def quantiles(self, q: float) -> dict[str, Float64]:
-        """Return quantiles (2,) in seconds of ours and of Open3D, by row."""
+        """Return the quantiles (2,), s, of ours and of Open3D, by row."""
         return {row: np.quantile(pairs[FIRST:], q, axis=0) for row, pairs in self._measured.items()}
 
     def lifting(self) -> float:
-        """Return the median time of lifting in s."""
+        """Return the median time of lifting, s."""
         return float(np.median(self._lifting[FIRST:]))

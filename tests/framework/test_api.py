@@ -72,7 +72,7 @@ def test_mapper_add_unusable_frame_keeps_map_unchanged(room: CornerRoom) -> None
     assert not mapper.add(room[2]).lost
 
 
-def test_mapper_add_keeps_sensor_and_logs_it(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+def test_mapper_add_keeps_and_logs_sensor(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
     mapper = Mapper(*STAGES, "detector=none")
     with caplog.at_level("INFO"):
         for k, sensor in enumerate((None, SensorKind.PHONE_LIDAR, None)):
@@ -86,9 +86,9 @@ def test_mapper_add_keeps_sensor_and_logs_it(room: CornerRoom, caplog: pytest.Lo
 
 @pytest.mark.parametrize("fuser", ["bayesian_tsdf", "open3d_vbg", "object_volumes", "class_only_fusion"])
 def test_mapper_sensor_up_direction_is_saved_in_map(fuser: str, tmp_path: Path) -> None:
-    """Only a slanted table is visible, so that surfaces give a wrong up direction; the world is the first frame."""
+    """Only a slanted table is visible, so surfaces give a wrong up direction; the world is the first camera frame."""
     tilt = np.radians(20)
-    up = np.array([np.sin(tilt), -np.cos(tilt) * np.sin(1.0), -np.cos(tilt) * np.cos(1.0)])  # in the first camera
+    up = np.array([np.sin(tilt), -np.cos(tilt) * np.sin(1.0), -np.cos(tilt) * np.cos(1.0)])  # in the first camera frame
     table = Scene(planes=[(np.array([0.0, -np.sin(1.0), -np.cos(1.0)]), -0.8)])
     stages = ("detector=none", "tracker=ground_truth", "refiner=identity", f"fuser={fuser}", "fuser.voxel_size=0.04")
     sensed, unsensed = Mapper(*stages), Mapper(*stages)
@@ -142,7 +142,7 @@ def test_mapper_pickle_round_trip_continues_mapping(room: CornerRoom, fuser: str
     mapper = Mapper(*STAGES, f"fuser={fuser}")
     mapper.add(room[0])
     pickled = pickle.dumps(mapper)
-    assert len(pickled) < 20e6, "without reserved memory, which is gigabytes"
+    assert len(pickled) < 20e6, "reserved memory is not pickled"
     copied = pickle.loads(pickled)
     for one in (mapper, copied):
         one.add(room[1])
@@ -240,7 +240,7 @@ def test_instancemap_help_lists_public_api() -> None:
         assert words in done.stdout
 
 
-def test_import_names_conflicting_framework_package(tmp_path: Path) -> None:
+def test_import_error_names_conflicting_framework_package(tmp_path: Path) -> None:
     (tmp_path / "framework").mkdir()
     (tmp_path / "framework" / "__init__.py").touch()
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import instancemap"

@@ -1,4 +1,4 @@
-"""Tests of the data objects, which validate themselves."""
+"""Tests of the data objects and of their validation."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_camera_non_numeric_value_raises(name: str, value: object) -> None:
 
 
 def test_frame_copies_only_read_only_images() -> None:
-    """Read-only arrays would compile the kernels again."""
+    """Numba would compile the kernels again for read-only arrays."""
     depth = np.ones((3, 4), np.float32)
     assert frame(depth=depth).depth is depth
     depth.flags.writeable = False
@@ -199,7 +199,7 @@ def test_data_objects_invalid_values_raise_one_line_error(
 
 
 def test_instance_mesh_of_instance_has_only_its_vertices() -> None:
-    """The instance has the quad 0 1 2 3 without vertex 1."""
+    """The instance has all vertices of the quad 0 1 2 3 except vertex 1."""
     whole = mesh(
         vertices=np.arange(12, dtype=np.float32).reshape(4, 3),
         triangles=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
@@ -217,7 +217,7 @@ def test_instance_mesh_of_instance_has_only_its_vertices() -> None:
 
 
 def test_frame_converts_image_views_to_contiguous_arrays() -> None:
-    """bgr[..., ::-1] is a view that the kernels could not read."""
+    """The kernels cannot read views such as bgr[..., ::-1]."""
     bgr = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
     depth = np.ones((4, 3), np.float32).T
     made = frame(color=bgr[..., ::-1], depth=depth)
@@ -267,9 +267,9 @@ def test_camera_implausible_intrinsics_raise(wrong: dict[str, float], message: s
 
 
 def test_camera_accepts_crops_and_extreme_lenses() -> None:
-    Camera(1, 1, 525.0, 525.0, -319.5, 239.5)  # its last pixel, alone
-    Camera(640, 480, 60.0, 60.0, 319.5, 239.5)  # 160 degrees
-    Camera(640, 480, 20000.0, 20000.0, 319.5, 239.5)  # 2 degrees
+    Camera(1, 1, 525.0, 525.0, -319.5, 239.5)  # a crop of one pixel
+    Camera(640, 480, 60.0, 60.0, 319.5, 239.5)  # field of view of 160 degrees
+    Camera(640, 480, 20000.0, 20000.0, 319.5, 239.5)  # field of view of 2 degrees
 
 
 def test_pose_rigidity_check_tolerates_rounding() -> None:
@@ -377,6 +377,6 @@ def test_deferred_truth_invalid_image_raises(wrong: np.ndarray) -> None:
         _ = deferred(lambda: wrong).instance_ids
 
 
-def test_frame_deferred_truth_shape_mismatch_raises_unrendered() -> None:
+def test_deferred_truth_shape_mismatch_raises_before_rendering() -> None:
     with pytest.raises(DataError, match=r"frame 7: truth\.instance_ids: expected shape \(3, 4\), got \(2, 2\)"):
         frame(truth=deferred(lambda: pytest.fail("rendered"), (2, 2)))

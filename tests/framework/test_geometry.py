@@ -137,7 +137,7 @@ def test_nearest_rigid_non_rigid_matrix_raises(matrix: np.ndarray, why: str) -> 
 
 
 @given(twists, twists)
-def test_interpolate_moves_evenly_between_poses(xi_a: np.ndarray, xi_b: np.ndarray) -> None:
+def test_interpolate_is_linear_between_poses(xi_a: np.ndarray, xi_b: np.ndarray) -> None:
     T_a, T_b = geometry.exp_se3(xi_a), geometry.exp_se3(xi_b)
     np.testing.assert_allclose(geometry.interpolate(T_a, T_b, 0), T_a, atol=1e-12)
     np.testing.assert_allclose(geometry.interpolate(T_a, T_b, 1), T_b, atol=1e-7)  # half turns are ill-conditioned
@@ -147,6 +147,6 @@ def test_interpolate_moves_evenly_between_poses(xi_a: np.ndarray, xi_b: np.ndarr
     assert geometry.rotation_angle(T_a[:3, :3].T @ third[:3, :3]) == pytest.approx(whole / 3, abs=1e-7)
 
 
-def test_adjoint_moves_twist_through_motion() -> None:
+def test_adjoint_transforms_twist_to_other_frame() -> None:
     T, xi = geometry.exp_se3(np.array([0.3, -0.2, 0.1, 0.4, -0.5, 0.2])), np.array([0.02, 0.01, -0.03, 0.1, 0.05, -0.2])
     np.testing.assert_allclose(T @ geometry.exp_se3(xi), geometry.exp_se3(geometry.adjoint(T) @ xi) @ T, atol=1e-14)

@@ -102,7 +102,7 @@ def test_run_escapes_invalid_unicode_file_names(tmp_path: Path) -> None:
         assert f"frame skipped: {tmp_path}/color/\\udcff_0.png: expected a JPEG or PNG file" in message
 
 
-def test_leave_working_folder_of_removed_folder_exits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_leave_working_folder_in_deleted_folder_exits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
@@ -117,19 +117,19 @@ def test_leave_working_folder_of_removed_folder_exits(tmp_path: Path, monkeypatc
 def test_module_search_path_excludes_working_folder(
     options: list[str], at: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With --config-dir, `python -m framework` and the console script append these folders at the end."""
+    """With --config-dir, the working folder is at the end of the path, as Hydra appends it."""
     monkeypatch.chdir(tmp_path)
     for first in ("", str(tmp_path)):
         monkeypatch.setattr(sys, "path", [first, "/elsewhere"])
         leave_working_folder(["detector=x", *options])
         assert sys.path == (["/elsewhere"] if at is None else ["/elsewhere", str(tmp_path)])
-    monkeypatch.setattr(sys, "path", ["/usr/bin", "/elsewhere"])  # as the console script has it
+    monkeypatch.setattr(sys, "path", ["/usr/bin", "/elsewhere"])  # as in the console script
     leave_working_folder(options)
     assert sys.path == ["/usr/bin", "/elsewhere", *([] if at is None else [str(tmp_path)])]
     monkeypatch.chdir(CHECKOUT)
     monkeypatch.setattr(sys, "path", [str(CHECKOUT)])
     leave_working_folder([])
-    assert sys.path == [str(CHECKOUT)], "the folder of the project"
+    assert sys.path == [str(CHECKOUT)], "the project folder is kept"
 
 
 def test_run_directory_creation_error_is_one_line(tmp_path: Path) -> None:
@@ -172,7 +172,7 @@ def test_help_after_override_lists_commands(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["check", "detect", "show-refinement", "train-detector"])
-def test_help_of_hydra_command_states_arguments(tmp_path: Path, command: str) -> None:
+def test_help_of_hydra_command_lists_arguments(tmp_path: Path, command: str) -> None:
     done = words(command, "--help", directory=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(f"usage: instancemap {command} ")
@@ -210,16 +210,15 @@ FAULTY = {
 }
 
 
-@pytest.mark.parametrize(
-    "command", sorted(COMMANDS.keys() - {"doctor"})
-)  # whose findings are not errors of the command
+# Failed checks of doctor are not errors of the command.
+@pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"doctor"}))
 def test_command_debug_shows_traceback(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "metrics.json").write_text(json.dumps({"config_hash": config_hash({})}))
     (tmp_path / "old" / "config.yaml").write_text("{}")
-    if (CONF / f"{command.replace('-', '_')}.yaml").exists():  # Hydra's changes of its process stay there
+    if (CONF / f"{command.replace('-', '_')}.yaml").exists():  # Hydra changes its process
         stderr = words(command, *FAULTY[command], "debug=true", directory=tmp_path).stderr
     else:
         monkeypatch.chdir(tmp_path)
@@ -234,7 +233,7 @@ def test_command_debug_shows_traceback(
     assert not (tmp_path / "debug=true").exists()
 
 
-def test_run_writes_record(tmp_path: Path) -> None:
+def test_run_writes_outputs(tmp_path: Path) -> None:
     done = start(tmp_path, "dataset.unreadable=1", "dataset.frames=4")
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
@@ -246,8 +245,8 @@ def test_run_writes_record(tmp_path: Path) -> None:
     assert done.stderr.splitlines()[-1].endswith("INFO    overview.png, mesh.ply, instances.json")
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="sh closes the streams")
-def test_run_with_closed_streams_writes_record(tmp_path: Path) -> None:
+@pytest.mark.skipif(sys.platform == "win32", reason="requires sh")
+def test_run_with_closed_streams_writes_outputs(tmp_path: Path) -> None:
     line = command(f"hydra.run.dir={tmp_path}")
     closed = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *line]
     assert subprocess.run(closed, cwd=tmp_path, env=environment(), check=False).returncode == 0
@@ -256,7 +255,7 @@ def test_run_with_closed_streams_writes_record(tmp_path: Path) -> None:
     assert "ERROR" not in log
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="requires /dev/full")
 @pytest.mark.parametrize("words", [["--help"], ["plugins", "viewer", "none"]], ids=" ".join)
 def test_command_output_error_is_one_line(words: list[str], tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
@@ -274,11 +273,11 @@ def test_sweep_continues_after_failed_job(tmp_path: Path) -> None:
     assert done.stderr.count("ERROR") == 1
     assert "Traceback" not in done.stderr
     jobs = sorted(path for path in tmp_path.iterdir() if path.is_dir())
-    assert [(job / "metrics.json").exists() for job in jobs] == [True, True, False]  # 1, 2, many
+    assert [(job / "metrics.json").exists() for job in jobs] == [True, True, False]  # frames=1, 2, many
     assert "'many'" in (jobs[2] / "instancemap.log").read_text()
     assert done.stdout.splitlines()[-1] == "table.md, table.tex, table.csv"
     assert (tmp_path / "table.md").read_text() in done.stdout
-    assert done.stderr.count("overview.png, mesh.ply, instances.json") == 2, "a line a run"
+    assert done.stderr.count("overview.png, mesh.ply, instances.json") == 2, "one line per run"
 
 
 def test_sweep_rejects_misspelled_name_before_first_job(tmp_path: Path) -> None:
@@ -288,7 +287,7 @@ def test_sweep_rejects_misspelled_name_before_first_job(tmp_path: Path) -> None:
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
-def test_run_ctrl_c_writes_partial_record(tmp_path: Path) -> None:
+def test_run_ctrl_c_writes_partial_outputs(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{}")  # of an earlier run in the same directory
     line = command(f"hydra.run.dir={tmp_path}", "dataset.frames=100000", "dataset.slow_s=0.02")
     with subprocess.Popen(line, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True) as process:
@@ -309,7 +308,7 @@ def test_run_ctrl_c_writes_partial_record(tmp_path: Path) -> None:
     assert 0 < metrics["frames"] < 100000
 
 
-def test_run_full_map_writes_partial_record_and_fails(tmp_path: Path) -> None:
+def test_run_full_map_writes_partial_outputs_and_fails(tmp_path: Path) -> None:
     done = start(tmp_path, "fuser.capacity=2")
     assert done.returncode == 3
     assert "raise fuser.capacity" in done.stderr.splitlines()[-1]

@@ -1,4 +1,4 @@
-"""Tests of the main loop: order, errors, early ends, and worker threads that change no result."""
+"""Tests of the main loop: order, errors, early ends, and worker threads, which do not change the result."""
 
 from __future__ import annotations
 
@@ -270,7 +270,7 @@ def test_run_to_any_end_returns_partial_result_after_error(room: CornerRoom) -> 
 
 @dataclass
 class FailsOnceOnKeyframes(GivenPose):
-    """Its keyframes raise an error on first access, after the last frame."""
+    """Tracker whose keyframes raise an error on the first access, after the last frame."""
 
     asked: int = 0
 
@@ -287,7 +287,7 @@ def test_run_to_any_end_keeps_map_after_keyframes_error(room: CornerRoom) -> Non
     assert (result.frames, len(result.tracked)) == (6, 6)
     assert len(mapped(result).vertices) > 0
     result = pipeline(tracker=FailsOnceOnKeyframes(), fuser=_Fails()).run_to_any_end(room)
-    assert "40 GiB" in str(result.stopped_by), "what came first"
+    assert "40 GiB" in str(result.stopped_by), "the first error is reported"
 
 
 @PREFETCH
@@ -315,7 +315,7 @@ class PressesCtrlC(GivenPose):
 
 
 def working_threads() -> int:
-    """Return all threads except tqdm's monitor, which the first progress bar of a process starts."""
+    """Return the number of threads without tqdm's monitor, which the first progress bar of a process starts."""
     return sum(not isinstance(thread, TMonitor) for thread in threading.enumerate())
 
 
@@ -345,7 +345,7 @@ def test_pipeline_runs_outside_main_thread(room: CornerRoom) -> None:
 
 @dataclass
 class _InPairs(SphereDetector):
-    """Each detection waits for a second one: their number must be even."""
+    """Detector whose detections wait for each other in pairs; their number must be even."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -358,14 +358,14 @@ class _InPairs(SphereDetector):
 
 @dataclass
 class _OneReader(CornerRoom):
-    """Can only be read in order, frame by frame."""
+    """Dataset that checks that its frames are read in order, one at a time."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.slow_s, self._next, self._reading = 0.005, 0, threading.Lock()
 
     def __getitem__(self, k: int) -> Frame:
-        assert self._reading.acquire(blocking=False), "two at once"
+        assert self._reading.acquire(blocking=False), "concurrent reads"
         assert k == self._next, "not in order"
         self._next += 1
         try:
@@ -375,7 +375,7 @@ class _OneReader(CornerRoom):
 
 
 def pretend_cores(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Set the core count for callers of numba; numba itself is unchanged."""
+    """Replace the core count that Numba reports; its threads are unchanged."""
     monkeypatch.setattr(numba, "get_num_threads", lambda: count)
     monkeypatch.setattr(numba, "set_num_threads", lambda number: None)
 
@@ -429,7 +429,7 @@ def test_pipeline_runs_without_stderr(room: CornerRoom, monkeypatch: pytest.Monk
 
 @dataclass
 class Listener(Viewer):
-    """Records its calls."""
+    """Viewer that records its calls."""
 
     calls: list[str] = field(default_factory=list)
     stages: list[set[str]] = field(default_factory=list)

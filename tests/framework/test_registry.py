@@ -67,7 +67,7 @@ class Abstract(Detector):
 
 @dataclass
 class Suppression:
-    """A part: parameters that several plugins share."""
+    """Part with parameters that several plugins share."""
 
     nms: float = 0.5
     agnostic: bool = False
@@ -101,7 +101,7 @@ REGISTERED = ("Probe", "Undecorated", "Abstract", "Assembled", "Ambiguous", "Odd
 
 
 def register(monkeypatch: pytest.MonkeyPatch, folder: Path, stage: str, *targets: str) -> None:
-    """Register the options like --config-dir."""
+    """Register one option per target, as --config-dir does."""
     (folder / stage).mkdir(exist_ok=True)
     for target in targets:
         (folder / stage / f"{target.replace('.', '_').lower()}.yaml").write_text(f"_target_: {target}\n")
@@ -222,7 +222,7 @@ def test_find_class_import_failure_raises_one_line_error(tmp_path: Path, monkeyp
 
 @pytest.fixture
 def printing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write a package, and a module with a class Named, which print when they are imported."""
+    """Write a package and a module with the class Named, both of which print when they are imported."""
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "printing").mkdir()
     (tmp_path / "printing" / "__init__.py").write_text("print('imported')\n")
@@ -237,7 +237,7 @@ def printing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (
             "plugins.trackers.ground_truth.GroundTruth",
             "expected the _target_ of a registered option of",
-        ),  # of another stage
+        ),  # a plugin of another stage
         ("printing.one.Named", "expected the _target_ of a registered option of"),
         ("os.system", "expected the _target_ of a registered option of"),
         ("this.X", "expected the _target_ of a registered option of"),
@@ -247,7 +247,7 @@ def printing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_build_does_not_import_unregistered_target(
     target: str, output: str, hydra_runs: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Options come from Hydra's search path, also for a stored config without Hydra."""
+    """Registered options are found in Hydra applications and, for stored configs, without Hydra."""
     monkeypatch.setattr(composition, "_added", [])
     with initialize_config_dir(str(CONF), version_base="1.3") if hydra_runs else nullcontext():
         assert output in fault(_target_=target)

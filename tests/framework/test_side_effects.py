@@ -34,7 +34,7 @@ def tree(node):
 
 
 def functions():
-    """Return the identity of everything that modules of Hydra, OmegaConf and numba, and their classes, define."""
+    """Return the ids of the functions and classes of Hydra, OmegaConf and Numba, and of their methods."""
     found = {}
     for name, module in list(sys.modules.items()):
         if name.partition(".")[0] in ("hydra", "omegaconf", "numba"):
@@ -73,7 +73,7 @@ def state():
 
 
 def kept(before, after):
-    """Whether a mapping keeps its entries; modules that are loaded in between add some of functions and pools."""
+    """Return True if a mapping keeps its entries; modules that are loaded in between add functions and pools."""
     return all(after.get(key) == value for key, value in before.items())
 
 

@@ -36,7 +36,7 @@ def test_option_composes_and_builds(stage: str, name: str, ready: Callable[..., 
     assert isinstance(ready(stage, name), GROUPS[stage])
 
 
-NEEDY = {  # by option: the first parameter that the user must set
+NEEDY = {  # the first parameter that the user must set, by option
     key: asked[0]
     for key, option in registered.OPTION.items()
     if (asked := [parameter.name for parameter in option.parameters if parameter.default == "???"])
@@ -63,7 +63,7 @@ def test_option_yaml_lists_all_parameters_with_comments(stage: str, name: str) -
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
-    """Return the default value; "???" is OmegaConf's marker of a missing one."""
+    """Return the default value; "???" is OmegaConf's marker of a missing value."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return "???" if field.default is dataclasses.MISSING else field.default
@@ -71,11 +71,11 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
 def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
-    """Variants may differ. Values that the user must set have no default in either."""
+    """Variants may differ. Values that the user must set have no default in the file and in the class."""
     path = CONF / stage / f"{name}.yaml"
     own = OmegaConf.load(path)
     is_variant = "_target_" not in own  # of the option that it inherits
-    assert not is_variant or re.match(r"# (?!@)\S", path.read_text()), "a variant says first what it changes"
+    assert not is_variant or re.match(r"# (?!@)\S", path.read_text()), "the first line states what the variant changes"
     node = registered.composed(stage, name)[stage]
     plugin_class = find_class(GROUPS[stage], node["_target_"])
     links = plugin_fields(plugin_class)
@@ -86,7 +86,7 @@ def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
         )
         for link in [shown] if one else node[key]:
             found = node[key] if one else node[key][link]
-            assert found == registered.composed(stage, link)[stage], "a link is the option of its name"
+            assert found == registered.composed(stage, link)[stage], "a link equals the option of its name"
     fields = [field for name, (field, _) in parameter_fields(plugin_class).items() if name not in links]
     asked = [field.name for field in fields if OmegaConf.is_missing(node, field.name)]
     answered = set(own) if is_variant else set()  # desk sets the path of its frames
@@ -100,7 +100,7 @@ def test_option_yaml_values_equal_class_defaults(stage: str, name: str) -> None:
     }
     assert set(differing) == (set(own) - {"defaults"} if is_variant else set()), differing
     of_the_run = {key for key in node if OmegaConf.is_interpolation(node, key)}
-    assert of_the_run <= {"seed", "device"}, "interpolations were resolved above, against the defaults of a run"
+    assert of_the_run <= {"seed", "device"}, "other keys need values of the run"
 
 
 def test_schedule_and_table_yaml_equal_class_defaults() -> None:

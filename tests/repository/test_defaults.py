@@ -1,4 +1,4 @@
-"""Tests of the default detector of each dataset, and that all defaults are part of the project."""
+"""Tests of the default detector of each dataset, and that the files of all defaults are part of the project."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TIMED = {"table1_runtime", "figure3_stage_times", "ablation_detection_interval"}
 
 
 def chosen(*overrides: str, main: str = "config") -> dict[str, str]:
-    """Return Hydra's choices for these overrides by group; those of the composed config must agree."""
+    """Return the dataset and the detector that Hydra chooses; the composed config must have this detector."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config: DictConfig = compose(main, [*overrides], return_hydra_config=True)
     choices = {stage: str(config.hydra.runtime.choices[stage]) for stage in ("dataset", "detector")}
@@ -48,14 +48,14 @@ def test_default_detector_depends_on_dataset(dataset: str, main: str) -> None:
 
 @pytest.mark.parametrize("dataset", ["synthetic", "rgbd_folder"])
 @pytest.mark.parametrize("detector", ["none", "maskrcnn2go", "mask_rcnn_rooms"])
-def test_default_detector_is_overridden_by_explicit_one(dataset: str, detector: str) -> None:
+def test_default_detector_is_overridden_by_explicit_detector(dataset: str, detector: str) -> None:
     for order in ([0, 1], [1, 0]):
         words = [f"dataset={dataset}", f"detector={detector}"]
         assert chosen(*(words[k] for k in order))["detector"] == detector
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_experiment_chooses_its_detector(experiment: str) -> None:
+def test_experiment_sets_its_detector(experiment: str) -> None:
     expected = "mask_rcnn_rooms" if experiment in TIMED else "simulated_yolo11n"
     assert chosen(f"experiment={experiment}")["detector"] == expected
 
@@ -68,7 +68,7 @@ def test_experiment_detector_overrides_dataset_not_command_line(experiment: str)
 
 
 def test_default_detector_of_external_dataset_is_set(tmp_path: Path) -> None:
-    """A dataset that inherits the rendered rooms inherits their detector."""
+    """A dataset that inherits from dataset=synthetic inherits its detector."""
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "theirs.yaml").write_text("_target_: theirs.Theirs\n")
     (tmp_path / "dataset" / "their_rooms.yaml").write_text("defaults: [synthetic, _self_]\nframes: 3\n")
@@ -82,12 +82,12 @@ def test_default_dataset_is_desk() -> None:
     assert chosen() == {"dataset": "desk", "detector": "maskrcnn2go"}
 
 
-def test_default_detector_without_dataset_is_for_photos() -> None:
+def test_default_detector_without_dataset_is_maskrcnn2go() -> None:
     assert composed("~dataset").detector == registered.composed("detector", "maskrcnn2go").detector
 
 
 def test_default_detector_depends_on_dataset_of_sweep_job() -> None:
-    """The launcher composes each job from the sweep's own config and the job's overrides."""
+    """The launcher composes each job from the config of the sweep and the overrides of the job."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
         sweep = loader.load_configuration("config", ["dataset=synthetic,rgbd_folder"], RunMode.MULTIRUN)

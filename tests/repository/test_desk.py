@@ -22,7 +22,7 @@ def test_desk_data_is_small_and_has_attribution() -> None:
 
 
 def test_desk_is_tracked_and_objects_are_detected() -> None:
-    """The included network detects objects in the first two dozen frames."""
+    """The included network detects objects in the first 24 frames."""
     config = composed("dataset=desk")
     assert config.detector._target_ == "plugins.detectors.maskrcnn2go.MaskRCNN2Go"
     sequence = build(RGBDSequence, composed("dataset=desk", "dataset.stop=24").dataset)

@@ -19,7 +19,7 @@ from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 
 pytestmark = pytest.mark.integration
 
-EXECUTED = ["for frame in sequence", "for frame in frames:", "class ColorBlobs"]  # in test_readme.py
+EXECUTED = ["for frame in sequence", "for frame in frames:", "class ColorBlobs"]  # executed in test_readme.py
 CONTRACT = block("python", "class TestMyRefiner")
 PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]
 
@@ -27,11 +27,11 @@ PARSED = [line for line in LINES if line.startswith("python -m framework ") and 
 OURS = ("python", "instancemap", "make", "pip", "docker")
 
 
-RUN_ELSEWHERE = {"python -m framework doctor"}  # in test_doctor.py
+RUN_ELSEWHERE = {"python -m framework doctor"}  # executed in test_doctor.py
 
 
 class ParsedError(Exception):
-    """Raised in place of running a command."""
+    """Error raised instead of running a command."""
 
 
 @pytest.mark.parametrize("command", [line for line in PARSED if line not in {*COMMANDS, *RUNNABLE, *RUN_ELSEWHERE}])
@@ -49,7 +49,7 @@ def test_documented_command_line_is_parsed(command: str, monkeypatch: pytest.Mon
 
 
 def test_documented_commands_and_scripts_are_all_tested() -> None:
-    """This includes every script and console line, except those of other programs such as viewers."""
+    """All scripts and console lines are checked, except those of other programs such as viewers."""
     make = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
     looked_at = {*COMMANDS, *RUNNABLE, *PARSED, *BENCHMARKS, *(f"make {target}" for target in make), OWN_PLUGIN}
     shown_in = (CHECKOUT / "docker" / "Dockerfile").read_text()

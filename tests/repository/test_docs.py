@@ -36,7 +36,7 @@ LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
 
 
 def anchors(page: str) -> set[str]:
-    """Return the anchors of a page's headings, as code hosts and myst-parser generate them."""
+    """Return the anchors of the headings of a page, as code hosts and myst-parser generate them."""
     titles = re.findall(r"^#+ (.*)", re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
@@ -46,8 +46,8 @@ def test_page_links_resolve(name: str) -> None:
     here = CHECKOUT / name
     for path, anchor in LINK.findall(CODE.sub("", LINKING[name])):
         target = (here.parent / path).resolve() if path else here
-        assert target.is_relative_to(CHECKOUT), f"{path} leads out of the project"
-        assert target.exists(), f"there is no {path}"
+        assert target.is_relative_to(CHECKOUT), f"{path} is outside of the project"
+        assert target.exists(), f"{path} does not exist"
         if anchor:
             assert anchor in anchors(target.read_text()), f"{path} has no heading #{anchor}"
 
@@ -58,10 +58,10 @@ def option_names(stage: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the pages as HTML."""
+    """Build the pages as HTML and return their folder."""
     missing = [name for name in ("sphinx", "furo", "myst_parser") if find_spec(name) is None]
     if missing:
-        pytest.skip(f"{', '.join(missing)}: not installed, pip install --group docs")
+        pytest.skip(f"requires {', '.join(missing)}: pip install --group docs")
     place = tmp_path_factory.mktemp("docs")
     command = ["-m", "sphinx", "-W", "--keep-going", "-n", "-q", "-d", str(place / "doctrees"), str(DOCS)]
     done = subprocess.run(
@@ -91,7 +91,7 @@ def test_configuration_reference_has_all_parameters(built: Path) -> None:
 
 
 def test_page_plugins_and_parameters_exist(built: Path) -> None:
-    """`fuser=NAME` and `fuser.parameter` in prose and commands are in the configuration reference."""
+    """`fuser=NAME` and `fuser.parameter` in prose and commands must be in the configuration reference."""
     text = "\n".join(PAGES.values())
     for stage in GROUPS:
         reference = (built / "configuration" / f"{stage}.html").read_text()
@@ -102,7 +102,7 @@ def test_page_plugins_and_parameters_exist(built: Path) -> None:
         assert not [name for name in given if f"{stage}.{name}</span>" not in reference]
 
 
-def test_pages_need_no_network(built: Path) -> None:
+def test_pages_load_no_external_resources(built: Path) -> None:
     for page in built.rglob("*.html"):
         asked = re.findall(r'<(?:script|link|img|iframe)\b[^>]*?(?:src|href)="(?:https?:)?//[^"]*"', page.read_text())
         assert not asked, page.name
@@ -133,7 +133,7 @@ def test_citation_file_has_required_keys() -> None:
 
 
 def test_dockerfile_matches_project_files() -> None:
-    """The image is not built here: its copied files exist, and it installs what the Makefile installs."""
+    """Only the Dockerfile is read: its copied files exist, and its packages are those of the Makefile."""
     dockerfile = (CHECKOUT / "docker" / "Dockerfile").read_text().replace("\\\n", " ")
     steps = re.findall(r"^([A-Z]+) (.*)", dockerfile, re.MULTILINE)
     copied = {source for step, words in steps if step == "COPY" for source in words.split()[:-1]}

@@ -44,7 +44,7 @@ def test_prefetch_does_not_change_map(sequence: Synthetic) -> None:
 
 
 def test_ground_truth_masks_give_accurate_instances(sequence: Synthetic) -> None:
-    """Errors come from tracking and mapping instead of detection."""
+    """Errors are caused only by tracking and mapping, not by detection."""
     scene = mapped(sequence, GroundTruthDetector(), prefetch=2)
     truth = sequence.scene_truth()
     assert truth is not None

@@ -116,7 +116,7 @@ def test_layers_cover_all_packages() -> None:
 
 
 def test_packages_have_no_import_cycle() -> None:
-    """Imports inside functions count."""
+    """Imports inside functions are included."""
     imports = {part: set[str]() for part in LAYER}
     for path in MODULES:
         if (name := name_of(path)).startswith("framework."):
@@ -126,7 +126,7 @@ def test_packages_have_no_import_cycle() -> None:
 
 
 def test_modules_have_no_import_cycle() -> None:
-    """Imports inside functions count, because they only hide a cycle."""
+    """Imports inside functions are included, because they only hide a cycle."""
     modules = {name_of(path): path for path in MODULES}
     imports = {name: set(imported_modules(path, modules)) - {name} for name, path in modules.items()}
     TopologicalSorter(imports).prepare()
@@ -166,7 +166,7 @@ def test_public_classes_are_defined_once() -> None:
 
 @pytest.mark.parametrize("package", ["framework", "plugins"])
 def test_test_folders_mirror_package(package: str) -> None:
-    """Each folder of tests corresponds to the folder of the same name."""
+    """Each test folder corresponds to the package folder of the same name."""
     folders = {path.parent.relative_to(CHECKOUT / "tests") for path in (CHECKOUT / "tests" / package).rglob("*.py")}
     assert folders <= python_folders(package) | {Path(package)}
 

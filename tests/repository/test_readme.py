@@ -31,7 +31,7 @@ from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, K
 
 pytestmark = pytest.mark.integration
 
-COMMANDS = {  # by the main config that they compose
+COMMANDS = {  # main config, by command
     line: "config" if "=" in words[3] or words[3] == "-m" else words[3].replace("-", "_")
     for line in LINES
     if (words := line.split())[:3] == ["python", "-m", "framework"]
@@ -84,7 +84,7 @@ def test_tutorial_detector_detects_red_square(my_plugins: Path, monkeypatch: pyt
     camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     color = np.full((48, 64, 3), 200, np.uint8)
     color[10:30, 5:25] = (220, 20, 30)  # a red square
-    color[35:40, 40:45] = (220, 20, 30)  # red too, but too small
+    color[35:40, 40:45] = (220, 20, 30)  # red, but too small
     color[10:30, 40:60] = (20, 220, 30)  # green
     found = detector.detect(Frame(0, 0.0, color, np.ones((48, 64), np.float32), camera))
     assert len(found) == 1
@@ -97,7 +97,7 @@ def test_tutorial_detector_detects_red_square(my_plugins: Path, monkeypatch: pyt
 
 
 def test_tutorial_detector_runs_by_option_name(my_plugins: Path) -> None:
-    """The command is that of the tutorial, with the other stages faked for speed."""
+    """The command is that of the tutorial; the other stages are fakes, for speed."""
     chosen = [f"{stage}=fake" for stage in FAKES]
     (my_plugins / "my_conf").joinpath("dataset").mkdir()
     for stage, name in FAKES.items():
@@ -133,12 +133,12 @@ def test_documented_command_composes(command: str) -> None:
             )
 
 
-OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording, and reads the outputs of a run
+OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording and reads the outputs of a run
 SMALL = ["dataset.frames=4", "dataset.width=160", "dataset.height=120"]
 OWN = ["dataset=rgbd_folder", "dataset.root=DIR"]  # the imported recording
 DEFAULTS = "python -m framework"
-RUNNABLE = {  # arguments to append, by command, so that it takes seconds
-    # twice as large: tracking fails on a noisy room at a quarter of 160x120
+RUNNABLE = {  # arguments appended to each command, so that it takes seconds
+    # 320x240 px, because tracking of the noisy room fails at 160x120 px
     DEFAULTS: [*SMALL, "dataset=synthetic", "dataset.width=320", "dataset.height=240", "hydra.run.dir=defaults"],
     "python -m framework import SOURCE DIR": [],
     "python -m framework check dataset=rgbd_folder dataset.root=DIR": [],
@@ -193,7 +193,7 @@ for line in json.load(open("commands.json")):
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder in which all commands ran in one process, because loading libraries takes longest."""
+    """Run all commands in one process, because loading libraries is slow, and return their folder."""
     folder = tmp_path_factory.mktemp("readme")
     write_stray_scanner(folder / "SOURCE", room_frames(6))
     recording, result = OWN_DATA
@@ -221,7 +221,7 @@ def test_documented_commands_write_expected_files(ran: Path) -> None:
 
 
 def test_default_pipeline_runs_end_to_end(ran: Path) -> None:
-    """The included network, tracking, both refiner links and fusion run on four small frames."""
+    """The included network, tracking, all refiner links and fusion run on four small frames."""
     metrics = json.loads((ran / "defaults" / "metrics.json").read_text())
     assert (metrics["frames"], metrics["frames_lost"], metrics["frames_skipped"]) == (4, 0, 0)
     assert metrics["pose_source"] == "tracked"

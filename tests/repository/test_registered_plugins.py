@@ -68,7 +68,7 @@ class TestViewers(ViewerContract):
     @pytest.fixture(autouse=True, params=registered.names("viewer"))
     def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
         if request.param == "rerun":
-            pytest.importorskip("rerun", reason="rerun-sdk, of the extra viewer, is not installed")
+            pytest.importorskip("rerun", reason="requires rerun-sdk (extra viewer)")
         self.plugin = lambda: ready("viewer", request.param)
 
 
@@ -84,11 +84,11 @@ def video(request: pytest.FixtureRequest, ready: Ready, monkeypatch: pytest.Monk
 
 
 def come(video: LiveVideo) -> Iterator[Frame]:
-    """Return the frames of a live video, which must be readable; a wait without frames is logged."""
+    """Yield the frames of a live video after checking that it yields None while it waits for a frame."""
     with closing(video.frames()) as readers:
         message = time.monotonic()
         for reader in readers:
-            assert time.monotonic() - message < 1, "ten times per second, with slack for a busy machine"
+            assert time.monotonic() - message < 1, "about 10 times per second are expected"
             if reader is not None:
                 yield reader()
             message = time.monotonic()

@@ -32,12 +32,12 @@ ROWS = {"part": ["dataset.stop=8"], "whole": []}
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Use small panels, which are drawn quickly."""
+    """Reduce the resolution so that panels are drawn quickly."""
     monkeypatch.setattr(map_figure, "PDF_DPI", 40)
 
 
 def list_objects(directory: Path, class_name: str, vertices: list[int]) -> None:
-    """Write an instances.json with an object for each number of vertices."""
+    """Write an instances.json with one object per entry of `vertices`, the number of its vertices."""
     expected = {"class": class_name, "confidence": 0.9, "class_probabilities": {class_name: 1.0}, "observations": 5}
     box = {"center": [0, 0, 0], "extent": [1, 1, 1], "rotation": np.eye(3).tolist()}
     expected |= {"first_frame": 0, "last_frame": 9, "centroid": [0, 0, 0], "obb": box}
@@ -84,7 +84,7 @@ def texts(root: Path) -> list[str]:
 
 @pytest.fixture
 def maps(tmp_path: Path) -> Path:
-    """Return runs of two sequences; the run of the first row failed in the second sequence."""
+    """Write the runs of two rows on two sequences and return their folder; one run of the first row failed."""
     root = experiment(tmp_path / "figure4", kind="maps", names={"part": "in progress"})
     run(root, "part", "011", frames=8)
     run(root, "whole", "011")
@@ -176,7 +176,7 @@ def test_map_figure_zoom_adds_second_line(tmp_path: Path) -> None:
     pictured = Pictured.below(root)
     page = DRAWN["maps"](pictured)
     assert len(page.figure.axes) == 6
-    assert [len(axes.patches) for axes in page.figure.axes] == [1, 1, 1, 0, 0, 0]  # where it is
+    assert [len(axes.patches) for axes in page.figure.axes] == [1, 1, 1, 0, 0, 0]  # the frame of the zoom window
     names = [[text.get_text() for text in axes.texts] for axes in page.figure.axes[3:]]
     assert all("chair" in one for one in names[1:])
 
@@ -247,7 +247,7 @@ def test_figures_command_prints_paths_and_errors(
 def test_sweep_writes_figure_except_after_ctrl_c(
     maps: Path, error: BaseException | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("signal.signal", lambda *_: None)  # settings of the process changed by a sweep
+    monkeypatch.setattr("signal.signal", lambda *_: None)  # a sweep changes the signal handlers of the process
     monkeypatch.setenv("PYTHONWARNINGS", "")
     with suppress(InstanceMapError, KeyboardInterrupt), sweep_in(maps, with_table=False, with_figure=True):
         if error is not None:

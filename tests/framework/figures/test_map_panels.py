@@ -29,7 +29,7 @@ def stored(ids: Mapping[int, int]) -> StoredMap:
 
 
 def hue(color: np.ndarray) -> np.ndarray:
-    """Return the colors without brightness, which depends on the light."""
+    """Return the direction of an RGB color; its length, the brightness, depends on the lighting."""
     direction = color - color.min()
     return direction / np.linalg.norm(direction)
 
@@ -41,7 +41,10 @@ def truth() -> SceneTruth:
 
 @pytest.fixture(scope="module")
 def line(truth: SceneTruth) -> PanelLine:
-    """Return a panel line of maps with swapped ids and a missed box; their lengths are equal, so there are no paths."""
+    """Return a panel line with a missing map, swapped ids and a missed box.
+
+    All trajectories have the same length, so the panels show no paths.
+    """
     return panel_line([stored({1: 7, 2: 3}), None, stored({1: 5}), stored({1: 2, 2: 1})], truth, SIZE, zoom=True)
 
 

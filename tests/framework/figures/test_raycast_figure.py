@@ -25,7 +25,10 @@ CENTERS = {3: np.zeros(3), 12: np.ones(3)}
 
 
 def wall(depth: float = 2.0) -> View:
-    """Return a wall in front of a rotated camera; the left edge is unmapped, and id 99 is not a listed object."""
+    """Return the view of a wall `depth` m from a rotated camera.
+
+    The left edge is unmapped, and id 99 is not a listed object.
+    """
     T = pose(0.5, -0.2, 0.1, (0.0, 0.3, 0.0))
     depths = np.full(CAMERA.shape, depth, np.float32)
     depths[:, :8] = 0
@@ -57,7 +60,7 @@ def test_raycast_page_colorbar_is_in_meters() -> None:
     assert bar.get_ylim() == (1.0, 2.0), "unmapped pixels have no depth"
 
 
-def test_raycast_page_contains_texts() -> None:
+def test_raycast_page_texts_fit_on_page() -> None:
     page = raycast_page(wall(1e3), NAMES, CENTERS, "a long note " * 30)
     renderer = FigureCanvasAgg(page.figure).get_renderer()
     width, height = page.figure.bbox.size
@@ -73,7 +76,7 @@ def test_raycast_colors_match_geometry() -> None:
     view = wall()
     mapped = view.depth > 0
     assert np.abs(normal_colors(view)[mapped].astype(int) - (128, 128, 255)).max() <= 1, (
-        "normals point towards the camera"
+        "normals point toward the camera"
     )
     positions = np.stack([view.depth, -view.depth, 0 * view.depth], axis=-1).astype(np.float64)
     colors = position_colors(positions, np.array([0.0, -2.0, 0.0]), np.array([4.0, 2.0, 0.0]))

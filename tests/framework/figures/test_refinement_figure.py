@@ -148,7 +148,7 @@ def test_side_view_shows_depth_distances() -> None:
     side = SideView.of(frame, ClusterMarks.before(change), after, 1.7)
     assert side is not None
     at = {column: side.points[(side.rows == 24) & (side.columns == column)][0] for column in (31, 32)}
-    moved = at[32] - at[31]  # the two readings are 1 m apart in depth, and 3/60 + 0.5/60 in x
+    moved = at[32] - at[31]  # the readings are 1 m apart in depth; `x` is their distance along x, m
     angle, sign = side_view.AZIMUTH_RAD, np.sign(side.forward)
     x = 0.5 / 60 * 3 + 0.5 / 60 * 2
     assert moved[0] == pytest.approx(sign * np.sin(angle) + x * np.cos(angle), abs=0.01)
@@ -225,7 +225,7 @@ def test_refinement_figure_height_is_limited_for_many_clusters() -> None:
     stripes = [box(frame, k, k + 1, 4, 20) for k in range(30)]
     few = picture(refined(frame, stripes[:24], stripes[:24]), "all", "refiner=identity")
     many = picture(refined(frame, stripes, [*stripes, *stripes[:3]]), "all", "refiner=split")
-    assert many.shape == few.shape, "the table has an end"
+    assert many.shape == few.shape, "the number of table rows is limited"
 
 
 def test_write_refinement_creates_complete_image(tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ def test_reader_non_regular_file_raises_without_blocking(
         os.mkfifo(path)
     elif kind == "folder":
         if read is path_hash:
-            return  # which takes folders
+            return  # path_hash accepts folders
         path.mkdir()
     else:
         path.symlink_to(kind)
@@ -141,7 +141,7 @@ def test_atomic_write_follows_symbolic_link(tmp_path: Path) -> None:
 
 
 def test_atomic_write_failure_names_requested_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error does not name the temporary file, which may not be removable on a read-only disk."""
+    """The error does not name the temporary file, even if its removal fails on a read-only disk."""
 
     def refused(*_: object, **__: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")

@@ -95,7 +95,7 @@ def test_directory_lock_unsupported_file_system_logs_warning(
     assert "expected a file system with locks, got No locks available" in caplog.text
 
 
-def test_directory_lock_named_pipe_as_file_raises(tmp_path: Path) -> None:
+def test_directory_lock_named_pipe_as_holder_file_raises(tmp_path: Path) -> None:
     """Opening a pipe without a reader would block."""
     os.mkfifo(tmp_path / HOLDER)
     with pytest.raises(DataError, match=rf"{HOLDER}: expected a regular file, got a device, a pipe"), locked(tmp_path):

@@ -1,4 +1,4 @@
-"""Tests of JPEG and PNG files: valid ones are read exactly, damaged ones raise."""
+"""Tests of JPEG and PNG files: valid ones are read exactly, and damaged ones raise."""
 
 import io
 

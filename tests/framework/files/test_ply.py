@@ -38,7 +38,7 @@ end_header
 
 
 def encoded(encoding: str, coordinate: str, count: str, index: str, polygons: list[list[int]]) -> bytes:
-    """Return VERTICES, LABELS and polygons, among unused elements and properties."""
+    """Return a PLY file with VERTICES, LABELS and `polygons` among unused elements and properties."""
     codes = {"float": "f", "float64": "d", "uchar": "B", "int32": "i", "int": "i", "short": "h", "uint": "I"}
     order = ">" if encoding == "binary_big_endian" else "<"
     header = f"""ply
@@ -303,7 +303,7 @@ def test_ply_writing_invalid_mesh_raises_and_leaves_no_file(tmp_path, change, me
 
 
 def test_ply_arrays_do_not_reference_file_buffer(tmp_path):
-    """Otherwise a mesh of some MB would keep hundreds of MB in memory."""
+    """Otherwise a mesh of a few MB would keep hundreds of MB in memory."""
     write_ply(tmp_path / "a.ply", VERTICES, np.array(FANS, np.int32), {"label": LABELS})
     mesh = read_ply(tmp_path / "a.ply")
     assert isinstance(mesh, PlyMesh)

@@ -1,4 +1,4 @@
-"""Tests of depth registration to a second camera, on exact geometry."""
+"""Tests of depth registration to a second camera, with exact synthetic geometry."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_depth_registration_of_room_matches_target_view() -> None:
     truth = look(target, np.eye(4))[0]
     assert (found > 0).mean() > 0.97
     error = np.abs(found - truth)[found > 0]
-    assert np.median(error) < 0.004  # a depth value is up to half a pixel from its new pixel
+    assert np.median(error) < 0.004  # a depth value is up to half a pixel from the center of its new pixel
     assert (error > 0.03).mean() < 0.03
     turned_back = DepthRegistration(DEPTH, COLOR, np.linalg.inv(T_COLOR_DEPTH))
     wrong = turned_back.apply(look(DEPTH, T_COLOR_DEPTH)[0].astype(np.float32))
@@ -54,7 +54,7 @@ def test_depth_registration_keeps_nearer_of_two_surfaces() -> None:
     shifted = np.eye(4)
     shifted[0, 3] = 0.5
     depth = np.full((30, 40), 4.0, np.float32)
-    depth[:, :10] = 1.0  # moves by 20 px, in front of the far surface, which moves by 5
+    depth[:, :10] = 1.0  # moves by 20 px, in front of the far surface, which moves by 5 px
     found = DepthRegistration(camera, camera, shifted).apply(depth)
     assert set(np.unique(found)) == {0, 1, 4}
     assert (found[:, 18:26] == 1).all()

@@ -1,4 +1,4 @@
-"""Tests of the drawing thread, which must not block the loop and logs each failure once."""
+"""Tests of the drawing thread, which must not block the mapping loop and logs each failure once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EXACT = SphereDetector()
 
 @dataclass
 class Notebook:
-    """A drawing that records its input; it may wait or fail at the first frames."""
+    """Drawing that records its input; `draw_frames` waits for an event or fails if requested."""
 
     waits_for: threading.Event | None = None
     fails: bool = False
@@ -83,11 +83,11 @@ def test_drawing_thread_does_not_block_and_draws_newest_image(room: CornerRoom) 
     book.waits_for = going_on
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
-    while not book.threads:  # it has begun to draw, and blocks
+    while not book.threads:  # until it has started to draw and blocks
         time.sleep(0.001)
     for frame in list(room)[1:]:
         background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
-    assert not book.notes, "all frames were taken, and none was drawn"
+    assert not book.notes, "all frames are queued, and none is drawn"
     going_on.set()
     background.end()
     assert [picture.frame.index for picture in book.pictures] == [0, 5]
@@ -144,7 +144,7 @@ def test_drawing_thread_map_error_does_not_end_run(room: CornerRoom, caplog: pyt
 
 
 def test_drawing_thread_draws_last_frame_without_successor(room: CornerRoom) -> None:
-    """In a live video the next frame may never come."""
+    """In a live stream there may be no next frame."""
     book = Notebook()
     background = DrawingThread(mapped(room), book, frame_interval=1, map_interval=3600)
     for frame in room:

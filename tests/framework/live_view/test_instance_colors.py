@@ -1,4 +1,4 @@
-"""Tests of instance colors: constant over time, distinct between neighbors."""
+"""Tests of instance colors: constant over time and distinct between neighbors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def test_instance_colors_are_unchanged_by_new_instances() -> None:
     colors = InstanceColors()
     colors.add({key: centroids[key] for key in (5, 3)})
     first = {key: colors[key].tolist() for key in (3, 5)}
-    colors.add({**centroids, 3: np.array([50.0, 0, 0])})  # 3 has moved
+    colors.add({**centroids, 3: np.array([50.0, 0, 0])})  # instance 3 has moved
     assert {key: colors[key].tolist() for key in (3, 5)} == first
     assert len({tuple(colors[key].tolist()) for key in centroids}) == 4
     assert [colors[key].tolist() for key in (3, 5)] == instance_colors(np.array([centroids[3], centroids[5]])).tolist()
@@ -34,7 +34,7 @@ def test_instance_colors_paint_only_instance_vertices() -> None:
 
 
 def room_mesh() -> InstanceMesh:
-    """Return the depth of the first frame as vertices of the spheres 1 and 2 and of the room."""
+    """Return the back-projected depth of the first frame as vertices of the room (0) and the spheres (1, 2)."""
     depth, _, color, ids = look(CAMERA, pose_at(0))
     v, u = np.nonzero(depth > 0)
     points = back_project(CAMERA, np.stack([u, v], 1).astype(np.int32), depth[v, u])

@@ -1,4 +1,4 @@
-"""Tests of mesh regions, which together equal the mesh and report only changes."""
+"""Tests of mesh regions: their parts together equal the mesh, and only changed parts are returned."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from framework.live_view.mesh_regions import MeshPart, MeshRegions, Region
 
 
 def sheet(width: int, height: int, spacing: float = 0.1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a grid of vertices about the origin, its triangles, and colors."""
+    """Return the vertices, m, the triangles and the colors of a grid in the plane z = 0, centered on the origin."""
     x, y = np.meshgrid(np.arange(width) - width // 2, np.arange(height) - height // 2, indexing="ij")
     vertices = (np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) * spacing).astype(np.float32)
     corner = (np.arange(width - 1)[:, None] * height + np.arange(height - 1)).ravel()
@@ -18,7 +18,7 @@ def sheet(width: int, height: int, spacing: float = 0.1) -> tuple[np.ndarray, np
 
 
 def corners(vertices: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Return (F, 18) positions and colors of each triangle's corners, sorted."""
+    """Return the positions and colors (F, 18) of the corners of each triangle, sorted."""
     rows = np.concatenate([vertices, colors.astype(np.float32)], axis=1)[triangles].reshape(len(triangles), -1)
     return rows[np.lexsort(rows.T)]
 
@@ -38,10 +38,10 @@ def test_mesh_regions_together_equal_mesh(side: float) -> None:
         first = part.vertices[part.triangles[:, 0]] / side
         assert (np.floor(first + 1e-6) <= region).any()
         assert ((first >= np.array(region) - 1e-5) & (first <= np.array(region) + 1 + 1e-5)).all()
-        assert np.unique(part.triangles).tolist() == list(range(len(part.vertices))), "no vertex is idle"
+        assert np.unique(part.triangles).tolist() == list(range(len(part.vertices))), "every vertex is used"
 
 
-def test_mesh_regions_support_more_than_16_bit_numbers() -> None:
+def test_mesh_regions_support_bounding_box_of_over_65536_cubes() -> None:
     vertices, triangles, colors = sheet(40, 40, spacing=10.0)
     parts = changed(MeshRegions(1.0), vertices, triangles, colors)
     assert len(parts) == len(triangles)
@@ -53,7 +53,7 @@ def test_mesh_regions_return_only_changed_parts() -> None:
     vertices, triangles, colors = sheet(40, 40)
     assert len(changed(regions, vertices, triangles, colors)) == 16
     assert not changed(regions, vertices.copy(), triangles.copy(), colors.copy())
-    colors[0] += 1  # the corner at x = y = -2
+    colors[0] += 1  # the corner at x = y = -2 m
     assert list(changed(regions, vertices, triangles, colors)) == [(-2, -2, 0)]
 
 

@@ -1,4 +1,4 @@
-"""Tests of the up direction: exact in synthetic rooms, within about a degree in real ones."""
+"""Tests of the up direction: within 0.1 degrees on exact surfaces, within 2 degrees with noise and clutter."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from framework.mapping.storage.map_header import MapHeader
 
 
 def rectangle(origin: Float64, a: Float64, b: Float64, cells: int = 12) -> tuple[Float32, Int32]:
-    """Return a wall or a floor from `origin` along a and b, its normal along a x b."""
+    """Return the vertices, m, and triangles of a rectangle from `origin` along a and b, with normal along a x b."""
     s, t = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1), indexing="ij")
     vertices = origin + s.reshape(-1, 1) * a + t.reshape(-1, 1) * b
     corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
@@ -35,7 +35,7 @@ X, Y, Z = np.eye(3)
 
 
 def room() -> tuple[Float32, Int32]:
-    """Return a floor at z = 0, a table, and two large walls, which have more surface."""
+    """Return the mesh of a floor at z = 0, a table, and two walls of larger area."""
     return joined(
         rectangle(np.zeros(3), 3 * X, 4 * Y),
         rectangle(np.array([1.0, 1, 0.7]), X, Y),
@@ -45,11 +45,11 @@ def room() -> tuple[Float32, Int32]:
 
 
 def held(turned: Float64, downwards: float = 0.5) -> GravityEstimator:
-    """Return the estimator of a hand-held camera that looks down by an angle (rad), in the rotated world."""
+    """Return the estimator of a hand-held camera that looks down by `downwards` rad, in a world rotated by `turned`."""
     gravity = GravityEstimator()
     for k in range(8):
         heading = Rotation.from_euler("z", k / 8 * 3)
-        # camera axes: x right, y down, z forward; without a turn forward is the world's y
+        # camera axes: x right, y down, z forward; at heading 0, forward is the world's y
         looking = Rotation.from_matrix(np.stack([X, -Z, Y], axis=1)) * Rotation.from_euler("x", -downwards)
         T = np.eye(4)
         T[:3, :3] = turned @ (heading * looking).as_matrix()
@@ -69,15 +69,15 @@ def test_gravity_up_is_found_in_any_orientation(seed: int) -> None:
 
 
 def test_gravity_upward_faces_select_axis() -> None:
-    """A tilted camera sees a table, walls and a surface inclined along x, as in TUM's freiburg1_rpy."""
+    """A tilted camera sees a table, walls and a surface rotated about x, as in TUM's freiburg1_rpy."""
     vertices, triangles = joined(
         rectangle(np.zeros(3), 2 * X, 2 * Y),
-        rectangle(2 * X, 2 * Z, 2 * Y),  # the wall in front of the camera, which is tilted to x: it faces away from x
+        rectangle(2 * X, 2 * Z, 2 * Y),  # a wall with normal -x in front of the camera, which is tilted toward x
         rectangle(2 * Y, 1.5 * X, 1.5 * Z),
-        rectangle(3 * Y, X, Y + Z),  # a lid inclined along x
+        rectangle(3 * Y, X, Y + Z),  # a lid rotated about x
     )
     askew = GravityEstimator()
-    askew.camera_up = np.array([0.68, 0.2, 0.7])  # 1 degree from being nearer to x than to z
+    askew.camera_up = np.array([0.68, 0.2, 0.7])  # 1 degree closer to z than to x
     up = askew.estimate(vertices, triangles).up
     assert up is not None
     assert np.degrees(np.arccos(min(up @ Z, 1.0))) < 0.1
@@ -99,7 +99,7 @@ def test_gravity_without_evidence_is_none() -> None:
     assert GravityEstimator().estimate(vertices, triangles).up is None
     assert held(np.eye(3)).estimate(vertices, triangles[:0]).up is None
     directions = half_sphere(500) * np.where(np.arange(500) % 2, 1, -1)[:, None]
-    pebbles = [rectangle(8 * n, *np.linalg.svd(n[None])[2][1:], 1) for n in directions]  # each has another slope
+    pebbles = [rectangle(8 * n, *np.linalg.svd(n[None])[2][1:], 1) for n in directions]  # all slopes differ
     assert held(np.eye(3)).estimate(*joined(*pebbles)).up is None
 
 
@@ -114,7 +114,7 @@ def test_floor_height_of_unseen_floor_is_none() -> None:
 
 def test_gravity_faces_have_triangle_normals_and_areas() -> None:
     vertices = np.float32([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 0]])
-    normals, areas, centers = faces(vertices, np.int32([[0, 1, 2], [0, 3, 1]]))  # the second has no area
+    normals, areas, centers = faces(vertices, np.int32([[0, 1, 2], [0, 3, 1]]))  # the second triangle has no area
     np.testing.assert_allclose(normals, [[0, 0, 1]])
     np.testing.assert_allclose(areas, [3])
     np.testing.assert_allclose(centers, [[2 / 3, 1, 0]])
@@ -123,7 +123,7 @@ def test_gravity_faces_have_triangle_normals_and_areas() -> None:
 def sensing(
     turned: Float64, noise: float = 0.0, bias: float = 0.0, frames: int = 40, seed: int = 0
 ) -> GravityEstimator:
-    """Return the estimator of a camera with changing heading, and accelerometer noise and bias in rad."""
+    """Return the estimator of a camera that turns by 360 degrees, with accelerometer `noise` and `bias`, rad."""
     gravity, chosen = GravityEstimator(), np.random.default_rng(seed)
     for k in range(frames):
         looking = Rotation.from_matrix(np.stack([X, -Z, Y], axis=1)) * Rotation.from_euler("x", -0.5)
@@ -155,14 +155,14 @@ def test_gravity_sensor_is_used_without_level_surfaces(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_gravity_sensor_noise_and_bias_average_out(seed: int) -> None:
-    """There is noise in 40 frames, and a bias about the camera's x, which changes direction with the heading."""
+    """The bias is a rotation about the camera's x axis, whose direction in the world changes with the heading."""
     noise, bias = np.radians(3), np.radians(2)
     assert degrees(sensing(np.eye(3), noise, seed=seed).sensed(), Z) < 3 * np.degrees(noise) / np.sqrt(40)
     assert degrees(sensing(np.eye(3), 0, bias, seed=seed).sensed(), Z) < 1e-3
 
 
 def test_gravity_contradictory_sensor_is_ignored(caplog: pytest.LogCaptureFixture) -> None:
-    """The sensor's axes may differ from the camera's."""
+    """Measurements contradict each other if the sensor's axes differ from the camera's."""
     vertices, triangles = room()
     gravity = held(np.eye(3))
     for k in range(8):

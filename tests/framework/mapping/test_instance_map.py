@@ -125,7 +125,7 @@ def test_instance_map_damaged_file_raises(scene_map: InstanceMap, tmp_path: Path
         path.write_bytes(damaged)
         with pytest.raises(DataError, match=r"map\.npz"):
             InstanceMap.load(path)
-    entry = whole.rindex(b"tsdf.npy") - 46  # of that array in the archive's directory, which no checksum covers
+    entry = whole.rindex(b"tsdf.npy") - 46  # the array's entry in the archive directory, which has no checksum
     for place, bit in ((entry + 8, 0x01), (entry + 33, 0x08), (entry + 46, 0x08)):  # "encrypted", comment length, name
         damaged = bytearray(whole)
         damaged[place] ^= bit
@@ -162,7 +162,7 @@ def test_instance_map_excludes_instances_below_threshold(
     assert not loaded.mesh().instance_ids.any()
     assert (loaded.mesh().class_ids == -1).all()
     T = walk(12)[3]
-    assert loaded.render(room().frame(T).camera, T).instance_ids.any(), "association still needs it"
+    assert loaded.render(room().frame(T).camera, T).instance_ids.any(), "association uses unconfirmed instances"
 
 
 @pytest.mark.parametrize("points", [1, 2, 3])
@@ -172,7 +172,7 @@ def test_oriented_box_of_few_vertices_is_valid(points: int) -> None:
     assert np.allclose(np.sort(box.extent), [0, 0, 2 if points > 1 else 0], atol=1e-5)
 
 
-def test_instance_map_continued_after_loading_is_identical(tmp_path: Path) -> None:
+def test_instance_map_resumed_after_loading_is_identical(tmp_path: Path) -> None:
     """A map that is saved, loaded and extended equals one that was never saved."""
     whole, resumed = (assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0) for _ in range(2))
     for k, T in enumerate(walk(4)):

@@ -43,7 +43,7 @@ def visit(sequence: RGBDSequence, *overrides: str) -> Visit:
 def changed_room(
     start: int, without: tuple[int, ...] = (), moved: Mapping[int, tuple[float, float]] | None = None
 ) -> Synthetic:
-    """Return every ninth frame of the walk, without some objects or with some moved by (x, y) m."""
+    """Return every ninth frame of the office from `start`, without some objects or with some moved by (x, y), m."""
     room = copy(office())
     shift = moved or {}
     objects = [
@@ -61,7 +61,7 @@ def before() -> Visit:
     return visit(changed_room(0), "detector=ground_truth")
 
 
-CHAIR, TABLE = 5, 6  # ids of well visible objects of this room
+CHAIR, TABLE = 5, 6  # ids of clearly visible objects
 
 
 def expected(found: list, kind: Kind) -> list[str]:
@@ -81,7 +81,7 @@ def test_changes_of_unchanged_room_are_empty(before: Visit) -> None:
     assert all(0 <= change.probability <= 1 for change in found)
 
 
-def test_changes_removed_objects_vanish_or_appear_reversed(before: Visit) -> None:
+def test_changes_removed_objects_vanish_and_appear_in_reverse(before: Visit) -> None:
     after = visit(changed_room(1, without=(CHAIR, TABLE)), "detector=ground_truth")
     found = changes(before, after)
     assert expected(found, Kind.VANISHED) == ["chair", "dining table"]
@@ -97,7 +97,7 @@ def test_changes_displaced_object_has_moved(before: Visit) -> None:
     found = changes(before, visit(changed_room(1, moved={CHAIR: (-0.9, 0.6)}), "detector=ground_truth"))
     [moved] = [change for change in found if change.kind is Kind.MOVED]
     assert moved.name == "chair"
-    assert moved.distance == pytest.approx(np.hypot(0.9, 0.6), abs=0.4), "of its box: each visit saw other sides"
+    assert moved.distance == pytest.approx(np.hypot(0.9, 0.6), abs=0.4), "each visit sees other sides of the box"
     assert None not in (moved.before, moved.after)
     assert expected(found, Kind.VANISHED) == expected(found, Kind.APPEARED) == []
 
@@ -111,7 +111,7 @@ def test_changes_with_noisy_detector_are_empty() -> None:
 
 
 def test_changes_between_halves_of_real_recording_are_empty(shared_data: Path) -> None:
-    """The halves are alternate frames of a flat, detected by 2Go; objects missed in one half have not moved."""
+    """The halves are the even and odd frames of an apartment, with detections of MaskRCNN2Go."""
     halves = [
         visit(RgbdFolder(shared_data / "replica_floor2", start=k, stop=40, stride=2), "fuser.voxel_size=0.04")
         for k in (0, 1)
@@ -124,7 +124,7 @@ def bits(there: int, through: int, of: int = 10) -> tuple[Bool, Bool]:
     return np.arange(of) < there, np.arange(of) >= of - through
 
 
-def test_probability_gone_follows_evidence() -> None:
+def test_probability_gone_depends_on_evidence() -> None:
     def gone(there: int, through: int, matched: bool, confidence: float = 0.8) -> float:
         return probability_gone(confidence, *bits(there, through), matched)
 
@@ -133,7 +133,9 @@ def test_probability_gone_follows_evidence() -> None:
     assert gone(0, 10, False) > 0.8
     assert gone(0, 10, False) > gone(5, 5, False) > gone(10, 0, False)
     assert gone(8, 2, False) > gone(8, 2, True)
-    assert gone(0, 10, False, confidence=0.1) < gone(0, 10, False, confidence=0.9), "it was rarely found before"
+    assert gone(0, 10, False, confidence=0.1) < gone(0, 10, False, confidence=0.9), (
+        "an uncertain object is less likely to be gone"
+    )
 
 
 def test_look_for_separates_surface_from_free_space(before: Visit) -> None:
@@ -141,7 +143,7 @@ def test_look_for_separates_surface_from_free_space(before: Visit) -> None:
     there, through = look_for(before, vertices)
     assert there.mean() > 0.8
     camera = before.poses[:, :3, 3].mean(axis=0)
-    nearer = (camera + 0.5 * (vertices - camera)).astype(np.float32)  # in the air
+    nearer = (camera + 0.5 * (vertices - camera)).astype(np.float32)  # in free space
     there, through = look_for(before, nearer)
     assert through.mean() > 0.6
     assert there.mean() < 0.1

@@ -171,7 +171,7 @@ def test_mapper_accepts_keyword_parameters(value: str) -> None:
 
 
 def test_mapper_and_command_line_maps_are_identical(tmp_path: Path) -> None:
-    """The beginning of the demo is tracked and labeled by the network."""
+    """The first six frames of the demo are tracked, and labeled by the default detector."""
     asked = ("fuser.voxel_size=0.02", "seed=3")
     line = [sys.executable, "-m", "framework", "dataset=desk", "dataset.stop=6", *asked, "hydra.run.dir=run"]
     done = subprocess.run(

@@ -44,7 +44,7 @@ def test_lift_skips_pixels_without_depth(room: CornerRoom) -> None:
 
 
 def test_lift_mask_size_mismatch_raises(room: CornerRoom) -> None:
-    frame, shape = room[0], (1, 1)  # numpy would broadcast it over the image
+    frame, shape = room[0], (1, 1)  # NumPy would broadcast this shape to the image
     masks = np.ones((1, *shape), np.bool_)
     one = np.ones((1, 1), np.float32)
     with pytest.raises(DataError, match=r"frame 0: expected masks of shape \(72, 96\), got \(1, 1\)"):

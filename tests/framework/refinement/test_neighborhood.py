@@ -32,12 +32,12 @@ def clusters_of(masks: np.ndarray, frame: Frame) -> PointClusters:
 
 
 def neighborhoods(clusters: PointClusters, frame: Frame, *ring: float, **named: float) -> Neighborhoods:
-    """Return all points of masks and rings."""
+    """Return the neighborhoods with all points of masks and rings."""
     return surroundings(clusters, frame, Ring(*ring, **named)).sampled(10**9)
 
 
 def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
-    """Return five overlapping blobs, some at the image border, over a depth image with holes."""
+    """Return the masks of five overlapping blobs, some at the image border, and a frame with missing depth."""
     rng = np.random.default_rng(seed)
     masks = np.zeros((5, 40, 60), np.uint8)
     for mask in masks:
@@ -80,7 +80,7 @@ def test_neighborhood_thread_schedule_balances_costs():
 
 
 def test_neighborhood_excludes_structure_from_ring_and_border():
-    """They are treated as missing depth, except for the clusters' own points."""
+    """Structure is treated as missing depth, except for the points of the cluster itself."""
     masks, frame = random_scene(0)
     structure = np.random.default_rng(1).random((40, 60)) < 0.5
     clusters = clusters_of(masks, frame)
@@ -95,11 +95,11 @@ def test_neighborhood_excludes_structure_from_ring_and_border():
         expected = np.concatenate([inside[own], -outside[ring]]) / 3
         np.testing.assert_allclose(found.depth_in_mask[part], expected, rtol=1e-6)
         assert (found.points_camera[part, 2] > 0).all()
-    assert (structure & in_a_mask & (frame.depth > 0)).any(), "the input must differ"
+    assert (structure & in_a_mask & (frame.depth > 0)).any(), "some structure is in a mask"
 
 
 def test_depth_in_mask_equals_chamfer_distance():
-    """Inside the cluster it is the distance to the nearest pixel with depth outside; outside, to the cluster."""
+    """Inside a cluster, the distance is to the nearest outer pixel with depth; in the ring, to the cluster."""
     for seed in range(5):
         masks, frame = random_scene(seed)
         around = neighborhoods(clusters_of(masks, frame), frame, ring_fraction=0.25, min_ring=6, max_ring=8)
@@ -133,7 +133,7 @@ def test_neighborhood_matches_back_projection_and_distances():
             own = masks[k] & (frame.depth > 0)
             width = int(np.clip(np.rint(0.25 * np.sqrt(own.sum())), 3, 5))
             assert around.ring_widths[k] == width
-            # OpenCV's 3-4 chamfer distance, in pixels of 0.955 / 3: only its proportion to the step matters
+            # the chessboard distance is at most a third of the 3-4 chamfer distance
             steps = cv2.distanceTransform((~own).astype(np.uint8), cv2.DIST_C, 3)
             ring = ~own & (frame.depth > 0) & (_chamfer_reference(own) <= 3 * width)
             assert (steps[ring] <= width).all()
@@ -147,7 +147,7 @@ def test_neighborhood_matches_back_projection_and_distances():
 
 
 def _chamfer_reference(mask: np.ndarray) -> np.ndarray:
-    """Compute the 3-4 chamfer distance by relaxation until nothing changes."""
+    """Return the 3-4 chamfer distance (H, W), px / 3, from a mask, by relaxation until convergence."""
     distance = np.where(mask, 0, 10**6)
     while True:
         padded = np.pad(distance, 1, constant_values=10**6)

@@ -1,4 +1,4 @@
-"""Tests that hold for all refiners: exact masks are unchanged, and invalid pixels raise."""
+"""Tests of `refine`, for all refiners: exact masks are unchanged, and invalid pixels raise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FRAME = Frame(0, 0.0, np.zeros((4, 5, 3), np.uint8), np.ones((4, 5), np.float32)
 
 @dataclass
 class Moving(ClusterRefiner):
-    """Moves the last point to a given pixel."""
+    """Refiner that moves the last point to a given pixel."""
 
     pixel: tuple[int, int]
 

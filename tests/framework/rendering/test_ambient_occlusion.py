@@ -17,7 +17,7 @@ RAYS = np.stack([X, Y, np.ones_like(X)], axis=-1)
 
 
 def plane(normal: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the depth and the normals of the plane of points p with normal @ p = -distance."""
+    """Return the depth (H, W), m, and the normals (H, W, 3) of the plane normal @ p = -distance."""
     return np.float32(-distance / (RAYS @ normal)), np.tile(normal.astype(np.float32), (*CAMERA.shape, 1))
 
 
@@ -34,10 +34,10 @@ def test_openness_in_corner_matches_ray_casting() -> None:
     normals = np.stack([np.zeros_like(Y), -np.sign(Y), -np.ones_like(Y)], axis=-1).astype(np.float32) / np.sqrt(2)
     found = openness(CAMERA, depth, normals)
     rng = np.random.default_rng(0)
-    height, turn = np.sqrt(rng.uniform(0, 1, 20000)), rng.uniform(0, 2 * np.pi, 20000)  # Lambert's law
-    towards = np.sqrt(1 - height**2) * np.cos(turn)  # the other plane
+    height, turn = np.sqrt(rng.uniform(0, 1, 20000)), rng.uniform(0, 2 * np.pi, 20000)  # cosine-weighted directions
+    towards = np.sqrt(1 - height**2) * np.cos(turn)  # component toward the other plane
     for row in range(TILE, CAMERA.height - TILE, 7):
-        distance = np.abs(Y[row, 0]) * depth[row, 0] * np.sqrt(2)  # from the edge
+        distance = np.abs(Y[row, 0]) * depth[row, 0] * np.sqrt(2)  # m, from the edge
         blocked = (distance < RANGE_M * towards).mean()
         assert found[row, TILE:-TILE].mean() == pytest.approx(1 - DEPTH * blocked, abs=0.03)
     assert found.min() < 0.75

@@ -11,17 +11,17 @@ from framework.rendering.lit_view_kernels import AMBIENT, DIFFUSE, LAMP
 from framework.rendering.surface import Surface
 
 CAMERA = Camera(40, 20, 20.0, 20.0, 19.5, 9.5)
-LIGHT = AMBIENT - DIFFUSE * LAMP[2] / np.linalg.norm(LAMP)  # on surfaces facing the camera
+LIGHT = AMBIENT - DIFFUSE * LAMP[2] / np.linalg.norm(LAMP)  # shading of surfaces that face the camera
 
 
 def quad(left: float, right: float) -> np.ndarray:
-    """Return the corners (m) of a plane 1 m in front of the camera that is higher than the picture."""
+    """Return the corners (4, 3), m, of a rectangle 1 m in front of the camera that is taller than the image."""
     return np.array([[left, -2, 1], [left, 2, 1], [right, 2, 1], [right, -2, 1]], np.float32)
 
 
 @pytest.fixture(scope="module")
 def view() -> LitView:
-    """Return a view with instance 1, 10 columns wide, 10 columns without an id, and 10 empty columns on either side."""
+    """Return a view of two rectangles, each 10 columns wide, with 10 empty columns on the left and on the right."""
     triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
     return LitView(Surface(np.concatenate([quad(-0.5, 0), quad(0, 0.5)]), triangles), CAMERA, np.eye(4))
 
@@ -46,11 +46,11 @@ def test_lit_view_in_instances_has_colors_and_dark_borders(view: LitView) -> Non
     pale = (178 + 0.22 * 100) * LIGHT
     np.testing.assert_allclose(image[:, 11:19], np.tile(painted, (20, 8, 1)), atol=1)
     np.testing.assert_allclose(image[:, 21:29], pale, atol=1)
-    # one of two finer columns on either side of the border
+    # at a border, one of the two supersampled columns of a pixel is dark
     np.testing.assert_allclose(image[:, 19], np.tile(painted * (1 + 0.45) / 2, (20, 1)), atol=1)
     np.testing.assert_allclose(image[:, 20], pale * (1 + 0.45) / 2, atol=1)
     np.testing.assert_allclose(image[:, 10], np.tile(painted * (1 + 0.45) / 2, (20, 1)), atol=1)
-    np.testing.assert_allclose(image[:, 29], pale, atol=1)  # the end of the map is not a border of the unnamed part
+    np.testing.assert_allclose(image[:, 29], pale, atol=1)  # no border where the part without an instance ends
 
 
 def test_lit_view_is_invariant_to_world_rotation() -> None:
@@ -59,7 +59,7 @@ def test_lit_view_is_invariant_to_world_rotation() -> None:
     triangles = rng.integers(0, 60, (40, 3), np.int32)
     colors = rng.integers(0, 256, (60, 3)).astype(np.uint8)
     turned = np.eye(4)
-    turned[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # without rounding
+    turned[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # an exact rotation
     here = LitView(Surface(vertices, triangles), CAMERA, np.eye(4))
     there = LitView(Surface(vertices @ turned[:3, :3].T.astype(np.float32), triangles), CAMERA, turned)
     assert 0.1 < here.hits.seen.mean() < 0.9

@@ -21,20 +21,20 @@ def ids(*runs: tuple[int, int]) -> np.ndarray:
 
 
 def test_same_objects_is_one_to_one() -> None:
-    # 5 has most of the bed, 6 a part of it; 7 has the chair and half of the third; 8 is on the wall
+    # 5 covers most of the bed, 6 a part of it, and 7 the chair and half of object 30; 8 is on the wall
     found = ids((0, 30), (8, 10), (5, 30), (6, 10), (7, 30), (0, 10))
-    assert same_objects(found, TRUE) == {5: 900000, 7: 20}  # IoU 0.75, 20 / 30; 6 could only be the bed, too
+    assert same_objects(found, TRUE) == {5: 900000, 7: 20}  # IoU 30 / 40 and 20 / 30; 6 overlaps only the bed
 
 
 def test_same_objects_maximizes_total_overlap() -> None:
     true = ids((1, 50), (2, 30))
-    found = ids((5, 20), (6, 30), (5, 30))  # 5 is a little of 1 and all of 2; 6 most of 1
+    found = ids((5, 20), (6, 30), (5, 30))  # 5 covers 20 of the 50 points of 1 and all of 2; 6 covers 30 points of 1
     assert same_objects(found, true) == {5: 2, 6: 1}
 
 
 def test_same_objects_requires_minimum_iou() -> None:
     assert same_objects(ids((0, 40), (5, 9), (0, 71)), TRUE) == {}
-    assert same_objects(ids((0, 40), (5, 10), (0, 70)), TRUE) == {5: 900000}  # 10 / 40: from here on
+    assert same_objects(ids((0, 40), (5, 10), (0, 70)), TRUE) == {5: 900000}  # the minimum is 10 / 40
 
 
 def test_same_objects_without_points_or_instances_is_empty() -> None:
@@ -55,7 +55,7 @@ def test_object_colors_are_shared_only_by_matched_objects() -> None:
     assert {color_of[first[5]], color_of[first[7]]} < clear
     assert color_of[first[5]] != color_of[first[7]]
     assert color_of[first[8]] not in clear
-    assert color_of[second[2]] == UNKNOWN  # the third true object
+    assert color_of[second[2]] == UNKNOWN  # object 30 has no class
     assert colors.name_of == {first[5]: "bed", first[7]: "chair"}
 
 

@@ -20,13 +20,13 @@ ASIDE = 2e-3  # px: if rays this far apart meet the same vertex, the result does
 
 
 def drawn(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """Return (H, W) the index of the nearest vertex, -1 = nothing."""
+    """Return the index (H, W) of the nearest vertex, -1 = no surface."""
     numbered = np.arange(1, len(vertices) + 1, dtype=np.int32)
     return Rasterizer(vertices, triangles).draw(camera, T).nearest(triangles, numbered) - 1
 
 
 def met_by_rays(caster: RayCaster, triangles: np.ndarray, T: np.ndarray, du: float, dv: float) -> np.ndarray:
-    """Return the vertex indices of rays (du, dv) px away from the pixel centers."""
+    """Return the index (H, W) of the vertex nearest to each hit of rays (du, dv) px from the pixel centers."""
     u, v = np.arange(CAMERA.width)[None, :] + du, np.arange(CAMERA.height)[:, None] + dv
     hits = caster.cast(pixel_rays(CAMERA, T, u, v))
     weights = np.stack([1 - hits.uv.sum(axis=-1), hits.uv[..., 0], hits.uv[..., 1]], axis=-1)
@@ -43,7 +43,7 @@ def assert_sees_what_rays_meet(vertices: np.ndarray, triangles: np.ndarray, T: n
 
 
 def confetti(rng: np.random.Generator, size: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return triangles of this size (m) around the origin."""
+    """Return the vertices, m, and triangles of `count` random triangles of about `size` m around the origin."""
     centers = rng.uniform(-3, 3, (count, 1, 3))
     vertices = (centers + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3).astype(np.float32)
     return vertices, np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
@@ -52,7 +52,7 @@ def confetti(rng: np.random.Generator, size: float, count: int) -> tuple[np.ndar
 @pytest.mark.parametrize(("size", "count"), [(0.02, 40 * CHUNK + 7), (0.2, 500), (3.0, 6)])
 @pytest.mark.parametrize("seed", range(3))
 def test_rasterizer_matches_ray_casting(size: float, count: int, seed: int) -> None:
-    """Some triangles are small, and some reach from the front of the camera to its back; poses are random."""
+    """Some triangles are small, and some extend from in front of the camera to behind it; poses are random."""
     rng = np.random.default_rng([seed, count])
     vertices, triangles = confetti(rng, size, count)
     assert_sees_what_rays_meet(vertices, triangles, exp_se3(rng.normal(0, 1, 6)))
@@ -81,7 +81,7 @@ def test_rasterizer_depth_and_weights_match_ray_casting(size: float) -> None:
 
 
 def test_rasterized_closed_surface_has_no_gaps() -> None:
-    """The camera is inside a triangulated ball: every pixel shows one triangle, also at edges and corners."""
+    """The camera is inside a triangulated ball: every pixel shows a triangle, including those on edges and corners."""
     side = 40
     theta, phi = np.meshgrid(
         np.linspace(0, np.pi, side), np.linspace(0, 2 * np.pi, side, endpoint=False), indexing="ij"
@@ -91,12 +91,12 @@ def test_rasterized_closed_surface_has_no_gaps() -> None:
     a, b = i * side + j, i * side + (j + 1) % side
     triangles = np.concatenate([np.stack([a, b, a + side], 1), np.stack([b, b + side, a + side], 1)]).astype(np.int32)
     for T in (np.eye(4), look(np.array([0.3, 0.0, 0.0]), 1.0, 0.5, 0.2)):
-        for faces in (triangles, triangles[:, ::-1].copy()):  # from either side
+        for faces in (triangles, triangles[:, ::-1].copy()):  # both orientations
             assert (drawn(ball.astype(np.float32), faces, T) >= 0).all()
 
 
 def test_rasterizer_includes_pixels_on_edges_and_corners() -> None:
-    """The square from (1, 1) to (5, 4) px at 2 m has two triangles and includes its border."""
+    """The rectangle from (1, 1) to (5, 4) px at 2 m has two triangles and includes its border."""
     camera = Camera(8, 6, 4.0, 4.0, 0.0, 0.0)
     vertices = np.array([[1, 1], [5, 1], [5, 4], [1, 4]], np.float32) / 4 * 2
     vertices = np.column_stack([vertices, np.full(4, 2, np.float32)])

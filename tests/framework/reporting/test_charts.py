@@ -28,7 +28,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def parsed(picture: str) -> ElementTree.Element:
-    """Return the XML of the picture. Fails for invalid numbers."""
+    """Return the XML tree of an SVG image, after checking that it has no NaN or infinite numbers."""
     assert "nan" not in picture
     assert "inf" not in picture
     return ElementTree.fromstring(picture)
@@ -51,7 +51,7 @@ def circle(radius: float) -> np.ndarray:
 def test_top_view_keeps_shapes_and_marks_lost_poses() -> None:
     picture, share = top_view([PlottedPath(circle(2.0), [5])], [circle(2.2)], [], UP)
     [mine], [true] = paths(picture, "chart-path"), paths(picture, "chart-true")
-    assert np.ptp(mine, axis=0) == pytest.approx(np.full(2, np.ptp(mine[:, 1])), rel=0.03), "a circle stays one"
+    assert np.ptp(mine, axis=0) == pytest.approx(np.full(2, np.ptp(mine[:, 1])), rel=0.03), "a circle stays a circle"
     assert np.ptp(true[:, 1]) / np.ptp(mine[:, 1]) == pytest.approx(1.1, rel=0.01)
     assert (true > 0).all()
     assert (true < [WIDTH, HEIGHT]).all()

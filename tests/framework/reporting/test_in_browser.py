@@ -1,4 +1,4 @@
-"""Tests of the report page in a browser without network: clicks, keys and the canvas."""
+"""Tests of the report page in a browser without network access: clicks, keys and the canvas."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PLACE_OF = """id => {
 def browser() -> Iterator[Any]:
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: pip install --group test")
     if not Path(CHROMIUM).exists():
-        pytest.skip(f"{CHROMIUM} is not there")
+        pytest.skip(f"{CHROMIUM} does not exist")
     with playwright.sync_playwright() as driver:
         found = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         yield found
@@ -44,7 +44,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Return the pages of two runs and their comparison; an object of the second run has a hostile name."""
+    """Return the pages of two runs and of their comparison; one class name of the second run contains HTML."""
     folder = tmp_path_factory.mktemp("runs")
     first = write_run(folder / "first")
     second = Path(shutil.copytree(first, folder / "second"))
@@ -56,7 +56,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture
 def opened(browser: Any) -> Iterator[Any]:
-    """Open a page without network. At the end there are no requests and no errors."""
+    """Return a function that opens pages offline; finally, check that there were no requests and no errors."""
     contexts, faults = [], []
 
     def open_page(path: Path, **options: Any) -> Any:
@@ -80,8 +80,8 @@ def opened(browser: Any) -> Iterator[Any]:
 
 
 def canvas(page: Any) -> np.ndarray:
-    """Return the image of the map's canvas (H, W, 3)."""
-    page.wait_for_timeout(150)  # for the next frame
+    """Return the RGB image (H, W, 3) of the canvas that shows the map."""
+    page.wait_for_timeout(150)  # until the next frame is rendered
     picture = page.locator("#canvas").screenshot()
     return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
 
@@ -127,7 +127,7 @@ def test_report_view_buttons_change_map_colors(pages: list[Path], opened: Any) -
     assert np.abs(instances - own).max() > 60
     page.locator("#confidence").fill("1")
     assert page.inner_text("#confidence-value") == "1.00"
-    assert colored(canvas(page)) < 0.5 * colored(instances), "no object is that likely"
+    assert colored(canvas(page)) < 0.5 * colored(instances), "no object has confidence 1"
     page.get_by_role("button", name="Classes").click()
     assert page.locator("#legend button").count() == 0
     page.locator("#confidence").fill("0")
@@ -167,7 +167,8 @@ def test_report_table_is_sorted_searched_and_selected_by_keys(pages: list[Path],
     chosen = rows.nth(1).get_attribute("data-id")
     assert rows.nth(1).get_attribute("aria-selected") == "true"
     assert page.locator("#panel h3").inner_text().endswith(str(chosen))
-    while page.evaluate("Boolean(window.report.viewer.flight)"):  # wait_for_function is eval, which the policy forbids
+    # wait_for_function uses eval, which the policy forbids.
+    while page.evaluate("Boolean(window.report.viewer.flight)"):
         page.wait_for_timeout(50)
     after = page.evaluate("window.report.viewer.camera.position.toArray()")
     assert np.linalg.norm(np.subtract(after, before)) > 0.05, "the camera does not move"

@@ -56,7 +56,7 @@ def test_scene_glb_has_linear_colors_and_first_seen_times() -> None:
     accessor = tree["accessors"][attributes["COLOR_0"]]
     assert (accessor["componentType"], accessor["type"], accessor["normalized"]) == (5123, "VEC4", True)
     colors = values("COLOR_0", np.uint16, 4) / 65535
-    np.testing.assert_allclose(colors[0], [0.5029, 0, 1, 1], atol=1e-4)  # sRGB 188 is half of the light
+    np.testing.assert_allclose(colors[0], [0.5029, 0, 1, 1], atol=1e-4)  # sRGB 188 is half of the linear intensity
     np.testing.assert_array_equal(values("_FIRST_SEEN", np.float32, 1)[:, 0], first_seen[4:])
 
 

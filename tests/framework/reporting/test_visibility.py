@@ -14,7 +14,7 @@ CAMERA = Camera(200, 150, 150.0, 150.0, 99.5, 74.5)
 
 
 def wall(n: int = 41) -> InstanceMesh:
-    """Return a wall 2 m before the origin, 4 x 1 m, with an object at each end."""
+    """Return a wall of 4 m x 1 m, 2 m in front of the origin, with an object at each end."""
     x, y = np.meshgrid(np.linspace(-2, 2, n), np.linspace(-0.5, 0.5, n), indexing="ij")
     vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
@@ -32,7 +32,7 @@ def at(x: float) -> np.ndarray:
 def test_sightings_first_seen_is_first_visible_pose() -> None:
     mesh = wall()
     found = sightings(mesh, mesh.instance_ids, np.array([at(-1.0), at(-0.2), at(0.2)]), CAMERA, {})
-    half = 2 * 100 / 150  # m, visible to either side of the camera
+    half = 2 * 100 / 150  # m, visible on each side of the optical axis
     x = mesh.vertices[:, 0]
     assert found.chosen == [0, 1, 2]
     assert (found.first_seen[x < -1.0 + half - 0.05] == 0).all()
@@ -45,7 +45,7 @@ def test_sightings_first_seen_is_first_visible_pose() -> None:
 def test_sightings_best_pose_shows_whole_object() -> None:
     mesh = wall()
     near = at(-1.0)
-    near[2, 3] = 1.0  # it shows more pixels, but only 0.59 of the object
+    near[2, 3] = 1.0  # more pixels, but only 0.59 of the object
     poses = np.array([at(-3.2), near, at(-1.4), at(0.0), at(1.7)])
     assert sightings(mesh, mesh.instance_ids, poses, CAMERA, {}).best == {3: 2, 4: 4}
 
@@ -70,7 +70,7 @@ def test_sightings_exclude_occluded_objects() -> None:
     assert 3 not in found.best
 
 
-def test_spread_out_poses_cover_video_evenly() -> None:
+def test_spread_out_poses_cover_trajectory_evenly() -> None:
     assert spread_out(0) == []
     assert spread_out(1) == [0]
     assert spread_out(5) == [0, 1, 2, 3, 4]

@@ -1,4 +1,4 @@
-"""Tests of the hash of the inputs, which decides with the config if a run is resumed."""
+"""Tests of the input hash; a completed run is skipped if its config and its input hash are unchanged."""
 
 from __future__ import annotations
 

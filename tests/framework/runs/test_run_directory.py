@@ -49,7 +49,7 @@ Run = Callable[..., RunResult]
 
 @pytest.fixture
 def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRecord:
-    """Write a run directory without its picture, which has its own tests."""
+    """Begin a run directory; the overview image is replaced, because it has its own tests."""
     monkeypatch.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
     return RunRecord.begin(tmp_path / "run", CONFIG, CHOICES)
 
@@ -176,7 +176,7 @@ def test_record_recreates_removed_directory(record: RunRecord, room: CornerRoom)
 
 
 def test_rpe_ignores_steps_over_skipped_frames(room: CornerRoom) -> None:
-    """The drift is 1 cm per frame and frame 2 is skipped: RPE is 1 cm, not that of steps of 1, 2 and 1 cm."""
+    """The drift is 1 cm per frame and frame 2 is skipped; the step of 2 cm over frame 2 is not used."""
     true = np.eye(4)
     tracked = []
     for position in (0, 1, 3, 4):
@@ -279,7 +279,7 @@ def test_timings_csv_matches_stage_metrics(record: RunRecord, room: CornerRoom) 
 
 
 def test_pose_source_comes_from_tracker(room: CornerRoom) -> None:
-    """It does not depend on the poses: the first tracked pose is the true one, and lost poses have no source."""
+    """The pose source does not depend on the poses, which may equal the true poses or be lost."""
     one_frame = CornerRoom(frames=1)
     given = [mapped(room), mapped(room, lost_from=1, lost_to=99), mapped(one_frame)]
     assert [run_metrics(result)["pose_source"] for result in given] == ["ground_truth"] * 3
@@ -352,7 +352,7 @@ def test_code_version_of_installed_package_is_unknown(tmp_path: Path, monkeypatc
 
 
 def read_ply(path: Path) -> InstanceMesh:
-    """Read a PLY file by its header alone."""
+    """Return the mesh of a PLY file, read as its header declares."""
     content = path.read_bytes()
     header, _, body = content.partition(b"end_header\n")
     lines = header.decode().splitlines()

@@ -45,7 +45,7 @@ def test_mean_of_fewer_than_two_values_has_nan_deviation() -> None:
 
 
 def test_row_differences_are_paired() -> None:
-    """Rooms differ by 0.5, rows by 0.1: only paired differences are significant."""
+    """Rooms differ by 0.5 and rows by 0.1, so only paired differences are significant."""
     base, other = row("a", seed0=0.1, seed1=0.6, seed2=0.9), row("b", seed0=0.2, seed1=0.7, seed3=0.0)
     difference = Mean.of(other.differences(base, AP).values())
     assert difference.count == 2
@@ -74,9 +74,9 @@ def test_is_not_zero_matches_paired_t_test() -> None:
 
 
 def test_is_not_zero_is_false_for_equal_differences() -> None:
-    """Two more instances in each of two rooms have no spread, which gives no significance."""
+    """Equal differences have no spread, so their significance is undefined."""
     assert not Mean.of([2.0, 2.0]).is_not_zero
-    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, "the values differ only in the last digit"
+    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, "the differences are equal except for rounding"
 
 
 def test_rows_keep_experiment_order_and_sort_seeds() -> None:
@@ -100,7 +100,7 @@ def test_rows_split_by_parameter_independent_of_seed() -> None:
 
 
 def test_rows_without_experiment_are_named_by_choices() -> None:
-    """Parameters of one refiner differ from those of another; they do not split rows."""
+    """Parameters that only one of two refiners has do not split rows."""
     parameters: dict[str, dict[str, Any]] = {"kmeans": {"centers": 5}, "gmm": {"steps": 8, "floor": 0.1}}
     records = [
         record({"seed": seed, "refiner": node}, refiner=name, fuser="bayes")
@@ -122,7 +122,7 @@ def test_rows_split_by_command_line_overrides() -> None:
 
 
 def test_row_names_include_undeclared_choice_differences() -> None:
-    """One row was tracked and the other was not: this is no declared difference, and is in their names."""
+    """The rows differ in the tracker, which no row overrides, so their names include it."""
     records = [
         record({"row": "a", "seed": 0}, tracker="icp", fuser="bayes"),
         record({"row": "b", "seed": 0}, tracker="given", fuser="count"),
@@ -134,7 +134,7 @@ def test_row_names_include_undeclared_choice_differences() -> None:
 
 
 def test_row_names_include_undeclared_parameter_differences() -> None:
-    """The rows differ in a parameter that no row overrides: it is in their names."""
+    """The rows differ in a parameter that no row overrides, so their names include it."""
     frames = {"a": 8, "b": 16}
     records = [
         record({"row": row, "seed": 0, "dataset": {"frames": count}, "fuser": {"voxel": count, "inner": {"x": count}}})
@@ -144,7 +144,7 @@ def test_row_names_include_undeclared_parameter_differences() -> None:
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.frames=8", "b, dataset.frames=16"]
     changes["b"].append("dataset=other")
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
-    assert [row.name for row in rows_of(records, ["seed"])] == ["a", "b"], "their effect is unknown"
+    assert [row.name for row in rows_of(records, ["seed"])] == ["a", "b"], "the overrides of the rows are unknown"
 
 
 def test_rows_without_experiment_are_split_by_scene() -> None:
@@ -160,7 +160,7 @@ def test_rows_accept_numeric_names() -> None:
     assert list(names(records, "0", "20")) == ["0", "20"]
 
 
-def test_rows_following_lists_parameters_varying_with_seed() -> None:
+def test_following_lists_parameters_that_vary_with_seed() -> None:
     records = [
         record({"seed": seed, "dataset": {"seed": seed, "stride": seed, "start": 1}, "fuser": {"voxel": 1}})
         for seed in (1, 2)

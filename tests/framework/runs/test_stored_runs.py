@@ -1,4 +1,4 @@
-"""Tests of stored runs: complete, damaged, missing."""
+"""Tests of stored runs: complete, damaged and missing runs."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_is_recorded_same_config_is_true(directory: Path, caplog: pytest.LogCapt
 
 
 def test_is_recorded_logs_missing_map_files(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """They may have been removed to save disk space; the metrics are still those of the run."""
+    """Map files may have been removed to save disk space; the metrics remain valid."""
     (directory / "map.npz").unlink()
     (directory / "mesh.ply").unlink()
     assert is_recorded(directory, OmegaConf.create(CONFIG))
@@ -233,7 +233,7 @@ def test_is_recorded_changed_weights_or_data_is_false(
     (data / "outputs").mkdir()
     (data / "outputs" / "table.md").write_text("of runs that were begun here")
     os.utime(weights, ns=(1, 1))
-    assert is_recorded(directory, OmegaConf.create(config)), "neither concerns this run"
+    assert is_recorded(directory, OmegaConf.create(config)), "these changes do not affect the inputs"
 
 
 def test_is_recorded_without_inputs_hash_is_true(directory: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from tests.support.scenes.corner_room import GridMap
 def test_timings_file_round_trip_has_nan_for_missing_stages(tmp_path: Path) -> None:
     times = (
         *(StageTime(4, "tracking", 2.5), StageTime(4, "fusion", 20.0)),
-        StageTime(6, "tracking", 3.0),  # lost: not fused
+        StageTime(6, "tracking", 3.0),  # a lost frame is not fused
         *(StageTime(8, "tracking", 3.5), StageTime(8, "fusion", 0.0)),
     )
     result = RunResult(GridMap(10), frames=3, frames_skipped=0, tracked=(), timings=times, seconds=1.0)

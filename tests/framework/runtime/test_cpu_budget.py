@@ -1,4 +1,4 @@
-"""Tests of the CPU budget: the latest frames divide the cores between prefetching and mapping."""
+"""Tests of the CPU budget, which divides the cores by the load of prefetching and mapping in recent frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from framework.runtime.cpu_budget import RECENT, CpuBudget
 
 @pytest.fixture
 def thread_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], None]]:
-    """Replace the CPU clock by one that advances only when requested."""
+    """Replace the CPU clock; return the function that advances it by a number of seconds."""
     now = [0.0]
     monkeypatch.setattr(time, "thread_time", lambda: now[0])
 
@@ -26,7 +26,7 @@ def thread_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], N
 
 @pytest.fixture(params=[1, 2, 4])
 def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> CpuBudget:
-    """Return a budget of several cores; numba's own limit is replaced by a variable."""
+    """Return a budget of 1, 2 or 4 cores; Numba's thread limit is replaced by a variable."""
     threads = [request.param]
     monkeypatch.setattr(numba, "get_num_threads", lambda: threads[0])
     monkeypatch.setattr(numba, "set_num_threads", lambda number: threads.__setitem__(0, number))
@@ -34,7 +34,7 @@ def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def pass_frames(sharing: CpuBudget, passes: Callable[[float], None], ahead: float, mapping: float) -> None:
-    """Process some frames with this load; the mapping's loops scale perfectly."""
+    """Simulate frames with `ahead` s of prefetching and `mapping` s of perfectly parallel mapping."""
     for _ in range(RECENT):
         with sharing.prefetching():
             passes(ahead)
@@ -71,7 +71,7 @@ def test_cpu_budget_is_divided_among_workers(sharing: CpuBudget, thread_time: Ca
 def test_cpu_budget_ignores_single_slow_frame(sharing: CpuBudget, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
     with sharing.mapping():
-        thread_time(100.0)  # kernels are compiled
+        thread_time(100.0)  # compilation of kernels
     assert sharing.prefetch_cores() == sharing.cores // 2
 
 

@@ -36,7 +36,7 @@ SLOW_S = 0.03  # duration of a stage that is too slow for the video
 
 @dataclass
 class Handed(LiveVideo):
-    """Frames that a test passes as numbers: `come` waits until the listener has them."""
+    """Live video whose frames are the numbers passed to `come`, which waits until the listener has received them."""
 
     def __post_init__(self) -> None:
         self.name = "handed"
@@ -54,7 +54,7 @@ class Handed(LiveVideo):
 
     def come(self, *numbers: int) -> None:
         self.coming.extend(numbers)
-        for _ in range(3):  # iterations of the listener, the last of them complete
+        for _ in range(3):  # iterations of the listener; the last one is complete
             while self.asked.acquire(blocking=False):
                 pass
             assert self.asked.acquire(timeout=PATIENCE_S)
@@ -153,12 +153,12 @@ def test_live_video_at_fast_rate_drops_and_counts_frames(prefetch: int, caplog: 
     assert result.frames < 40
     indices = [frame.index for frame in result.tracked]
     assert indices == sorted(set(indices))
-    assert indices[-1] == 59, "the last frame stays the newest"
+    assert indices[-1] == 59, "the last frame of the video is mapped"
     assert caplog.messages == [f"{result.live.frames_dropped} frames dropped because mapping fell behind"]
 
 
 def test_live_video_frames_are_not_queued() -> None:
-    """The prefetch of recordings does not apply: a queue would add its length to each latency."""
+    """Live frames are not prefetched, because each queued frame would increase the latency."""
     video, waiting = LiveRoom(frames_sent=200, period_s=0.002), []
 
     @dataclass
@@ -199,7 +199,7 @@ def test_live_video_ctrl_c_ends_normally(prefetch: int) -> None:
 
 
 def test_live_video_second_ctrl_c_interrupts_frame() -> None:
-    """The frame is interrupted, so that the record is partial."""
+    """The frame is interrupted, so the outputs are partial."""
     video = LiveRoom(frames_sent=1000)
     result = pipeline(tracker=PressesCtrlC(at=2, times=2)).run(video)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
@@ -208,7 +208,7 @@ def test_live_video_second_ctrl_c_interrupts_frame() -> None:
 
 
 def test_live_video_ctrl_c_before_first_frame_raises() -> None:
-    """The worker waits for a first frame that never comes."""
+    """The worker waits for a first frame that never arrives."""
 
     @dataclass
     class Silent(LiveRoom):

@@ -1,4 +1,4 @@
-"""Tests without Python's Linux-specific and POSIX modules."""
+"""Tests of commands without Python's Linux-specific and POSIX modules."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ import fcntl, os, signal, sys
 flags, synced = fcntl.fcntl, os.fsync
 
 def fsync(descriptor):
-    assert flags(descriptor, 3) & os.O_ACCMODE, "Windows syncs only what can be written to"  # 3: F_GETFL
+    assert flags(descriptor, 3) & os.O_ACCMODE, "Windows syncs only writable files"  # 3: F_GETFL
     synced(descriptor)
 
 os.fsync = fsync
@@ -32,7 +32,7 @@ main()
 """
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system lacks some of it anyway")
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="requires a system with these modules")
 def test_commands_run_without_linux_specific_modules(tmp_path: Path) -> None:
     def start(*arguments: str) -> str:
         done = subprocess.run(

@@ -12,7 +12,7 @@ import pytest
 from framework.runtime.frame_stream import Turns, prefetched_map
 
 
-def test_map_ahead_is_bounded_and_ordered() -> None:
+def test_prefetched_map_is_bounded_and_ordered() -> None:
     begun: list[int] = []
 
     def square(k: int) -> int:
@@ -26,8 +26,8 @@ def test_map_ahead_is_bounded_and_ordered() -> None:
     assert begun == list(range(10))
 
 
-def test_map_ahead_overlaps_with_consumer() -> None:
-    """Both sides wait for each other: without a worker thread this would never end."""
+def test_prefetched_map_overlaps_with_consumer() -> None:
+    """Both sides wait for each other; without a worker thread they would deadlock."""
     fusing, detected = threading.Event(), threading.Event()
 
     def detect(k: int) -> int:
@@ -43,7 +43,7 @@ def test_map_ahead_overlaps_with_consumer() -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
-def test_map_ahead_results_keep_order(workers: int) -> None:
+def test_prefetched_map_results_keep_order(workers: int) -> None:
     def sleep(k: int) -> int:
         time.sleep(0.002 * (k % 3))
         return k
@@ -52,7 +52,7 @@ def test_map_ahead_results_keep_order(workers: int) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_map_ahead_worker_exception_is_raised_in_order(workers: int) -> None:
+def test_prefetched_map_worker_exception_is_raised_in_order(workers: int) -> None:
     def fail(k: int) -> int:
         if k == 3:
             raise OSError("the disk is gone")
@@ -70,7 +70,7 @@ def test_turns_run_in_order_despite_exceptions() -> None:
 
     def work(number: int) -> None:
         with turns.turn(number):
-            assert inside.acquire(blocking=False), "two at once"
+            assert inside.acquire(blocking=False), "two turns overlap"
             taken.append(number)
             time.sleep(0.001)
             inside.release()

@@ -1,4 +1,4 @@
-"""Tests of the progress display: in a terminal, without one, and disabled."""
+"""Tests of the progress display: in a terminal, without a terminal, and disabled."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.terminals import terminal_stderr
 
 
 class Clock:
-    """A clock that is set by the test."""
+    """Clock whose time, s, is set by the test."""
 
     now = 100.0
 

@@ -13,7 +13,7 @@ from framework.sensors.noise_models_kernels import (
 )
 
 PUBLISHED = {  # m, standard deviation at depth z (m) of a surface that faces the camera
-    SensorKind.EXACT: lambda z: 0.001,  # the floor
+    SensorKind.EXACT: lambda z: 0.001,  # the minimum of all models
     SensorKind.KINECT_V1: lambda z: 0.0012 + 0.0019 * (z - 0.4) ** 2,  # Nguyen et al.
     SensorKind.REALSENSE_D435: lambda z: z**2 * 0.08 / (424 * 0.05),  # Grunnet-Jepsen et al.
     SensorKind.TIME_OF_FLIGHT: lambda z: (1.5 - 0.5 * z + 0.3 * z**2) / 1000,  # Fankhauser et al.
@@ -48,14 +48,14 @@ def test_depth_noise_at_angle_matches_published_model(kind: SensorKind, slant, z
 
 
 @pytest.mark.parametrize("kind", SensorKind)
-def test_depth_noise_near_camera_is_at_least_floor(kind: SensorKind) -> None:
+def test_depth_noise_near_camera_is_at_least_1_mm(kind: SensorKind) -> None:
     for z in (0.0, 0.01, 0.2):
         assert axial_sigma(z, kind.noise) >= 0.001
         assert axial_sigma_single(np.float32(z), kind.noise) >= np.float32(0.001)
 
 
 def test_depth_noise_of_kinect_is_byte_identical() -> None:
-    """The order of operations of earlier versions, whose maps must be reproduced."""
+    """The order of operations is that of earlier versions, so that their maps are reproduced."""
     z = np.linspace(0.3, 9, 10_000, dtype=np.float32)
     beyond = z - np.float32(0.4)
     expected = np.float32(0.0012) + np.float32(0.0019) * beyond * beyond
@@ -65,7 +65,7 @@ def test_depth_noise_of_kinect_is_byte_identical() -> None:
 
 
 def test_depth_noise_rounding_is_independent_of_caller() -> None:
-    """Without its own setting, numba would inherit fast math from the first calling kernel."""
+    """Without an explicit setting, Numba would use the fast-math setting of the first calling kernel."""
 
     @njit(fastmath=True)
     def fill(z: np.ndarray, noise: DepthNoise, out: np.ndarray) -> None:
@@ -101,5 +101,5 @@ def test_sensor_choices_are_kinds_and_auto() -> None:
         ("/camera/depth_registered/image", None),
     ],
 )
-def test_kind_of_device_follows_its_name(name: str, kind: SensorKind | None) -> None:
+def test_kind_of_device_is_derived_from_name(name: str, kind: SensorKind | None) -> None:
     assert kind_of_device(name) is kind

@@ -1,4 +1,4 @@
-"""Tests of the ten benchmark rooms and of their roles, without rendering."""
+"""Tests of the ten benchmark rooms and of their layouts, without rendering."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def classes_of(pieces) -> Counter:
     return Counter(piece.class_name for piece in pieces)
 
 
-def test_benchmark_scenes_have_unique_names_and_class_repeats() -> None:
+def test_benchmark_scenes_have_unique_names_and_repeated_classes() -> None:
     assert list(SCENES) == ROOMS
-    assert not any(name.isdigit() for name in SCENES), "a number would be taken for a sequence of SceneNN"
+    assert not any(name.isdigit() for name in SCENES), "numbers are sequences of SceneNN"
     promised = Counter(name for spec in SCENES.values() for name in spec.holds)
     assert set(promised) == set(SCENENN_TO_COCO.values())
     assert min(promised.values()) >= 2
@@ -58,7 +58,7 @@ def test_benchmark_scene_has_declared_objects(name: str, seed: int) -> None:
 def test_furnish_scene_places_all_declared_objects(name: str) -> None:
     spec = SCENES[name]
     room = furnish_scene(spec, np.random.default_rng([ROOMS.index(name) % len(SEEDS), 1]))
-    assert room.layout.free.max() > 1.0, "room to walk"
+    assert room.layout.free.max() > 1.0, "space for the camera path"
     found = classes_of(piece for _, piece in room.objects)
     assert all(found[class_name] >= least for class_name, least in spec.holds.items())
     assert any(piece.kind == "door" for _, piece in room.objects)
@@ -73,11 +73,11 @@ def test_cluttered_groups_place_objects_on_furniture(make, seed: int) -> None:
     lying = [p for p, m in zip(others, middles, strict=True) if (m[:2] > low[:2]).all() and (m[:2] < high[:2]).all()]
     assert {"blanket", "cushion", "backpack"} <= {piece.kind for piece in lying}
     for piece in lying:
-        assert 0.35 < piece.bounds()[0][2] < 0.72, "it lies on the seat or the mattress, or on a blanket there"
+        assert 0.35 < piece.bounds()[0][2] < 0.72, "it lies on the seat, the mattress or a blanket"
 
 
 def gap(piece, other) -> float:
-    """Return the distance between two boxes, m; negative is the depth of their overlap."""
+    """Return the distance, m, between two bounding boxes; negative = depth of their overlap."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
     return float(np.maximum(low - other_high, other_low - high).max())
 
@@ -112,7 +112,7 @@ def test_benchmark_chairs_under_tables_do_not_intersect(make, seed: int) -> None
         assert at[:, 1].min() < front - 0.05, "its seat is under the table"
         for board in boards:
             inside = ((at > board.min(axis=0)) & (at < board.max(axis=0))).all(axis=1)
-            assert not inside.any(), "nothing is in the table's wood"
+            assert not inside.any(), "the chair does not intersect the table"
         top = boards[0]
         near = at[(at[:, 2] > top[:, 2].min() - 0.1) & (at[:, 2] < top[:, 2].max() + 0.1)]
         assert 0 <= near[:, 1].min() - front < 0.1

@@ -14,7 +14,7 @@ POSE = look(np.array([0.3, -0.2, 1.4]), 0.4, -0.2, 0.1)
 
 
 def moved(right=0.0, down=0.0, ahead=0.0, turn=0.0):
-    """Return POSE (4, 4) moved by meters along the camera's axes, then rotated by `turn` rad about its y axis."""
+    """Return POSE (4, 4) translated along the camera axes, m, then rotated by `turn` rad about its y axis."""
     T = np.eye(4)
     T[:3, 3] = right, down, ahead
     c, s = np.cos(turn), np.sin(turn)
@@ -43,8 +43,8 @@ def test_motion_blur_width_equals_pixel_displacement(path):
     between = np.flatnonzero((row > 0) & (row < 200))
     assert abs(len(between) - path) <= 1
     assert (np.diff(row) >= 0).all()
-    assert abs(between.mean() - 47.5) <= 0.5, "the image does not move"
-    assert np.diff(row).max() < 1.5 * 200 / path, "evenly"
+    assert abs(between.mean() - 47.5) <= 0.5, "the blur is centered"
+    assert np.diff(row).max() < 1.5 * 200 / path, "the blur is uniform"
 
 
 def test_motion_blur_decreases_with_distance():

@@ -72,7 +72,7 @@ def test_renderer_lamp_casts_shadow():
     above = look(np.array([0.0, 0.0, 0.9]), 0.0, -np.pi / 2, 0.0)  # between plate and floor, looking down
     camera = Camera(101, 101, 30.0, 30.0, 50.0, 50.0)
     light = renderer.render(camera, above).color.astype(float).mean(axis=-1)
-    # The plate's shadow reaches 1 m from the middle: 33 px at 0.9 m.
+    # The shadow of the plate extends 1 m from the center, which is 33 px at 0.9 m.
     assert light[40:61, 40:61].mean() < 0.25 * light[50, 95:].mean()
 
 
@@ -88,7 +88,7 @@ def test_tone_curve_rises_from_black_to_white():
 
 
 def furnished():
-    """Return overlapping objects, some with depth steps inside one part, without a background."""
+    """Return a renderer of overlapping objects without a background; some parts contain depth steps."""
     floor = panel(3.0, 3.0).turned("x", np.pi / 2).moved(y=1.5, z=-0.5)
     return Renderer(
         scene(floor, rounded_box(0.5, 0.6, 0.7, 0.05), rounded_box(0.3, 0.2, 1.5, 0.02).moved(x=0.6, y=0.3)),
@@ -109,7 +109,7 @@ def test_image_rays_equal_vectorized_reference():
 
 
 def light_along(renderer, rays):
-    """Return the light (N, 3) along rays (N, 6), and the cosines (N,), hit by hit from the definitions."""
+    """Return the light (N, 3) and the cosines of incidence (N,) of rays (N, 6), computed from the definitions."""
     s, irradiance, hits = renderer.surfaces, renderer._lit.irradiance, renderer.caster.cast(rays)
     light, cosines = np.zeros((len(rays), 3)), np.zeros(len(rays))
     for n, f in enumerate(hits.triangle):
@@ -160,7 +160,7 @@ def test_renderer_image_matches_per_ray_shading():
         smooth += np.minimum(np.where(same[:, None], light[v, u], sample), WHITE) / len(EDGE_SAMPLES)
     light[v, u] = smooth
     difference = np.abs(picture.color.astype(int) - to_srgb(light.astype(np.float32)))
-    assert difference.max() <= 1  # a gray level, by rounding
+    assert difference.max() <= 1  # one gray level, due to rounding
     assert (difference > 0).mean() < 0.02
     for a, b in zip(renderer.depth_and_ids(CAMERA, T), (picture.depth, picture.instance_ids), strict=True):
         np.testing.assert_array_equal(a, b)

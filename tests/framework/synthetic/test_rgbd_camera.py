@@ -1,4 +1,4 @@
-"""Tests of the depth sensor's statistics, compared with the publication."""
+"""Tests of the simulated depth sensor: noise compared with publications, quantization and dropout."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def measure(depth, incidence=FRONT, noise=1.0, seed=0, max_range=8.0, kind=KINEC
 
 @pytest.mark.parametrize("z", [0.8, 1.5, 2.5, 4.0])
 def test_depth_noise_deviation_matches_nguyen_model(z):
-    # Spread over two depth steps, so that the wall's place among the steps does not matter.
+    # The wall extends over two depth steps, so that its position relative to the steps does not matter.
     depth = z + np.linspace(-1, 1, FRONT.size).reshape(FRONT.shape) * float(depth_step(np.float32(z), STEPS))
     error = (measure(depth) - depth)[measure(depth) > 0]
     expected = 0.0012 + 0.0019 * (z - 0.4) ** 2
@@ -52,7 +52,7 @@ def test_depth_of_exact_sensor_has_no_noise():
     np.testing.assert_array_equal(measure(depth, kind=SensorKind.EXACT), depth)
 
 
-def test_depth_of_time_of_flight_has_no_shadow():
+def test_time_of_flight_depth_has_no_projector_shadow():
     depth = np.full(FRONT.shape, 3.0)
     depth[:, 150:200] = 1.0
     left = np.s_[:, 138:148]  # in the shadow of a Kinect's projector
@@ -84,7 +84,7 @@ def test_depth_sensor_box_casts_projector_shadow_on_left():
     assert (missing[150 - int(shadow) + 2 : 149] > 0.99).all()
     assert (missing[: 150 - int(shadow) - 3] < 0.01).all()
     assert (missing[203:] < 0.01).all()
-    assert 0.2 < missing[199:201].mean() < 0.8  # the right edge drops depth at random
+    assert 0.2 < missing[199:201].mean() < 0.8  # at the right edge, depth is dropped at random
 
 
 def test_depth_sensor_edge_on_surface_has_no_reading():
@@ -126,7 +126,7 @@ def test_normal_quantiles_and_random_bits_are_unbiased():
 
 
 def jagged(seed):
-    """Return depth (H, W) m with steps, slants and holes, and cosines (H, W) from 0 to slightly over 1."""
+    """Return depth (H, W), m, with steps, noise and holes, and cosines (H, W) from 0 to slightly over 1."""
     rng = np.random.default_rng(seed)
     blocks = rng.uniform(0.2, 7, (CAMERA.height // 8, CAMERA.width // 8)).astype(np.float32)
     depth = np.kron(blocks, np.ones((8, 8), np.float32))
@@ -138,7 +138,7 @@ def jagged(seed):
 
 
 def slow_measure(depth, incidence, noise, max_range, rng):
-    """Return the measured depth, with one operation on the whole image after another."""
+    """Return the measured depth (H, W), m, computed by operations on whole images."""
     exact = np.where(depth <= max_range, depth, np.float32(0))
     disparity = np.where(depth > 0, np.float32(CAMERA.fx * 0.075) / np.maximum(depth, np.float32(0.1)), 0)
     place = np.arange(CAMERA.width, dtype=np.float32)[None, :] - disparity
@@ -183,7 +183,7 @@ def test_depth_sensor_equals_vectorized_reference(noise):
 def test_color_noise_is_rounded_and_clipped():
     color = np.random.default_rng(0).integers(0, 256, (24, 32, 3)).astype(np.uint8)
     grain = normal_quantiles()[random_bits(color.shape, np.random.default_rng(1)) >> 4]
-    for noise in (1.0, 40.0):  # gray levels beyond both ends
+    for noise in (1.0, 40.0):  # gray levels below 0 and above 255
         expected = np.clip(np.rint(color + np.float32(noise * 1.5) * grain), 0, 255).astype(np.uint8)
         np.testing.assert_array_equal(noisy_color(color, noise, np.random.default_rng(1)), expected)
     assert noisy_color(color, 0.0, np.random.default_rng(1)) is color
@@ -199,9 +199,9 @@ def measure_unread(unread, noise=1.0, seed=0):
 
 
 def slow_loss(unread, noise, seed):
-    """Return the pixels without depth: bilinear normal numbers, divided by their deviation, below a quantile."""
+    """Return the mask (H, W) of dropped pixels: normalized, interpolated Gaussian noise below a quantile."""
     rng = np.random.default_rng([seed])
-    random_bits((*FRONT.shape, 4), rng)  # the sensor's own dropout comes first
+    random_bits((*FRONT.shape, 4), rng)  # the sensor's own dropout uses the first numbers
     cell = PATCH * CAMERA.width / 640
     rows, columns = (int(side / cell) + 2 for side in FRONT.shape)
     nodes = normal_quantiles()[random_bits((rows, columns), rng) >> 4].astype(float)
@@ -229,10 +229,10 @@ def test_material_dropout_has_given_rate_and_forms_patches(share):
     lost = np.array([measure_unread(share, seed=seed) == 0 for seed in range(20)])
     assert lost.mean() == pytest.approx(share, abs=0.02)
     equal_neighbors = (lost[:, :, 1:] == lost[:, :, :-1]).mean()
-    assert equal_neighbors > 1 - 0.3 * 2 * share * (1 - share), "neighbors are lost together"
+    assert equal_neighbors > 1 - 0.3 * 2 * share * (1 - share), "neighbors are dropped together"
 
 
 def test_material_dropout_removes_only_unreadable_surfaces():
     assert not measure_unread(1.0).any()
     np.testing.assert_array_equal(measure_unread(0.0), measure(np.full(FRONT.shape, 2.0)))
-    assert measure_unread(1.0, noise=0.0).all(), "without noise readings are exact"
+    assert measure_unread(1.0, noise=0.0).all(), "without noise, depth is exact"

@@ -22,7 +22,7 @@ AHEAD = look(np.array([0.0, 0.0, 0.0]), 0.0, 0.0, 0.0)  # from the origin along 
 
 
 def scene(*solids):
-    """Return surfaces of solids: the first is the shell, the others are instances 1, 2, ..."""
+    """Return the surfaces of solids: the first is the shell, the others are instances 1, 2, ..."""
     objects = []
     for instance, solid in enumerate(solids):
         piece = Furniture("thing", "chair" if instance else None)
@@ -32,7 +32,7 @@ def scene(*solids):
 
 
 def wall(distance: float):
-    """Return a wall of 6 m x 6 m that faces the camera."""
+    """Return a wall of 6 m x 6 m that faces the camera at `distance` m."""
     return panel(6.0, 6.0, 0.5).moved(z=-3.0).turned("z", np.pi / 2).moved(x=distance)
 
 
@@ -57,7 +57,7 @@ def test_tessellate_limits_edge_length_and_keeps_surface(longest):
     exact = surfaces.vertices[surfaces.triangles].astype(np.float64)
     assert area(corners_of(mesh)) == pytest.approx(area(exact), rel=1e-5)
     volume = np.einsum("fc,fc->f", corners_of(mesh)[:, 0], np.cross(*corners_of(mesh)[:, 1:].swapaxes(0, 1))).sum() / 6
-    assert volume > 0, "triangles still turn counter-clockwise seen from outside"
+    assert volume > 0, "triangles are counterclockwise seen from outside"
 
 
 def test_tessellate_closed_body_stays_watertight():
@@ -87,7 +87,7 @@ def test_visible_mesh_excludes_occluded_surface():
     np.testing.assert_allclose(front[:, 0], 2.0, atol=1.1e-3)
     assert np.abs(front[:, 1:]).max() == pytest.approx(0.5, abs=1e-5)
     behind = mesh.vertices[mesh.instance_ids == 0]
-    shadow = 1.0  # m: the box's front, 0.5 m to each side at 2 m, hides twice that at 4 m
+    shadow = 1.0  # m; the front of the box, 0.5 m to each side at 2 m, occludes twice that at 4 m
     assert (np.abs(behind[:, 1:]).max(axis=1) > shadow - 1e-4).all()
     spacing = 0.02
     assert (np.abs(behind[:, 1:]).max(axis=1) < shadow + spacing).any()
@@ -131,7 +131,7 @@ def test_visible_mesh_excludes_screen_and_surface_behind_it():
     surfaces = assemble(objects)
     np.testing.assert_array_equal(surfaces.unreadable, surfaces.instance_ids == 1)
     mesh = visible_mesh(surfaces, RayCaster(surfaces.vertices, surfaces.triangles), CAMERA, [AHEAD], (0.4, 6.0), 0.05)
-    assert not mesh.instance_ids[mesh.triangles].any(), "at most border points of the screen remain"
+    assert not mesh.instance_ids[mesh.triangles].any(), "only border points of the screen remain"
     across = np.abs(mesh.vertices[:, 1:]).max(axis=1)
     np.testing.assert_allclose(across[mesh.instance_ids == 1], 0.5, atol=1e-6)
     assert across.min() == pytest.approx(0.5, abs=0.05)

@@ -1,4 +1,4 @@
-"""Tests of scene writing by several processes, which resume and write the same bytes as one."""
+"""Tests of scene writing by several processes: resuming, and files identical to those of one process."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_write_scenes_writes_common_files(root: Path) -> None:
     assert json.loads((root / "synthesize.json").read_text())["generation"] == GENERATION
     assert SceneNN(root, scene="007").domain == RENDERED_ROOMS
     assert "fx 54.447329\n" in (root / "intrinsic" / "asus.ini").read_text()
-    assert not list(root.rglob(".*")), "nothing unfinished is left"
+    assert not list(root.rglob(".*")), "no temporary file is left"
 
 
 @pytest.mark.acceptance
@@ -116,7 +116,7 @@ def test_write_scenes_killed_process_raises_one_line_error(tmp_path: Path) -> No
         write_scenes(tmp_path / "rooms", {"666": deadly}, RECORDING, jobs=1)
 
 
-def test_write_scenes_choose_prefers_own_then_untouched_scene(tmp_path: Path) -> None:
+def test_write_scenes_chooses_current_then_untouched_scene(tmp_path: Path) -> None:
     recording = BenchmarkSettings(frames=3 * FRAMES_AT_ONCE, width=64)
     first, second = (_Scene(tmp_path / name, SPEC, recording) for name in ("007", "008"))
     scenes = [first, second]
@@ -127,7 +127,7 @@ def test_write_scenes_choose_prefers_own_then_untouched_scene(tmp_path: Path) ->
     second.take()
     for _ in range(3):
         first.take()
-    assert first.ready == 0, "the scene waits for files that other processes write"
+    assert first.ready == 0, "other processes are writing the remaining files"
     assert _choose(scenes, first) is second
     first.running = 0
     assert first.ready == 1

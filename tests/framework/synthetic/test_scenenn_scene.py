@@ -60,7 +60,7 @@ def poses(scene: SceneNNScene):
     return read_trajectory_log(trajectory_file(scene.folder)).poses
 
 
-def test_scenenn_scene_files_follow_scenenn_naming(scene: SceneNNScene) -> None:
+def test_scenenn_scene_files_have_scenenn_names(scene: SceneNNScene) -> None:
     names = {str(path.relative_to(scene.folder)) for path in scene.folder.rglob("*.*")}
     numbered = {f"{kind}/{kind}{k + 1:05d}.png" for k in SHOWN for kind in ("image", "depth")}
     assert names == numbered | {"007.ply", "007.xml", "timestamp.txt", "trajectory.log"}
@@ -92,7 +92,7 @@ def test_scenenn_scene_annotation_labels_match_mesh(scene: SceneNNScene, mesh: P
     annotated = read_annotation(scene.folder / "007.xml")
     labels = mesh.properties["label"]
     assert sorted(one.id for one in annotated) == sorted(set(labels.tolist()) - {0})
-    assert max(one.id for one in annotated) > 1000, "ids are no small numbers"
+    assert max(one.id for one in annotated) > 1000, "ids are not consecutive"
     names = [one.nyu_class for one in annotated if one.nyu_class in SCENENN_TO_COCO]
     assert sorted(set(names) - {"books"}) == ["chair", "toilet"]
     assert names.count("chair") == 2
@@ -114,7 +114,7 @@ def test_scenenn_scene_mesh_matches_rendered_depth_and_labels(scene: SceneNNScen
     depth, instance_ids = picture.depth, picture.instance_ids
     hits = RayCaster(mesh.vertices, mesh.triangles).cast(image_rays(scene.camera, poses(scene)[index]))
     met = hits.triangle != NO_TRIANGLE
-    assert met[picture.unread < 1].mean() > 0.97, "holes only along what hides something, and where nothing is read"
+    assert met[picture.unread < 1].mean() > 0.97, "holes only at occlusion borders"
     same = met & (np.abs(hits.distance - depth) < 1e-3)
     assert same.sum() > 0.985 * met.sum()
     labels = mesh.properties["label"][mesh.triangles[hits.triangle, 0]]
@@ -130,7 +130,7 @@ def test_scenenn_scene_depth_in_millimeters_matches_mesh(scene: SceneNNScene, me
     read = (depth_mm > 0) & (hits.triangle != NO_TRIANGLE)
     error = np.abs(depth_mm[read] - 1000 * hits.distance[read])
     assert read.mean() > 0.6
-    assert np.median(error / (hits.distance[read] ** 2)) < 3.0, "mm at 1 m: the sensor's noise grows with the square"
+    assert np.median(error / (hits.distance[read] ** 2)) < 3.0, "mm at 1 m; noise is quadratic in depth"
     color = read_color(color_file)
     assert color.shape == (*scene.camera.shape, 3)
     assert color.std() > 10
@@ -154,7 +154,7 @@ def test_benchmark_settings_out_of_range_raise(wrong: dict[str, float]) -> None:
 def test_scenenn_scene_half_rate_equals_every_second_frame(
     scene: SceneNNScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scenenn_scene, "NOISE", 0.0)  # of color: each frame has its own grain
+    monkeypatch.setattr(scenenn_scene, "NOISE", 0.0)  # color noise differs between frames
     (tmp_path / "image").mkdir()
     (tmp_path / "depth").mkdir()
     half = replace(RECORDING, rate=RECORDING.rate / 2)
@@ -167,4 +167,4 @@ def test_scenenn_scene_half_rate_equals_every_second_frame(
         other.write_frame(index)
         colors.append(read_color(frame_files(tmp_path, index)[0]))
     np.testing.assert_array_equal(colors[0], colors[1])
-    assert (colors[0] != colors[2]).any(), "twice the rate: only half as far"
+    assert (colors[0] != colors[2]).any(), "at twice the rate the camera moves half as far"

@@ -1,4 +1,4 @@
-"""Tests of a rendered room as a sequence: exact poses, repeatable, with hand-held motion."""
+"""Tests of rendered rooms as sequences: exact poses, repeatable frames and hand-held motion."""
 
 import hashlib
 import os
@@ -116,10 +116,10 @@ def test_synthetic_frames_agree_after_reprojection(exact):
     same = np.all([b.truth.instance_ids[y + j, x + i] == own for i in (0, 1) for j in (0, 1)], axis=0)
     f, g = seen[:, 0] - x, seen[:, 1] - y
     weights = [((1 - f) * (1 - g), 0, 0), (f * (1 - g), 1, 0), ((1 - f) * g, 0, 1), (f * g, 1, 1)]
-    # The inverse of depth is linear over the image of a plane, so interpolating it is exact there.
+    # Inverse depth is linear over the image of a plane, so its interpolation is exact on planes.
     inverse_depth = sum(w / np.maximum(b.depth[y + j, x + i], 1e-6) for w, i, j in weights)
     error = np.abs(1 / inverse_depth - z)[same]
-    visible = error < 0.05  # the other points are hidden in b
+    visible = error < 0.05  # the other points are occluded in b
     assert visible.mean() > 0.9
     assert np.median(error) < 1e-5
     assert np.quantile(error[visible], 0.9) < 1e-3
@@ -139,7 +139,7 @@ def test_walk_has_hand_held_camera_motion(bedroom, exact):
         assert np.rad2deg(sum(turns)) > 90
         assert position[:, 2].min() > 1.2
         assert position[:, 2].max() < 1.7
-        assert np.abs(np.diff(position, n=3, axis=0)).max() < 1e-4  # smooth: no jerk
+        assert np.abs(np.diff(position, n=3, axis=0)).max() < 1e-4  # m; no jerk
 
 
 def test_walk_keeps_distance_from_walls_and_furniture(bedroom, exact):
@@ -193,7 +193,7 @@ def test_synthetic_parameter_out_of_range_raises(values, name):
 
 
 def test_synthetic_simulated_color_delay_moves_color_and_truth():
-    """Two frames are 1/30 s apart, so a delay of 1/30 s shows the color of the next frame."""
+    """Two frames are 1/30 s apart, so with a delay of 1/30 s each frame has the color of the next frame."""
     plain = Synthetic(seed=1, noise=0.0, **SMALL)
     late = Synthetic(seed=1, noise=0.0, simulated_color_delay=1 / 30, **SMALL)
     np.testing.assert_array_equal(late[3].depth, plain[3].depth)

@@ -88,7 +88,7 @@ def test_table_difference_error_is_over_scenes(tmp_path: Path) -> None:
             run(tmp_path, row, seed, ap, 1.0, scene=scene)
     text = write_tables(tmp_path)
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert "| other | 6 | +0.200 ± 0.100 |" in lines  # over six runs, it would be 0.045 and called significant
+    assert "| other | 6 | +0.200 ± 0.100 |" in lines  # the error over six runs would be 0.045: significant
     assert "paired by seed, scene: mean ± standard error over the values of scene, after averaging" in text
     with (tmp_path / "table.csv").open() as file:
         _, other = csv.DictReader(file)
@@ -104,7 +104,7 @@ def test_table_notes_list_missing_runs(sweep: Path) -> None:
     text = write_tables(sweep)
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "| identity | 3 | 0.300 ± 0.141 (2 of 3) | 0.3 ± 0.6 | ground_truth/tracked |" in lines
-    assert "| identity | 1 | -0.300 | -150.0 |" in lines  # seed 0 is the only pair, and has no error
+    assert "| identity | 1 | -0.300 | -150.0 |" in lines  # seed 0 is the only pair, so there is no error
     assert "- Missing in chain: seed=1,7." in lines
     assert "- Missing in identity: seed=2." in lines
     assert "- Incomplete: row=chain,seed=1: failed: the map is full." in lines
@@ -188,7 +188,7 @@ def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str |
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert lines[2] == "| row | runs | Hz | refinement (ms) | frames lost | poses |"
     assert "| the paper (published) | – | 10.8 | not known | – | tracked |" in lines
-    assert "Voxblox++ (published)" not in text, "an uninformative line"
+    assert "Voxblox++ (published)" not in text, "a row without values is omitted"
     assert "- Published, the paper: DDNS 2020, article 2528954; all components on every frame of 640x480" in text
     unknown = [line for line in lines if "Published results not looked up" in line]
     assert unknown == [
@@ -201,7 +201,7 @@ def test_table_on_scenenn_has_published_run_times(sweep: Path, annotation: str |
     ("dataset", "annotation", "only"),
     [
         ("scenenn", BenchmarkSettings().release, ""),
-        # one row was measured in the rooms, the others on the real data
+        # one row was measured on synthetic rooms, the others on real data
         ("scenenn", BenchmarkSettings().release, "chain"),
         ("scannet", "ScanNet v2", ""),
         ("synthetic", None, ""),
@@ -221,7 +221,7 @@ def test_table_on_other_data_has_no_published_numbers(
 
 
 def test_table_published_row_without_values_is_only_named(sweep: Path) -> None:
-    """The paper's times are known in Hz, not by stage, and it does not report lost frames."""
+    """The paper reports Hz, but neither times per stage nor lost frames."""
     of_dataset(sweep, "scenenn")
     for columns, named in ((["stage_ms.refinement.median"], True), (["frames_lost"], False)):
         table = RUN_TIMES | {"columns": columns}
@@ -232,7 +232,7 @@ def test_table_published_row_without_values_is_only_named(sweep: Path) -> None:
 
 
 def test_table_split_row_is_compared_with_matching_baseline(tmp_path: Path) -> None:
-    """The command line splits rows in two: voxels of one size are compared with each other."""
+    """The command line splits rows by voxel size; only rows with equal voxel sizes are compared."""
     root = tmp_path / "x"
     root.mkdir()
     (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": TABLE, "rows": ROWS})))
@@ -255,11 +255,11 @@ def test_table_unknown_metric_is_dash(sweep: Path) -> None:
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": TABLE | {"columns": ["no.such"]}, "rows": ROWS}))
     text = write_tables(sweep)
     assert "| identity |    3 |       – | ground_truth |" in text
-    assert "- Metrics in no run: no.such." in text, "it may be misspelt"
+    assert "- Metrics in no run: no.such." in text, "it may be misspelled"
 
 
 def test_table_without_experiment_has_available_columns(tmp_path: Path) -> None:
-    """Only columns with values are shown: your own recordings have no true instances."""
+    """Only columns with values are shown; your own recordings have no ground-truth instances."""
     poses = {"trajectory.ate_rmse_m": 0.012, "frames_lost": 2, "fps": 21.5}
     for name in ("a", "b"):
         run(tmp_path, name, 0, None, 1.0, **poses)
@@ -362,7 +362,7 @@ def test_table_notes_name_data_without_evaluation(tmp_path: Path) -> None:
     assert "- Data: dataset=desk; 90 to 600 frames per run.\n" in write_tables(tmp_path)
 
 
-def test_table_heads_have_units() -> None:
+def test_table_headers_have_units() -> None:
     keys = ("instances.ap50_agnostic", "stage_ms.update.median", "stage_ms.update.p95", "trajectory.ate_rmse_m", "x.y")
     assert [head(key) for key in keys] == ["AP50 agnostic", "update (ms)", "update (ms, p95)", "ATE (m)", "x.y"]
 

@@ -59,7 +59,7 @@ def run(root: Path, row: str, scene: str, seed: int, tracker: str = "ground_trut
 
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
-    """Return three rows, two scenes, two seeds and one failed run."""
+    """Write the runs of three rows, two scenes and two seeds, one of them failed; return their folder."""
     root = tmp_path / "table3"
     root.mkdir()
     experiment(root, ACROSS)
@@ -126,7 +126,7 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
     )
     found, missing = "**0.700 ± 0.141** | 0.400 ± 0.141 |", " ".join(["missing |"] * 8)
     assert first[2] == f"| ours | ground truth | made up | {found} {missing} **0.550 ± 0.000 (2 of 10)** |"
-    assert len(first) == 6, "the paper and others, of which nothing is known, have no line"
+    assert len(first) == 6, "systems without published values have no line"
     assert first[-1] == (
         "| Voxblox++ with Detectron2 panoptic (published) | ground truth | not known "
         "| 0.655 | 0.033 | 0.676 | 0.269 | 0.517 | 0.325 | 0.299 | – | 0.190 | – | – |"
@@ -139,7 +139,7 @@ def test_sequence_columns_table_has_published_rows(sweep: Path) -> None:
 
 @pytest.mark.parametrize("table", [ACROSS | {"published": "table3"}, BY | {"published": "table2"}])
 def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: dict[str, Any]) -> None:
-    """There are no columns or groups of sequences that only the publication has."""
+    """Sequences that only the publication has get no columns or groups."""
     experiment(sweep, table)
     run(sweep, "ours", "016", 2, release="synthetic 1, seed 0, 240 frames", **{AP50: 0.5})
     text = write_tables(sweep)
@@ -149,7 +149,7 @@ def test_table_of_synthetic_rooms_has_no_published_numbers(sweep: Path, table: d
 
 
 def test_table_compares_rows_of_same_pose_source(sweep: Path) -> None:
-    """Better poses do not improve the method: a tracked row is compared and ranked only with tracked rows."""
+    """A tracked row is compared and ranked only with tracked rows, because poses affect the results."""
     for row, value in (("ours", 0.2), ("prior", 0.3)):
         run(sweep, row, "011", 0, tracker="icp", **{AP50: value})
     first, second = grids(write_tables(sweep))
@@ -188,7 +188,7 @@ def test_table_tracked_row_needs_tracked_baseline(sweep: Path) -> None:
 def test_table_separates_other_data_and_annotations(
     sweep: Path, changed: dict[str, Any], usual: str, other: str, annotation: str
 ) -> None:
-    """They are neither averaged in a row nor compared between rows."""
+    """Runs with different data or annotations are neither averaged nor compared."""
     for path in sweep.glob("*row=other*/metrics.json"):
         path.unlink()
     run(sweep, "ours", "078", 0, **{AP50: 0.9}, **changed)
@@ -271,7 +271,7 @@ def test_sequence_groups_table_has_published_rows_in_group(sweep: Path) -> None:
     first, _ = grids(write_tables(sweep))
     han = "Voxblox++ with Detectron2 panoptic (published) | ground truth"
     assert first[5] == f"| | {han} | not known | 0.952 | – | 0.655 |"
-    assert f"| 030 | {han} | not known | 0.991 | 0.000 | 0.676 |" in first  # no run of ours, yet
+    assert f"| 030 | {han} | not known | 0.991 | 0.000 | 0.676 |" in first  # without a run of ours
     assert "| Voxblox++ (published) |" not in "".join(first)
     assert not [line for line in first if line.startswith("| 206")]
 

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.integration
 
 
 class Forgetful(SphereDetector):
-    """Detects less in every call."""
+    """Detector that finds fewer objects in every call."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class Forgetful(SphereDetector):
 
 
 class Sharing(SphereDetector):
-    """Declares concurrent detection, and keeps one frame for all calls."""
+    """Detector that declares concurrent detection, but shares one frame between all calls."""
 
     concurrent = True
 
@@ -58,7 +58,7 @@ class Sharing(SphereDetector):
 
 @dataclass
 class Shifting(ClusterRefiner):
-    """Moves points."""
+    """Refiner that moves points."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return replace(clusters, points_world=clusters.points_world + np.float32(0.01))
@@ -66,7 +66,7 @@ class Shifting(ClusterRefiner):
 
 @dataclass
 class Dropping(ClusterRefiner):
-    """Drops all points."""
+    """Refiner that drops all points."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return replace(clusters, cluster=np.full_like(clusters.cluster, -1))
@@ -74,7 +74,7 @@ class Dropping(ClusterRefiner):
 
 @dataclass
 class Writing(PoseTracker):
-    """Writes to the map, and begins at an arbitrary pose."""
+    """Tracker that starts at an arbitrary pose and, if `writes`, changes the map."""
 
     writes: bool = False
 
@@ -85,11 +85,11 @@ class Writing(PoseTracker):
 
 
 class Careless(GridFuser):
-    """Renders its map from any pose."""
+    """Fuser whose map is rendered from any pose, even an invalid one."""
 
 
 class Backwards(CornerRoom):
-    """Returns its frames in reverse order."""
+    """Dataset that returns its frames in reverse order."""
 
     def __getitem__(self, k: int) -> Frame:
         return super().__getitem__(len(self) - 1 - k)
@@ -116,7 +116,7 @@ def test_contract_detects_broken_plugin(contract: type[Any], plugin: object, tes
 
 
 class Late(Viewer):
-    """Reads the map after the call, and writes into the working folder."""
+    """Viewer that reads the map after the call and writes to the working directory."""
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
         self.scene = scene
@@ -130,7 +130,7 @@ class Late(Viewer):
 
 
 class Painting(Viewer):
-    """Writes into the frame."""
+    """Viewer that changes the frame."""
 
     def show(self, frame: Frame, *_: object) -> None:
         frame.color[0, 0] = 255 - frame.color[0, 0]
@@ -160,7 +160,7 @@ def test_viewer_contract_detects_broken_viewer(
 
 
 def option(folder: Path, text: str) -> OptionContract:
-    """Return the contract of a refiner's option with this YAML."""
+    """Return the contract of a refiner option with this YAML."""
     (folder / "refiner").mkdir()
     (folder / "refiner" / "own.yaml").write_text(text)
 

@@ -15,7 +15,7 @@ T_WORLD_CAMERA = exp_se3(np.array([0.4, -0.2, 1.0, 0.3, -0.6, 0.2]))
 
 
 def matches(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pixels, world points and depths that agree exactly."""
+    """Return the pixels (N, 2), world points (N, 3), m, and depths (N,), m, of exact matches."""
     rng = np.random.default_rng(seed)
     points = rng.uniform((-1, -1, 1), (1, 1, 4), (count, 3))
     points[:, :2] *= 0.4 * points[:, 2:]
@@ -46,8 +46,8 @@ def test_absolute_pose_rejects_outliers() -> None:
 
 
 @pytest.mark.parametrize("factor", [1, 3])
-def test_absolute_pose_error_limit_follows_resolution(factor: int) -> None:
-    """Pixels of the same images, 3 times larger, are 3 times less accurate."""
+def test_absolute_pose_error_limit_scales_with_resolution(factor: int) -> None:
+    """In an image that is enlarged by 3, pixel errors are 3 times larger."""
     pixels, points_world, _ = matches(100)
     camera = Camera(
         factor * CAMERA.width, factor * CAMERA.height, factor * CAMERA.fx, factor * CAMERA.fy,
@@ -104,7 +104,7 @@ def test_absolute_pose_ignores_non_finite_matches() -> None:
 def test_absolute_pose_rejects_matches_with_inconsistent_depth() -> None:
     pixels, points_world, depth = matches(100)
     depth[:30] *= 1.2
-    depth[30:50] = 0  # missing depth counts neither for nor against
+    depth[30:50] = 0  # missing depth does not affect matches
     found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, depth)
     assert found is not None
     assert found.inliers.tolist() == [False] * 30 + [True] * 70

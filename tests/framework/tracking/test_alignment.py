@@ -61,7 +61,7 @@ def test_color_alignment_at_true_pose_has_zero_step(level: int) -> None:
     T = pose(0.03, -0.02, 0.01, (0.01, 0.02, -0.01))
     xi, equations = step(WALL, WALL.frame(T), level, inverse(T_VIEW) @ T, COLOR)
     assert equations.matched > 0.5 * CAMERA.width * CAMERA.height / 4**level
-    assert np.abs(xi[:2] + 1.5 * np.array([xi[4], -xi[3]])).max() < 2e-3, "on the wall, m"
+    assert np.abs(xi[:2] + 1.5 * np.array([xi[4], -xi[3]])).max() < 2e-3, "shift on the wall, m"
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
@@ -104,7 +104,7 @@ def test_depth_alignment_step_recovers_motion_between_planes(level: int) -> None
 
 
 def test_depth_alignment_rejects_points_with_different_normals() -> None:
-    """A wall meets the same wall rotated by 60 degrees: near its axis, points are close but on another surface."""
+    """The wall is compared with a copy rotated by 60 degrees, which is close to it near the rotation axis."""
     n = np.array([np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)])
     turned = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.5]))])
     _, equations = step(WALL, turned.frame(T_VIEW), 0, np.eye(4), DEPTH)
@@ -115,7 +115,7 @@ def test_depth_alignment_rejects_points_with_different_normals() -> None:
 
 
 def with_noisy_normals(model: ModelView) -> ModelView:
-    """Return normals as in a map of one frame, a few meters away."""
+    """Return the model with noisy normals, as in a map of one frame at a distance of a few meters."""
     noisy = model.normals + np.random.default_rng(0).normal(0, 0.5, model.normals.shape).astype(np.float32)
     noisy /= np.linalg.norm(noisy, axis=0)
     return model._replace(normals=np.where(model.depth > 0, noisy, 0).astype(np.float32))
@@ -123,7 +123,7 @@ def with_noisy_normals(model: ModelView) -> ModelView:
 
 @pytest.mark.parametrize("level", [1, 2])
 def test_smoothed_normals_allow_motion_along_wall(level: int) -> None:
-    """A wall does not determine motions along it; a slanted one at the image border determines them."""
+    """A frontal wall does not constrain motion along it; a slanted wall at the image border does."""
     room = Scene(planes=[(np.array([0, 0, -1.0]), -2.0), (np.array([-0.8, 0, -0.6]), -1.95)])
     T = T_VIEW @ exp_se3(np.array([0.02, 0, 0, 0, 0, 0]))
     weights = DEPTH._replace(max_distance=np.float32(0.3), geometric_scale=np.float32(16))
@@ -133,7 +133,7 @@ def test_smoothed_normals_allow_motion_along_wall(level: int) -> None:
         return float(xi[0] / 0.02)
 
     assert share_found(lambda model: model) == pytest.approx(1, abs=0.02)
-    assert share_found(with_noisy_normals) < 0.8, "the case must have outliers"
+    assert share_found(with_noisy_normals) < 0.8, "noisy normals shorten the step"
     assert share_found(lambda model: smoothed(with_noisy_normals(model), level)) == pytest.approx(1, abs=0.1)
 
 
@@ -184,7 +184,7 @@ def test_alignment_beyond_range_is_scale_invariant(weights: Weights) -> None:
     assert far.energy == pytest.approx(near.energy, rel=1e-3)
 
 
-def test_distance_gate_beyond_range_grows_with_depth() -> None:
+def test_distance_gate_beyond_range_increases_with_depth() -> None:
     """At 17 to 23 m, Tukey's gate of 0.1 m allows more than 0.3 m. VoxelHashing's gate of 0.15 m is fixed."""
     backward = np.array([0, 0, 0.3, 0, 0, 0])
     assert enlarged(16, backward, DEPTH).matched > 1000
@@ -215,7 +215,7 @@ MAXIMA = LinearWeights(np.float32(4.0), np.float32(0.1))
 def slow_equations(
     level: PyramidLevel, model: ModelView, intensity: np.ndarray, T: np.ndarray, weights: Weights, linear: LinearWeights
 ) -> NormalEquations:
-    """Return the equations with linear weights in double precision, with derivatives by finite differences."""
+    """Return the equations with linear weights, computed in double precision with finite differences."""
     height, width = model.depth.shape
     v, u = np.nonzero(level.depth)
     z = level.depth[v, u].astype(np.float64)
@@ -241,7 +241,7 @@ def slow_equations(
     compared &= np.min(corners, axis=0) >= 0
 
     def errors(xi: np.ndarray) -> np.ndarray:
-        """Return (2, P) the distances from the planes and the intensity differences after a twist."""
+        """Return the distances from the planes, m, and the intensity differences (2, P) after a twist."""
         moved = exp_se3(xi)[:3, :3] @ p + exp_se3(xi)[:3, 3:]
         a = (model.fx * moved[0] / moved[2] + model.cx + 0.5) / scale - 0.5 - left
         b = (model.fy * moved[1] / moved[2] + model.cy + 0.5) / scale - 0.5 - top
@@ -263,7 +263,7 @@ def slow_equations(
 @pytest.mark.parametrize("level", [0, 1, 2])
 @pytest.mark.parametrize("dropped", [{}, {"color_weight": 0}, {"depth_weight": 0}], ids=["both", "depth", "color"])
 def test_linear_weights_match_slow_reference(level: int, dropped: dict[str, int]) -> None:
-    """Weights have all sizes, and some points exceed each maximum; no projection is on a pixel border."""
+    """Weights cover their whole range, and some points exceed each maximum; no projection is on a pixel border."""
     weights = VOXEL_HASHING._replace(**{name: np.float32(value) for name, value in dropped.items()})
     T = exp_se3(np.array([0.011, -0.007, 0.06, 0.003, -0.005, 0.002]))
     frame = CORNER.frame(T_VIEW @ exp_se3(np.array([0.05, -0.03, 0.02, 0.02, -0.03, 0.01])))
@@ -281,7 +281,7 @@ def test_linear_weights_match_slow_reference(level: int, dropped: dict[str, int]
 
 
 def test_linear_weight_is_zero_at_maximum_depth() -> None:
-    """The wall is 1.5 m away and seen from its true pose, so that the distance is 0 and all depths are similar."""
+    """The wall is 1.5 m away and the pose is exact, so distances are 0 and all depths are similar."""
     frame = WALL.frame(T_VIEW)
     model, intensities = model_of(WALL)
     level = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)[0]

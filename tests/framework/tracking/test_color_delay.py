@@ -31,7 +31,7 @@ PALETTE = np.array([[0, 0, 0], [60, 60, 60], [230, 230, 230], [250, 180, 180], [
 
 
 def turning(t: float) -> Float64:
-    """Return the pose of a camera that turns to and fro in two axes."""
+    """Return the pose of a camera that rotates back and forth about its axes, at time `t`, s."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([0.12 * np.sin(5 * t), 0.2 * np.sin(4 * t + 1), 0.05 * np.sin(3 * t)]).as_matrix()
     T[:3, 3] = [0.05 * np.sin(2 * t), 0, 0]
@@ -39,7 +39,7 @@ def turning(t: float) -> Float64:
 
 
 def delayed_frames(delay: float, count: int = 60, speed: float = 1.0) -> Iterator[tuple[Frame, Float64]]:
-    """Yield frames with color `delay` s after depth, with their poses."""
+    """Yield `count` frames whose color was taken `delay` s after depth, and their poses."""
     scene = Scene([WALL], SPHERES)
     for k in range(count):
         t = k / 30
@@ -62,7 +62,7 @@ def test_delay_estimator_known_delay_is_found_within_2_ms(delay: float) -> None:
 def test_delay_estimator_uses_timestamps_of_both_images() -> None:
     estimator = DelayEstimator()
     for frame, pose in delayed_frames(0.02):
-        late = 0.008 if frame.index % 2 else 0.012  # the timestamp of depth, after the one of color
+        late = 0.008 if frame.index % 2 else 0.012  # s, from the color timestamp to the depth timestamp
         stamped = Frame(
             frame.index, frame.timestamp, frame.color, frame.depth, CAMERA,
             color_timestamp=frame.timestamp - late, depth_timestamp=frame.timestamp,
@@ -71,7 +71,7 @@ def test_delay_estimator_uses_timestamps_of_both_images() -> None:
     assert estimator.estimate.seconds == pytest.approx(0.03, abs=0.002)
 
 
-def test_delay_estimator_standing_camera_stays_unknown() -> None:
+def test_delay_estimator_of_static_camera_is_unknown() -> None:
     estimator = DelayEstimator()
     for frame, pose in delayed_frames(0.02, count=40, speed=0):
         estimator.add(frame, pose)
@@ -109,8 +109,8 @@ def test_regress_ignores_outliers() -> None:
     assert regress(np.column_stack([delays, motion]), start=0.02).seconds == pytest.approx(0.02, abs=0.001)
 
 
-def test_regress_deviation_at_constant_motion_is_that_of_offset() -> None:
-    """A constant offset and a delay have the same effect if the camera turns at one rate."""
+def test_regress_constant_motion_has_deviation_of_offset() -> None:
+    """A constant offset and a delay have the same effect if the camera rotates at a constant rate."""
     rng = np.random.default_rng(2)
     motion = np.array([0.3, 0.0]) + rng.normal(0, 0.001, (8 * BLOCKS, 2))
     delays = 0.02 + rng.normal(0, 0.001, len(motion)) / 0.3

@@ -34,7 +34,7 @@ def frame_at(t: float, delay: float, index: int = 0) -> Frame:
 
 
 def error(frame: Frame, expected: np.ndarray) -> float:
-    """Return the mean color difference without the border, where color is outside of the image."""
+    """Return the mean color difference, gray levels, without the border, where color is missing."""
     inner = np.s_[12:-12, 12:-12]
     return float(np.abs(frame.color[inner].astype(float) - expected[inner]).mean())
 
@@ -75,7 +75,7 @@ def test_color_to_depth_pixels_refer_to_color_image() -> None:
 
 
 def test_color_to_depth_timestamps_add_to_delay() -> None:
-    """Color 12 ms after depth: a delay of 20 ms, and a timestamp 8 ms before the one of depth."""
+    """Color is taken 12 ms after depth: its timestamp is 8 ms before that of depth, and the delay is 20 ms."""
     registration = ColorToDepth(0.02)
     for k in range(3):
         frame = replace(frame_at(k / 30, 0.012, k), color_timestamp=k / 30 - 0.008, depth_timestamp=k / 30)

@@ -1,4 +1,4 @@
-"""Limits that grow with depth, and measures without units."""
+"""Tests of the depth scale: limits that increase with depth, and scale-invariant measures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def test_depth_scale_grows_beyond_range(depth: float, growth: float) -> None:
 
 def test_depth_scale_is_median_of_readings() -> None:
     assert DepthScale.of(np.array([[0, 2, 3], [0, 8, 0]], np.float32)).depth == 3
-    assert DepthScale.of(np.zeros((2, 3), np.float32)).growth == 1, "without readings"
+    assert DepthScale.of(np.zeros((2, 3), np.float32)).growth == 1, "no depth"
 
 
 def test_depth_scale_divides_translation_by_growth() -> None:
@@ -30,7 +30,7 @@ def test_depth_scale_divides_translation_by_growth() -> None:
 
 
 def test_information_without_units_is_scale_invariant() -> None:
-    """The derivative of a pixel by a translation is inversely proportional to the depth."""
+    """The derivative of a pixel with respect to a translation is inversely proportional to the depth."""
     rng = np.random.default_rng(0)
     J = rng.normal(size=(20, 6))
     far = np.concatenate([J[:, :3] / 7, J[:, 3:]], axis=1)

@@ -14,7 +14,7 @@ CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 
 
 def blobs(camera: Camera, centers: np.ndarray, sigma: float) -> Frame:
-    """Return white Gaussian blobs on gray, 2 m away."""
+    """Return a frame of white Gaussian blobs on gray at a depth of 2 m."""
     v, u = np.mgrid[: camera.height, : camera.width]
     squared = (u - centers[:, 0, None, None]) ** 2 + (v - centers[:, 1, None, None]) ** 2
     gray = 60 + 160 * np.exp(-squared / (2 * sigma**2)).sum(axis=0)
@@ -30,9 +30,9 @@ def test_feature_positions_have_subpixel_accuracy(camera: Camera) -> None:
     features = FeatureExtractor().extract(blobs(camera, centers, sigma=camera.width / 100))
     distance = np.linalg.norm(features.pixels[:, None] - centers, axis=-1)
     found = distance.min(axis=0)
-    assert found.max() < 0.1 * camera.width / 320, "a tenth of a pixel of the image that SIFT sees"
+    assert found.max() < 0.1 * camera.width / 320, "0.1 px of the image used by SIFT"
     error = (features.pixels[distance.argmin(axis=0)] - centers).mean(axis=0)
-    assert np.abs(error).max() < 0.03 * camera.width / 320, "not on one side: half-pixel faults are 0.25 and more"
+    assert np.abs(error).max() < 0.03 * camera.width / 320, "no bias; half-pixel errors are at least 0.25 px"
     assert (features.depth[distance.argmin(axis=0)] == 2).all()
 
 
@@ -89,7 +89,7 @@ def test_feature_matching_matches_brute_force_reference() -> None:
         ]
         assert match(query, reference, max_ratio).tolist() == [list(pair) for pair in expected]
     assert len(match(query, reference, 0.8)) >= 30
-    assert len(match(query, reference[:1], 0.8)) == 0, "nothing to compare the one candidate with"
+    assert len(match(query, reference[:1], 0.8)) == 0, "the ratio test needs two candidates"
 
 
 def test_feature_extractor_parameter_out_of_range_raises() -> None:

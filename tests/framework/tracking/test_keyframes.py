@@ -75,7 +75,7 @@ def test_keyframes_skip_near_frames_after_featureless_frame() -> None:
     keyframes.extractor.extract = lambda frame: seen.append(frame) or extract(frame)
     nothing = blanked(papered_frame(pose(0)))
     assert not any(has_become_one(keyframes, nothing, pose(x)) for x in (0, 0.01, 0.04, 0.06, 0.07))
-    assert len(seen) == 2, "at 0 and at 0.06 m"
+    assert len(seen) == 2, "features are extracted at 0 m and 0.06 m"
     without_depth = replace(papered_frame(pose(1)), depth=np.zeros(CAMERA.shape, np.float32))
     assert not has_become_one(keyframes, without_depth, pose(1.0))
     assert has_become_one(keyframes, papered_frame(pose(0.9)), pose(0.9))
@@ -83,7 +83,7 @@ def test_keyframes_skip_near_frames_after_featureless_frame() -> None:
 
 
 def slowed(keyframes: Keyframes, seconds: float) -> None:
-    """Delay the feature extraction."""
+    """Delay the feature extraction by `seconds` s."""
     extract = keyframes.extractor.extract
 
     def slow(frame: Frame) -> Features:
@@ -95,7 +95,7 @@ def slowed(keyframes: Keyframes, seconds: float) -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, 0.05])
 def test_keyframes_are_independent_of_extraction_time(seconds: float) -> None:
-    """The camera moves in steps of all sizes, half of them without texture, past more keyframes than are kept."""
+    """The camera moves in steps of different sizes, half of them without texture; old keyframes are removed."""
     rng = np.random.default_rng(3)
     at_once, later = (Keyframes(max_keyframes=4, min_distance=0.2) for _ in range(2))
     slowed(later, seconds)
@@ -126,10 +126,10 @@ def test_keyframes_add_waits_only_for_relevant_features() -> None:
     keyframes.extractor.extract = held
     keyframes.add(papered_frame(pose(0)), pose(0))
     keyframes.add(papered_frame(pose(0.04)), pose(0.04))
-    assert not may_end.is_set(), "the camera is at this keyframe"
+    assert not may_end.is_set(), "near the pending keyframe, add does not wait"
     threading.Timer(0.1, may_end.set).start()
     keyframes.add(papered_frame(pose(0.1)), pose(0.1))
-    assert may_end.is_set(), "near enough for a keyframe, not for a frame with too few features"
+    assert may_end.is_set(), "here the result depends on the pending features"
     assert len(keyframes) == 1
 
 
@@ -183,7 +183,7 @@ def test_relocalize_is_deterministic(keyframes: Keyframes) -> None:
     np.testing.assert_array_equal(found[0].T_world_camera, found[1].T_world_camera)
 
 
-def test_relocalize_unknown_place_returns_none(keyframes: Keyframes) -> None:
+def test_relocalize_in_unknown_scene_returns_none(keyframes: Keyframes) -> None:
     rng = np.random.default_rng(0)
     frame = papered_frame(pose(0))
     noise = rng.integers(0, 255, (*CAMERA.shape, 3)).astype(np.uint8)
@@ -227,8 +227,8 @@ def test_keyframes_parameter_out_of_range_raises(bound: dict[str, float]) -> Non
         Keyframes(**bound)
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/data")
-def test_relocalize_real_video_finds_only_known_places() -> None:
+@pytest.mark.skipif(not SHARED.is_dir(), reason="requires ../shared/data")
+def test_relocalize_real_video_succeeds_only_in_known_scene() -> None:
     kitchen = RgbdFolder(SHARED / "redkitchen")
     keyframes = Keyframes()
     for k in range(0, 150, 10):

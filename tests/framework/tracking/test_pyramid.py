@@ -50,7 +50,7 @@ def test_model_intensities_close_single_pixel_holes() -> None:
 
 
 def slope(step: float, nearest: float) -> np.ndarray:
-    """Return depth (120, 160) m from `nearest` to 4 m, in whole steps, 0 = unchanged."""
+    """Return depth (120, 160), m, from `nearest` to 4 m, rounded down to multiples of `step`; 0 = not rounded."""
     depth = np.broadcast_to(np.linspace(nearest, 4, 160), (120, 160)) + np.linspace(0, 0.02, 120)[:, None]
     return (np.floor(depth / step) * step if step else depth).astype(np.float32)
 
@@ -58,7 +58,7 @@ def slope(step: float, nearest: float) -> np.ndarray:
 @pytest.mark.parametrize("nearest", [0.6, 1.0, 2.0])
 def test_is_coarse_detects_eight_bit_depth(nearest: float) -> None:
     assert is_coarse(slope(0.0392, nearest), otherwise=False)
-    disparity = 8 * 580 * 0.075 / slope(0, nearest)  # of a Kinect, in eighths of a pixel
+    disparity = 8 * 580 * 0.075 / slope(0, nearest)  # of a Kinect, px / 8
     kinect = (8 * 580 * 0.075 / np.rint(disparity)).astype(np.float32)
     for fine in (slope(0.001, nearest), slope(0, nearest), kinect):
         assert not is_coarse(fine, otherwise=True)

@@ -39,7 +39,7 @@ def test_keyframe_term_step_recovers_pose_from_any_view(level: int) -> None:
     assert np.linalg.norm((inverse(truth) @ T_view_camera)[:3, 3]) < 0.3 * before
 
 
-def test_keyframe_term_at_finest_level_has_weight_of_its_points() -> None:
+def test_keyframe_term_at_finest_level_is_scaled_by_point_ratio() -> None:
     term = KeyframeTerm.at(RawKeyframe.of(pyramid(T_KEY), T_KEY), T_KEY, DepthScale())
     assert term is not None
     levels = pyramid(T_KEY)
@@ -52,7 +52,7 @@ def test_keyframe_term_at_finest_level_has_weight_of_its_points() -> None:
     ("offset", "weight"),
     [(0.0, 1.0), (NEW_DISTANCE, 1.0), (0.5 * (NEW_DISTANCE + USED_DISTANCE), 0.5), (USED_DISTANCE, None), (1.0, None)],
 )
-def test_keyframe_term_weight_falls_with_distance(offset: float, weight: float | None) -> None:
+def test_keyframe_term_weight_decreases_with_distance(offset: float, weight: float | None) -> None:
     keyframe = RawKeyframe.of(pyramid(T_KEY), T_KEY)
     for xi in ([offset, 0, 0, 0, 0, 0], [0, 0, 0, 0, offset, 0]):
         term = KeyframeTerm.at(keyframe, T_KEY @ exp_se3(np.array(xi, np.float64)), DepthScale())

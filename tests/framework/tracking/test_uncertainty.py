@@ -1,4 +1,4 @@
-"""Covariances of poses from normal equations with known noise."""
+"""Tests of pose covariances from normal equations with known noise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.tracking.uncertainty import CORRELATED, is_significant, pose_cova
 def equations(
     J: np.ndarray, r: np.ndarray, J_color: np.ndarray | None = None, r_color: np.ndarray | None = None
 ) -> NormalEquations:
-    """Return the equations of unit weights for Jacobians (n, 6) and residuals (n,)."""
+    """Return the equations with unit weights for Jacobians (n, 6) and residuals (n,)."""
     J_color = np.zeros((0, 6)) if J_color is None else J_color
     r_color = np.zeros(0) if r_color is None else r_color
     A_color = J_color.T @ J_color
@@ -24,14 +24,14 @@ def equations(
 
 
 @pytest.mark.parametrize("noise", [1.0, 3.0])
-def test_covariance_follows_residuals_not_assumed_noise(noise: float) -> None:
+def test_covariance_depends_on_residuals_not_assumed_noise(noise: float) -> None:
     J = np.random.default_rng(0).normal(size=(40, 6))
     C = pose_covariance([equations(J, np.full(40, noise))], np.eye(4))
     np.testing.assert_allclose(C, CORRELATED * noise**2 * np.linalg.inv(J.T @ J))
 
 
 def test_covariance_of_terms_matches_simulated_estimates() -> None:
-    """Three times the assumed noise in color, half of it in geometry; least squares with unit weights."""
+    """The noise of color is 3 times the assumed noise, that of geometry half of it; all weights are 1."""
     rng = np.random.default_rng(1)
     J, J_color = rng.normal(size=(60, 6)), rng.normal(size=(60, 6))
     both = np.concatenate([J, J_color])
@@ -42,8 +42,8 @@ def test_covariance_of_terms_matches_simulated_estimates() -> None:
     np.testing.assert_allclose(np.cov(estimates.T) / np.outer(scale, scale), found / np.outer(scale, scale), atol=0.03)
 
 
-def test_covariance_is_that_of_camera_frame() -> None:
-    """exp(xi) T_view_camera = T_view_camera exp(Ad xi), with the adjoint of T_camera_view."""
+def test_covariance_is_in_camera_frame() -> None:
+    """exp(xi) T_view_camera = T_view_camera exp(Ad xi), where Ad is the adjoint of T_camera_view."""
     J = np.random.default_rng(2).normal(size=(40, 6))
     T_view_camera = exp_se3(np.array([0.3, -0.2, 0.5, 0.2, 0.4, -0.3]))
     Ad = adjoint(inverse(T_view_camera))
@@ -56,7 +56,7 @@ def test_covariance_is_that_of_camera_frame() -> None:
 @pytest.mark.parametrize("axis", range(6))
 def test_motion_is_significant_beyond_its_uncertainty(axis: int) -> None:
     C = np.diag(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) * 1e-3) ** 2
-    for factor, expected in ((2.4, False), (2.5, True)):  # the square root of 6 is 2.45
+    for factor, expected in ((2.4, False), (2.5, True)):  # the limit is sqrt(6) = 2.45
         xi = np.zeros(6)
         xi[axis] = -factor * np.sqrt(C[axis, axis])
         assert is_significant(exp_se3(xi), C) == expected

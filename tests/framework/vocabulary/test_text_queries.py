@@ -34,7 +34,7 @@ from framework.vocabulary.text_queries import ObjectWords, object_words
         ("wine glasses", ("wine glass",), (), ()),
     ],
 )
-def test_object_words_splits_classes_colors_and_unknown(
+def test_object_words_splits_classes_colors_and_unknown_words(
     query: str, classes: tuple[str, ...], colors: tuple[str, ...], unknown: tuple[str, ...]
 ) -> None:
     assert object_words(query, COCO) == ObjectWords(classes, colors, unknown)

@@ -1,4 +1,4 @@
-"""Tests of detector=mask_rcnn with random tiny networks, and with one that finds a known object."""
+"""Tests of detector=mask_rcnn with random tiny networks, and with one that detects a known object."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ def detector(path):
 
 
 def test_mask_rcnn_class_row_excludes_background(path):
-    """Without suppression across classes, each detection is one label of a proposal, with its softmax."""
+    """Without suppression across classes, each detection is one label of a proposal with its softmax scores."""
     detector, frame = MaskRCNNDetector(weights=path, device="cpu", agnostic_nms_iou=1.0), noise(0)
     seen = []
     classify = detector._network.classify
@@ -45,7 +45,7 @@ def test_mask_rcnn_class_row_excludes_background(path):
     found = detector.detect(frame)
     everything = torch.softmax(seen[0][0].double(), dim=1).numpy()
     assert len(found) > 5
-    assert everything[:, 0].min() > 0.01, "a background that counts"
+    assert everything[:, 0].min() > 0.01, "background is not negligible"
     for score, row in zip(found.scores, found.class_probabilities, strict=True):
         of_objects = everything[:, 1:] / everything[:, 1:].sum(axis=1, keepdims=True)
         nearest = np.abs(of_objects - row).max(axis=1).argmin()
@@ -99,7 +99,7 @@ def test_mask_rcnn_proposal_and_detection_limits_are_respected(path, monkeypatch
     assert len(given[0]) == 7
     one = MaskRCNNDetector(weights=path, device="cpu", proposals_before_nms=1)
     one.detect(noise(4))
-    assert len(given[1]) <= 5, "one a level"
+    assert len(given[1]) <= 5, "one proposal per level"
 
 
 def test_mask_rcnn_sides_default_to_network_settings(path):
@@ -113,7 +113,10 @@ def test_mask_rcnn_sides_default_to_network_settings(path):
 
 
 def known_object(folder, monkeypatch, extent, resized):
-    """Return a detector at a scale; every proposal is a chair in the box x1 y1 x2 y2 of a 160 x 120 image."""
+    """Return a detector that resizes images to a short side of `resized` px and detects one chair.
+
+    `extent` is the box x1 y1 x2 y2 of the chair, px of an image of 160x120 px.
+    """
     network = tiny_network(replace(TINY, short_side=resized, long_side=4 * resized))
     for parameter in network.roi_heads.parameters():
         parameter.data.zero_()
@@ -129,7 +132,7 @@ def known_object(folder, monkeypatch, extent, resized):
 
 @pytest.mark.parametrize("resized", [60, 96, 120, 300])
 def test_mask_rcnn_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch, resized):
-    """Pixels u = 20..59, v = 30..89 have the borders 20..60, 30..90 in every resized image."""
+    """Pixels u = 20..59, v = 30..89 have the borders 20..60, 30..90 at every scale."""
     found = known_object(tmp_path, monkeypatch, (20, 30, 60, 90), resized).detect(noise(6))
     assert len(found) == 1
     expected = np.zeros((120, 160), bool)
@@ -141,11 +144,12 @@ def test_mask_rcnn_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("short_side", [32, 40, 80])
 def test_mask_rcnn_resize_keeps_ramp_position(path, short_side):
-    """A pixel's value is 5 times its position: after resizing, pixel u' shows (u' + 0.5) / scale - 0.5."""
+    """The value of pixel u is 5 u; pixel u' of the resized image shows u = (u' + 0.5) / scale - 0.5."""
     ramp = np.repeat(np.tile(5 * np.arange(50, dtype=np.uint8), (40, 1))[..., None], 3, axis=2)
     image = MaskRCNNDetector(weights=path, device="cpu", short_side=short_side, long_side=400)._resize(picture(ramp))
     places = (np.arange(image.shape[3]) + 0.5) * 40 / short_side - 0.5
-    np.testing.assert_allclose(image[0, 0, 5, 2:-2].numpy(), 5 * places[2:-2], atol=0.51)  # rounded to whole numbers
+    # Values are rounded to integers.
+    np.testing.assert_allclose(image[0, 0, 5, 2:-2].numpy(), 5 * places[2:-2], atol=0.51)
 
 
 def test_mask_rcnn_overflow_raises(tmp_path):
@@ -164,7 +168,7 @@ def test_mask_rcnn_without_proposals_detects_nothing(detector, monkeypatch):
     assert len(detector.detect(noise(8))) == 0
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA here: half precision is not compared")
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="requires CUDA")
 def test_mask_rcnn_half_precision_agrees_with_single(path):
     frame = noise(9)
     half, single = (
@@ -174,7 +178,7 @@ def test_mask_rcnn_half_precision_agrees_with_single(path):
     np.testing.assert_allclose(half.scores[:5], single.scores[:5], atol=0.02)
 
 
-# Faults
+# Errors
 
 
 @pytest.mark.parametrize(

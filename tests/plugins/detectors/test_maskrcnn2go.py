@@ -1,4 +1,4 @@
-"""Tests of Mask R-CNN 2Go: the published network on real images, in integers and in float."""
+"""Tests of Mask R-CNN 2Go: the published network on real images, in 8-bit integers and in float."""
 
 import json
 from pathlib import Path
@@ -30,11 +30,11 @@ def picture(color):
 def shared_picture(scene, index):
     path = SHARED / "data" / scene / "color" / f"{index:06d}.jpg"
     if not path.exists():
-        pytest.skip(f"{path} is absent")
+        pytest.skip(f"{path} does not exist")
     return picture(cv2.imread(str(path))[..., ::-1].copy())
 
 
-in_integers = pytest.mark.skipif(not has_int8_kernels(), reason="this processor has no VNNI")
+in_integers = pytest.mark.skipif(not has_int8_kernels(), reason="requires a CPU with VNNI")
 
 
 @pytest.fixture(scope="module", params=[pytest.param(True, marks=in_integers), False], ids=["int8", "float"])
@@ -69,10 +69,10 @@ def test_maskrcnn2go_detects_expected_objects_in_real_images(detector, scene, in
 
 
 def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
-    """The confident detection of a bed covers the labeled bed of Replica's ground truth."""
+    """Confident detections of beds overlap the ground-truth beds of Replica."""
     root = SHARED / "data" / "replica_floor2"
     if not root.is_dir():
-        pytest.skip(f"{root} is absent")
+        pytest.skip(f"{root} does not exist")
     beds = [int(i) for i, about in json.loads((root / "instances.json").read_text()).items() if about["class"] == "bed"]
     ious = []
     for index in range(0, 123, 2):
@@ -82,11 +82,11 @@ def test_maskrcnn2go_mask_of_bed_overlaps_ground_truth(detector):
             if score > 0.7 and COCO[row.argmax()] == "bed":
                 ious.append(max((mask & (ids == i)).sum() / (mask | (ids == i)).sum() for i in beds))
     assert len(ious) >= 5
-    assert np.median(ious) > 0.7  # its pillows have their own labels
+    assert np.median(ious) > 0.7  # the pillows on a bed have their own labels
 
 
 def test_maskrcnn2go_mask_grids_match_full_graph():
-    """The shortcut computes one class per detection; the full graph computes all 81."""
+    """`_mask_grids` computes one class per detection; the full graph computes all 81."""
     detector = MaskRCNN2Go(device="cpu", int8=False)
     graph, tensors, _ = _read_network(WEIGHTS)
     whole = network_between(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
@@ -99,7 +99,7 @@ def test_maskrcnn2go_mask_grids_match_full_graph():
 
 @in_integers
 def test_maskrcnn2go_int8_detections_agree_with_float():
-    """The confident detections of real images have the same number, classes and similar masks."""
+    """Each confident float detection in real images has a similar int8 mask of the same class."""
     integers, real = MaskRCNN2Go(device="cpu"), MaskRCNN2Go(device="cpu", int8=False)
     agreements = []
     for scene, index in (("redkitchen", 0), ("redkitchen", 290), ("mit76", 0), ("replica_floor2", 40)):
@@ -198,7 +198,7 @@ def test_maskrcnn2go_default_weights_load_from_any_folder(tmp_path, monkeypatch)
     assert MaskRCNN2Go(device="cpu").classes == COCO
 
 
-# Faults
+# Errors
 
 
 def test_maskrcnn2go_missing_weights_error_has_path(tmp_path, monkeypatch):

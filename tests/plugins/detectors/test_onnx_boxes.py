@@ -1,4 +1,4 @@
-"""Tests of box detectors from ONNX files: known networks on known rooms, and YOLOX-nano on real images."""
+"""Tests of box detectors from ONNX files: networks with known outputs, and YOLOX-nano on real images."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +19,11 @@ from tests.support.networks.tiny_networks import constant_network
 
 WEIGHTS = Path("weights") / "yolox_nano" / "yolox_nano.onnx"
 
-# A cup before a wall; the network's input is half the image, and the box of the cup in it is known.
+# A cup in front of a wall; the network's input has half the size of the image, and the box of the cup is known.
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 CUP = np.zeros((120, 160), np.bool_)
 CUP[30:70, 40:60] = True
-BOX = np.array([19.0, 14.0, 31.0, 36.0])  # x1 y1 x2 y2 in the input: the cup with two pixels of the image around it
+BOX = np.array([19.0, 14.0, 31.0, 36.0])  # x1 y1 x2 y2 in the input: the cup with a margin of two image pixels
 SHAPE = (60, 80)
 LABELS = ("chair", "cup", "wall")  # nyu40 has the class wall, which is not an object
 
@@ -38,7 +38,7 @@ def center_size(box):
 
 
 def outputs_of(layout):
-    """Return outputs of a cup (0.6 cup, 0.2 chair), a wall, and a weak candidate."""
+    """Return the network outputs for a cup (0.6 cup, 0.2 chair), a wall and a weak candidate."""
     boxes = np.array([BOX, BOX + 20, BOX - 10])
     scores = np.array([[0.2, 0.6, 0.0], [0.1, 0.1, 0.9], [0.01, 0.02, 0.0]])
     rows = np.array([center_size(box) for box in boxes])
@@ -67,7 +67,7 @@ EXPECTED = {  # score, and distribution over chair and cup
     OutputLayout.yolo_objectness: (0.5, [2 / 7, 5 / 7]),
     OutputLayout.yolox: (0.6, [0.25, 0.75]),
     OutputLayout.ssd_unit: (0.6, [0.25, 0.75]),
-    OutputLayout.ssd_tensorflow: (0.6, [0.25, 0.75]),  # 0.2 0.6 0.2, without the wall
+    OutputLayout.ssd_tensorflow: (0.6, [0.25, 0.75]),  # from 0.2 0.6 0.2, without the wall
     OutputLayout.ssd_torchvision: (0.6, [0.25, 0.75]),
 }
 
@@ -93,7 +93,7 @@ def test_onnx_boxes_known_network_detects_cup_in_each_layout(tmp_path, layout):
 
 @pytest.mark.parametrize("placement", Placement)
 def test_onnx_boxes_image_placement_is_inverted(tmp_path, placement):
-    """The input is taller than the image: the box is that of the cup in each placement."""
+    """The input is taller than the image; the position of the cup in it depends on the placement."""
     top, scale = {Placement.top_left: (0, 0.5), Placement.center: (20, 0.5), Placement.stretch: (0, 5 / 6)}[placement]
     box = np.array([BOX[0], BOX[1] / 0.5 * scale + top, BOX[2], BOX[3] / 0.5 * scale + top])
     weights = constant_network(
@@ -110,7 +110,7 @@ def test_onnx_boxes_image_placement_is_inverted(tmp_path, placement):
         device="cpu",
         min_readings=1.0,
     )
-    # at this significance, everything in the box is foreground, so that the mask is the box
+    # at constant depth, everything in the box is foreground, so the mask is the box
     flat = replace(frame(), depth=np.ones((120, 160), np.float32))
     (mask,) = detector.detect(flat).masks
     expected = np.zeros_like(mask)
@@ -186,7 +186,7 @@ def shared_frame(shared, scene, index):
     folder = shared / "data" / scene
     color = cv2.imread(str(folder / "color" / f"{index:06d}.jpg"))
     if color is None:
-        pytest.skip(f"{folder} has no frame {index}")
+        pytest.skip(f"frame {index} does not exist in {folder}")
     depth = cv2.imread(str(folder / "depth" / f"{index:06d}.png"), cv2.IMREAD_UNCHANGED)
     meters = np.where(depth == 65535, 0, depth / 1000).astype(np.float32)
     return Frame(index, 0.0, color[..., ::-1].copy(), meters, Camera(640, 480, 585.0, 585.0, 319.5, 239.5))
@@ -195,7 +195,7 @@ def shared_frame(shared, scene, index):
 @pytest.fixture(scope="module")
 def nano(shared):
     if not (shared / WEIGHTS).is_file():
-        pytest.skip(f"{shared / WEIGHTS} is absent")
+        pytest.skip(f"{shared / WEIGHTS} does not exist")
     return OnnxBoxes(weights=shared / WEIGHTS, device="cpu")
 
 

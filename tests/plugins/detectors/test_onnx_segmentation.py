@@ -16,7 +16,7 @@ from tests.support.recordings.rewritten_exports import LAYOUTS, rewritten
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 V, U = np.indices((120, 160))
 LABELS = ("chair", "cup", "wall")
-SIZE = 80  # of the input: the image is halved, and lies 10 px down
+SIZE = 80  # px, side of the input; the image is scaled by 1/2 and is 10 px from the top
 CELL = 2  # px of the input
 
 
@@ -25,7 +25,10 @@ def frame():
 
 
 def outputs(objectness=False, transposed=False):
-    """Return a cup in the left and a chair in the lower half of their boxes; prototypes are linear in the pixel."""
+    """Return the outputs for a cup in the left half of its box and a chair in the lower half of its box.
+
+    The prototypes are linear in the pixel.
+    """
     cells = SIZE // CELL
     prototypes = np.stack(
         [np.tile(np.arange(cells) - 10.4, (cells, 1)), np.tile(np.arange(cells) - 25.4, (cells, 1)).T]
@@ -62,7 +65,7 @@ def test_onnx_segmentation_known_network_gives_expected_output(tmp_path, objectn
 
 
 def check_cup_and_chair(found):
-    # A pixel u of the image has its center at (u + 0.5) / 2 in the input and at a half of that, less 0.5, in cells.
+    # The center of image pixel u is at (u + 0.5) / 2 in the input, and at (u + 0.5) / 4 - 0.5 in cells.
     cup = ((U + 0.5) / 4 - 0.5 < 10.4) & (U >= 10) & (U < 70) & (V >= 20) & (V < 60)
     chair = (((V + 0.5) / 2 + 10) / 2 - 0.5 > 25.4) & (U >= 100) & (U < 140) & (V >= 60) & (V < 100)
     np.testing.assert_array_equal(found.masks, [cup, chair])
@@ -89,7 +92,7 @@ def test_onnx_segmentation_tflite_file_error_names_converter(tmp_path):
 
 
 def suppressed(folder, **parameters):
-    """Return the same candidates from a network with internal suppression and one class each."""
+    """Return the detector of a network with internal suppression and the same candidates, one class each."""
     table, prototypes = outputs(transposed=True).values()
     (folder / "labels.txt").write_text("\n".join(LABELS))
     center, size, scores = table[0, :, :2], table[0, :, 2:4], table[0, :, 4:7]
@@ -101,7 +104,7 @@ def suppressed(folder, **parameters):
 
 @pytest.mark.parametrize(("spread", "expected"), [(1.0, [0.6, 0.5]), (0.5, [0.8, 0.7]), (0.0, [1.0, 1.0])])
 def test_onnx_segmentation_single_class_spreads_remaining_mass(tmp_path, spread, expected, caplog):
-    """A score of 0.4 is less than the equal probability of two classes, with spread 1."""
+    """With spread 1, the score of 0.4 is raised to 0.5, the equal probability of two classes."""
     with caplog.at_level("INFO"):
         found = suppressed(tmp_path, class_spread=spread).detect(frame())
     assert "n.onnx reports one class per detection" in caplog.text
@@ -170,10 +173,10 @@ IMAGES = ("mit76/color/000000.jpg", "redkitchen/color/000240.jpg", "replica_floo
 
 @pytest.fixture(scope="module")
 def yolo(shared):
-    """Return a real network in its exporter's format."""
+    """Return the path of YOLO11n-seg in the layout of its exporter."""
     path = shared / "weights" / "yolo11n_seg" / "yolo11n_seg.onnx"
     if not path.is_file():
-        pytest.skip(f"{path} is not there")
+        pytest.skip(f"{path} does not exist")
     return path
 
 

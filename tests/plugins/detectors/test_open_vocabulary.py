@@ -1,4 +1,4 @@
-"""Tests of detection by text: boxes and masks of fake networks are mapped to pixels for any image shape."""
+"""Tests of text-prompted detection: boxes and masks of fake networks are mapped to pixels for any image shape."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.support.networks.tiny_open_vocabulary import SIDE, write_owlv2, write
 
 pytest.importorskip("transformers")
 CPU = torch.device("cpu")
-SHAPES = ((60, 80), (80, 60), (64, 64))  # px: wide, high and square
+SHAPES = ((60, 80), (80, 60), (64, 64))  # (height, width), px: wide, tall and square
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +42,13 @@ def picture(shape: tuple[int, int]) -> Frame:
 
 
 class Saying:
-    """Replaces OWLv2: returns these boxes in px with these probabilities of the queries."""
+    """Replacement of OWLv2 that returns given boxes, px, with given probabilities of the queries."""
 
     dtype = torch.float32
 
     def __init__(self, shape: tuple[int, int], boxes: list[list[float]], probabilities: list[list[float]]) -> None:
-        shares = (torch.tensor(boxes) + 0.5) / max(shape)  # of the square with the image in its upper left
+        # Fractions of the square that has the image at its upper left.
+        shares = (torch.tensor(boxes) + 0.5) / max(shape)
         centers = (shares[:, :2] + shares[:, 2:]) / 2
         self.boxes = torch.cat([centers, shares[:, 2:] - shares[:, :2]], dim=1)[None]
         self.logits = torch.logit(torch.tensor(probabilities))[None]
@@ -58,7 +59,7 @@ class Saying:
 
 
 class Filling:
-    """Replaces SAM: fills the prompted box, in a grid of a quarter of the input's size."""
+    """Replacement of SAM that fills the prompted box."""
 
     dtype = torch.float32
 
@@ -128,7 +129,7 @@ def test_open_vocabulary_masks_lie_in_prompt_boxes(sam: Path, shape: tuple[int, 
     expected = np.zeros((2, *shape), np.bool_)
     expected[0, 20:50, 10:30] = expected[1, :10, :60] = True
     overlap = (found & expected).sum(axis=(1, 2)) / (found | expected).sum(axis=(1, 2))
-    assert (overlap > 0.9).all(), "except for the rounding of the grid"
+    assert (overlap > 0.9).all(), "equal except for rounding to the grid"
     for mask, wanted in zip(found, expected, strict=True):
         center, middle = (np.argwhere(area).mean(axis=0) for area in (mask, wanted))
         np.testing.assert_allclose(center, middle, atol=0.5)

@@ -57,7 +57,7 @@ def detected(folder: Path, *entries: Any, **parameters: Any) -> Detections:
     [
         {"size": [6, 8], "counts": PACKED},
         {"size": [6, 8], "counts": RUN_LENGTHS},
-        [[2, 1, 7, 1, 7, 4, 2, 4]],  # borders of the pixels, from the image's corner
+        [[2, 1, 7, 1, 7, 4, 2, 4]],  # pixel borders, measured from the image corner
         [[2, 1, 7, 1, 7, 3, 2, 3], [2, 3, 7, 3, 7, 4, 2, 4]],  # two parts
     ],
     ids=["packed", "list", "polygon", "polygons"],
@@ -65,7 +65,7 @@ def detected(folder: Path, *entries: Any, **parameters: Any) -> Detections:
 def test_precomputed_all_segmentation_formats_are_read(tmp_path: Path, segmentation: Any) -> None:
     found = detected(tmp_path, entry(segmentation=segmentation))
     np.testing.assert_array_equal(found.masks, MASK[None])
-    np.testing.assert_array_equal(found.boxes, [[2, 1, 6, 3]])  # no bbox: the mask's
+    np.testing.assert_array_equal(found.boxes, [[2, 1, 6, 3]])  # without a bbox, the box of the mask
 
 
 @pytest.mark.parametrize("image_id", [12, "000012", "12", "color/000012.png", "frame/000012.color.png"[6:12]])

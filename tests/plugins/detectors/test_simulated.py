@@ -37,11 +37,11 @@ PERFECT = SimulatedDetector(
 )
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 IDS = np.zeros((120, 160), np.int32)
-IDS[20:60, 20:60] = 5  # a chair in the open
+IDS[20:60, 20:60] = 5  # a chair
 IDS[20:60, 60:100] = 6  # a couch that touches it
 IDS[70:90, 40:60] = 9  # a small cup
 IDS[80:120, 100:160] = 12  # a bed cut by the image corner
-IDS[0:10, 0:10] = 30  # of no known class
+IDS[0:10, 0:10] = 30  # an object without a class
 TRUTH = FrameTruth(IDS, {5: "chair", 6: "couch", 9: "cup", 12: "bed", 30: None})
 
 
@@ -139,7 +139,7 @@ def test_simulated_bleed_grows_mask_by_given_pixels():
         (box,) = [b for b, m in zip(detections.boxes, detections.masks, strict=True) if m[40, 40] and not m[40, 90]]
         assert box.tolist() == [40 - side / 2, 40 - side / 2, 39 + side / 2, 39 + side / 2]
     bed = max(replace(PERFECT, bleed=-4.0).detect(frame()).masks, key=lambda m: m[110, 150])
-    assert bed[119, 159], "a mask must not shrink away from the image's border"
+    assert bed[119, 159], "a mask does not shrink at the image border"
 
 
 def test_simulated_shift_and_border_noise_have_given_deviation():
@@ -189,7 +189,7 @@ def test_confusion_kernel_is_normalized_and_favors_lookalikes():
 
 
 def distributions(detector, frames):
-    """Return the class rows of the couch, found by its position."""
+    """Return the class distributions (frames, classes) of the couch, found by its position."""
     rows = []
     for k in range(frames):
         detections = detector.detect(frame(k))
@@ -286,7 +286,7 @@ def test_simulated_miss_spread_varies_miss_rate_between_objects():
     assert even.mean() == pytest.approx(0.5, abs=0.05)
     assert uneven.mean() == pytest.approx(0.5, abs=0.13)
     assert ((even > 0.1) & (even < 0.9)).all()
-    # 27 % of a normal variable with standard deviation 2 lie outside +-2.2: seen in less than 10 % or more than 90 %
+    # 27 % of a normal distribution with deviation 2 is outside +-2.2, where the rates are below 10 % or above 90 %
     assert ((uneven < 0.1) | (uneven > 0.9)).mean() == pytest.approx(0.27, abs=0.15)
 
 
@@ -305,9 +305,9 @@ def test_simulated_false_positives_keep_world_position():
             classes.append(int(row.argmax()))
     assert 20 < len(places) < 60
     _, counts = np.unique(classes, return_counts=True)
-    assert counts.max() > 20, "the first place is chosen whenever there is a ghost"
+    assert counts.max() > 20, "one position is used in most frames"
     first = np.array(places)[np.array(classes) == np.bincount(classes).argmax()]
-    assert np.ptp(first) < 0.55, "a place is 0.5 m wide, and its visible part has its middle in it"
+    assert np.ptp(first) < 0.55, "the position is 0.5 m wide"
 
 
 def test_simulated_recurring_false_positives_need_poses():
@@ -344,7 +344,7 @@ def test_simulated_ellipse_matches_reference(place):
     v, u = np.ogrid[:120, :160]
     for seed, (a, b) in enumerate(((12.0, 80.0), (40.5, 13.0), (79.0, 80.0))):
         wobble = smooth_field(np.random.default_rng(seed), (120, 160), 12.0) * np.float32(0.4)
-        for field in (wobble, wobble + np.float32(3)):  # the latter leaves nothing
+        for field in (wobble, wobble + np.float32(3)):  # the latter gives an empty ellipse
             expected = np.hypot((u - x) / a, (v - y) / b) + field < 1
             np.testing.assert_array_equal(ellipse(x, y, a, b, field), expected)
 

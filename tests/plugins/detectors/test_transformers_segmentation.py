@@ -13,7 +13,7 @@ from torch.nn import functional
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError
 
-# the contract tests of registered detectors; here they run on the networks below
+# the contract tests of registered detectors, which run on the networks below
 from framework.testing.contracts import DetectorContract
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID
 from plugins.detectors.transformers_segmentation import (
@@ -65,13 +65,13 @@ def test_transformers_all_model_families_are_covered():
 
 def test_transformers_tiny_networks_return_detections(detector):
     found = [detector.detect(frame(seed)) for seed in range(3)]
-    assert sum(map(len, found)) >= 3, "otherwise the other tests are meaningless"
+    assert sum(map(len, found)) >= 3, "the other tests need detections"
     assert detector.classes == CLASSES
     assert not np.array_equal(found[0].masks, found[1].masks)
 
 
 def slow_decoding(detector, kind, image, threshold):
-    """Decode query by query: (score, mask, class distribution), best first, before suppression."""
+    """Return (score, mask, class distribution) of each query, the best first, before suppression."""
     pixels, (down, right) = detector._preprocessing(image.color, torch.device("cpu"))
     output = detector._network(pixel_values=pixels)
     instance = "masks_queries_logits" not in output
@@ -113,15 +113,15 @@ def test_transformers_decoding_matches_reference(folders, kind):
     assert len(expected) > 1
     np.testing.assert_allclose(found.scores, [score for score, _, _ in expected], rtol=1e-4)
     np.testing.assert_allclose(found.class_probabilities, [row for _, _, row in expected], atol=1e-5)
-    if kind != "rf_detr":  # the slow decoder uses the network's size, which equals the image size only there
+    if kind != "rf_detr":  # the reference decodes at the network's size, which differs for rf_detr
         assert np.mean(found.masks == np.array([mask for _, mask, _ in expected])) > 0.999
 
 
 def test_transformers_decoding_agrees_with_mask2former(folders):
-    """Each (query, label) pair that is the best of its query has the same mask and score."""
+    """The best label of each query has the same mask and score."""
     from transformers import Mask2FormerImageProcessorPil
 
-    camera = Camera(384, 384, 300.0, 300.0, 191.5, 191.5)  # the size at which it always decodes
+    camera = Camera(384, 384, 300.0, 300.0, 191.5, 191.5)  # the size at which Mask2Former always decodes
     image = frame(2, camera)
     folder = folders["mask2former"]
     detector = built(folder, score_threshold=0.05, agnostic_nms_iou=1.0, short_side=384, long_side=384)
@@ -149,7 +149,7 @@ def test_transformers_decoding_agrees_with_mask2former(folders):
 def test_transformers_decoding_agrees_with_eomt(folders):
     from transformers import EomtImageProcessorPil
 
-    image = frame(3, CAMERA)  # 48 rows on 64: padded below
+    image = frame(3, CAMERA)  # 48 rows are padded to 64 at the bottom
     detector = built(folders["eomt"], score_threshold=0.03, agnostic_nms_iou=1.0)
     processor = EomtImageProcessorPil(size={"shortest_edge": 64, "longest_edge": 64}, do_pad=True)
     with torch.inference_mode():
@@ -181,13 +181,14 @@ def test_transformers_decoding_agrees_with_eomt(folders):
     ],
 )
 def test_transformers_preprocessing_agrees_with_library(name, numbers, shape):
-    color = np.random.default_rng(0).integers(64, 192, (*shape, 3), np.uint8)  # bicubic never leaves 0..255
+    # Bicubic resampling of these values stays within 0 to 255.
+    color = np.random.default_rng(0).integers(64, 192, (*shape, 3), np.uint8)
     processor = getattr(transformers, name)(**numbers)
     expected = processor(images=color, return_tensors="pt")["pixel_values"][0].numpy()
     content = {"image_processor_type": name, **numbers}
     pixels, _ = Preprocessing.parse(content, "here")(color, torch.device("cpu"))
     assert pixels.shape[1:] == expected.shape
-    # theirs is quantized to 8 bits after resizing
+    # the library quantizes to 8 bits after resizing
     np.testing.assert_allclose(pixels[0].numpy(), expected, atol=2 / 255 / 0.2)
     assert np.abs(pixels[0].numpy() - expected).mean() < 0.6 / 255 / 0.2
 
@@ -298,7 +299,7 @@ IN_A_ROW = {**dict(enumerate(COCO)), **dict.fromkeys(range(80, 91), "N/A")}
 
 @pytest.mark.parametrize("names", [dict(enumerate(COCO_BY_ID)), {k: f"LABEL_{k}" for k in range(91)}, IN_A_ROW])
 def test_transformers_rf_detr_uses_coco_91_ids(tmp_path, names):
-    """As in transformers' test, number 17 is the cat and 75 the remote; the decoding agrees."""
+    """As in a test of transformers, class 17 is the cat and class 75 the remote."""
     detector = coco_rf_detr(tmp_path, names)
     assert detector.classes == COCO
     labels = Checkpoint(str(tmp_path), "main").labels

@@ -34,7 +34,7 @@ def siglip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Blocks(Detector):
-    """Three bright squares, of 40x40, 30x30 and 10x10 px."""
+    """Detector of three squares of 40x40, 30x30 and 10x10 px."""
 
     classes = ("chair", "bed")
 
@@ -99,7 +99,7 @@ def test_with_embeddings_frame_interval_sets_embedded_frames(siglip: Path) -> No
 
 
 def test_with_embeddings_contrast_controls_background(siglip: Path) -> None:
-    """With 0, the background has no influence; with 1, it has; the object always has."""
+    """With contrast 0, only the object affects the embedding; with contrast 1, the background does, too."""
     plain, other = picture(), picture()
     inside = Blocks().detect(plain).masks[0]
     other.color[~inside] = 255 - other.color[~inside]
@@ -125,7 +125,7 @@ def test_with_embeddings_crop_is_padded_square_around_box() -> None:
     mask[:] = False
     mask[0, :4, :4] = True
     [corner] = square_crops(color, mask, 8, 2.0)
-    assert (corner[:2] == 0).all(), "beyond the image"
+    assert (corner[:2] == 0).all(), "0 outside the image"
     assert (corner[2:6, 2:6, 3] == 255).all()
     assert not square_crops(color, np.zeros((1, 40, 60), np.bool_), 8, 1.5).any()
 

@@ -1,4 +1,4 @@
-"""Tests of association and of the instance table with every map, on spheres with exact masks."""
+"""Tests of association and of the instance table in all fusers that use them, on spheres with exact masks."""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from tests.support.true_masks import fuse_masks, masks_of
 NewFuser = Callable[..., MapFuser]
 
 
-@pytest.fixture(params=[BayesianTsdf, Open3DVoxelBlockGrid], ids=["our voxels", "Open3D's voxels"])
+@pytest.fixture(params=[BayesianTsdf, Open3DVoxelBlockGrid], ids=["bayesian_tsdf", "open3d_vbg"])
 def new_fuser(request: pytest.FixtureRequest) -> NewFuser:
     return lambda **parameters: assemble(request.param, **{"voxel_size": 0.02, "max_depth": 4.0} | parameters)
 
@@ -56,9 +56,9 @@ def test_fuser_weak_detection_creates_no_instance(new_fuser: NewFuser, frames: l
     ("parameters", "updates"),
     [
         ({}, True),
-        ({"overlap_rule": OverlapRule.IOU}, False),  # a part has a small overlap with the union
+        ({"overlap_rule": OverlapRule.IOU}, False),  # the IoU of a part is small
         ({"min_class_agreement": 0.9}, True),
-        ({"min_class_agreement": 1.0}, False),  # only the floor keeps distributions from agreeing completely
+        ({"min_class_agreement": 1.0}, False),  # the class floor prevents complete agreement
     ],
 )
 def test_fuser_overlap_rule_and_class_agreement_limit_matches(
@@ -91,12 +91,12 @@ def test_fuser_split_instance_merges_under_whole_mask(new_fuser: NewFuser, frame
 
 @pytest.mark.parametrize(
     ("fuser_class", "merge_frames"),
-    [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # with equal votes, the other half is soon outvoted
+    [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # unweighted votes relabel voxels sooner
 )
-def test_fuser_instances_often_under_one_cluster_merge(
+def test_fuser_merges_instances_covered_by_one_cluster(
     fuser_class: type[MapFuser], merge_frames: int, frames: list[Frame]
 ) -> None:
-    """Weak detections of the whole would need long to outvote the voxels of the other half."""
+    """The detections of the whole are weak and would relabel the voxels of the other half only slowly."""
     fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0, merge_overlap=0.5, merge_frames=merge_frames)
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
@@ -104,13 +104,13 @@ def test_fuser_instances_often_under_one_cluster_merge(
     fuse_masks(fuser, frames[0], [left, whole & ~left], [0.9, 0.8])
     for k in range(1, 1 + merge_frames):
         fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1])
-    assert len(fuser.scene.table.records) == 2, "once apart and so often together is not yet so much more"
+    assert len(fuser.scene.table.records) == 2, "one frame with both halves delays the merge"
     last = 1 + merge_frames
     fuse_masks(fuser, dataclasses.replace(frames[0], index=last), [whole], [0.1])
     [record] = fuser.scene.table.records.values()
     assert record.id == 1
     assert record.observations == 1 + last
-    assert record.visible == 1 + last, "a frame that had both in view counts once"
+    assert record.visible == 1 + last, "a frame with both halves in view counts once"
     assert record.detections == 2 + last
     assert record.score_sum == pytest.approx(0.9 + 0.8 + last * 0.1)
     odds = (0.68 / 0.32) ** record.detections
@@ -126,7 +126,7 @@ def test_fuser_instances_often_under_one_cluster_merge(
 def test_fuser_merges_supported_object_only_if_classes_agree(
     merge_agreement: float, agrees: bool, merged: bool, frames: list[Frame]
 ) -> None:
-    """The table's mask covers the object in every frame; a part of the table would be merged."""
+    """The mask of the table also covers the object on it; a part of the table is merged."""
     fuser = assemble(
         BayesianTsdf,
         voxel_size=0.02,
@@ -198,7 +198,7 @@ def test_fuser_empty_scene_leaves_map_unchanged(new_fuser: NewFuser) -> None:
 
 
 def test_fuser_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFuser, frames: list[Frame]) -> None:
-    """Otherwise its confidence would fall in frames that show only a small part of it."""
+    """Otherwise frames that show only a small part of an instance would decrease its confidence."""
     fuser = new_fuser(create_points=50)
     mask = masks_of(frames[0])[0]
     fuse_masks(fuser, frames[0], [mask], [0.9])
@@ -214,7 +214,7 @@ def test_fuser_instance_with_few_visible_pixels_is_not_counted(new_fuser: NewFus
 
 @pytest.mark.parametrize("voxel_size", [0.01, 0.02, 0.04])
 def test_fuser_min_area_does_not_depend_on_voxel_size(new_fuser: NewFuser, voxel_size: float) -> None:
-    """The object is a poster on a wall with a known area."""
+    """The object is a poster of known area on a wall."""
     depth, poster = 1.5, np.zeros(CAMERA.shape, np.bool_)
     poster[30:90, 40:120] = True
     area = poster.sum() * depth**2 / (CAMERA.fx * CAMERA.fy)
@@ -224,7 +224,7 @@ def test_fuser_min_area_does_not_depend_on_voxel_size(new_fuser: NewFuser, voxel
         for k in range(3):
             fuse_masks(fuser, wall.frame(np.eye(4), k), [poster], [0.9])
         assert len(fuser.scene.instances()) == count
-        assert len(fuser.scene.instance_ids()) == 1, "which does not look at the mesh"
+        assert len(fuser.scene.instance_ids()) == 1, "independent of the mesh"
 
 
 @pytest.mark.parametrize(
@@ -259,9 +259,9 @@ def test_fuser_floored_distribution_is_positive_and_normalized() -> None:
 def test_fuser_supported_object_keeps_voxels_under_larger_mask(
     lying_on: float, same_class: bool, keeps: bool, frames: list[Frame]
 ) -> None:
-    """The object is confirmed; the desk's mask covers it in frames without its detection.
+    """The object is confirmed; later only the desk is detected, with a mask that covers the object.
 
-    Parts of the desk are merged.
+    An object of the same class is a part of the desk and is merged.
     """
     fuser = assemble(
         BayesianTsdf,

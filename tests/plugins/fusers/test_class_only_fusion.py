@@ -25,8 +25,8 @@ from tests.support.true_masks import CLASSES, PROBABILITIES, fuse_masks, masks_o
 
 VIEWS = [look_from(x, -1.5, 1.6, (0.0, 1.0, 0.3)) for x in (-1.0, -0.3, 0.4, 1.1)]
 LEFT, RIGHT = (-0.6, 0.8, 0.0, -0.1, 1.2, 0.5), (0.2, 0.8, 0.0, 0.7, 1.2, 0.5)
-SECOND_FOUND = (1, 3, 5)  # frames
-TOUCHING = (-0.1, 0.8, 0.0, 0.4, 1.2, 0.5)  # the left box's side
+SECOND_FOUND = (1, 3, 5)  # frames in which the second sphere is detected
+TOUCHING = (-0.1, 0.8, 0.0, 0.4, 1.2, 0.5)  # touches the left box
 
 
 def new_fuser(**parameters: object) -> ClassOnlyFusion:
@@ -34,9 +34,9 @@ def new_fuser(**parameters: object) -> ClassOnlyFusion:
 
 
 def mapped_boxes(boxes: list[box_scene.Box], class_ids: list[int]) -> SemanticMap:
-    """Map the boxes on the floor from all views under their true masks.
+    """Map boxes on the floor from all views with their true masks.
 
-    A hidden side with few visible pixels is a separate component: `min_area` excludes it.
+    A box side with few visible pixels is a separate component, which `min_area` excludes.
     """
     scene, fuser = BoxScene([[box] for box in boxes]), new_fuser(min_area=0.03)
     for k, T in enumerate(VIEWS):
@@ -98,7 +98,7 @@ def test_class_only_single_false_detection_is_removed(frames: list[Frame], when:
             assert len(fuser.scene.instances()) == 1
     assert not fuser.scene.instances()
     class_ids = fuser.scene.render(CAMERA, walk(10)[5]).class_ids
-    assert (class_ids >= 0).sum() < 0.01 * masks_of(frames[5])[0].sum(), "on the silhouette, what that frame alone saw"
+    assert (class_ids >= 0).sum() < 0.01 * masks_of(frames[5])[0].sum(), "only silhouette points remain"
 
 
 def test_class_only_missed_1_ignores_unmasked_frames(frames: list[Frame]) -> None:
@@ -156,7 +156,7 @@ def test_class_only_voxel_evidence_matches_reference(mapped: SemanticMap, frames
         same = (evidence.masked[row, n], evidence.unmasked[block, n]) == (masked, unmasked)
         differing += not (same and np.allclose(held, log[:2] - log[2], atol=1e-3))
     assert seen > 50
-    assert differing <= 6, "pixels on the edge of two, in float32"
+    assert differing <= 6, "rounding at pixel borders in float32"
 
 
 def test_class_only_instance_attributes_match_voxel_reference(mapped: SemanticMap) -> None:
@@ -204,7 +204,7 @@ def test_class_only_detected_spheres_are_instances(mapped: SemanticMap) -> None:
 
 
 def test_class_only_score_is_probability_of_best_class(frames: list[Frame]) -> None:
-    """If the best class has 0.7, score 0.33 leaves more than half to the background, and 0.6 a seventh."""
+    """The best class has 0.7, so the background has more than half with score 0.33, and a seventh with 0.6."""
     for score, label in ((0.33, -1), (0.6, 0)):
         fuser = new_fuser()
         fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [score])
@@ -249,7 +249,7 @@ def test_class_only_loaded_map_can_be_extended(frames: list[Frame], tmp_path: Pa
         if k == 2:
             resumed.scene.save(tmp_path / "map.npz")
             resumed.scene = SemanticMap.load(tmp_path / "map.npz")
-            resumed.scene.volume.integrator.frames = k  # on which the rounding of averages depends
+            resumed.scene.volume.integrator.frames = k  # the rounding of averages depends on it
         for fuser in (whole, resumed):
             fuse_masks(fuser, frame, masks_of(frame), [0.6, 0.5, 0.4])
     ours, theirs = whole.scene.labels.saved(), resumed.scene.labels.saved()
@@ -284,7 +284,7 @@ def test_class_only_invalid_parameter_raises() -> None:
 
 
 def with_smoothness(mapped: SemanticMap, tmp_path: Path, smoothness: float) -> SemanticMap:
-    """Return the map with all components, however small."""
+    """Return the map with this smoothness and without a minimum area."""
     mapped.save(tmp_path / "map.npz")
     scene = SemanticMap.load(tmp_path / "map.npz")
     scene.elections = scene.elections._replace(min_area=0.0, smoothness=smoothness)
@@ -292,7 +292,7 @@ def with_smoothness(mapped: SemanticMap, tmp_path: Path, smoothness: float) -> S
 
 
 def slowly_smoothed(scene: SemanticMap, smoothness: float) -> Int32:
-    """Run iterated conditional modes vertex by vertex, in float64 and with sets."""
+    """Return the class ids (V,) after iterated conditional modes, vertex by vertex in float64."""
     surface, grid, evidence = scene.volume.surface(), scene.volume.voxels.grid, scene.labels.evidence
     class_ids = scene.mesh().class_ids.tolist()
     neighbors: list[set[int]] = [set() for _ in class_ids]

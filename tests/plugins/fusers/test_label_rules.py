@@ -15,7 +15,7 @@ from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
 from tests.support.scenes.analytic_scene import CAMERA, room, walk
 
 SEEN = [(0.5, [0.6, 0.3, 0.1]), (0.9, [0.2, 0.1, 0.7]), (0.4, [0.6, 0.4, 0.0])]
-"""Score and distribution over three classes, frame by frame."""
+"""Score and distribution over three classes in each frame."""
 
 
 def product() -> np.ndarray:
@@ -33,7 +33,7 @@ def product() -> np.ndarray:
         (Open3DVoxelBlockGrid, {}, product()),
     ],
 )
-def test_fuser_class_probabilities_follow_its_label_rule(
+def test_fuser_class_probabilities_match_label_rule(
     fuser_class: type[MapFuser], parameters: dict[str, object], expected: np.ndarray
 ) -> None:
     fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0, **parameters)
@@ -52,7 +52,7 @@ def test_fuser_class_probabilities_follow_its_label_rule(
     [instance] = fuser.scene.instances().values()
     assert np.allclose(instance.class_probabilities, expected, atol=1e-5)
     assert (instance.first_frame, instance.last_frame) == (0, 2)
-    # the voxels agree with the table, except that each was visible in only some of the frames
+    # the voxels agree with the table, although each is visible in only some of the frames
     view = fuser.scene.render(CAMERA, walk(3)[1])
     classes = view.class_ids[view.instance_ids == instance.id]
     assert np.bincount(classes).argmax() == np.argmax(expected)

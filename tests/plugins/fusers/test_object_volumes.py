@@ -27,7 +27,7 @@ def new_fuser(**parameters: object) -> ObjectVolumes:
 
 
 def pan(width: float) -> list[Frame]:
-    """Return ten views of both boxes, `width` m from the first to the last."""
+    """Return ten views of both boxes from a camera that moves by `width` m."""
     places = np.linspace(-width / 2, width / 2, 10)
     return [BOXES.frame(look_from(x, -1.4, 1.5, (0.0, 0.6, 0.2)), k) for k, x in enumerate(places)]
 
@@ -74,12 +74,12 @@ def test_object_volumes_each_box_is_one_instance(mapped: ObjectVolumes) -> None:
     for key, instance in instances.items():
         points = mesh.vertices[instance.vertices].astype(np.float64)
         owners = BOXES.owners(points, VOXEL / 2)
-        assert np.isin(owners, (key, -1)).mean() > 0.97, "-1: where the box stands on the floor"
+        assert np.isin(owners, (key, -1)).mean() > 0.97, "-1 = where the box touches the floor"
         assert (owners == key).sum() > 300
 
 
 def test_object_volumes_label_whole_object_surface(mapped: ObjectVolumes) -> None:
-    """Otherwise half of the true points would have a background vertex as nearest neighbor."""
+    """Otherwise the nearest vertex of half of the true points would be in the background."""
     mesh = mapped.scene.mesh()
     owners = BOXES.owners(mesh.vertices.astype(np.float64), VOXEL / 4)
     for key in (1, 2):
@@ -99,20 +99,20 @@ def test_object_volumes_statistics_include_all_volumes(mapped: ObjectVolumes) ->
     scene = mapped.scene
     objects = sum(volume.block_count for volume in scene.volumes.values())
     assert scene.statistics.voxels == 512 * (scene.background.voxels.block_count + objects)
-    per_object_voxel = 8 + 4  # a grid's, and the two counts
+    per_object_voxel = 8 + 4  # bytes of a grid and of the two counts
     assert scene.statistics.bytes > 8 * 512 * scene.background.voxels.block_count + per_object_voxel * 512 * objects
     assert 0 < objects < scene.background.voxels.block_count
 
 
 def share_of_the_room(fuser: ObjectVolumes) -> float:
-    """Return the fraction of the first object's vertices on the floor or wall, a voxel away from all boxes."""
+    """Return the fraction of the first object's vertices that are more than a voxel from all boxes."""
     mesh = fuser.scene.mesh()
     points = mesh.vertices[mesh.instance_ids == 1].astype(np.float64)
     return float((BOXES.owners(points, VOXEL) == 0).mean())
 
 
 def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
-    """Voxels always seen under the mask remain in both cases, so the camera moves little."""
+    """The camera moves little, so with constant bleed the same voxels are always under the mask."""
     once, always = new_fuser(), new_fuser()
     for k, frame in enumerate(pan(0.1)):
         mask = masks_of(frame)[0]
@@ -123,7 +123,7 @@ def test_object_volumes_remove_single_but_not_constant_bleed() -> None:
 
 
 def test_object_volumes_remove_bled_voxels_after_unmasked_view(frames: list[Frame]) -> None:
-    """Beta(1 + 1, 1 + 0), then Beta(2, 2), which is not above 1/2."""
+    """The foreground distribution is Beta(2, 1), then Beta(2, 2), whose mean is not above 1/2."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     mask = masks_of(frame)[0]
     fuse(fuser, frame, [bled(mask, 12)])
@@ -198,10 +198,10 @@ def test_object_volumes_two_detections_are_one_observation(frames: list[Frame]) 
     (record,) = fuser.scene.table.records.values()
     assert (record.observations, record.detections, record.visible) == (2, 3, 2)
     counts = fuser.scene.volumes[1].arrays()
-    assert (counts["foreground"][counts["foreground"] > 0] == 2).mean() > 0.95, "every voxel is in the second mask too"
+    assert (counts["foreground"][counts["foreground"] > 0] == 2).mean() > 0.95, "each voxel counts once per frame"
 
 
-def test_object_volumes_weak_or_far_detection_creates_none(frames: list[Frame]) -> None:
+def test_object_volumes_weak_or_far_detection_creates_no_object(frames: list[Frame]) -> None:
     frame = frames[0]
     mask = masks_of(frame)[0]
     for fuser in (new_fuser(create_score=0.9), new_fuser(max_depth=0.9)):
@@ -225,7 +225,7 @@ def test_object_volumes_probabilities_are_mean_of_detections(frames: list[Frame]
 
 
 def test_object_volumes_unconfirmed_is_removed_when_visible(frames: list[Frame]) -> None:
-    """After 1 detection and n misses it exists with probability 2 / (3 + n), below 0.1 from n = 18 on."""
+    """After 1 detection and n misses, the probability of existence is 2 / (3 + n), below 0.1 for n >= 18."""
     frame, fuser = frames[0], new_fuser(min_observations=1)
     wall = np.zeros(CAMERA.shape, np.bool_)
     wall[10:50, 100:180] = True
@@ -243,7 +243,7 @@ def test_object_volumes_unconfirmed_is_removed_when_visible(frames: list[Frame])
     assert not fuser.scene.volumes
     assert (fuser.scene.mesh().instance_ids == 0).all()
     fuse(fuser, replace(frame, index=49), [wall])
-    assert set(fuser.scene.table.records) == {2}, "ids are never used again"
+    assert set(fuser.scene.table.records) == {2}, "ids are not reused"
 
 
 def test_object_volumes_below_min_area_are_excluded(frames: list[Frame]) -> None:
@@ -272,7 +272,7 @@ def test_object_volumes_incremental_mesh_equals_loaded_mesh(frames: list[Frame],
 
 
 def test_object_volumes_keep_surfaces_of_overlapping_objects(frames: list[Frame]) -> None:
-    """Each frame has one detection, of the whole or of a small part, which an IoU rule does not match."""
+    """The first detection is of the whole, the second of a small part, which the IoU rule does not match."""
     fuser = new_fuser(min_observations=1)
     whole = masks_of(frames[0])[0]
     for k, mask in enumerate([whole, part_of(whole, 0.15)]):

@@ -60,7 +60,7 @@ def one_view(**changes: float) -> tuple[Open3DMap, Frame]:
 
 
 def majority(votes: list[int]) -> tuple[int, int]:
-    """Return candidate and counter after Boyer and Moore, one vote at a time."""
+    """Return the candidate and the counter of the Boyer-Moore majority vote."""
     candidate = count = 0
     for vote in votes:
         if vote == candidate:
@@ -85,7 +85,7 @@ def test_open3d_vbg_voxel_votes_match_boyer_moore(votes: list[int]) -> None:
 
 
 def voxel_centers(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices and positions (m) of all voxels with a slow reference."""
+    """Return the indices (N,) and positions (N, 3), m, of all voxels, computed block by block."""
     r, size = scene.grid.settings.block_resolution, scene.grid.settings.voxel_size
     hashmap = scene.grid.blocks.hashmap()
     z, y, x = np.mgrid[:r, :r, :r].reshape(3, -1)
@@ -114,7 +114,7 @@ def test_open3d_vbg_only_voxels_in_band_under_mask_vote(frames: list[Frame]) -> 
     expected[inside] = mask[at] & (np.abs(frame.depth[at] - z[inside]) <= 2.0 * 0.02)
     found = scene.grid.flat("instance")[numbers] == 7
     assert expected.sum() > 500
-    assert (found != expected).mean() < 1e-4, "rounding at the border alone"
+    assert (found != expected).mean() < 1e-4, "equal except for rounding"
     assert (scene.grid.flat("instance") == 7).sum() == found.sum(), "voxels without a block have no votes"
 
 
@@ -135,7 +135,7 @@ def test_open3d_vbg_shared_pixels_go_to_higher_score(frames: list[Frame], scores
 
 @pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.1, 0.5, 0.0), (-0.2, -0.4, 0.3)])
 def test_open3d_vbg_rendered_surface_is_accurate(rotvec: tuple[float, float, float]) -> None:
-    """Open3D's own rays end 12 mm too far, and its depth lookup is off by half a pixel; both are corrected."""
+    """Open3D's rays end 12 mm too far, and its depth lookup is off by half a pixel; both are corrected."""
     scene, T = Open3DMap(SETTINGS, CONFIRMATION), pose(rotvec=rotvec)
     walls = Scene(planes=[(np.array([-0.3, 0.1, -1.0]) / np.sqrt(1.1), -1.777)], spheres=room().spheres)
     for _ in range(3):
@@ -150,7 +150,7 @@ def test_open3d_vbg_rendered_surface_is_accurate(rotvec: tuple[float, float, flo
     assert np.median(np.abs(error)) < 0.002
     assert np.median(np.abs(view.color[wall].astype(int) - color[wall])) <= 3
     normal = view.normals_world[wall] @ walls.planes[0][0]
-    assert np.median(normal) > 0.95  # one view, nearest readings: the field has steps
+    assert np.median(normal) > 0.95  # one view and nearest-neighbor depth: the field has steps
     assert np.quantile(normal, 0.1) > 0.8
     near = scene.render_near(CAMERA, elsewhere, depth)
     assert np.array_equal(near.depth, view.depth)
@@ -182,12 +182,12 @@ def test_open3d_vbg_min_weight_applies_after_first_frames() -> None:
         scene.integrate(dataclasses.replace(frame, depth=half), np.eye(4))
     seen = scene.render(CAMERA, np.eye(4)).depth > 0
     assert seen[:, : CAMERA.width // 2 - 4].mean() > 0.9
-    assert not seen[:, CAMERA.width // 2 + 4 :].any(), "the right half was seen once, three times are asked for"
+    assert not seen[:, CAMERA.width // 2 + 4 :].any(), "the right half was observed once, min_weight is 3"
     assert scene.mesh().vertices[:, 0].max() < 0.1
 
 
 def test_open3d_vbg_low_resolution_image_leaves_no_holes() -> None:
-    """Open3D touches blocks only at every 4th pixel: here 12 cm apart, for blocks of 8 cm."""
+    """Open3D allocates blocks only at every 4th pixel, which are 12 cm apart here; blocks are 8 cm wide."""
     coarse = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
     scene = Open3DMap(dataclasses.replace(SETTINGS, voxel_size=0.01), CONFIRMATION)
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.2)])
@@ -197,7 +197,7 @@ def test_open3d_vbg_low_resolution_image_leaves_no_holes() -> None:
 
 
 def test_open3d_vbg_close_view_is_complete_without_output(mapped: Open3DMap, capfd: pytest.CaptureFixture[str]) -> None:
-    """Open3D sizes its range map by the first view; in a later one it prints a warning and leaves holes."""
+    """Open3D sizes its range map for the first view; in a larger view it would print a warning and leave holes."""
     scene = Open3DMap(mapped.grid.settings, CONFIRMATION)
     for T in walk(3):
         scene.integrate(room().frame(T), T)
@@ -352,7 +352,7 @@ def test_open3d_vbg_empty_map_round_trip_is_exact(tmp_path: Path) -> None:
 
 
 def test_open3d_vbg_single_depth_reading_is_mapped(frames: list[Frame]) -> None:
-    """It is between the pixels that Open3D uses, which then raises an error."""
+    """The pixel is between those that Open3D samples; without a sample Open3D would raise an error."""
     depth = np.zeros_like(frames[0].depth)
     depth[61, 83] = 1.5
     fuser = new_fuser()

@@ -19,7 +19,7 @@ from tests.support import registered
 
 
 class Halving(LargestComponent):
-    """Keeps every other point, so that its result depends on its input."""
+    """Refiner that keeps every other point, so its result depends on its input."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return PointClusters(
@@ -81,7 +81,7 @@ def test_chain_overrides_set_remove_replace_and_add_links(overrides: list[str], 
     chain = registered.built("refiner", "chain", *overrides)
     found = {name: type(link) for name, link in chain.links.items()}
     assert found == links
-    assert list(found) == list(links), "in their order"
+    assert list(found) == list(links), "in this order"
     if "std_floor" in overrides[0]:
         assert chain.links["gmm_em"].std_floor == 0.02
 

@@ -1,4 +1,4 @@
-"""Tests of connected components of a cluster: parts behind a depth step are removed, parts behind an occluder kept."""
+"""Tests of connected components: parts beyond a depth step are removed, parts split by an occluder are kept."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def kept(refiner: Connected | LargestComponent, mask: Bool, depth: Float32) -> B
 
 
 def test_connected_occluder_does_not_split_object() -> None:
-    """A couch at 3 m is behind a pole at 2 m that the mask excludes: LargestComponent loses the smaller half."""
+    """A couch at 3 m is behind a pole at 2 m that the mask excludes; LargestComponent drops the smaller half."""
     pole = (U >= 20) & (U < 24)
     depth = np.where(pole, 2.0, 3.0)
     assert (kept(Connected(), ~pole, depth) == ~pole).all()
@@ -63,7 +63,7 @@ def test_connected_removes_background_between_slats() -> None:
 
 
 def test_connected_keeps_slanted_surface_behind_occluder() -> None:
-    """The slope is 0.8 m of depth per meter; across 4 m it would be a step."""
+    """The depth slope is 0.8 m per m, so the depth on both sides of the pole differs as at a step."""
     x = (U - CAMERA.cx) / CAMERA.fx
     slanted = 2.0 / (1 - 0.8 * x)  # z = 2 + 0.8 x z
     pole = (U >= 20) & (U < 30)

@@ -1,4 +1,4 @@
-"""Tests of density-based clustering."""
+"""Tests of refiner=dbscan, density-based clustering."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def clusters_of(*sets: np.ndarray) -> PointClusters:
 
 
 def blobs(seed: int, count: int = 1500) -> np.ndarray:
-    """Return four dense balls of different density that nearly touch, with noise, far from the origin."""
+    """Return the points of four balls of different density that nearly touch, with noise, far from the origin."""
     rng = np.random.default_rng(seed)
     centers = rng.uniform(-0.4, 0.4, (4, 3))
     sigmas = rng.uniform(0.02, 0.08, 4)
@@ -41,7 +41,7 @@ def blobs(seed: int, count: int = 1500) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_dbscan_keeps_largest_component_with_border(seed):
-    """The reference is scikit-learn's largest cluster by core points, with all points within eps of one."""
+    """The reference is the largest cluster of core points of scikit-learn, with all points within eps of them."""
     eps, min_points, points = 0.04, 12, blobs(seed)
     reference = DBSCAN(eps=eps, min_samples=min_points).fit(points)
     core = reference.core_sample_indices_
@@ -54,7 +54,7 @@ def test_dbscan_keeps_largest_component_with_border(seed):
     assert 0 < right.sum() < len(points)
 
 
-def test_dbscan_eps_grows_with_depth():
+def test_dbscan_eps_increases_with_depth():
     """The points are 5 cm apart on a line at 2 m."""
     line = np.stack([np.arange(20) * 0.05, np.zeros(20), np.full(20, 2.0)], axis=1)
     line[12:, 0] += 0.06
@@ -63,8 +63,8 @@ def test_dbscan_eps_grows_with_depth():
         assert len(refined.pixels) == kept, slope
 
 
-def test_dbscan_skipped_points_follow_sampled_points():
-    """There are two plates of different size; with a stride, pixels between samples follow near samples."""
+def test_dbscan_skipped_points_join_nearby_samples():
+    """The two plates have different sizes; with a stride, skipped pixels are assigned like nearby samples."""
     v, u = np.mgrid[:60, :90]
     plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.3)], axis=-1).reshape(-1, 3)
     clusters = clusters_of(plates)
@@ -75,13 +75,13 @@ def test_dbscan_skipped_points_follow_sampled_points():
 
 
 def test_dbscan_weights_sampled_points_for_skipped_points():
-    """Of a plate of 5400 points at most 600 are searched: every third row and column, with weight nine."""
+    """Of the 5400 points of a plate, at most 600 are sampled: every third row and column, with weight 9."""
     v, u = np.mgrid[:60, :90]
     plate = np.stack([u * 0.01, v * 0.01, 0 * u + 2.0], axis=-1).reshape(-1, 3)
     plate[-90:, 1] += 0.5  # the last row is removed: it contains no sample
     for eps, min_points, kept in ((0.035, 9 * 3, 59 * 90), (0.035, 9 * 5 + 1, 60 * 90)):
         refiner = Dbscan(eps=eps, eps_per_depth=0.0, min_points=min_points, stride=1, max_points=600)
-        assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, "each has at most 5 within eps"
+        assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, "at most 5 samples are within eps"
 
 
 def test_dbscan_first_of_two_equal_components_stays():

@@ -17,7 +17,7 @@ POSE = Pose(exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1])))
 
 
 def table() -> tuple[np.ndarray, np.ndarray]:
-    """Return depth (H, W) m and ids: 1 a box whose front is 1.2 m away, 0 the table below and the wall 2 m away."""
+    """Return depth (H, W), m, and ids (H, W): 1 = box with its front 1.2 m away, 0 = table and wall at 2 m."""
     v, u = np.mgrid[:240, :320]
     x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
     depth = np.minimum(2.0, 0.7 / np.maximum(y, 1e-9))
@@ -45,7 +45,7 @@ def image_of(clusters: PointClusters, k: int) -> np.ndarray:
     u, v = clusters.pixels[clusters.cluster == k].T
     assert not image[v, u].any()
     image[v, u] = True
-    assert image.sum() == (clusters.cluster == k).sum(), "no pixel twice"
+    assert image.sum() == (clusters.cluster == k).sum(), "each pixel occurs once"
     return image
 
 
@@ -58,7 +58,7 @@ def shifted(mask: np.ndarray, dv: int, du: int) -> np.ndarray:
 
 
 def test_geometric_corrects_shifted_mask_to_box():
-    """The mask is eight pixels too far right: the table is removed, and the box's left rim is added."""
+    """The mask is 8 px too far right; the table is removed, and the left border of the box is added."""
     depth, ids = table()
     frame = frame_of(depth)
     mask = shifted(ids == 1, 0, 8)
@@ -66,8 +66,8 @@ def test_geometric_corrects_shifted_mask_to_box():
     after = Geometric().refine(before, frame)
     box = image_of(after, 0)
     assert (box & (ids == 1)).sum() > 0.97 * (ids == 1).sum()
-    assert (box & (ids == 0)).sum() < 2 * 90, "of the table, along its border"
-    assert (box & ~mask).sum() > 200, "it has grown"
+    assert (box & (ids == 0)).sum() < 2 * 90, "table pixels only along the border"
+    assert (box & ~mask).sum() > 200, "the mask has grown"
     everything = lifted(np.ones((1, *CAMERA.shape), bool), frame).points_world.reshape(*CAMERA.shape, 3)
     u, v = after.pixels.T
     np.testing.assert_allclose(after.points_world, everything[v, u], atol=1e-5)
@@ -95,7 +95,7 @@ def test_geometric_segment_goes_to_mask_of_largest_coverage():
     assert set(refined.cluster.tolist()) == {1}
     assert image_of(refined, 1)[ids == 1].mean() > 0.97
     equal = Geometric().refine(lifted(np.stack([ids == 1, ids == 1]), frame), frame)
-    assert set(equal.cluster.tolist()) == {0}, "of equals the first"
+    assert set(equal.cluster.tolist()) == {0}, "the first of equal masks"
 
 
 @pytest.mark.parametrize(("min_overlap", "claimed"), [(0.4, True), (0.6, False)])
@@ -131,7 +131,7 @@ def test_geometric_collinear_points_are_not_extended():
     np.testing.assert_array_equal(refiner.refine(before, frame).pixels, before.pixels)
     mask[0, 40:80, 61] = True
     mask[0, 70:80, 61] = False
-    assert len(refiner.refine(lifted(mask, frame), frame).pixels) == 80, "two columns fix the pose"
+    assert len(refiner.refine(lifted(mask, frame), frame).pixels) == 80, "two columns determine the pose"
 
 
 def test_geometric_degenerate_input_is_valid():

@@ -19,7 +19,7 @@ CLASSES = ("chair", "bed")
 
 
 def clusters_of(points: Float32, masks: Int32, scores: tuple[float, ...], pixels: Int32 | None = None) -> PointClusters:
-    """Return clusters without common pixels."""
+    """Return the clusters of points; without `pixels`, each point has its own pixel."""
     n = np.arange(len(points))
     return PointClusters(
         points_world=points,
@@ -32,7 +32,7 @@ def clusters_of(points: Float32, masks: Int32, scores: tuple[float, ...], pixels
 
 
 def three_objects(seed: int, bleed: float = 0.15) -> tuple[Float32, Int32, Int32]:
-    """Return points (S, 3) of three curved objects, their masks with some wrong points, and the true objects."""
+    """Return the points (S, 3), m, of three curved objects, their masks (S,), some wrong, and the true objects (S,)."""
     rng = np.random.default_rng(seed)
     centers = np.array([[0.0, 0.0, 2.0], [0.5, 0.1, 2.2], [0.1, 0.6, 1.7]])
     truth = np.sort(rng.integers(0, 3, 900))
@@ -90,7 +90,10 @@ def em(points: Float64, gaussians: list[Gaussian], refiner: GmmFrame) -> list[Ga
 
 
 def split(node: Gaussian, points: Float64, refiner: GmmFrame) -> list[Gaussian]:
-    """Return the children of a node, whose weights sum to its own; itself if it has too few points."""
+    """Return the children of a node, or the node itself if it has too few points.
+
+    The weights of the children sum to the weight of the node.
+    """
     if len(points) < 32:
         return [node]
     values, vectors = np.linalg.eigh(node.Sigma)
@@ -105,7 +108,7 @@ def split(node: Gaussian, points: Float64, refiner: GmmFrame) -> list[Gaussian]:
 
 
 def slow_masks(refiner: GmmFrame, points: Float32, masks: Int32, count: int) -> Int32:
-    """Return the mask at the root of each point's most probable leaf."""
+    """Return the mask (S,) of the root of each point's most probable leaf."""
     x = points.astype(np.float64)
     first = m_step(x, np.eye(count)[masks], list(range(count)), refiner.std_floor**2)
     leaves = em(x, first, refiner)
@@ -127,7 +130,7 @@ def test_gmm_frame_point_assignment_matches_reference(levels: int, children: int
     found = np.empty(len(points), np.int32)
     found[refined.pixels[:, 0] + 80 * refined.pixels[:, 1]] = refined.cluster
     assert len(refined.cluster) == len(points)
-    assert (found != expected).mean() < 0.005  # single precision may decide a tie
+    assert (found != expected).mean() < 0.005  # ties may differ in single precision
     assert (found == truth).mean() > 0.93 > (masks == truth).mean()
     assert (np.diff(refined.cluster) >= 0).all()
 
@@ -151,7 +154,7 @@ def test_gmm_frame_pixel_in_several_masks_goes_to_best_score() -> None:
     points, masks, _ = three_objects(3, bleed=0.0)
     n = np.arange(len(points))
     pixels = np.stack([n % 80, n // 80], axis=1).astype(np.int32)
-    again = np.flatnonzero(masks == 1)  # mask 2 covers mask 1, and has a better score
+    again = np.flatnonzero(masks == 1)  # mask 2 covers mask 1 and has a higher score
     clusters = clusters_of(
         np.concatenate([points, points[again]]),
         np.concatenate([masks, np.full(len(again), 2, np.int32)]),

@@ -17,9 +17,9 @@ CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 
 
 def room() -> tuple[np.ndarray, np.ndarray]:
-    """Return depth (H, W) m with noise and ids: the front (1) of a 0.5 m box at 2 m, and its top (2), 16 px high.
+    """Return noisy depth (H, W), m, and ids (H, W): 1 = front of a 0.5 m box at 2 m, 2 = its top, 16 px high.
 
-    The box is on a floor in front of a wall at 3 m.
+    The box is on a floor in front of a wall at 3 m; both have id 0.
     """
     v, u = np.mgrid[:240, :320]
     ray_x, ray_y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
@@ -44,7 +44,7 @@ def lifted(masks: np.ndarray, frame: Frame) -> PointClusters:
 
 
 def bleeding(mask: np.ndarray, px: int) -> np.ndarray:
-    """Return the mask grown by `px` to all sides."""
+    """Return the mask dilated by `px` pixels."""
     v, u = np.nonzero(mask)
     grown = np.zeros_like(mask)
     for dv in range(-px, px + 1):
@@ -70,11 +70,11 @@ def test_gmm_tree_removes_mask_bleed(px, levels):
     assert after[ids == 1].mean() > 0.98, "the top is within the bleeding margin, so that it is ambiguous"
     assert 1 - after[mask & (ids == 0)].mean() > 0.92
     before = kept(Identity().refine(lifted(mask[None], frame), frame))
-    assert before[mask].all(), "the input must have background points"
+    assert before[mask].all(), "the input has background points"
 
 
 def test_gmm_tree_mask_log_odds_decide_in_one_plane():
-    """Object and wall are in one plane: geometry is uninformative, and the border is where the log-odds are 0."""
+    """Object and wall are in one plane, so only the log-odds of the mask are informative."""
     depth = np.full(CAMERA.shape, 2.0, np.float32)
     frame = frame_of(depth)
     mask = np.zeros((1, *CAMERA.shape), bool)
@@ -82,7 +82,7 @@ def test_gmm_tree_mask_log_odds_decide_in_one_plane():
     clusters = lifted(mask, frame)
     after = kept(GmmTree().refine(clusters, frame))
     assert after[85:155, 125:195].mean() > 0.98
-    assert len(GmmTree(mask_log_odds=0.0).refine(clusters, frame).pixels) == 0, "without evidence it is a tie"
+    assert len(GmmTree(mask_log_odds=0.0).refine(clusters, frame).pixels) == 0, "without evidence, both sides tie"
 
 
 def test_gmm_tree_refines_masks_independently():
@@ -105,7 +105,7 @@ def test_gmm_tree_cluster_with_too_few_points_is_unchanged():
     assert len(GmmTree().refine(lifted(tiny, frame), frame).pixels) == 25, "fewer than min_points"
     lonely = frame_of(np.where(ids > 0, depth, 0).astype(np.float32))
     box = lifted((ids > 0)[None], lonely)
-    assert len(GmmTree().refine(box, lonely).pixels) == (ids > 0).sum(), "a ring without readings"
+    assert len(GmmTree().refine(box, lonely).pixels) == (ids > 0).sum(), "a ring without depth"
     sparse = frame_of(np.where((np.indices(depth.shape).sum(axis=0) % 40) == 0, depth, 0).astype(np.float32))
     few = lifted(bleeding(ids > 0, 8)[None], sparse)
     assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), "a tree without a node"

@@ -28,9 +28,9 @@ T_WORLD_CAMERA = exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1]))
 
 
 def room(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth (H, W) m with 1 % noise, and ids: 0 wall at 3 m and floor 0.8 m below, 1 a 0.5 m box on it.
+    """Return noisy depth (H, W), m, and ids (H, W): 0 = wall at 3 m and floor, 1 = box of 0.5 m, 2 = pole.
 
-    The front of the box is 2 m away; a pole (id 2) is in front of its left edge at 1.2 m.
+    The front of the box is 2 m away; the pole is in front of its left edge at 1.2 m.
     """
     v, u = np.mgrid[:240, :320]
     ray_x, ray_y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
@@ -67,7 +67,7 @@ def bleeding(mask: np.ndarray, px: int) -> np.ndarray:
 
 
 def recall_and_rejection(refined: PointClusters, before: PointClusters, ids: np.ndarray) -> tuple[float, float]:
-    """Return the kept fraction of the box's points, and the dropped fraction of the others, in cluster 0."""
+    """Return the kept fraction of the box points and the dropped fraction of the other points of cluster 0."""
     right, was_right = (ids[c.pixels[c.cluster == 0, 1], c.pixels[c.cluster == 0, 0]] == 1 for c in (refined, before))
     return right.sum() / was_right.sum(), 1 - (~right).sum() / (~was_right).sum()
 
@@ -80,7 +80,7 @@ def test_gmm_em_removes_mask_bleed(px):
     before = lifted(bleeding(ids == 1, px)[None], frame)
     recall, rejection = recall_and_rejection(GmmEm().refine(before, frame), before, ids)
     assert recall > 0.97
-    assert rejection > (0.95 if px < 6 else 0.88)  # the mask is trusted up to 4.8 px of bleeding: `expected_bleed`
+    assert rejection > (0.95 if px < 6 else 0.88)  # masks are trusted up to `expected_bleed`, 4.8 px
     doubting = GmmEm(object_components=2, mask_log_odds=2.0, expected_bleed=0.5).refine(before, frame)
     doubting_recall, doubting_rejection = recall_and_rejection(doubting, before, ids)
     assert doubting_recall > 0.97
@@ -157,7 +157,7 @@ def test_shrinking_refiner_keeps_cluster_with_too_few_points(make):
     assert len(make().refine(lifted(tiny, frame), frame).pixels) == 25, "fewer than min_points"
     lonely = frame_of(np.where(ids == 1, depth, 0).astype(np.float32))
     box = lifted((ids == 1)[None], lonely)
-    assert len(make().refine(box, lonely).pixels) == (ids == 1).sum(), "a ring without readings"
+    assert len(make().refine(box, lonely).pixels) == (ids == 1).sum(), "a ring without depth"
 
 
 def test_shrinking_refiner_unassigned_points_stay():
@@ -188,7 +188,7 @@ def test_largest_component_keeps_larger_of_two_pieces():
 
 
 @pytest.mark.parametrize(("reach", "kept"), [(1, 20), (2, 39)])
-def test_largest_component_bridges_missing_readings(reach, kept):
+def test_largest_component_bridges_missing_depth(reach, kept):
     camera = Camera(40, 1, 50.0, 50.0, 19.5, 0.0)
     depth = np.full((1, 40), 1.0, np.float32)
     depth[0, 20] = 0
@@ -216,7 +216,7 @@ def test_largest_component_agrees_with_scipy():
 @pytest.mark.parametrize("reach", [1, 2, 3])
 @pytest.mark.parametrize("density", [0.05, 0.3, 0.9])
 def test_largest_component_matches_reference(reach, density):
-    """The reference is a graph over noisy depth with an edge between points that are near in image and depth."""
+    """The reference is a graph over noisy depth with edges between points that are close in image and depth."""
     from scipy.sparse.csgraph import connected_components
 
     camera = Camera(37, 23, 50.0, 50.0, 18.0, 11.0)
@@ -251,7 +251,7 @@ def test_shrinking_refiner_invalid_parameter_raises(make, parameters, message):
 
 
 def slow_posterior(points: np.ndarray, iterations: int, std_floor: float, outliers: float) -> np.ndarray:
-    """Return (P,) the posterior of one Gaussian against a uniform density after float64 EM from all points."""
+    """Return the posterior (P,) of one Gaussian against a uniform density, after EM in float64 from all points."""
     x = points.astype(np.float64)
     density = 1 / np.prod(np.maximum(x.max(axis=0) - x.min(axis=0), 4 * std_floor))
     weight, responsibilities, uniform = 0.0, np.full(len(x), 1 - outliers), outliers

@@ -72,7 +72,7 @@ def test_given_poses_skip_frames_without_pose_with_one_warning(
 def test_given_poses_missing_do_not_hide_unreadable_frames(
     tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Unreadable frames are logged one by one up to a limit, in which frames without poses do not count."""
+    """Unreadable frames are logged one by one up to a limit; frames without poses do not count toward it."""
     caplog.set_level("WARNING")
     late = 30
     room = CornerRoom(frames=late + 2, unposed=tuple(range(late)), unreadable=late)
@@ -89,7 +89,7 @@ def test_given_poses_missing_do_not_hide_unreadable_frames(
 
 
 def test_given_poses_error_uses_only_frames_with_true_pose(tmp_path: Path) -> None:
-    """Every given pose without a true pose is wrong; neither ATE nor RPE may change."""
+    """The given poses of frames without a true pose are wrong and must not change ATE or RPE."""
     poses = [np.linalg.inv(pose_at(9 * k)) if k in GAP else pose_at(k) for k in range(FRAMES)]
     write_tum(tmp_path / "poses.txt", [k / 30 for k in range(FRAMES)], poses)
     tracker = TrajectoryFile(tmp_path / "poses.txt")
@@ -120,7 +120,7 @@ def test_given_poses_missing_in_sequence_raise_before_reading() -> None:
             return False
 
         def __getitem__(self, k: int) -> Frame:
-            raise AssertionError("it was read")
+            raise AssertionError("a frame was read")
 
     with pytest.raises(
         DataError, match="corner_room: expected ground-truth poses, got none for the 6 frames; add the poses"

@@ -68,7 +68,7 @@ def test_pycolmap_pnp_relocalizes_after_uninformative_frames(frames: list[Frame]
     assert [pose.lost for pose in poses] == [False] * 17 + [True] * 4 + [False]
     assert "fewer than 20 of the frame's" in poses[17].reason
     np.testing.assert_array_equal(poses[20].T_world_camera, poses[16].T_world_camera)
-    assert_near(poses[-1], frames[1])  # which the keyframes near the last pose do not show
+    assert_near(poses[-1], frames[1])  # not visible in the keyframes near the last pose
 
 
 def test_pycolmap_pnp_depth_inconsistent_with_color_is_lost(frames: list[Frame]) -> None:
@@ -91,7 +91,7 @@ def test_pycolmap_pnp_invalid_parameter_raises() -> None:
             PycolmapPnp(**bound)
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/data")
+@pytest.mark.skipif(not SHARED.is_dir(), reason="requires ../shared/data")
 def test_pycolmap_pnp_tracks_real_video() -> None:
     kitchen = list(RgbdFolder(SHARED / "redkitchen", stop=60, stride=3))
     poses = track(kitchen)

@@ -1,4 +1,4 @@
-"""Tests of poses from a file by timestamp, in the world frame of the contract or of the file."""
+"""Tests of poses from a file, found by timestamp, in the world frame of the sequence or of the file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ T_FILE_WORLD = exp_se3(np.array([3.0, -2.0, 1.0, 0.4, -0.7, 0.2]))  # world of a
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Write frames 0 to 5 of the corner room with timestamps 4 ms late, and without frame 3."""
+    """Write the poses of frames 0 to 5 of the corner room except frame 3, with timestamps 4 ms late."""
     path = tmp_path / "other_slam.txt"
     frames = [0, 1, 2, 4, 5]
     write_tum(path, [k / 30 + 0.004 for k in frames], [T_FILE_WORLD @ pose_at(k) for k in frames])

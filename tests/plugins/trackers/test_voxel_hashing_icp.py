@@ -40,7 +40,7 @@ def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], Scen
 
 
 def drift(pose: Pose, frame: Frame) -> tuple[float, float]:
-    """Return (m, rad) between the estimate and the truth."""
+    """Return the errors of the position, m, and of the rotation, rad."""
     assert frame.T_world_camera is not None
     error = inverse(frame.T_world_camera) @ pose.T_world_camera
     return float(np.linalg.norm(error[:3, 3])), rotation_angle(error[:3, :3])
@@ -56,8 +56,8 @@ def test_voxel_hashing_icp_recovers_known_motion(color_weight: float) -> None:
     assert drift(poses[-1], frames[-1])[1] < 0.003
 
 
-def test_voxel_hashing_icp_keyframe_stops_drift_at_standstill(shared: Path) -> None:
-    """Structure below the voxel size biases the alignment to the map alone."""
+def test_voxel_hashing_icp_keyframe_prevents_drift_when_static(shared: Path) -> None:
+    """Structure below the voxel size biases the alignment if the keyframe is not used."""
     frame = dataclasses.replace(RgbdFolder(shared / "data" / "redkitchen")[0], T_world_camera=np.eye(4))
     with_keyframe, alone = (
         run(VoxelHashingIcp(raw_keyframe=raw_keyframe), [frame] * 60)[0][-1] for raw_keyframe in (True, False)
@@ -74,11 +74,11 @@ def test_voxel_hashing_icp_color_determines_motion_along_wall() -> None:
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], frames[-1])[0] < 0.01
     alone, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=0.0), frames)
-    assert any(pose.lost for pose in alone), "alone it reports that the motion is undetermined"
+    assert any(pose.lost for pose in alone), "geometry alone does not determine the motion"
 
 
 def enlarged(frame: Frame, scale: float) -> Frame:
-    """Return the frame of the scene enlarged by `scale`."""
+    """Return the frame as seen in the scene enlarged by `scale`."""
     assert frame.T_world_camera is not None
     T = frame.T_world_camera.copy()
     T[:3, 3] *= scale
@@ -87,7 +87,7 @@ def enlarged(frame: Frame, scale: float) -> Frame:
 
 @pytest.mark.parametrize("scale", [1, 8])
 def test_voxel_hashing_icp_hall_is_tracked_as_accurately_as_room(scale: float) -> None:
-    """At scale 8, depths are 10 to 25 m and steps 8 cm."""
+    """At scale 8, depths are 10 to 25 m and steps are 8 cm."""
     frames = [enlarged(room().frame(T, k), scale) for k, T in enumerate(walk(20))]
     fuser = assemble(BayesianTsdf, voxel_size=0.02 * scale, max_depth=4.0 * scale)
     tracker = VoxelHashingIcp(finest_scale=1.0)
@@ -116,7 +116,7 @@ def test_voxel_hashing_icp_resumes_after_covered_frames() -> None:
     assert drift(poses[-1], frames[-1])[0] < 0.006
 
 
-def test_voxel_hashing_icp_relocalizes_or_loses_jump() -> None:
+def test_voxel_hashing_icp_relocalizes_or_is_lost_after_jump() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(20))]
     away = walk(1)[0].copy()
     away[:3, 3] += (0.0, 0.0, -1.2)
@@ -131,7 +131,7 @@ def test_voxel_hashing_icp_relocalizes_or_loses_jump() -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1])
 def test_voxel_hashing_icp_does_not_depend_on_feature_timing(seconds: float) -> None:
-    """A doubtful or lost frame needs keyframes right after one was offered to the worker thread."""
+    """Doubtful and lost frames need keyframes while the worker thread is still extracting one."""
     path = [exp_se3(np.array([0.03 * k - 0.3, 0, 0, 0, 0.01 * k, 0])) for k in range(24)]
     for k in (8, 16, 17):
         path[k] = path[k] @ exp_se3(np.array([0, 0, -0.4, 0, 0.3, 0]))
@@ -165,7 +165,7 @@ def test_voxel_hashing_icp_does_not_depend_on_feature_timing(seconds: float) -> 
         np.testing.assert_array_equal(later.keyframes()[name], array, err_msg=name)
 
 
-def test_voxel_hashing_icp_pickles_with_keyframes() -> None:
+def test_voxel_hashing_icp_pickle_includes_keyframes() -> None:
     frames = [papered_frame(exp_se3(np.array([0.03 * k, 0, 0, 0, 0, 0])), k) for k in range(8)]
     tracker = VoxelHashingIcp()
     _, scene = run(tracker, frames[:-1])
@@ -204,7 +204,7 @@ def test_voxel_hashing_icp_tracks_images_of_odd_sizes(size: tuple[int, int]) -> 
 
 
 @pytest.mark.parametrize("finest", [0.3, 0.75, 2.0])
-def test_voxel_hashing_icp_finest_scale_not_half_power_raises(finest: float) -> None:
+def test_voxel_hashing_icp_invalid_finest_scale_raises(finest: float) -> None:
     with pytest.raises(ConfigError, match="finest_scale: expected"):
         VoxelHashingIcp(finest_scale=finest)
 
@@ -263,7 +263,7 @@ def test_voxel_hashing_icp_starts_after_unusable_first_frame(name: str) -> None:
     assert drift(poses[-1], frames[-1])[0] < 0.004
 
 
-def test_voxel_hashing_icp_loses_unmappable_depth() -> None:
+def test_voxel_hashing_icp_depth_out_of_range_is_lost() -> None:
     far = [dataclasses.replace(f, depth=100 * f.depth) for f in (room().frame(T, k) for k, T in enumerate(walk(4)))]
     poses, scene = run(VoxelHashingIcp(finest_scale=1.0), far)
     assert scene.statistics.voxels == 0
@@ -308,7 +308,7 @@ ONE_STEP = {
 
 
 def test_voxel_hashing_icp_accepts_pose_after_good_final_step() -> None:
-    """Before the step, 6 cm away, too few points agree with the map; the step removes most of the distance."""
+    """Before the step, the error is 6 cm and too few points agree with the map; the step corrects most of it."""
     start = walk(1)[0]
     frames = [room().frame(T, k) for k, T in enumerate((start, start @ exp_se3(np.array([0.06, 0, 0, 0, 0, 0]))))]
     poses, _ = run(VoxelHashingIcp(**ONE_STEP), frames)
@@ -316,7 +316,7 @@ def test_voxel_hashing_icp_accepts_pose_after_good_final_step() -> None:
     assert drift(poses[1], frames[1])[0] < 0.03
 
 
-def test_voxel_hashing_icp_loses_pose_after_bad_final_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxel_hashing_icp_is_lost_after_bad_final_step(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
     assert not any(pose.lost for pose in run(VoxelHashingIcp(**ONE_STEP), frames)[0])
     monkeypatch.setattr(voxel_hashing_icp, "_solved", lambda *_: np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
@@ -326,7 +326,7 @@ def test_voxel_hashing_icp_loses_pose_after_bad_final_step(monkeypatch: pytest.M
 
 
 def aligned(T_world_camera: np.ndarray, agreement: float = 0.85, behind: float = 0.05) -> Alignment:
-    """Return the alignment of an imperfect camera, or a wrong pose."""
+    """Return an alignment with imperfect agreement, as for an inexact camera or a wrong pose."""
     return Alignment(T_world_camera, 0.7, agreement, behind, agreement / (1 - behind), "", "85% agree")
 
 
@@ -348,7 +348,7 @@ def test_voxel_hashing_icp_steady_motion_needs_less_agreement(
         tracker, "_align", lambda *_: (a := aligned(next(ends))) and (a._replace(doubt="") if perfect.pop(0) else a)
     )
     lost = [tracker.track(frame, fuser.scene).lost for frame in frames[1 : STEADY + 4]]
-    assert not any(lost), "the prediction has been right before"
+    assert not any(lost), "the prediction was correct before"
     monkeypatch.setattr(tracker, "_align", lambda *_: aligned(tracker._T_world_last @ moved(0.2)))
     assert tracker.track(frames[-2], fuser.scene).lost, "20 cm from the prediction"
     for worse in (aligned(tracker._T_world_last, agreement=0.7), aligned(tracker._T_world_last, 0.8, behind=0.15)):
@@ -381,7 +381,7 @@ def test_voxel_hashing_icp_features_reject_contradicting_pose(monkeypatch: pytes
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_voxel_hashing_icp_resumes_without_relocalization(moving: bool) -> None:
-    """Half of the view is hidden for some frames, while the camera stands still or rotates."""
+    """Half of the view is replaced with random depth in four frames, while the camera is static or moves."""
     there = walk(30)[:14]
     frames = [room().frame(T, k) for k, T in enumerate(there)]
     hidden = [room().frame(there[7 + (k if moving else 0)], 7 + k) for k in range(4)]
@@ -399,7 +399,7 @@ LARGER = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
 
 
 def noisy(step: float, count: int) -> list[Frame]:
-    """Return frames with a Kinect's noise, `step` m and 0.3 `step` rad apart."""
+    """Return frames with Kinect noise; the camera moves by `step` m and 0.3 `step` rad per frame."""
     rng = np.random.default_rng(0)
     frames = [room().frame(exp_se3(step * k * np.array([1, 0, 0, 0, 0.3, 0])), k, LARGER) for k in range(count)]
     return [
@@ -412,7 +412,7 @@ def noisy(step: float, count: int) -> list[Frame]:
     ]
 
 
-def test_standing_camera_keeps_pose() -> None:
+def test_voxel_hashing_icp_static_camera_keeps_pose() -> None:
     frames = noisy(0.0, 40)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     changes = sum(not np.array_equal(a.T_world_camera, b.T_world_camera) for a, b in pairwise(poses))
@@ -420,8 +420,8 @@ def test_standing_camera_keeps_pose() -> None:
     assert drift(poses[-1], frames[-1])[0] < 0.0006
 
 
-def test_slow_motion_is_tracked() -> None:
-    """Steps of 0.1 mm are below their uncertainty; 6 mm are not."""
+def test_voxel_hashing_icp_tracks_slow_motion() -> None:
+    """A step of 0.1 mm is below its uncertainty; the total motion of 6 mm is not."""
     frames = noisy(0.0001, 60)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     stops = sum(np.array_equal(a.T_world_camera, b.T_world_camera) for a, b in pairwise(poses))
@@ -430,8 +430,8 @@ def test_slow_motion_is_tracked() -> None:
 
 
 @pytest.mark.parametrize(("step", "held"), [(0.0005, True), (0.002, False)])
-def test_only_small_uncertain_motion_is_held(step: float, held: bool) -> None:
-    """As along a wall with little texture: the uncertainty is larger than the motion of a moving camera."""
+def test_voxel_hashing_icp_holds_only_small_uncertain_motion(step: float, held: bool) -> None:
+    """Along a wall with little texture, the uncertainty may exceed the motion of a moving camera."""
     tracker = VoxelHashingIcp()
     tracker._T_world_last = moved(1.0)
     uncertain = aligned(moved(1.0 + step))._replace(covariance=np.eye(6))
@@ -440,8 +440,8 @@ def test_only_small_uncertain_motion_is_held(step: float, held: bool) -> None:
     assert tracker._held(uncertain._replace(covariance=1e-12 * np.eye(6))).T_world_camera is uncertain.T_world_camera
 
 
-def test_pose_covariance_predicts_errors() -> None:
-    """Errors relative to the previous frame, in units of their covariance."""
+def test_voxel_hashing_icp_covariance_matches_errors() -> None:
+    """The errors relative to the previous frame are compared with their covariance."""
     frames = noisy(0.004, 30)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert poses[0].covariance is not None
@@ -454,7 +454,7 @@ def test_pose_covariance_predicts_errors() -> None:
     assert 0.02 < np.mean(squares) < 3
 
 
-def test_linear_weights_have_no_covariance() -> None:
+def test_voxel_hashing_icp_linear_weights_give_no_covariance() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(3))]
     tracker = VoxelHashingIcp(finest_scale=1.0, residual_weights=ResidualWeights.LINEAR, raw_keyframe=False)
     assert run(tracker, frames)[0][-1].covariance is None
@@ -466,14 +466,14 @@ def scattered(frame: Frame, missing: float) -> Frame:
     return dataclasses.replace(frame, depth=np.where(rng.random(frame.depth.shape) < missing, 0, frame.depth))
 
 
-def test_scattered_depth_is_tracked() -> None:
+def test_voxel_hashing_icp_tracks_scattered_depth() -> None:
     frames = [scattered(room().frame(T, k), 0.7) for k, T in enumerate(walk(30))]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], frames[-1])[0] < 0.006
 
 
-def test_voxel_hashing_icp_loss_names_scattered_depth() -> None:
+def test_voxel_hashing_icp_lost_reason_names_scattered_depth() -> None:
     frames = [scattered(room().frame(T, k), 0.7) for k, T in enumerate(walk(3))]
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0, raw_keyframe=False), frames)
     assert poses[-1].lost
@@ -481,7 +481,7 @@ def test_voxel_hashing_icp_loss_names_scattered_depth() -> None:
 
 
 def coarse(frame: Frame) -> Frame:
-    """Quantize depth as if it were stored in 8 bits."""
+    """Return the frame with depth in steps of 3.92 cm, as in 8 bits."""
     steps = (np.floor(frame.depth / 0.0392) + 0.5) * 0.0392
     return dataclasses.replace(frame, depth=np.where(frame.depth > 0, steps, 0).astype(np.float32))
 
@@ -499,7 +499,7 @@ def test_voxel_hashing_icp_tracks_coarse_depth_without_normals(monkeypatch: pyte
     monkeypatch.setattr(VoxelHashingIcp, "_align", recorded)
     poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert not any(pose.lost for pose in poses)
-    assert max(drift(pose, frame)[0] for pose, frame in zip(poses, frames, strict=True)) < 0.0392, "a step"
+    assert max(drift(pose, frame)[0] for pose, frame in zip(poses, frames, strict=True)) < 0.0392, "one depth step"
     without_normals, matched[:] = np.mean(matched), []
     monkeypatch.setattr(voxel_hashing_icp, "is_coarse", lambda *_, **__: False)
     run(VoxelHashingIcp(finest_scale=1.0), frames)

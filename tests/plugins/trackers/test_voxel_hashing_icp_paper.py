@@ -1,4 +1,4 @@
-"""Tests of the tracker of preset=paper: VoxelHashing's parameters, without our checks and relocalization."""
+"""Tests of the tracker of preset=paper: VoxelHashing's parameters, without additional checks and relocalization."""
 
 import dataclasses
 from typing import Any
@@ -36,7 +36,7 @@ def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> list[Pose]:
 
 
 def drift(pose: Pose, frame: Frame) -> float:
-    """Return the distance (m) of the estimate from the true position."""
+    """Return the distance, m, of the estimated position from the true position."""
     assert frame.T_world_camera is not None
     return float(np.linalg.norm(pose.T_world_camera[:3, 3] - frame.T_world_camera[:3, 3]))
 
@@ -70,13 +70,13 @@ def test_paper_tracker_uses_published_parameters(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(voxel_hashing_icp, "CONVERGED", 0.0)
     run(paper_tracker(), walked(2))
     widths = [width for width, *_ in calls]
-    assert [widths.count(width) for width in (40, 80, 160)] == [4, 6, 8 + 1]  # 1: the counts of the result
+    assert [widths.count(width) for width in (40, 80, 160)] == [4, 6, 8 + 1]  # + 1 for the result
     for width, weights, brightness, linear in calls:
         assert weights.color_weight == (0 if width == 160 else 1)
         assert weights.depth_weight == 1
         assert weights.max_distance == np.float32(0.15)
         assert weights.min_normal_dot == np.float32(0.97)
-        assert linear == (np.float32(4.0), np.float32(0.1)), "the largest depth of the map"
+        assert linear == (np.float32(4.0), np.float32(0.1)), "max_depth of the map"
         assert brightness == 0, "exposure is not compensated"
 
 
@@ -113,7 +113,7 @@ def hidden_frames() -> list[Frame]:
 
 
 def test_paper_tracker_agreement_is_not_checked() -> None:
-    """Half of the points are random, which only the agreement checks of the default tracker reject."""
+    """Half of the points are random; only the agreement checks of the default tracker would reject them."""
     poses = run(paper_tracker(), hidden_frames())
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], hidden_frames()[-1]) < 0.01
@@ -133,7 +133,7 @@ def test_paper_tracker_steady_motion_has_no_effect(monkeypatch: pytest.MonkeyPat
         np.testing.assert_array_equal(pose.T_world_camera, other.T_world_camera)
 
 
-def test_paper_tracker_single_alignment_ends_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paper_tracker_recovers_with_single_alignment(monkeypatch: pytest.MonkeyPatch) -> None:
     aligned: list[bool] = []
     align = VoxelHashingIcp._align
     monkeypatch.setattr(VoxelHashingIcp, "_align", lambda *a: aligned.append(True) or align(*a))  # type: ignore[func-returns-value]
@@ -161,14 +161,14 @@ def test_paper_tracker_frame_after_implausible_step_is_lost() -> None:
 
 
 def test_paper_tracker_frame_of_single_wall_is_lost() -> None:
-    """The finest level uses no color, so that nothing determines a motion along the wall."""
+    """The finest level uses no color, so the motion along the wall is undetermined."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     poses = run(paper_tracker(), [wall.frame(T, k) for k, T in enumerate(walk(3))])
     assert [pose.lost for pose in poses] == [False, True, True]
     assert "does not determine the motion" in poses[1].reason
 
 
-def test_paper_tracker_linear_weights_alone_change_poses_little() -> None:
+def test_paper_tracker_linear_weights_alone_have_little_effect() -> None:
     frames = walked(12)
     tukey, linear = (
         run(VoxelHashingIcp(finest_scale=1.0, residual_weights=weights), frames) for weights in ResidualWeights

@@ -34,7 +34,7 @@ from plugins.viewers.rerun import Mode, RerunViewer
 from tests.support import registered
 from tests.support.scenes.corner_room import CAMERA, CornerRoom, GivenPose, KeepAll, SphereDetector, pose_at
 
-pytest.importorskip("rerun", reason="rerun-sdk, of the extra viewer, is not installed")
+pytest.importorskip("rerun", reason="requires rerun-sdk (extra viewer)")
 from pyarrow.types import is_temporal
 from rerun.chunk import RrdReader
 
@@ -47,7 +47,7 @@ PATIENCE_S = 120
 
 
 class GetsLost(GivenPose):
-    """Loses frame 4."""
+    """Tracker that is lost in frame 4."""
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         pose = super().track(frame, scene)
@@ -61,7 +61,7 @@ def pipeline(viewer: RerunViewer, **stages: Any) -> Pipeline:
 
 
 def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
-    """Return the logged values of an entity by column, and the times by timeline, in ns."""
+    """Yield the rows logged for an entity: the values by column, and the times, ns, by timeline."""
     for chunk in RrdReader(file).stream():
         if chunk.entity_path == f"/{entity}" and not chunk.is_static:
             batch = chunk.to_record_batch()
@@ -74,7 +74,7 @@ def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
 
 
 def fixed(file: Path) -> Path:
-    """Return the complete messages, which rerun's viewer shows: `RrdReader` rejects a truncated file."""
+    """Write the complete messages to a new file and return it; `RrdReader` rejects a truncated file."""
     whole = file.with_name("whole.rrd")
     rrd("merge", file, "-o", str(whole))
     return whole
@@ -82,7 +82,7 @@ def fixed(file: Path) -> Path:
 
 def rrd(command: str, file: Path, *options: str) -> None:
     line = [sys.executable, "-m", "rerun", "rrd", command, str(file), *options]
-    home = os.environ | {"HOME": str(file.parent)}  # rerun records here that it has run
+    home = os.environ | {"HOME": str(file.parent)}  # rerun writes its settings to HOME
     done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, env=home)
     assert done.returncode == 0, done.stderr
 
@@ -93,7 +93,7 @@ def entities(file: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run of six frames, of which 2 cannot be read and 4 is lost."""
+    """Return the recording of six frames; frame 2 is unreadable, and frame 4 is lost."""
     directory = tmp_path_factory.mktemp("run")
     viewer = RerunViewer(frame_interval=1, stride=1, mesh_interval=0.1, min_confidence=0.1)
     pipeline(viewer).run_to_any_end(CornerRoom(unreadable=2), directory)
@@ -101,7 +101,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def stages_timed(milliseconds: Sequence[float]) -> list[str]:
-    """Return the stages with a time, of a value for each stage in the legend."""
+    """Return the stages with a finite time; there is one value per stage of the legend."""
     return [stage for stage, time in zip(STAGE_COLORS, milliseconds, strict=True) if np.isfinite(time)]
 
 
@@ -114,7 +114,7 @@ def test_rerun_stage_times_cover_only_completed_stages(recorded: Path) -> None:
     times = {row["frame"]: row["Scalars:scalars"] for row in rows(recorded, "milliseconds")}
     assert sorted(times) == [0, 1, 3, 4, 5]
     assert all(stages_timed(times[k]) == [*STAGE_NAMES] for k in (0, 1, 3, 5))
-    assert stages_timed(times[4]) == ["reading", "detection", "tracking"], "its pose is lost"
+    assert stages_timed(times[4]) == ["reading", "detection", "tracking"], "frame 4 is lost"
 
 
 def test_rerun_lost_and_skipped_frames_are_logged(recorded: Path) -> None:
@@ -168,7 +168,7 @@ def test_rerun_camera_has_pose_and_intrinsics(recorded: Path) -> None:
     np.testing.assert_allclose(camera["Transform3D:translation"][0], pose_at(5)[:3, 3], atol=1e-6)
     assert camera["Pinhole:resolution"][0] == [CAMERA.width, CAMERA.height]
     K = np.array(camera["Pinhole:image_from_camera"][0]).reshape(3, 3).T
-    np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # rerun's pixels begin at whole numbers
+    np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # rerun's pixel centers are at half-integers
 
 
 def test_rerun_viewer_does_not_change_result(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def build_viewer(name: str, *overrides: str) -> Any:
 
 
 def test_rerun_recording_of_killed_run_has_last_second(tmp_path: Path) -> None:
-    """The clock is that of the recording; the reference is the time of the last fused frame."""
+    """The last log time of the recording is compared with the time of the last fused frame."""
     endless = ("dataset.frames=100000", "dataset.slow_s=0.03", "fuser.capacity=100000", "fuser.note=note")
     line = [
         sys.executable,
@@ -219,9 +219,9 @@ def test_rerun_recording_of_killed_run_has_last_second(tmp_path: Path) -> None:
     finally:
         os.kill(run.pid, signal.SIGKILL)
         run.communicate()
-    fused_at = (tmp_path / "note").stat().st_mtime  # nothing can be drawn later, and everything before must be
+    fused_at = (tmp_path / "note").stat().st_mtime  # s, time of the last fused frame
     file = tmp_path / "run" / "recording.rrd"
-    os.truncate(file, file.stat().st_size - 1)  # as if killed during a write, which happens occasionally
+    os.truncate(file, file.stat().st_size - 1)  # as if killed during a write
     frames = list(rows(fixed(file), "world/camera/color"))
     assert len(frames) > 3
     last = max(row["log_time"] for row in frames) / 1e9
@@ -239,7 +239,7 @@ def test_rerun_mapper_writes_recording(tmp_path: Path, monkeypatch: pytest.Monke
     del mapper
     times = {row["frame"]: row["Scalars:scalars"] for row in rows(tmp_path / "recording.rrd", "milliseconds")}
     assert sorted(times) == [0, 2]
-    assert stages_timed(times[0]) == [*STAGE_NAMES[1:]], "the caller has read the frame"
+    assert stages_timed(times[0]) == [*STAGE_NAMES[1:]], "the caller reads the frame"
     assert [row["TextLog:text"] for row in rows(tmp_path / "recording.rrd", "log")]
 
 
@@ -299,24 +299,24 @@ def test_rerun_occupied_port_raises(tmp_path: Path) -> None:
 
 
 def listening() -> set[str]:
-    """Return ADDRESS:PORT, in /proc's hexadecimal, on which this process listens."""
+    """Return where this process listens, as ADDRESS:PORT in the hexadecimal format of /proc."""
     own = {str(file.readlink()) for file in list(Path("/proc/self/fd").iterdir()) if file.is_symlink()}
     lines = [line.split() for table in ("tcp", "tcp6") for line in Path("/proc/net", table).read_text().splitlines()]
     return {line[1] for line in lines if line[3] == "0A" and f"socket:[{line[9]}]" in own}
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="who listens is in /proc")
+@pytest.mark.skipif(sys.platform != "linux", reason="requires /proc")
 def test_rerun_browser_mode_listens_only_on_localhost(tmp_path: Path) -> None:
     viewer = RerunViewer(mode=Mode.BROWSER, port=free_port(), web_port=free_port())
     begun(viewer, tmp_path)
     served = {address.partition(":")[2]: address.partition(":")[0] for address in listening()}
     viewer.end()
     assert {served.pop(f"{port:04X}") for port in (viewer.port, viewer.web_port)} == {"0100007F"}
-    assert not {host for host in served.values() if not host.endswith("7F")}, "nothing else is open"
+    assert not {host for host in served.values() if not host.endswith("7F")}, "no other address is open"
 
 
 def test_rerun_window_mode_binds_only_localhost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A program that records its arguments and listens replaces rerun."""
+    """Rerun is replaced by a program that records its arguments and listens on the port."""
     program, port = tmp_path / "rerun", free_port()
     program.write_text(
         f"""#!{sys.executable}
@@ -329,7 +329,7 @@ if "--port" in sys.argv:
     )
     program.chmod(0o755)
     monkeypatch.setattr(rerun_program, "program", lambda: str(program))
-    for _ in range(2):  # the second call finds it running
+    for _ in range(2):  # at the second call it is already running
         rerun_program.open_window(port, "1GB")
     disabled, opened, *others = (tmp_path / "calls").read_text().splitlines()
     assert disabled == "analytics disable"
@@ -354,4 +354,4 @@ def test_rerun_browser_page_connects_only_to_own_server(tmp_path: Path) -> None:
     assert "*" not in policy
     assert (tmp_path / "also.rrd").exists()
     with socket.socket() as probe:
-        assert probe.connect_ex(("127.0.0.1", viewer.web_port)) != 0, "it is closed"
+        assert probe.connect_ex(("127.0.0.1", viewer.web_port)) != 0, "the server is closed"

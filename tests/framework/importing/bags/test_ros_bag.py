@@ -1,4 +1,4 @@
-"""Tests of ROS bags of a small room, in all formats, valid and damaged."""
+"""Tests of ROS bags of a small room: valid and damaged files in all formats."""
 
 from __future__ import annotations
 
@@ -189,11 +189,11 @@ def test_ros_bag_realsense_depth_is_registered_to_color(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_realsense(bag, DEPTH_CAMERA)
     assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
-    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # readings are moved to the nearest pixel
+    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # depth moves to the nearest pixel
     assert json.loads((tmp_path / "out/camera.json").read_text())["sensor"] == "REALSENSE_D435"
 
 
-def test_topics_without_known_driver_write_no_sensor(tmp_path: Path) -> None:
+def test_ros_bag_topics_of_unknown_driver_write_no_sensor(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag, "depth_registered")
     assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
@@ -306,7 +306,7 @@ def two_cameras() -> BagWriter:
         ),
     ],
 )
-def test_ros_bag_ambiguous_or_invalid_topic_names_option(tmp_path: Path, given: dict[str, str], output: str) -> None:
+def test_ros_bag_ambiguous_or_invalid_topic_raises(tmp_path: Path, given: dict[str, str], output: str) -> None:
     path = two_cameras().write(tmp_path / "bag")
     with pytest.raises(ConfigError, match=output):
         open_source(path, Topics(**given))
@@ -346,7 +346,7 @@ def test_ros_bag_missing_topic_raises(tmp_path: Path, left_out: str, output: str
         open_source(path)
 
 
-def test_ros_bag_topics_for_phone_export_raise(tmp_path: Path) -> None:
+def test_topic_options_for_phone_export_raise(tmp_path: Path) -> None:
     (tmp_path / "a.r3d").touch()
     with pytest.raises(ConfigError, match="--color, --poses: expected a ROS bag for topics, got"):
         open_source(tmp_path / "a.r3d", Topics(color="/a", poses="/b"))
@@ -361,7 +361,10 @@ R_IMU_CAMERA = Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix()
 def add_accelerometer(
     bag: BagWriter, topic: str = "/camera/imu", frame_id: str = "imu", length: float = 9.81, late: float = 0.0
 ) -> None:
-    """Add an accelerometer at 300 Hz to a slowly rotating camera, with vibrations of 4 m/s^2 at 50 Hz."""
+    """Add accelerometer messages of a slowly rotating camera at 300 Hz, with vibrations of 4 m/s^2 at 50 Hz.
+
+    `length` is the length of gravity, m/s^2; `late` is added to the timestamps, s.
+    """
     for n in range(-30, 10 * COUNT + 30):
         acceleration = length * UP_WORLD + np.array([4.0, 0, 0]) * np.sin(2 * np.pi * n / 6)
         measured = R_IMU_CAMERA @ pose_at(n / 10)[:3, :3].T @ acceleration
@@ -381,7 +384,7 @@ def check_up(folder: Path, within: float = 1.0) -> None:
 
 @pytest.mark.parametrize("name", ["ros1.bag", "ros2_folder"])
 def test_ros_bag_accelerometer_gives_up_vector_in_camera_axes(tmp_path: Path, name: str) -> None:
-    """The frame chain is used in both directions; the topic of a gyroscope has no acceleration."""
+    """The frame chain contains inverted transforms; messages of a gyroscope have no acceleration."""
     bag = BagWriter(ros1=KINDS[name])
     add_camera_of_ros(bag)
     add_accelerometer(bag)
@@ -468,7 +471,7 @@ def spoilt(message: Any, name: str) -> Any:
 
 @pytest.mark.parametrize("topic", ["/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"])
 @pytest.mark.parametrize("name", ["encoding", "height", "step", "width", "data"])
-def test_ros_bag_damaged_message_loses_one_frame(tmp_path: Path, topic: str, name: str) -> None:
+def test_ros_bag_damaged_message_skips_one_frame(tmp_path: Path, topic: str, name: str) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     number = [k for k, entry in enumerate(bag.messages) if entry[1] == topic][1]
@@ -481,7 +484,7 @@ def test_ros_bag_damaged_message_loses_one_frame(tmp_path: Path, topic: str, nam
 
 
 @pytest.mark.parametrize("depth", [b"", b"123", bytes(12), bytes(12) + b"\x89PNG\r\n\x1a\n" + bytes(40)])
-def test_ros_bag_damaged_compressed_depth_loses_one_frame(tmp_path: Path, depth: bytes) -> None:
+def test_ros_bag_damaged_compressed_depth_skips_one_frame(tmp_path: Path, depth: bytes) -> None:
     bag = BagWriter()
     for k in range(COUNT):
         color, metric = seen(k)
@@ -523,7 +526,7 @@ def test_ros_bag_truncated_is_imported_or_raises_one_line_error(tmp_path: Path, 
         assert 0 < len(RgbdFolder(tmp_path / "out")) <= COUNT
 
 
-def test_ros_bag_inverted_byte_loses_at_most_one_frame(tmp_path: Path) -> None:
+def test_ros_bag_inverted_byte_skips_at_most_one_frame(tmp_path: Path) -> None:
     bag = BagWriter(ros1=True)
     add_camera_of_ros(bag)
     path = bag.write(tmp_path / "a.bag")

@@ -1,4 +1,4 @@
-"""Tests of rotated images, whose pixels, rays and lenses show the same world."""
+"""Tests of image rotation: images, cameras, poses and lens models are rotated consistently."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_image_rotation_rotates_lens_with_camera(quarters: int) -> None:
 
 
 @pytest.mark.parametrize(("up", "quarters"), [((0, -1, 0), 0), ((-1, 0, 0), 1), ((0, 1, 0), 2), ((1, 0, 0), 3)])
-def test_upright_turn_points_up_direction_upward(up: tuple[float, ...], quarters: int) -> None:
+def test_upright_turn_maps_up_direction_to_image_top(up: tuple[float, ...], quarters: int) -> None:
     assert upright([np.array(up), np.array(up)]) == Turn(quarters)
     assert (Turn(quarters).R_turned_camera @ up)[1] == pytest.approx(-1)
 

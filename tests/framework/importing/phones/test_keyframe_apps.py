@@ -1,4 +1,4 @@
-"""Tests of the exports of Polycam and 3D Scanner App, which store each frame separately; valid and damaged."""
+"""Tests of valid and damaged exports of Polycam and 3D Scanner App, which store each frame separately."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def test_polycam_optimized_poses_and_images_are_used(tmp_path: Path) -> None:
     write_polycam(tmp_path / "export", FRAMES, "corrected_")
     assert not write(tmp_path / "export/keyframes", tmp_path)
     check_imported(tmp_path / "out", FRAMES, tells_up=False)
-    for frame, seen in zip(drifted, RgbdFolder(tmp_path / "out"), strict=True):  # of ARKit's own world
+    for frame, seen in zip(drifted, RgbdFolder(tmp_path / "out"), strict=True):  # up in ARKit's world
         np.testing.assert_allclose(frame.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)
 
 
 def test_polycam_optimized_poses_without_images_are_used(tmp_path: Path) -> None:
-    """Such exports have no optimized images, and only the pose of the camera."""
+    """Such exports have no optimized images, and their optimized camera files contain only the pose."""
     drifted = [replace(frame, T_world_camera=DRIFT @ frame.T_world_camera) for frame in FRAMES]
     write_polycam(tmp_path / "export", drifted)
     write_polycam(tmp_path / "export", FRAMES, "corrected_")
@@ -128,7 +128,7 @@ SPOILT_CAMERAS = {
 @pytest.mark.parametrize(
     ("app", "how", "message"), [(app, *case) for app, cases in SPOILT_CAMERAS.items() for case in cases]
 )
-def test_keyframe_apps_damaged_camera_loses_one_frame(tmp_path: Path, app: str, how, message: str) -> None:
+def test_keyframe_apps_damaged_camera_skips_one_frame(tmp_path: Path, app: str, how, message: str) -> None:
     WRITERS[app](tmp_path / "export", FRAMES)
     change(second(tmp_path / "export", "frame_*.json" if app == "3D Scanner App" else "cameras/*.json"), how)
     [fault] = write(tmp_path / "export", tmp_path)
@@ -143,7 +143,7 @@ def test_keyframe_apps_damaged_camera_loses_one_frame(tmp_path: Path, app: str, 
         *(("Polycam", f"{kind}/*") for kind in ("cameras", "images", "depth", "confidence")),
     ],
 )
-def test_keyframe_apps_truncated_file_loses_one_frame(tmp_path: Path, app: str, pattern: str) -> None:
+def test_keyframe_apps_truncated_file_skips_one_frame(tmp_path: Path, app: str, pattern: str) -> None:
     WRITERS[app](tmp_path / "export", FRAMES)
     path = second(tmp_path / "export", pattern)
     path.write_bytes(path.read_bytes()[:-10])

@@ -1,4 +1,4 @@
-"""Tests of Record3D's export and .r3d files: valid, damaged, and a real export."""
+"""Tests of EXR exports and .r3d files of Record3D: valid files, damaged files and a real export."""
 
 from __future__ import annotations
 
@@ -72,8 +72,8 @@ def test_record3d_older_export_uses_common_camera_and_rate(export: Path, tmp_pat
     assert [frame.timestamp for frame in sequence] == pytest.approx([k / 30 for k in range(4)])
 
 
-def test_record3d_poses_from_identity_give_no_gravity_file(export: Path, tmp_path: Path) -> None:
-    """In 2022 the app wrote poses in the world of the first frame."""
+def test_record3d_identity_first_pose_writes_no_gravity_file(export: Path, tmp_path: Path) -> None:
+    """In 2022 the app wrote poses relative to the first frame, which give no gravity direction."""
     changed(export, lambda m: m["poses"].__setitem__(0, [0, 0, 0, 1, 0, 0, 0]))
     write_folder(open_source(export), tmp_path / "out", Writing())
     assert len(RgbdFolder(tmp_path / "out")) == 4
@@ -98,7 +98,7 @@ def changed(export: Path, change: Callable[[dict[str, Any]], Any]) -> None:
         (lambda m: m["frameTimestamps"].__setitem__(1, 0.0), "expected a timestamp > "),
     ],
 )
-def test_record3d_damaged_pose_loses_one_frame(export: Path, tmp_path: Path, change, message: str) -> None:
+def test_record3d_damaged_pose_skips_one_frame(export: Path, tmp_path: Path, change, message: str) -> None:
     changed(export, change)
     written = write_folder(open_source(export), tmp_path / "out", Writing())
     [fault] = written.errors
@@ -127,7 +127,7 @@ def test_record3d_invalid_metadata_raises(export: Path, change, message: str) ->
 
 
 @pytest.mark.parametrize("spoil", [lambda data: data[:1000], lambda data: b"", lambda data: data[:300] + data[400:]])
-def test_record3d_damaged_exr_image_loses_one_frame(export: Path, tmp_path: Path, spoil) -> None:
+def test_record3d_damaged_exr_image_skips_one_frame(export: Path, tmp_path: Path, spoil) -> None:
     path = export / "depth/1.exr"
     path.write_bytes(spoil(path.read_bytes()))
     written = write_folder(open_source(export), tmp_path / "out", Writing())
@@ -163,7 +163,7 @@ def rewritten(r3d: Path, name: str, content: bytes | None) -> Path:
         ("rgbd/1.conf", b"", r"rgbd/1\.conf: expected LZFSE data"),
     ],
 )
-def test_record3d_damaged_r3d_member_loses_one_frame(
+def test_record3d_damaged_r3d_member_skips_one_frame(
     r3d: Path, tmp_path: Path, name: str, content: bytes | None, message: str
 ) -> None:
     written = write_folder(open_source(rewritten(r3d, name, content)), tmp_path / "out", Writing())
@@ -172,7 +172,7 @@ def test_record3d_damaged_r3d_member_loses_one_frame(
     assert len(RgbdFolder(tmp_path / "out")) == 3
 
 
-def test_record3d_decompression_bomb_loses_its_frame(r3d: Path, tmp_path: Path) -> None:
+def test_record3d_decompression_bomb_skips_its_frame(r3d: Path, tmp_path: Path) -> None:
     lzfse = pytest.importorskip("lzfse")
     packed = lzfse.compress(bytes(10**6))
     bomb = 100 * packed[:-4] + packed[-4:]  # the last four bytes end the stream
@@ -202,7 +202,7 @@ def test_record3d_real_export_is_imported(shared_data: Path, tmp_path: Path) -> 
     pytest.importorskip("OpenEXR")
     original = shared_data / "originals" / "record3d" / "EXR_RGBD"
     if not original.is_dir():
-        pytest.skip(f"{original} is not there")
+        pytest.skip(f"{original} does not exist")
     written = write_folder(open_source(original), tmp_path / "out", Writing())
     assert (len(written.timestamps), len(written.errors)) == (REAL_FRAMES, 345 - REAL_FRAMES)
     sequence = RgbdFolder(tmp_path / "out")
@@ -213,7 +213,7 @@ def test_record3d_real_export_is_imported(shared_data: Path, tmp_path: Path) -> 
     assert frame.timestamp == pytest.approx(0.05000420800206484)
     assert (frame.depth > 0).mean() > 0.99
     assert np.median(frame.depth) == pytest.approx(0.247, abs=0.003)
-    # it looks down at a door handle, 50 degrees below the horizon
+    # the camera looks at a door handle, 50 degrees below the horizon
     T_world_camera = frame.T_world_camera
     assert T_world_camera is not None
     assert T_world_camera[1, 2] == pytest.approx(-0.77, abs=0.02)

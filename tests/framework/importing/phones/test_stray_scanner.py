@@ -1,4 +1,4 @@
-"""Tests of Stray Scanner's folders: valid, damaged, and a real one."""
+"""Tests of Stray Scanner recordings: valid folders, damaged folders and a real recording."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def spoil_row(folder: Path, number: int, change) -> None:
         ),
     ],
 )
-def test_stray_scanner_damaged_odometry_row_loses_its_frame(folder: Path, tmp_path: Path, change, message: str) -> None:
+def test_stray_scanner_damaged_odometry_row_skips_its_frame(folder: Path, tmp_path: Path, change, message: str) -> None:
     spoil_row(folder, 2, change)
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
     [fault] = written.errors if "77" not in message else written.errors[:1]
@@ -92,7 +92,7 @@ def test_stray_scanner_damaged_odometry_row_loses_its_frame(folder: Path, tmp_pa
 
 
 @pytest.mark.parametrize("name", ["depth/000002.png", "confidence/000002.png"])
-def test_stray_scanner_damaged_image_loses_one_frame(folder: Path, tmp_path: Path, name: str) -> None:
+def test_stray_scanner_damaged_image_skips_one_frame(folder: Path, tmp_path: Path, name: str) -> None:
     path = folder / name
     path.write_bytes(path.read_bytes()[:-20])
     written = write_folder(open_source(folder), tmp_path / "out", Writing())
@@ -135,10 +135,10 @@ def test_stray_scanner_invalid_export_leaves_no_folder(
 
 
 def test_stray_scanner_real_recording_is_imported(shared_data: Path, tmp_path: Path) -> None:
-    """Poses, depth and confidence are real; the video is a replacement."""
+    """Poses, depth and confidence are real; the video is replaced with random images."""
     original = shared_data / "originals" / "stray_scanner"
     if not original.is_dir():
-        pytest.skip(f"{original} is not there")
+        pytest.skip(f"{original} does not exist")
     for name in ("depth", "confidence"):
         shutil.copytree(original / name, tmp_path / "export" / name)
     for name in ("odometry.csv", "camera_matrix.csv"):
@@ -153,12 +153,12 @@ def test_stray_scanner_real_recording_is_imported(shared_data: Path, tmp_path: P
     assert len(sequence) == 4
     assert len(written.errors) == len((original / "odometry.csv").read_text().splitlines()) - 1 - 4
     depth = sequence[0].depth
-    assert (depth > 0).mean() == pytest.approx(1 - 8939 / (192 * 256), abs=0.01)  # confidence 0
+    assert (depth > 0).mean() == pytest.approx(1 - 8939 / (192 * 256), abs=0.01)  # 8939 have confidence 0
     assert np.median(depth[depth > 0]) == pytest.approx(2.72, abs=0.05)
-    # the accelerometer: gravity is 0.20 along the view, which is a camera that looks down
+    # in the accelerometer data, too, the camera looks down: 0.20 of gravity is along its optical axis
     assert sequence[0].T_world_camera[1, 2] == pytest.approx(-0.24, abs=0.01)
     assert upright(written.ups) == Turn(1)  # the phone was held upright
-    # at rest Core Motion's acceleration points down; the camera's x is the phone's -y, its y -x, its z -z
+    # at rest Core Motion's acceleration points down; the camera's x, y, z are the phone's -y, -x, -z
     rows = [line.split(",") for line in (original / "imu.csv").read_text().splitlines()[1:]]
     x, y, z = -np.mean([[float(word) for word in row[1:4]] for row in rows if float(row[0]) < 248630.7], axis=0)
     measured = np.array([-y, -x, -z]) / np.linalg.norm([x, y, z])

@@ -1,4 +1,4 @@
-"""Tests of association on small exact cases."""
+"""Tests of the association of point clusters with instances, on small exact cases."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -28,7 +28,7 @@ SHAPE = (4, 5)
 
 
 def clusters_of(masks: list[np.ndarray], scores: list[float]) -> PointClusters:
-    """Return point clusters under these (4, 5) masks; world positions are not used here."""
+    """Return the point clusters of these (4, 5) masks; their world positions are unused."""
     cluster, v, u = np.nonzero(np.array(masks))
     return PointClusters(
         points_world=np.zeros((len(u), 3), np.float32),
@@ -76,7 +76,7 @@ def test_class_agreement_is_bhattacharyya_coefficient() -> None:
 
 
 def best_first(overlap: np.ndarray, threshold: float) -> np.ndarray:
-    """Return the matches above `threshold`, the largest overlap first."""
+    """Return the instance of each cluster, -1 = none; the largest overlap above `threshold` is matched first."""
     return match_one_to_one(overlap > threshold, overlap)
 
 
@@ -110,7 +110,7 @@ def test_overlaps_with_stride_match_full_resolution() -> None:
         pixels=pixels[kept],
         cluster=clusters.cluster[kept],
     )
-    odd = count_overlaps(list_points_by_pixel(smaller, (7, 7)), seen[:7:2, :7:2].copy(), 2)  # the same samples
+    odd = count_overlaps(list_points_by_pixel(smaller, (7, 7)), seen[:7:2, :7:2].copy(), 2)  # samples the same pixels
     for name in ("instance_ids", "visible", "sizes", "votes"):
         assert getattr(sampled, name).tolist() == getattr(all_pixels, name).tolist(), name
         assert getattr(odd, name).tolist() == getattr(sampled, name).tolist(), name
@@ -122,22 +122,22 @@ def test_match_prefers_best_overlap_and_is_one_to_one() -> None:
     assert best_first(overlap, 0.25).tolist() == [1, -1, 0]
 
 
-def test_overlap_stray_pixels_do_not_win_cluster() -> None:
+def test_overlap_min_pixels_prevents_match_with_stray_pixels() -> None:
     seen = np.zeros(SHAPE, np.int32)
-    seen[:, :3] = 1  # the object, of which the cluster sees most
+    seen[:, :3] = 1  # the object; the cluster covers most of it
     seen[0, 0] = 2  # a single voxel of another instance
     overlaps = overlaps_of(clusters_of([columns(0, 2)], [1]), seen)
-    assert best_first(overlaps.over_smaller(min_pixels=1), 0.35).tolist() == [1], "7/8 of 1 lose against 1/1 of 2"
+    assert best_first(overlaps.over_smaller(min_pixels=1), 0.35).tolist() == [1], "1/1 of 2 exceeds 7/8 of 1"
     assert best_first(overlaps.over_smaller(min_pixels=4), 0.35).tolist() == [0]
 
 
-def test_match_table_is_not_assigned_to_book_on_it() -> None:
-    """The table's mask covers all of the book, and not quite all of the table."""
+def test_match_does_not_assign_table_to_book_on_top() -> None:
+    """The mask of the table covers the whole book and most of the table."""
     seen = np.full(SHAPE, 1, np.int32)
     seen[:, 2] = 2  # the book
     overlaps = overlaps_of(clusters_of([columns(0, 4), columns(2, 3)], [1, 1]), seen)
     smaller = overlaps.over_smaller(min_pixels=1)
-    assert smaller[0].argmax() != 0, "counted over the smaller alone, the book is the table's best match"
+    assert smaller[0].argmax() != 0, "by the overlap over the smaller area, the table matches the book best"
     assert match_one_to_one(smaller > 0.35, overlaps.over_union(min_pixels=1)).tolist() == [0, 1]
 
 
@@ -184,14 +184,14 @@ def test_keep_on_top_assigns_pixels_to_smaller_object() -> None:
     assert clusters_at(keep_on_top(points, ids, 0.25)) == 4 * [[0], [0], [1], [0], [0]]
     assert clusters_at(keep_on_top(points, ids, 0.2)) == 4 * [[0], [0], [0, 1], [0], [0]]
     unmatched = keep_on_top(points, np.int32([7, 0]), 0.25)
-    assert clusters_at(unmatched) == 4 * [[0], [0], [0], [0], [0]], "it takes no pixels and has no votes"
+    assert clusters_at(unmatched) == 4 * [[0], [0], [0], [0], [0]], "an unmatched cluster has no pixels"
     assert clusters_at(points) == 4 * [[0], [0], [0, 1], [0], [0]], "the input lists are unchanged"
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10_000))
 def test_points_by_pixel_keep_point_order(seed: int) -> None:
-    """The points are in any order, some without a cluster, some twice at one pixel in one cluster."""
+    """The points are in random order; some have no cluster, and some are duplicates."""
     rng = np.random.default_rng(seed)
     clusters = clusters_of([rng.random(SHAPE) < filled for filled in rng.random(4)], [1] * 4)
     count = len(clusters.cluster)
@@ -209,7 +209,7 @@ def test_points_by_pixel_keep_point_order(seed: int) -> None:
     points = list_points_by_pixel(clusters, SHAPE)
     assert clusters_at(points) == expected
     used = [tuple(found) for found in expected]
-    assert (points.pixel_counts > 0).sum() == len({*used, ()}) - (() not in used), "a list for each combination"
+    assert (points.pixel_counts > 0).sum() == len({*used, ()}) - (() not in used), "one list per set of clusters"
 
 
 @settings(max_examples=100, deadline=None)

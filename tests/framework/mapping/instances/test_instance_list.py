@@ -13,7 +13,7 @@ def test_confirmation_requires_observations_and_confidence() -> None:
         record = table.create(1, 0)
         for frame, score in enumerate(scores):
             table.observe(record.id, np.zeros(1), score, frame)
-    table.records[4].in_view = FrameSet([[0, 5]])  # in three of which it was detected
+    table.records[4].in_view = FrameSet([[0, 5]])  # visible in 6 frames, detected in 3
     assert Confirmation(3, 0.26, 0).counts(table).tolist() == [False, False, True, False, False]
     assert Confirmation(3, 0.25, 0).counts(table).tolist() == [False, False, True, False, True]
     assert Confirmation(1, 0, 0).counts(InstanceTable()).tolist() == [False]
@@ -23,9 +23,9 @@ def test_confirmation_requires_observations_and_confidence() -> None:
     ("min_area", "voxel_size", "vertices"),
     [
         (0.003, 0.01, 30),
-        (0.003, float(np.float32(0.01)), 30),  # as the grid keeps it
+        (0.003, float(np.float32(0.01)), 30),  # the grid stores float32
         (0.075, 0.05, 30),
-        (0.003, 0.05, MIN_VERTICES),  # 1.2 would be enough
+        (0.003, 0.05, MIN_VERTICES),  # the area has 1.2 vertices
         (0.0, 0.01, MIN_VERTICES),
     ],
 )

@@ -1,4 +1,4 @@
-"""Tests of the table of instances over time."""
+"""Tests of the instance table: frame sets and merged instances."""
 
 import numpy as np
 import pytest
@@ -23,8 +23,8 @@ def test_frame_set_behaves_like_set(ours: list[int], theirs: list[int]) -> None:
         assert all(before[1] + 1 < after[0] for before, after in zip(found.spans, found.spans[1:], strict=False))
 
 
-@pytest.mark.parametrize("second", [range(10, 20), range(5, 15)], ids=["one after the other", "half together"])
-def test_instance_table_merge_keeps_confidence_of_whole(second: range) -> None:
+@pytest.mark.parametrize("second", [range(10, 20), range(5, 15)], ids=["consecutive", "half overlapping"])
+def test_instance_table_merge_equals_unfragmented_instance(second: range) -> None:
     """Each fragment is detected in every other frame in which it is visible."""
     table = InstanceTable()
     seen = {table.create(1, 0).id: range(10), table.create(1, 0).id: second, table.create(1, 0).id: range(second.stop)}

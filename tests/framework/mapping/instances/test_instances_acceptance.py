@@ -1,4 +1,4 @@
-"""Acceptance tests of the default refiner and fuser: touching objects are separated, one object stays one."""
+"""Acceptance tests of the default refiner and fuser: they separate touching objects and keep each object whole."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ CHAIR, TABLE, COUCH = 0, 1, 2
 
 
 def mapped(frames: list[Frame], detections: list[Detections], refiner: str = "chain") -> MapFuser:
-    """Return the map with true poses."""
+    """Return the fuser after mapping the frames with true poses."""
     cleaner = built("refiner", refiner)
     fuser = built("fuser", "bayesian_tsdf", f"fuser.voxel_size={VOXEL}")
     for frame, found in zip(frames, detections, strict=True):
@@ -26,7 +26,10 @@ def mapped(frames: list[Frame], detections: list[Detections], refiner: str = "ch
 
 
 def shares(scene: BoxScene, fuser: MapFuser) -> np.ndarray:
-    """Return (objects + 1, instances + 1) the fraction of each object's vertices per instance; 0 = room, none."""
+    """Return the fraction (objects + 1, instances + 1) of the vertices of each object per instance.
+
+    Row 0 is the room, and column 0 is no instance.
+    """
     mesh = fuser.scene.mesh()
     owners = scene.owners(mesh.vertices, VOXEL)
     ids = [0, *fuser.scene.instances()]
@@ -40,7 +43,7 @@ def true_mask(frame: Frame, *objects: int) -> np.ndarray:
 
 
 def assert_one_each(scene: BoxScene, fuser: MapFuser, least: float) -> None:
-    """Check that each object has one own instance on `least` of its vertices, and the room has almost none."""
+    """Check that one instance covers more than the fraction `least` of each object, and that the room has none."""
     found = shares(scene, fuser)
     assert found.shape[1] == scene.count, f"{scene.count - 1} objects became {found.shape[1] - 1} instances"
     assert sorted(found[1:, 1:].argmax(axis=1)) == list(range(scene.count - 1))
@@ -48,12 +51,12 @@ def assert_one_each(scene: BoxScene, fuser: MapFuser, least: float) -> None:
     assert found[0, 0] > 0.99, found[0].round(4)
 
 
-# A fridge and a couch side by side, face to face.
+# A fridge and a couch side by side; one face of each touches the other.
 TOUCHING = [[(-0.6, 1.0, 0.0, 0.0, 1.6, 1.5)], [(0.0, 0.9, 0.0, 0.9, 1.6, 0.7)]]
 
 
 def test_instances_of_touching_objects_are_separated() -> None:
-    """Every other frame, including the first, has one mask over both; the others have one each; all bleed by 8 px."""
+    """Even frames have one mask over both objects, odd frames one mask per object; all masks bleed by 8 px."""
     scene = BoxScene(TOUCHING)
     frames = [scene.frame(look_from(-1.2 + 0.1 * k, -1.6, 1.4, (0.1, 1.2, 0.5)), k) for k in range(24)]
     detections = []
@@ -77,7 +80,7 @@ def test_instance_of_bleeding_mask_excludes_neighbor() -> None:
 
 
 def test_instances_of_adjacent_chairs_stay_separate() -> None:
-    """Identical chairs 10 cm apart are seen along the row and from the side; a third of the detections is missed."""
+    """Identical chairs 10 cm apart are seen along the row and from the side; a third of the detections are missing."""
     scene = BoxScene([chair(-0.275, 1.2), chair(0.275, 1.2)])
     frames = [
         scene.frame(look_from(2.4 * np.sin(a), 1.2 - 2.4 * np.cos(a), 1.3, (0.0, 1.2, 0.5)), k)
@@ -91,7 +94,7 @@ def test_instances_of_adjacent_chairs_stay_separate() -> None:
 
 
 def test_table_seen_from_two_sides_is_one_instance() -> None:
-    """The camera sees one side from low down and then, after a jump, the other side."""
+    """The camera is low; it sees one side and then, after a jump, the other side."""
     scene = BoxScene([table(0.0, 0.0)])
     sides = [(x, y, 1.2) for y in (-2.2, 1.8) for x in np.linspace(-0.8, 0.8, 12)]
     frames = [scene.frame(look_from(*at, (0.0, 0.0, 0.5)), k) for k, at in enumerate(sides)]

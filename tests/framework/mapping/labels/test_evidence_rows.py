@@ -1,4 +1,4 @@
-"""Tests of the evidence of map blocks, compared voxel by voxel: updates, merging, and growing slots."""
+"""Tests of evidence rows, compared voxel by voxel: updates, merged instances and growing slots."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.integration
 
 
 def with_voxels(count: int) -> EvidenceRows:
-    """Return the labels of an earlier map with this many voxels."""
+    """Return the evidence rows of a stored map with `count` labeled voxels."""
     labeled = np.full(-(-count // 512) * 512, -1, np.int32)
     labeled[:count] = np.arange(count)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 100))
@@ -31,10 +31,10 @@ def with_voxels(count: int) -> EvidenceRows:
 @pytest.mark.parametrize(
     ("ids", "logs", "merged_ids", "merged_logs"),
     [
-        ([1, 2, 3, 0], [5, 4, 3, 0], [3, 1, 0, 0], [7, 5, 0, 0]),  # both there: the sum becomes the best
-        ([2, 1, 4, 5], [5, 4, 3, 2], [3, 1, 4, 5], [5, 4, 3, 2]),  # only the dropped one there: it is renamed
-        ([1, 2, 3, 4], [5, 4, -6, 1], [1, 4, 3, 0], [5, 1, -2, 0]),  # evidence against either counts too
-        ([1, 3, 4, 0], [5, 4, 3, 0], [1, 3, 4, 0], [5, 4, 3, 0]),  # the dropped one not there: nothing changes
+        ([1, 2, 3, 0], [5, 4, 3, 0], [3, 1, 0, 0], [7, 5, 0, 0]),  # both instances: their sum becomes the best
+        ([2, 1, 4, 5], [5, 4, 3, 2], [3, 1, 4, 5], [5, 4, 3, 2]),  # only the dropped instance: it is renamed
+        ([1, 2, 3, 4], [5, 4, -6, 1], [1, 4, 3, 0], [5, 1, -2, 0]),  # negative evidence is added, too
+        ([1, 3, 4, 0], [5, 4, 3, 0], [1, 3, 4, 0], [5, 4, 3, 0]),  # no dropped instance: nothing changes
     ],
 )
 def test_evidence_merge_adds_evidence_and_keeps_best_first(
@@ -46,12 +46,12 @@ def test_evidence_merge_adds_evidence_and_keeps_best_first(
     found = dict(zip(rows.evidence.instance_ids[0].tolist(), rows.evidence.instance_value[0].tolist(), strict=True))
     assert found == dict(zip(merged_ids, merged_logs, strict=True))
     assert rows.evidence.instance_ids[0, 0] == merged_ids[0]
-    assert ((rows.evidence.instance_ids[0] > 0) == (np.array(merged_ids) > 0)).all(), "filled from the front"
+    assert ((rows.evidence.instance_ids[0] > 0) == (np.array(merged_ids) > 0)).all(), "the used slots come first"
 
 
 @pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
 def test_evidence_merge_updates_all_labeled_voxels(count: int) -> None:
-    """Of thousands of voxels, a few have the instance: the first, the last, and some between them."""
+    """Only the first voxel, the last and one between them have the dropped instance."""
     rows = with_voxels(count)
     evidence = rows.evidence
     evidence.instance_ids[: count + 100], evidence.instance_value[: count + 100] = [4, 2, 0, 0], [7, 5, 0, 0]
@@ -74,14 +74,14 @@ def test_evidence_rows_with_256_classes_raise() -> None:
 
 
 def at_pixel(block: int, *voxels: int) -> SeenBlocks:
-    """Return a frame that sees these voxels of one block at its only pixel."""
+    """Return the seen blocks of a frame whose only pixel sees these voxels of one block."""
     pixel = np.full((1, 512), -1, np.int32)
     pixel[0, voxels] = 0
     return seen_at(np.array([block], np.int32), pixel)
 
 
 def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
-    """Return a frame that sees the voxels of some blocks at pixels (A, 512), -1 = not near."""
+    """Return the seen blocks of a frame; `pixels` (A, 512) are those of their voxels, -1 = far from the surface."""
     block, voxel = np.nonzero(pixels >= 0)
     count = np.bincount(block, minlength=len(blocks))
     return SeenBlocks(
@@ -93,7 +93,7 @@ def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
     )
 
 
-def test_evidence_rows_allocate_only_named_voxels() -> None:
+def test_evidence_rows_allocate_only_labeled_voxels() -> None:
     for storage in Storage:
         rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=storage)
         rows.begin(6)
@@ -104,7 +104,7 @@ def test_evidence_rows_allocate_only_named_voxels() -> None:
         assert rows.voxels.grid.label_row[:2].tolist() == [-1, 0]
         assert best_class(rows.evidence, rows.evidence.labeled[0, 7]) == 2
         rows.update(at_pixel(0, 3), voted([0], [1.0], [3], Combine.SUM))
-        assert (rows.row_count, rows.voxel_count) == (1, 1), "there was no output"
+        assert (rows.row_count, rows.voxel_count) == (1, 1), "a cluster without an instance allocates nothing"
         assert len(rows.in_use().class_ids) == 1
 
 
@@ -112,7 +112,7 @@ def test_evidence_rows_allocate_only_named_voxels() -> None:
 def test_evidence_update_of_many_blocks_matches_voxelwise(
     blocks: int, frames: int, max_blocks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pixels are under zero to several clusters, with and without instance, with and without new slots."""
+    """Pixels have zero to several clusters, with and without an instance; some updates need new slots."""
     monkeypatch.setattr(evidence_rows, "RESERVED", 1 if max_blocks == 4 else 128)
     first, other = by_one_thread_and_two(lambda: _updated(blocks, frames, max_blocks))
     for one, two in zip(first, other, strict=True):
@@ -120,19 +120,19 @@ def test_evidence_update_of_many_blocks_matches_voxelwise(
 
 
 def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
-    """Return the evidence of some blocks after a few frames, compared voxel by voxel."""
+    """Return the evidence of some blocks after updates and merges that are compared voxel by voxel."""
     rng = np.random.default_rng(3)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, max_blocks))
     rows.begin(6)
     rows.voxels.allocate(np.array([[k, 0, 0] for k in range(block_count)], np.int32))
     by_voxel: dict[tuple[int, int], Evidence] = {}
     evicted = 0
-    for frame in range(frames):  # in the last of 40 of which no voxel is new
+    for frame in range(frames):  # the last of 40 frames has no new voxel
         instances = [0, 1, 2, 3 + frame]
         message = voted(instances, [1.0, 0.5, 2.0, 1.5], rng.integers(0, 6, 4).tolist(), Combine.SUM)
         points = 12
         cluster = rng.integers(0, 4, points).astype(np.int32)
-        pixel_of = rng.integers(0, 8, points)  # of 10 pixels, so that two are under none
+        pixel_of = rng.integers(0, 8, points)  # pixels 8 and 9 have no cluster
         lists = [[k for k in cluster[pixel_of == pixel] if instances[k]] for pixel in range(10)]
         message = message._replace(
             list_ids=np.arange(1, 11, dtype=np.int32)[None],
@@ -140,9 +140,8 @@ def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
             clusters=np.array([k for clusters in lists for k in clusters], np.int32),
             absence=np.float32(-0.2),
         )
-        message = message._replace(
-            class_scores=message.class_scores.astype(np.int32), max_score=MAX_SCORE
-        )  # as compact storage
+        # The types and limits of compact storage.
+        message = message._replace(class_scores=message.class_scores.astype(np.int32), max_score=MAX_SCORE)
         blocks = rng.permutation(block_count)[1:].astype(np.int32)
         pixels = rng.integers(-1, 10, (len(blocks), 512)).astype(np.int32)
         pixels[rng.random(pixels.shape) > 4 / block_count] = -1
@@ -181,7 +180,7 @@ def test_evidence_rows_count_evictions_of_new_voxel() -> None:
 
 
 def test_evidence_rows_exact_storage_keeps_all_evidence() -> None:
-    """There are many more instances and classes than compact slots, and every sum is kept."""
+    """Every sum is kept, although there are many more instances and classes than compact slots."""
     rng = np.random.default_rng(0)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=Storage.EXACT)
     rows.begin(30)

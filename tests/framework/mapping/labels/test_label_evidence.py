@@ -1,4 +1,4 @@
-"""Tests of the compact Bayesian update, compared with both recursions over all labels."""
+"""Tests of the compact Bayesian update, compared with the recursions over all instances and all classes."""
 
 import numpy as np
 import pytest
@@ -85,9 +85,9 @@ def test_label_update_absence_counts_only_if_detected() -> None:
     one = np.full((1, 3), 1 / 3)
     update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), COVERED)
     before = float(evidence.instance_value[0, 0])
-    update_voxel(evidence, 0, measured([2], [0.9], one, 0.5, 2), BARE)  # instance 2 found, not here
+    update_voxel(evidence, 0, measured([2], [0.9], one, 0.5, 2), BARE)  # instance 2 is detected elsewhere
     assert float(evidence.instance_value[0, 0]) == before
-    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)  # instance 1 found, not here
+    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)  # instance 1 is detected elsewhere
     assert float(evidence.instance_value[0, 0]) == np.float32(before + np.log(0.5))
     for _ in range(10):
         update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)
@@ -119,7 +119,7 @@ def test_label_slots_replace_least_likely_label_if_full() -> None:
     assert dict(zip(labels.tolist(), logs.tolist(), strict=True)) == {1: 4, 9: 1.5, 3: 2, 4: 3}
 
 
-def test_best_counted_instance_skips_uncounted() -> None:
+def test_best_counted_instance_skips_uncounted_instances() -> None:
     evidence = blank()
     evidence.instance_ids[0], evidence.instance_value[0] = [1, 5, 3, 2], [9, 4, 7, -1]
     counts = np.ones(6, np.bool_)
@@ -131,13 +131,13 @@ def test_best_counted_instance_skips_uncounted() -> None:
 
 
 SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2])]
-"""What four frames say of a voxel: instances, scores, classes."""
+"""Observations of a voxel in four frames: instances, scores and classes."""
 
 
 @pytest.mark.parametrize(
     ("combine", "weighed", "instance", "label"),
     [
-        (Combine.SUM, False, 2, 2),  # counts: instance 2 twice; classes 2 and 3 twice each, and the smaller one wins
+        (Combine.SUM, False, 2, 2),  # instance 2 has the most counts; classes 2 and 3 tie, and the smaller id is used
         (Combine.LARGEST, True, 1, 2),
         (Combine.LATEST, False, 3, 2),
     ],
@@ -163,7 +163,7 @@ def test_sum_rule_counts_observations() -> None:
     for _ in range(3):
         assert update_voxel(evidence, 0, voted([7], [1.0], [2], Combine.SUM), COVERED) == 0
     assert evidence.instance_value[0].tolist() == [3, 0, 0, 0]
-    assert evidence.class_value[0, 0] == 300, "units"
+    assert evidence.class_value[0, 0] == 300, "an observation is 100 stored units"
     assert evidence.class_ids[0].tolist() == [2, *[NO_CLASS] * (CLASS_SLOTS - 1)]
 
 
@@ -183,7 +183,7 @@ def test_compact_scores_saturate_without_wrapping() -> None:
 
 @pytest.mark.parametrize(("classes", "best"), [(2, 0.7), (3, 0.6), (9, 0.8), (80, 0.5)])
 def test_most_likely_class_is_stable_over_repetition(classes: int, best: float) -> None:
-    """The same distribution is fused 1000 times; its best class is the last one, and the first has most of the rest."""
+    """A distribution whose last class is the most likely, and the first the second most likely, is fused 1000 times."""
     p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
     relative, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)

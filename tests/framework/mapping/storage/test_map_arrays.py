@@ -20,7 +20,7 @@ FAR = 100_000_000
 
 @pytest.fixture(scope="module", params=registered.names("fuser"))
 def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[type[SceneMap], Path]:
-    """Return a map and its file."""
+    """Return the type of a map and the path of its file."""
     fuser: MapFuser = registered.built("fuser", request.param, "fuser.voxel_size=0.04")
     for k, T in enumerate(walk(2)):
         frame = room().frame(T, k)
@@ -36,7 +36,7 @@ def content(path: Path) -> dict[str, np.ndarray]:
 
 
 def refused(kind: type[SceneMap], path: Path, changes: dict[str, np.ndarray]) -> str:
-    """Return the error of the file with some arrays replaced."""
+    """Return the error raised for the file with some arrays replaced."""
     np.savez(path.with_name("changed.npz"), **(content(path) | changes))
     with pytest.raises(DataError) as caught:
         kind.load(path.with_name("changed.npz"))
@@ -54,7 +54,7 @@ def test_map_arrays_of_wrong_type_or_shape_raise(saved: tuple[type[SceneMap], Pa
             assert name in refused(kind, path, {name: array.astype(other)})
             assert name in refused(kind, path, {name: array[..., None]})
             assert array.ndim == 1 or name in refused(kind, path, {name: array[..., :-1]})
-            refused(kind, path, {name: array[:-1]})  # which of two arrays has the wrong length cannot be known
+            refused(kind, path, {name: array[:-1]})  # the error may name another array of the same length
 
 
 def test_map_arrays_with_invalid_ids_raise(

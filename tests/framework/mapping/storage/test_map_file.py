@@ -1,4 +1,4 @@
-"""Tests of the map file: round trips of any array, numpy compatibility, and damage."""
+"""Tests of the map file: round trips of any array, NumPy compatibility, and damaged files."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def test_map_file_is_reproducible(saved: Path, tmp_path: Path) -> None:
     assert (tmp_path / "again.npz").read_bytes() == saved.read_bytes()
     with zipfile.ZipFile(saved) as archive:
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}, (
-            "the same bytes at another time"
+            "the bytes do not depend on the time of writing"
         )
 
 
-def test_map_file_is_lightly_compressed(saved: Path) -> None:
+def test_map_file_is_compressed_at_level_1(saved: Path) -> None:
     with zipfile.ZipFile(saved) as archive:
         sizes = {info.filename: info.compress_size for info in archive.infolist()}
         few = archive.read("few.npy")

@@ -33,15 +33,15 @@ KINDS = ("bayesian_tsdf", "words", "exact", "last_write", "object_volumes", "ope
 
 @dataclass(frozen=True)
 class Saved:
-    """A map file."""
+    """Content of a map file."""
 
-    path: Path  # folder of changed files
+    path: Path  # where changed copies are written
     arrays: dict[str, np.ndarray] = field(repr=False)
 
 
 @pytest.fixture(scope="module", params=KINDS)
 def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Saved:
-    """Return one map of each kind."""
+    """Return the map file of a fuser, one per kind."""
     name = request.param
     variants = {"exact": ["bayesian_tsdf", "fuser.storage=EXACT"], "words": ["bayesian_tsdf"]}
     chosen = variants.get(name, [name])
@@ -76,7 +76,7 @@ def use(scene: SceneMap) -> None:
 
 
 def load_and_use(path: Path, content: bytes) -> str:
-    """Return the error line of the file; "" if it was usable."""
+    """Load and use a map file; return the error line, or "" if the file is usable."""
     path.write_bytes(content)
     began = time.process_time()
     try:
@@ -94,7 +94,7 @@ def load_and_use(path: Path, content: bytes) -> str:
 
 
 def archive(arrays: dict[str, np.ndarray]) -> bytes:
-    """Return the file with valid checksums."""
+    """Return the content of a map file with valid checksums."""
     file = io.BytesIO()
     np.savez(file, **arrays)  # type: ignore[arg-type]
     return file.getvalue()
@@ -126,7 +126,7 @@ def changed_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
 def odd_number(draw: st.DrawFn, dtype: np.dtype[Any]) -> Any:
     if dtype.kind == "f":
         return draw(st.sampled_from((0.0, -1.0, 1e38, -1e38, 1e-40, np.nan, np.inf, -np.inf)))
-    if dtype.kind not in "iu":  # the result of another change
+    if dtype.kind not in "iu":  # a previous change replaced the type
         return np.ones(1, dtype)[0]
     low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
     return draw(st.sampled_from([n for n in (*LARGE, low, high, low + 1) if low <= n <= high]))
@@ -153,7 +153,7 @@ def test_map_fuzz_changed_content_loads_or_raises(saved: Saved, data: st.DataObj
 )
 @given(data=st.data())
 def test_map_fuzz_damaged_bytes_load_or_raise(saved: Saved, data: st.DataObject) -> None:
-    """Any bytes are changed, including the headers of the archive and of its arrays."""
+    """Bytes in and after the headers of the archive and of its arrays are changed."""
     content = bytearray(archive(saved.arrays))
     headers = [match.start() for match in re.finditer(rb"PK|\x93NUMPY", content)]
     for _ in range(data.draw(st.integers(1, 4))):

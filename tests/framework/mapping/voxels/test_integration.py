@@ -1,4 +1,4 @@
-"""Tests of the TSDF, compared with a slow reference and with exact surfaces."""
+"""Tests of TSDF integration, compared with a slow reference and with exact surfaces."""
 
 import tracemalloc
 from dataclasses import replace
@@ -30,7 +30,7 @@ def new_integrator() -> Integrator:
 
 
 def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the updated blocks of a frame, and the pixels of their voxels near the surface, -1 for the others."""
+    """Return the updated blocks (A,) and the pixels (A, 512) of their voxels, -1 = far from the surface."""
     seen = integrator.integrate(frame, T_world_camera, VOXEL)
     pixels = np.full((len(seen.blocks), 512), -1)
     for a, (first, count) in enumerate(zip(seen.near_start, seen.near_count, strict=True)):
@@ -60,7 +60,7 @@ def test_integration_of_one_frame_matches_reference() -> None:
     band = SENSOR.truncation + SENSOR.truncation_slope * d
     seen = inside & (d > SENSOR.min_depth) & (d < SENSOR.max_depth) & (d - p[..., 2] >= -band)
     distance = np.minimum(d - p[..., 2], band)
-    # a voxel on the border between two pixels or at the edge of the band may fall to either side in float32
+    # in float32, a voxel on a pixel border or at the edge of the band may be rounded to either side
     clear = (np.abs(u + 0.5 - np.round(u + 0.5)) > 1e-3) & (np.abs(v + 0.5 - np.round(v + 0.5)) > 1e-3)
     clear &= (np.abs(d - p[..., 2] + band) > 1e-4) & inside
     stored = grid.tsdf[active]
@@ -77,7 +77,7 @@ def test_integration_of_one_frame_matches_reference() -> None:
     assert np.abs(grid.weight[active] - np.maximum(expected_weight, 1))[both].max() < 1.001
 
 
-@pytest.mark.parametrize("promised", [100_000, 10], ids=["reserved", "memory is counted by what is asked for"])
+@pytest.mark.parametrize("promised", [100_000, 10], ids=["reserved", "not reserved"])
 def test_integration_reuses_reserved_memory_for_more_blocks(monkeypatch: pytest.MonkeyPatch, promised: int) -> None:
     monkeypatch.setattr(integration, "reserved", lambda most, make: make(min(most, promised)))
     integrator, T = new_integrator(), walk(1)[0]
@@ -93,7 +93,7 @@ def test_integration_reuses_reserved_memory_for_more_blocks(monkeypatch: pytest.
 
 
 def near_pixels(seen: SeenBlocks) -> list[int]:
-    """Return the pixels of voxels near the surface, once per voxel."""
+    """Return the sorted pixels of the voxels near the surface, one entry per voxel."""
     parts = zip(seen.near_start.tolist(), seen.near_count.tolist(), strict=True)
     return sorted(p for first, count in parts for p in seen.near_pixel[first : first + count].tolist())
 
@@ -108,7 +108,7 @@ def test_integration_allocates_blocks_near_surface() -> None:
     surface = np.stack([(u - CAMERA.cx) / CAMERA.fx * d, (v - CAMERA.cy) / CAMERA.fy * d, d], axis=-1)
     blocks = {tuple(c) for c in integrator.voxels.grid.block_coords[: integrator.voxels.block_count]}
     wanted = {tuple(c) for c in np.floor(surface / (8 * VOXEL)).astype(int)}
-    assert len(wanted - blocks) <= 0.02 * len(wanted), "only corners seen by less than a stride of pixels may be missed"
+    assert len(wanted - blocks) <= 0.02 * len(wanted), "only blocks seen by fewer pixels than the stride may be missed"
 
 
 def test_integration_rounding_averages_are_unbiased() -> None:
@@ -119,7 +119,7 @@ def test_integration_rounding_averages_are_unbiased() -> None:
 
 @pytest.mark.parametrize("frame_number", [987, 2584, 121393])
 def test_integration_rounding_does_not_wrap_around(frame_number: int) -> None:
-    """At these frames frac(k * GOLDEN) is almost 1: air at the largest truncation stays air, and white stays white."""
+    """At these frames frac(k * GOLDEN) is almost 1, and rounding must not exceed the largest distance or white."""
     assert (frame_number * GOLDEN) % 1.0 > 0.9995
     scene = room()
     frame = scene.frame(pose())
@@ -136,7 +136,7 @@ def test_integration_rounding_does_not_wrap_around(frame_number: int) -> None:
 
 
 def channels(packed: np.ndarray) -> np.ndarray:
-    """Return (N, 3) red, green, blue in levels."""
+    """Return the RGB colors (N, 3), 0 to 255, of packed colors (N,)."""
     return np.stack([packed & 1023, (packed >> 10) & 1023, (packed >> 20) & 1023], axis=-1) / 4
 
 
@@ -201,8 +201,8 @@ def test_integration_stores_color_only_near_surface() -> None:
     assert (grid.color[active][air] == 0).all()
 
 
-def test_integration_does_not_average_color_of_air() -> None:
-    """A wall is moved to previously empty space: its color is not mixed with black."""
+def test_integration_does_not_average_color_of_free_space() -> None:
+    """A wall moves into free space: its color is not mixed with the initial black."""
     integrator = new_integrator()
     for depth, frames in ((1.5, 5), (1.4, 13)):
         wall = np.full(CAMERA.shape, depth, np.float32)
@@ -216,7 +216,7 @@ def test_integration_does_not_average_color_of_air() -> None:
 
 
 def test_integration_limits_weight_to_maximum() -> None:
-    """The weight is limited to max_weight in the stored unit, including the largest valid value."""
+    """The stored weight is limited to max_weight, also at the largest valid max_weight."""
     frame = room().frame(pose())
     for most in (3.0, 255.0):
         sensor = SENSOR._replace(max_weight=np.float32(most), full_weight_depth=np.float32(100.0))
@@ -227,7 +227,7 @@ def test_integration_limits_weight_to_maximum() -> None:
 
 
 def test_integration_averages_noise() -> None:
-    """After 40 frames with 10 mm noise, about 10 / sqrt(40) mm remain in the voxels at the surface."""
+    """After 40 frames with 10 mm noise, noise of about 10 / sqrt(40) mm remains in voxels near the surface."""
     frame = room().frame(pose())
     integrator = new_integrator()
     rng = np.random.default_rng(0)
@@ -263,7 +263,7 @@ def test_integration_removes_objects_seen_through() -> None:
         integrator.integrate(empty.frame(pose()), np.eye(4), VOXEL)
     bare = new_integrator()
     bare.integrate(empty.frame(pose()), np.eye(4), VOXEL)
-    center = np.array([-0.5, 0.6, 1.62])  # on the first sphere's front
+    center = np.array([-0.5, 0.6, 1.62])  # m, on the front of the first sphere
     block = {tuple(c): b for b, c in enumerate(grid.block_coords[: integrator.voxels.block_count])}
     voxel = np.round(center / VOXEL).astype(int)
     b = block[tuple(voxel >> 3)]
@@ -295,7 +295,7 @@ def test_integration_is_independent_of_thread_count() -> None:
         (SensorKind.EXACT, 1.0),
     ],
 )
-def test_integration_weight_follows_sensor_noise(kind: SensorKind, weight: float) -> None:
+def test_integration_weight_depends_on_sensor_noise(kind: SensorKind, weight: float) -> None:
     integrator = new_integrator()
     color, depth = np.zeros((*CAMERA.shape, 3), np.uint8), np.full(CAMERA.shape, 3.0, np.float32)
     integrator.integrate(Frame(0, 0.0, color, depth, CAMERA, sensor=kind), np.eye(4), VOXEL)

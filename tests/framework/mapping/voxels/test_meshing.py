@@ -1,4 +1,4 @@
-"""Tests of surface nets, compared with a slow reference and exact surfaces; updates equal full extraction."""
+"""Tests of surface nets, compared with a slow reference and exact surfaces, and of their incremental updates."""
 
 import itertools
 
@@ -30,13 +30,13 @@ MESH_ARRAYS = ("vertices", "triangles", "colors", "instance_ids", "class_ids")
 
 
 def block_of(distance: np.ndarray, block: np.ndarray) -> np.ndarray:
-    """Return (512,) a block at coordinates `block` >= 0 of a dense (X, Y, Z) array; x runs fastest."""
+    """Return the voxels (512,) of the block at coordinates `block` of a dense (X, Y, Z) array; x varies fastest."""
     x, y, z = 8 * block
     return distance[x : x + 8, y : y + 8, z : z + 8].transpose(2, 1, 0).ravel()
 
 
 def grid_of(distance: np.ndarray, blocks: np.ndarray, origin: tuple[int, int, int]) -> VoxelGrid:
-    """Return the blocks (N, 3) of a dense array of stored distances, moved by `origin` blocks."""
+    """Return a grid with the blocks (N, 3) of a dense array of stored distances, shifted by `origin` blocks."""
     voxels = VoxelGrid(VOXEL, BAND, 1000)
     voxels.allocate((blocks + origin).astype(np.int32))
     for number, block in enumerate(blocks):
@@ -45,7 +45,7 @@ def grid_of(distance: np.ndarray, blocks: np.ndarray, origin: tuple[int, int, in
 
 
 def slow_surface_nets(stored: np.ndarray, most_jump: float) -> tuple[dict, set]:
-    """Return {cell: vertex in voxels} and the quads as tuples of cells, by the definition."""
+    """Compute surface nets by definition: the vertex of each cell, voxels, and the quads as tuples of cells."""
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     vertices = {}
     for cell in itertools.product(*(range(n - 1) for n in stored.shape)):
@@ -74,7 +74,7 @@ def slow_surface_nets(stored: np.ndarray, most_jump: float) -> tuple[dict, set]:
 
 
 def test_surface_nets_match_reference() -> None:
-    """The field is random with steps, unseen voxels and absent blocks, across the origin."""
+    """The field has random steps, unseen voxels and absent blocks, and extends across the origin."""
     rng = np.random.default_rng(5)
     side, origin = 24, (-1, -2, 7)
     i, j, k = np.mgrid[:side, :side, :side] * 0.35
@@ -94,7 +94,7 @@ def test_surface_nets_match_reference() -> None:
     places = (np.array(list(expected.values())) + 8 * np.array(origin)) * VOXEL
     error, match = KDTree(places).query(surface.vertices)
     assert error.max() < 1e-5
-    assert np.array_equal(np.sort(match), np.arange(len(cells))), "each cell's vertex is there once"
+    assert np.array_equal(np.sort(match), np.arange(len(cells))), "each cell has exactly one vertex"
     first, second = match[surface.triangles[::2]], match[surface.triangles[1::2]]
     assert np.array_equal(first[:, [0, 2]], second[:, :2]), "two triangles share a diagonal"
     found = [tuple(cells[v] for v in (*t, u)) for t, u in zip(first, second[:, 2], strict=True)]
@@ -107,7 +107,7 @@ def test_surface_nets_match_reference() -> None:
 
 @pytest.fixture(scope="module")
 def sphere() -> VoxelGrid:
-    """Return the exact distances to a sphere of 0.6 m about (0.9, 0.85, 0.8)."""
+    """Return a grid with exact distances from a sphere with radius 0.6 m and center (0.9, 0.85, 0.8) m."""
     blocks = np.array(list(itertools.product(range(5), repeat=3)))
     points = np.stack(np.mgrid[:40, :40, :40], axis=-1) * VOXEL
     distance = np.linalg.norm(points - (0.9, 0.85, 0.8), axis=-1) - 0.6
@@ -118,14 +118,14 @@ def sphere() -> VoxelGrid:
 def test_surface_nets_sphere_is_closed_and_faces_outward(sphere: VoxelGrid) -> None:
     vertices, triangles, _ = SurfaceNets(sphere).extract()
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    assert len(np.unique(edges, axis=0)) == len(edges), "no edge is run through twice in one direction"
+    assert len(np.unique(edges, axis=0)) == len(edges), "no directed edge occurs twice"
     assert {tuple(e) for e in edges} == {tuple(e) for e in edges[:, ::-1]}, "each edge has a triangle on both sides"
     assert len(vertices) - len(edges) // 2 + len(triangles) == 2, "Euler's formula"
     a, b, c = (vertices[triangles[:, i]].astype(np.float64) for i in range(3))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
     assert volume == pytest.approx(4 / 3 * np.pi * 0.6**3, rel=0.01)
     error = np.abs(np.linalg.norm(vertices - (0.9, 0.85, 0.8), axis=1) - 0.6)
-    assert np.median(error) < 0.03 * VOXEL, "means of crossings lie inside, by the sagitta of a cell: 1/8 of 1/12 voxel"
+    assert np.median(error) < 0.03 * VOXEL, "vertices lie inside the sphere by the sagitta of a cell, 1/96 voxel"
     assert error.max() < 0.06 * VOXEL
 
 
@@ -202,7 +202,7 @@ def test_mesh_updates_match_full_extraction() -> None:
         fuse(updated, T, k)
         fuse(asked_late, T, k)
         mesh = updated.scene.mesh()
-        assert asked_late.scene.volume._nets is None, "without mesh requests there is no mesh cost"
+        assert asked_late.scene.volume._nets is None, "no mesh is extracted before the first request"
         reference = SurfaceNets(updated.scene.volume.voxels).extract()
         assert np.array_equal(mesh.vertices, reference.vertices)
         assert np.array_equal(mesh.triangles, reference.triangles)
@@ -216,13 +216,13 @@ def test_mesh_updates_match_full_extraction() -> None:
     kept, dropped = np.unique(ours.instance_ids)[1:3].tolist()
     updated.scene.merge(kept, dropped)
     merged = updated.scene.mesh()
-    assert merged.vertices is ours.vertices, "labels change without a vertex being touched"
+    assert merged.vertices is ours.vertices, "a merge changes labels, not vertices"
     assert dropped not in merged.instance_ids
     assert same_mesh(updated.scene)
 
 
 def test_mesh_of_furnished_room_lies_on_surface() -> None:
-    """With exact poses, no noise and 1 cm voxels, the median is 0.1 voxel and 95 % are within 0.5 voxel."""
+    """The poses are exact, the depth has no noise and the voxel size is 1 cm."""
     sequence = Synthetic(kind=RoomKind.LIVING_ROOM, frames=240, stride=12, noise=0.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.01)
     nothing = NoDetections()
@@ -248,7 +248,7 @@ def test_mesh_of_furnished_room_lies_on_surface() -> None:
 
 
 def distance_to(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the distance (m) of points (N, 3) from a mesh."""
+    """Return the distances (N,), m, of points (N, 3) from a mesh."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles.astype(np.uint32)))
     return np.asarray(scene.compute_distance(o3d.core.Tensor(points)).numpy())

@@ -32,7 +32,7 @@ def mapped(scene: Scene, poses: list[np.ndarray]) -> VoxelGrid:
 
 @pytest.mark.parametrize("slant", [0.0, 0.4, 0.8, 1.1])
 def test_raycast_slanted_plane_depth_is_unbiased(slant: float) -> None:
-    """Errors of half a pixel or half a voxel cause a bias that changes sign with the slant."""
+    """An offset of half a pixel or half a voxel would cause a bias that depends on the slant."""
     n = np.array([np.sin(slant), 0.3, -np.cos(slant)]) / np.linalg.norm([np.sin(slant), 0.3, -np.cos(slant)])
     scene = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.8]))])
     voxels = mapped(scene, walk(20))
@@ -70,7 +70,7 @@ def test_raycast_spheres_have_accurate_depth_without_holes() -> None:
     exact, color, surface = scene.render(CAMERA, T)
     on_sphere = surface > len(scene.planes)
     both = (view.depth > 0) & on_sphere
-    assert both.sum() > 0.9 * on_sphere.sum(), "the map has no holes where the camera has looked"
+    assert both.sum() > 0.9 * on_sphere.sum(), "the view has no holes in mapped areas"
     assert np.median(np.abs(view.depth - exact)[both]) < 0.1 * VOXEL
     assert np.median(np.abs(view.color.astype(float) - color)[both]) < 6
     assert (view.instance_ids == 0).all()
@@ -83,7 +83,7 @@ def test_raycast_from_outside_or_of_empty_map_is_empty() -> None:
     away = render(voxels, evidence, SENSOR, CAMERA, pose(rotvec=(0, np.pi, 0)))
     assert (away.depth == 0).all()
     behind = render(voxels, evidence, SENSOR, CAMERA, pose(z=5.0, rotvec=(0, np.pi, 0)))
-    assert (behind.depth == 0).mean() > 0.95, "the back of a surface is not a surface"
+    assert (behind.depth == 0).mean() > 0.95, "back faces are not rendered"
     empty = VoxelGrid(VOXEL, SENSOR.max_truncation, 10)
     nothing = render(empty, EvidenceRows(empty).evidence, SENSOR, CAMERA, pose())
     assert (nothing.depth == 0).all()
@@ -120,7 +120,7 @@ def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
     depth, _ = cast_view(voxels, SENSOR, camera, T)
     exhaustive = every_ray(voxels, T, camera)
     assert (exhaustive > 0).mean() > 0.1
-    # at ragged borders of the map, the start of a step decides tiny gaps
+    # at ragged borders of the map, tiny gaps depend on where a step starts
     assert ((depth == 0) & (exhaustive > 0)).mean() < 4e-3
     assert ((depth > 0) & (exhaustive == 0)).mean() < 15e-3
     both = (depth > 0) & (exhaustive > 0)
@@ -129,7 +129,7 @@ def test_raycast_bounds_match_exhaustive_search(k: int) -> None:
 
 @pytest.mark.parametrize("sparse", ["every pixel", "every fourth column", "one in ten"])
 def test_raycast_near_readings_finds_surface(sparse: str) -> None:
-    """This includes depth between the coarse rays."""
+    """The surface is also found at pixels between the coarse rays."""
     voxels = mapped(room(), [pose()])
     T = pose(0.1, -0.05, 0.1, (0.05, 0.1, 0.0))
     exhaustive = every_ray(voxels, T)
@@ -159,7 +159,7 @@ def test_raycast_ignores_surface_beyond_sensor_range() -> None:
 
 
 def every_ray(voxels: VoxelGrid, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """Return (H, W) m: every pixel searched from the nearest to the farthest depth."""
+    """Return the depth (H, W), m, found by searching every pixel from the nearest to the farthest depth."""
     tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
     near, far = (np.full(tiles, bound, np.float32) for bound in (SENSOR.min_depth, SENSOR.max_depth))
     depth = np.empty((camera.height + 1, camera.width + 1), np.float32)
@@ -176,7 +176,7 @@ def test_tile_bounds_ignore_block_next_to_camera() -> None:
 
 
 @pytest.mark.parametrize("fuser", ["bayesian_tsdf", "object_volumes", "class_only_fusion"])
-def test_render_near_searches_by_noise_of_sensor(fuser: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_render_near_uses_noise_of_sensor(fuser: str, monkeypatch: pytest.MonkeyPatch) -> None:
     noises = []
     monkeypatch.setattr(raycasting, "cast_near", lambda *given: noises.append(given[-2]) or given[-1].fill(0))
     scene = build(MapFuser, composed(f"fuser={fuser}").fuser).scene

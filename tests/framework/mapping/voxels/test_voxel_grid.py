@@ -1,4 +1,4 @@
-"""Tests of the hash table and of the blocks."""
+"""Tests of the voxel grid: its hash table and its blocks."""
 
 import resource
 
@@ -31,7 +31,7 @@ def test_find_block_returns_only_allocated_blocks() -> None:
     found = look_up(voxels.grid, coords)
     assert (voxels.grid.block_coords[found] == coords).all()
     in_order = coords[np.sort(first)]
-    assert (voxels.grid.block_coords[: voxels.block_count] == in_order).all(), "numbered in the order of first mention"
+    assert (voxels.grid.block_coords[: voxels.block_count] == in_order).all(), "numbered in order of first occurrence"
     absent = coords + np.int32(10_000)
     assert (look_up(voxels.grid, absent) == -1).all()
 
@@ -70,4 +70,4 @@ def test_voxel_grid_over_budget_raises() -> None:
     with pytest.raises(MapFullError, match=r"fuser\.max_blocks"):
         voxels.allocate(np.arange(33, dtype=np.int32).reshape(11, 3))
     assert voxels.block_count == 10
-    voxels.allocate(np.arange(3, dtype=np.int32).reshape(1, 3))  # what exists is still found
+    voxels.allocate(np.arange(3, dtype=np.int32).reshape(1, 3))  # existing blocks are still found

@@ -1,4 +1,4 @@
-"""Tests of Lloyd's algorithm, compared with scikit-learn, and of its start, compared with a reference."""
+"""Tests of Lloyd's algorithm, compared with scikit-learn, and of its start labels, compared with a reference."""
 
 from __future__ import annotations
 
@@ -52,7 +52,10 @@ def test_nearest_centers_tie_returns_first_center():
 
 
 def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:
-    """Return sets of (mask, ring) points in four blobs, and log-odds that are negative for a third of the mask."""
+    """Return neighborhoods with these (mask, ring) point counts, and the log-odds of the points.
+
+    The points are in four blobs; the log-odds are negative in the rings and for a third of the mask points.
+    """
     rng = np.random.default_rng(0)
     masks, rings = np.transpose(counts)
     starts = np.concatenate([[0], np.cumsum(masks + rings)])
@@ -71,7 +74,7 @@ def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:
 
 
 def groups_of(points: np.ndarray, groups: int, iterations: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return labels and centers of Lloyd's algorithm from the means of equal parts by depth."""
+    """Return the labels and centers of Lloyd's algorithm, started from the means of equal parts by depth."""
     by_depth = points[np.argsort(points[:, 2], kind="stable")]
     cuts = np.arange(groups + 1) * len(points) // groups
     centers = np.array([by_depth[a:b].mean(axis=0) for a, b in pairwise(cuts)])

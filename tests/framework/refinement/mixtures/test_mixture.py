@@ -11,7 +11,7 @@ from framework.refinement.mixtures.mixture_kernels import EmSettings, Mixtures
 
 
 def blobs(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
-    """Return float32 points of four overlapping Gaussians far from the origin, and half wrong start labels."""
+    """Return the points of four overlapping Gaussians far from the origin, and start labels, half of them wrong."""
     rng = np.random.default_rng(seed)
     true = rng.integers(0, 4, count)
     mixing = rng.normal(0, 0.2, (4, 3, 3)) + 0.1 * np.eye(3)
@@ -61,7 +61,7 @@ def test_mixture_fit_matches_scikit_learn(iterations):
 
 @pytest.mark.parametrize("bound", [0.1, 0.5, 0.9])
 def test_likely_members_match_analytic_posterior(bound):
-    """One object and one background Gaussian are at -1 and 1 in 1D, with unit covariance and a uniform density."""
+    """The object is a Gaussian at x = -1; the background is a Gaussian at x = 1 and a uniform density."""
     ours = Mixtures(
         weights=np.array([[0.3, 0.6]]),
         means=np.array([[[-1.0, 0, 0], [1.0, 0, 0]]]),
@@ -87,7 +87,7 @@ def test_likely_members_match_analytic_posterior(bound):
 
 @pytest.mark.parametrize("components", [1, 3, 8])
 def test_likely_members_match_full_posterior(components):
-    """The points are near the border and far from it, so that some are decided without a sum."""
+    """Some points are near the decision boundary; those far from it are decided without the full sum."""
     rng = np.random.default_rng(components)
     n = components + 2
     ours = Mixtures(
@@ -124,7 +124,7 @@ def test_mixture_fit_likelihood_increases_until_tolerance():
         mixture.fit(points, starts, labels, 4, EmSettings(i, -np.inf, 1e-6, 0.02))
         for i in range(1, 20)
     ]  # fmt: skip
-    assert (np.diff([fit.log_likelihoods[0] for fit in fits]) > -1e-4).all(), "except for single precision"
+    assert (np.diff([fit.log_likelihoods[0] for fit in fits]) > -1e-4).all(), "decreases only by rounding"
     stopped = mixture.fit(points, starts, labels, 4, EmSettings(1000, 1e-3, 1e-6, 0.02))
     assert stopped.iterations[0] < 1000
     before = fits[stopped.iterations[0] - 2].log_likelihoods[0]
@@ -134,7 +134,7 @@ def test_mixture_fit_likelihood_increases_until_tolerance():
 
 
 def test_mixture_fit_floors_only_small_eigenvalues():
-    """For points on a slanted plane, the eigenvalue along the normal rises to the floor."""
+    """For points on a slanted plane, the eigenvalue along the normal is raised to the floor."""
     rng = np.random.default_rng(0)
     plane = rng.normal(size=(5000, 2)) * [0.5, 0.3]
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -173,7 +173,7 @@ def test_mixture_fit_small_sets_stay_finite():
 
 
 def test_mixture_fit_prior_separates_equal_components():
-    """Two equal components do not separate the points; the prior alone gives the means of the first M-step."""
+    """The two components are equal, so the means of the first M-step depend only on the prior."""
     points = np.zeros((200, 3), np.float32)
     points[:, 0] = np.linspace(-1, 1, 200)
     odds = np.where(points[:, 0] < 0, np.log(4), -np.log(4)).astype(np.float32)

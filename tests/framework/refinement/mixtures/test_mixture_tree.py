@@ -1,4 +1,4 @@
-"""Tests of mixture trees, compared with a slow numpy recursion and with flat mixtures."""
+"""Tests of mixture trees, compared with a slow NumPy recursion and with flat mixtures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FLOOR = 0.02**2  # m^2
 
 
 def surface(seed: int, count: int) -> np.ndarray:
-    """Return (count, 3) float32 points on a wavy surface with a step, 2 m away, with 2 % outliers."""
+    """Return the points (count, 3), m, of a wavy surface with a step, about 2 m away, with 2 % outliers."""
     rng = np.random.default_rng(seed)
     u, v = rng.uniform(-1, 1, (2, count))
     z = 2 + 0.4 * np.sin(3 * u) * np.cos(2 * v) + np.where(u > 0.2, 0.5, 0.0)
@@ -32,7 +32,7 @@ def grown(points: np.ndarray, starts: np.ndarray, **changed: float) -> MixtureTr
     return mixture_tree.fit(points, starts, settings, **parameters)
 
 
-# The recursion as in the paper
+# Reference implementation of the recursion in the paper
 
 
 def slow_cut(points: np.ndarray, groups: int) -> np.ndarray:
@@ -57,7 +57,7 @@ def floored(Sigma: np.ndarray) -> np.ndarray:
 
 @dataclass
 class SlowNode:
-    """A Gaussian of weight `weight`, and the node's children once it has been expanded."""
+    """Gaussian of weight `weight` with its own points; `children` is filled if the node is expanded."""
 
     weight: float
     mean: np.ndarray
@@ -119,12 +119,12 @@ def test_mixture_tree_single_level_equals_flat_mixture():
     np.testing.assert_allclose(tree.levels[0].outlier_densities, flat.outlier_densities, rtol=1e-6)
     more = mixture.fit(
         points, starts, mixture_tree.cut(points, starts, 8), 8, EmSettings(9, -np.inf, FLOOR, 0.02),
-    )  # the log-likelihood is that of its last E-step, with the parameters of eight steps  # fmt: skip
+    )  # its last E-step uses the parameters after eight steps  # fmt: skip
     np.testing.assert_allclose(log_likelihoods(tree, points, starts), more.log_likelihoods, atol=1e-4)
 
 
 def masses(tree: MixtureTree, depth: int, sets: int) -> np.ndarray:
-    """Return (N,) the total weight of leaves and uniform components of each tree."""
+    """Return the total weight (sets,) of the leaves and uniform components of each tree."""
     mass = np.zeros(sets)
     for k, rows in leaves(tree, depth):
         np.add.at(mass, owners(tree, k)[rows], tree.levels[k].weights[rows])
@@ -145,7 +145,7 @@ def test_mixture_tree_weights_sum_to_one(min_support):
         expanded = np.diff(level.firsts) > 0
         assert expanded.any()
         np.testing.assert_allclose(children[expanded], above.weights[expanded], rtol=1e-12)
-        assert not level.outlier_weights[~expanded].any(), "a leaf has no children, a uniform one neither"
+        assert not level.outlier_weights[~expanded].any(), "a leaf has no uniform component"
         assert (level.weights >= min_support).all()
     for depth in (1, 2, 3):
         np.testing.assert_allclose(masses(tree, depth, 2), 1, rtol=1e-12)
@@ -160,7 +160,7 @@ def test_mixture_tree_likelihood_increases_with_depth(seed):
 
 
 def test_mixture_tree_assigns_points_to_best_child():
-    """Two tight blobs get their own node, and an outlier gets -1; the weights are computed manually."""
+    """Each point is assigned to its most likely node, and the outlier to -1."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0.5, 5, 5], [0.4, 0, 0]], np.float32)
     level = Level(
         weights=np.array([0.3, 0.5]), means=np.array([[0.0, 0, 0], [1.0, 0, 0]]),
@@ -189,12 +189,12 @@ def test_mixture_tree_own_ratios_maximize_likelihood():
     ratios = np.exp(odds[:60].astype(np.float64))[:, None]
     objective = np.log(grid * ratios + 1 - grid).sum(axis=0) + 4 * (0.5 * np.log(grid) + 0.5 * np.log(1 - grid))
     assert shares[0] == pytest.approx(grid[objective.argmax()], abs=2e-3)
-    assert shares[1] == pytest.approx(0.7), "without points, the parent's"
+    assert shares[1] == pytest.approx(0.7), "a node without points has the ratio of its parent"
     leaning = mixture_tree.own_ratios(odds, starts, np.full(4, 0.9, np.float32), 4.0)
     objective += 4 * (0.4 * np.log(grid) - 0.4 * np.log(1 - grid))
     assert leaning[0] == pytest.approx(grid[objective.argmax()], abs=2e-3)
     assert shares[2] > 0.6 > 0.4 > shares[3]
-    assert shares[2] + shares[3] == pytest.approx(1.0, abs=1e-5), "the two sides are alike"
+    assert shares[2] + shares[3] == pytest.approx(1.0, abs=1e-5), "opposite log-odds give complementary ratios"
 
 
 def test_mixture_tree_cut_matches_slow_reference():
@@ -204,15 +204,15 @@ def test_mixture_tree_cut_matches_slow_reference():
         labels = mixture_tree.cut(points, starts, groups)
         np.testing.assert_array_equal(labels[:300], slow_cut(points[:300].astype(np.float64), groups))
         np.testing.assert_array_equal(labels[300:], slow_cut(points[300:].astype(np.float64), groups))
-    assert not mixture_tree.cut(np.ones((50, 3), np.float32), np.array([0, 50]), 8).any(), "equal points stay together"
+    assert not mixture_tree.cut(np.ones((50, 3), np.float32), np.array([0, 50]), 8).any(), "equal points are not cut"
 
 
 def test_mixture_tree_degenerate_sets_are_handled():
     points = np.concatenate([np.ones((40, 3)), surface(0, 200), np.zeros((1, 3))]).astype(np.float32)
     starts = np.array([0, 0, 40, 240, 241])
     tree = grown(points, starts, levels=2)
-    assert np.diff(tree.levels[0].firsts)[[0, 3]].tolist() == [0, 0], "nothing, and one point"
-    assert np.diff(tree.levels[0].firsts)[1] == 1, "forty times the same point is one node"
+    assert np.diff(tree.levels[0].firsts)[[0, 3]].tolist() == [0, 0], "an empty set and a single point have no nodes"
+    assert np.diff(tree.levels[0].firsts)[1] == 1, "forty equal points have one node"
     found = log_likelihoods(tree, points, starts)
     assert found[0] == 0.0
     assert np.isfinite(found[1:3]).all()

@@ -1,4 +1,4 @@
-"""Tests of the convex segments of rendered boxes, and of each step compared with a slow reference."""
+"""Tests of convex segments of rendered boxes, and of each step, compared with a slow reference."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ def cut(depth: np.ndarray, camera: Camera = CAMERA, **changed: int) -> tuple[np.
 def rendered(
     boxes: np.ndarray, floor: float | None, pitch: float, camera: Camera = CAMERA
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return depth (H, W) and ids of boxes (B, 6), lowest and highest corner, numbered from 1; the floor is 0.
+    """Return the depth (H, W), m, and the ids (H, W) of a floor and of boxes.
 
-    In the world y points down. The camera is at the origin and looks along z, rotated down by `pitch` (rad). Without a
-    surface, depth is 0.
+    `boxes` (B, 6) are the lowest and highest corners, m; their ids start at 1. The floor has id 0 and is `floor` m
+    below the camera. In the world y points down. The camera is at the origin and looks along z, rotated down by
+    `pitch` rad. Pixels without a surface have depth 0 and id -1.
     """
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     x, y, z = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)
@@ -55,7 +56,7 @@ def noisy(depth: np.ndarray, noise: float) -> np.ndarray:
 
 
 def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, float]:
-    """Return the largest segment in a region, its fraction of the region, and the region's fraction of it."""
+    """Return the largest segment in a region, its fraction of the region, and the fraction of it inside the region."""
     label = np.bincount(labels[region] + 1).argmax() - 1
     both = ((labels == label) & region).sum()
     return int(label), both / region.sum(), both / (labels == label).sum()
@@ -64,7 +65,7 @@ def main_segment(labels: np.ndarray, region: np.ndarray) -> tuple[int, float, fl
 @pytest.mark.parametrize("cell", [1, 2])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_segments_separate_boxes_adjacent_in_image(cell, noise):
-    """The nearer box hides the edge of the other: they share a border of 60 px with a depth step of 0.4 m."""
+    """The near box occludes an edge of the far box; their common border has a depth step of 0.4 m."""
     boxes = np.array([[-0.5, -0.3, 1.2, 0.0, 0.3, 1.5], [-0.1, -0.4, 1.6, 0.6, 0.4, 2.0]])
     depth, ids = rendered(boxes, None, 0.0)
     labels, count = cut(noisy(depth, noise), cell=cell)
@@ -78,26 +79,26 @@ def test_segments_separate_boxes_adjacent_in_image(cell, noise):
 
 @pytest.mark.parametrize("cell", [1, 2])
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_segments_separate_box_from_table_and_keep_it_whole(cell, noise):
-    """The camera looks down from the side and sees the front, the top and the left face."""
+def test_segments_separate_box_from_table_and_keep_box_whole(cell, noise):
+    """The camera looks down from the side and sees the front, the top and the left face of the box."""
     camera = Camera(160, 120, 90.0, 90.0, 79.5, 59.5).scaled(cell)
     boxes = np.array([[0.35, 0.3, 0.9, 0.65, 0.6, 1.3]])
     depth, ids = rendered(boxes, 0.6, 0.5, camera)
     labels, _ = cut(noisy(depth, noise), camera, cell=cell)
     box, covered_box, pure_box = main_segment(labels, ids == 1)
     table, covered_table, _ = main_segment(labels, (ids == 0) & (depth < 2.0))
-    assert box != table, "the concave edge between them"
-    assert covered_box > 0.95, "the convex edges between its three faces are none"
+    assert box != table, "a concave edge separates them"
+    assert covered_box > 0.95, "convex edges between its faces do not split it"
     assert min(covered_table, pure_box) > 0.97
     assert (labels[ids == 1] == table).mean() < 0.02
     for face in faces_of(boxes[0], 0.5, camera, depth, ids == 1):
-        assert face.sum() > 150, "three faces are seen"
+        assert face.sum() > 150, "three faces are visible"
         assert main_segment(labels, face)[:1] == (box,)
         assert main_segment(labels, face)[1] > 0.9
 
 
 def faces_of(box: np.ndarray, pitch: float, camera: Camera, depth: np.ndarray, inside: np.ndarray) -> list[np.ndarray]:
-    """Return the pixels of the left, top and front face."""
+    """Return the pixels of the left, top and front face of a box."""
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     x, y = (u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth
     point = [x, y * np.cos(pitch) + depth * np.sin(pitch), depth * np.cos(pitch) - y * np.sin(pitch)]
@@ -106,7 +107,7 @@ def faces_of(box: np.ndarray, pitch: float, camera: Camera, depth: np.ndarray, i
 
 @pytest.mark.parametrize("cell", [1, 2])
 def test_segments_split_at_depth_step_but_not_at_slope(cell):
-    """The step is 2.5 cm, like a book on a table; a slope may change more per pixel."""
+    """The step is 2.5 cm, like that of a book on a table; the depth of the slope changes more per pixel."""
     depth = np.full(CAMERA.shape, 1.025)
     depth[30:90, 40:100] = 1.0
     labels, count = cut(depth, cell=cell)
@@ -119,10 +120,10 @@ def test_segments_split_at_depth_step_but_not_at_slope(cell):
 
 
 def test_segments_ball_is_one_segment():
-    """The surface may curve away from the camera by any angle."""
+    """A convex surface may curve away from the camera by any angle."""
     v, u = np.mgrid[:120, :160]
     x, y = (u - 79.5) / 135, (v - 59.5) / 135
-    # the ray's first hit with a ball of radius 0.3 around (0, 0, 1.2)
+    # first intersection of each ray with a ball of radius 0.3 m around (0, 0, 1.2) m
     a, b, c = x**2 + y**2 + 1, -2 * 1.2, 1.2**2 - 0.3**2
     root = b * b - 4 * a * c
     ball = root > 0
@@ -183,7 +184,7 @@ def test_normal_sigma_matches_spread_of_fitted_normals():
     fits = convexity_kernels.fit_planes(
         (1 / depth).astype(np.float32), window, NOISE._replace(factor=10.0), np.float32(1.0)
     )
-    slopes = fits[0, 3::7, 3::7] * camera.fx  # along x, of windows that do not overlap; 1 m away, of the depth
+    slopes = fits[0, 3::7, 3::7] * camera.fx  # slopes of the depth along x, in windows without overlap
     assert np.sqrt(2) * slopes.std() == pytest.approx(normal_sigma(sigma, window, cell, camera), rel=0.1)
 
 
@@ -195,7 +196,7 @@ def test_convexity_components_match_scipy():
         labels, count = convexity_kernels.connected(inverse, edges, NOISE, np.float32(0.1), 1)
         expected, expected_count = ndimage.label(~edges)
         assert count == expected_count
-        np.testing.assert_array_equal(labels, expected - 1)  # both number pieces by their first cell
+        np.testing.assert_array_equal(labels, expected - 1)  # both number components by their first cell
         large, large_count = convexity_kernels.connected(inverse, edges, NOISE, np.float32(0.1), 5)
         sizes = np.bincount(expected.ravel())
         np.testing.assert_array_equal(large >= 0, (sizes[expected] >= 5) & ~edges)
@@ -234,7 +235,7 @@ def test_segments_of_degenerate_images_are_valid(shape, cell):
     assert labels[0, 0] >= 0
 
 
-def test_segments_missing_depth_line_does_not_split():
+def test_segments_are_not_split_by_line_without_depth():
     depth = np.full(CAMERA.shape, 2.0)
     depth[60, :100] = 0
     labels, count = cut(depth)
@@ -251,5 +252,5 @@ def test_segments_are_independent_of_thread_count():
 @pytest.mark.parametrize(("sensor", "count"), [(SensorKind.KINECT_V1, 1), (SensorKind.EXACT, 2)])
 def test_segments_split_at_steps_above_sensor_noise(sensor, count):
     depth = np.full(CAMERA.shape, 3.0)
-    depth[:, 80:] = 3.03  # 2 standard deviations of a Kinect
+    depth[:, 80:] = 3.03  # a step of 2 standard deviations of the Kinect noise
     assert cut(depth, sensor=sensor)[1] == count

@@ -1,4 +1,4 @@
-"""Tests of plane detection in depth images: exact planes are recovered, noisy ones match Open3D's RANSAC."""
+"""Tests of plane detection in depth images: exact planes are recovered, and noisy planes match Open3D's RANSAC."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from framework.refinement.segmentation.planes_kernels import _order
 from tests.support.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
-FLOOR, WALL = np.array([0.0, 1 / 1.2, 0.0]), np.array([0.1, 0.05, 0.3])  # 1/m, n / d
+FLOOR, WALL = np.array([0.0, 1 / 1.2, 0.0]), np.array([0.1, 0.05, 0.3])  # unit normal divided by distance, 1/m
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 10, 257])
 def test_order_statistic_matches_sorted_values(count):
-    values = np.random.default_rng(count).integers(0, 40, count).astype(np.float64)  # with equal ones
+    values = np.random.default_rng(count).integers(0, 40, count).astype(np.float64)  # contains duplicates
     for k in range(count):
         assert _order(values.copy(), k) == np.sort(values)[k]
 
@@ -28,7 +28,7 @@ def rays(camera: Camera = CAMERA) -> np.ndarray:
 
 
 def depth_of(*planes: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
-    """Return the nearest of the planes at each pixel, 0 where none is in front of the camera."""
+    """Return the depth (H, W), m, of the nearest plane at each pixel; 0 = no plane in front of the camera."""
     q = np.max([rays(camera) @ m for m in planes], axis=0)
     return np.where(q > 0.02, 1 / np.maximum(q, 1e-9), 0)
 
@@ -52,7 +52,7 @@ def test_find_planes_recovers_exact_plane(camera):
     np.testing.assert_allclose(planes.m[0], WALL, atol=1e-6)
     np.testing.assert_allclose(planes.normals[0], -WALL / np.linalg.norm(WALL), atol=1e-6)
     assert planes.deviations[0] < 1e-6
-    assert planes.fractions[0] > 0.95, "all but what is left of a cell at the border"
+    assert planes.fractions[0] > 0.95, "all except incomplete cells at the border"
     assert planes.behind[0] == 0
 
 
@@ -66,7 +66,7 @@ def test_plane_area_matches_pixel_triangle_area():
 
 
 def test_find_planes_in_noisy_room_matches_open3d():
-    """Floor and wall have Kinect noise: the larger one is compared with segment_plane, both with the truth."""
+    """Floor and wall have Kinect noise. Both are compared with the truth, and the larger one with segment_plane."""
     open3d = pytest.importorskip("open3d")
     exact = depth_of(FLOOR, WALL)
     depth = exact + np.random.default_rng(0).normal(0, 0.002, exact.shape) * exact**2
@@ -110,7 +110,7 @@ def test_find_planes_separates_parallel_planes():
 
 
 def test_plane_image_assigns_depth_within_distance():
-    """The plane at 2 m has a slope of 45 degrees; points are 19 and 21 mm off it along its normal."""
+    """The plane has a slope of 45 degrees; the points are 19 mm or 21 mm from it along its normal."""
     m = np.array([0.0, 0.5, 0.5])
     planes = found(depth_of(m))
     image = plane_image(frame_of(depth_of(m)), planes, 0.02)
@@ -139,7 +139,7 @@ def test_find_planes_without_plane_is_empty():
     assert not plane_image(frame_of(one), found(one), 0.02).any()
     tiny = Camera(1, 1, 1.0, 1.0, 0.0, 0.0)
     assert len(found(np.ones((1, 1)), tiny)) == 0
-    assert len(found(np.ones((1, 400)), Camera(400, 1, 50.0, 50.0, 200.0, 0.0), min_area=0.0)) == 0, "a line"
+    assert len(found(np.ones((1, 400)), Camera(400, 1, 50.0, 50.0, 200.0, 0.0), min_area=0.0)) == 0, "a row of pixels"
 
 
 def test_plane_image_without_depth_is_zero():
@@ -161,7 +161,7 @@ def test_find_planes_is_independent_of_thread_count():
 
 
 def test_inverse_depth_of_plane_is_linear_in_pixel():
-    """The method relies on this; the project's own back-projection is used."""
+    """Plane detection relies on this property."""
     depth = depth_of(WALL).astype(np.float32)
     v, u = np.mgrid[:240, :320]
     points = back_project(CAMERA, np.stack([u.ravel(), v.ravel()], axis=1).astype(np.int32), depth.ravel())

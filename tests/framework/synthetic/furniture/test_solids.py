@@ -1,4 +1,4 @@
-"""Tests of the solids: closed, oriented outward, with matching normals."""
+"""Tests of furniture solids: they are closed and oriented outward, and their normals match."""
 
 import numpy as np
 import pytest
