@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -408,12 +408,10 @@ def nothing_in(frame: Frame, pose: Pose) -> PointClusters:
     return lift(Detections.none(CAMERA.shape, CLASSES), frame, pose)
 
 
-def same(a: object, b: object) -> bool:
+def same(a: Any, b: Any) -> bool:
     """Return True if two data objects of the pipeline contain equal arrays."""
-    return all(
-        same(x, y) if is_dataclass(x) else np.array_equal(x, y)
-        for x, y in zip(vars(a).values(), vars(b).values(), strict=True)
-    )
+    pairs = [(getattr(a, field.name), getattr(b, field.name)) for field in fields(a)]
+    return all(same(x, y) if is_dataclass(x) else np.array_equal(x, y) for x, y in pairs)
 
 
 def assert_data_error(call: Callable[[], object], words: str) -> None:

@@ -245,4 +245,4 @@ def test_import_error_names_conflicting_framework_package(tmp_path: Path) -> Non
     (tmp_path / "framework" / "__init__.py").touch()
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import instancemap"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert f"got {tmp_path}/framework/__init__.py; rename it" in done.stderr
+    assert f"got {tmp_path}/framework/__init__.py; rename the other package" in done.stderr

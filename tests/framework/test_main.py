@@ -311,6 +311,6 @@ def test_run_ctrl_c_writes_partial_outputs(tmp_path: Path) -> None:
 def test_run_full_map_writes_partial_outputs_and_fails(tmp_path: Path) -> None:
     done = start(tmp_path, "fuser.capacity=2")
     assert done.returncode == 3
-    assert "raise fuser.capacity" in done.stderr.splitlines()[-1]
+    assert "increase fuser.capacity" in done.stderr.splitlines()[-1]
     assert json.loads((tmp_path / "metrics.partial.json").read_text())["frames"] == 3
     assert not (tmp_path / "metrics.json").exists()
