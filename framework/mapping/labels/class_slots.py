@@ -1,8 +1,8 @@
 """Operations on all class slots of a voxel.
 
 The sixteen slots of compact storage are one SIMD vector. LLVM unrolls such a short loop before it can vectorize it. So
-these intrinsics emit vector instructions, which LLVM maps to any little-endian processor. Exact storage has other types
-and more slots, and uses loops with the same results.
+these intrinsics emit vector instructions, which LLVM compiles for any little-endian processor. Exact storage has other
+types and more slots, and uses loops with the same results.
 
 A quantized score is a log-odds (or a vote) times the scale of the label rule, rounded. Each entry of `cluster_scores`
 (NO_CLASS + 1,) holds the score of a class in the upper bits. The lowest NEW_CLASSES bits mark its index among the

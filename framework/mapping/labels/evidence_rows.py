@@ -31,7 +31,7 @@ from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
 INSTANCE_SLOTS = 4  # instance slots of a voxel in compact storage
-RESERVED = 128  # labeled voxels reserved per block of the budget; most blocks have fewer, and the array can grow
+RESERVED = 128  # number of labeled voxels reserved per block of the budget; most blocks have fewer; can grow
 ANY_INSTANCE = np.uint64(2**BITS - 1)
 SLOTS = Evidence._fields[1:]
 
@@ -46,7 +46,7 @@ class Storage(Enum):
 class NewVoxels(NamedTuple):
     """Voxels of A seen blocks that get slots in this frame."""
 
-    counts: Int32  # (A,) new voxels of each block
+    counts: Int32  # (A,) number of new voxels of each block
     rows: Int32  # (A,) evidence row of each block
     starts: Int32  # (A,) index of each block's first new voxel among the labeled voxels
 
@@ -59,7 +59,7 @@ class EvidenceRows:
         voxels: VoxelGrid,
         combine: Combine = Combine.SUM,
         storage: Storage = Storage.COMPACT,
-        score_scale: int = 64,  # quantized class score of evidence 1
+        score_scale: int = 64,  # quantized class score for evidence of 1
     ) -> None:
         self.voxels = voxels
         self.combine = combine
@@ -94,7 +94,7 @@ class EvidenceRows:
         return Evidence(self.evidence.labeled[: self.row_count], **slots)
 
     def fill(self, saved: Evidence) -> None:
-        """Copy the evidence of a saved map, or its own evidence from before the instance slots were doubled."""
+        """Copy the evidence of a saved map, or the own evidence from before the instance slots were doubled."""
         self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
         self._free()
         self._reserve(len(saved.labeled), len(saved.instance_ids))
