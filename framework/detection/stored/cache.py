@@ -1,4 +1,4 @@
-"""Cache of detections on disk. An ablation over refiners and fusers runs its network only once."""
+"""Cache of detections on disk. Ablations over refiners and fusers run the network only once."""
 
 from __future__ import annotations
 
