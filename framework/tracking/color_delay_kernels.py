@@ -73,8 +73,9 @@ def mean_gradients(points, transforms, intrinsics, scale, gradient, means):
 def register(color, depth, otherwise, intrinsics, T_color_depth, registered, pixels):
     """Set registered (H, W, 3) to the color at each pixel of `depth`, and pixels (H, W) to its flat index.
 
-    The index is -1 outside of the color image and without a reading. The color there is that of the nearest pixel, for
-    a depth of `otherwise` m. Colors are interpolated bilinearly.
+    The index is -1 outside of the color image and without a reading. A pixel outside of the color image gets the color
+    of the nearest pixel. A pixel without a reading gets the color at a depth of `otherwise` m. Colors are interpolated
+    bilinearly.
     """
     fx, fy, cx, cy = intrinsics
     T = T_color_depth

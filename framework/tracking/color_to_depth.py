@@ -1,11 +1,11 @@
-"""Registration of color to depth that show different times, by the motion of the camera.
+"""Registration of color images to depth images of other times, by the motion of the camera.
 
 Color is taken dt = t_color + delay - t_depth after depth, with the timestamps t_color and t_depth of the images and a
 constant delay. With the last two poses, at the times t_last and t_depth, and constant velocity:
 
     T_world_color = interpolate(T_world_last, T_world_camera, 1 + dt / (t_depth - t_last))
 
-Each depth reading is projected to the color image from there. Depth is not resampled.
+Each depth reading is projected into the color image at this pose. Depth is not resampled.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from framework.tracking.color_delay_kernels import register
 from framework.tracking.pyramid import intrinsics
 
 MIN_SHIFT = 0.5  # px, minimum image motion between color and depth for a registration
-NEAR = 1.0  # m, depth of the points for this image motion
+NEAR = 1.0  # m, assumed depth of the points for this image motion
 STRIDE = 8  # px, step between the depth readings for their median
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ class RegisteredFrame(NamedTuple):
 
     frame: Frame  # with the color at each depth pixel
     T_world_color: Float64  # (4, 4) pose of the color camera
-    color_pixels: Int32 | None = None  # (H, W) flat index of the color pixel of each reading, -1 = none; None = same
+    color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = own pixel
 
 
 class ColorToDepth:
@@ -50,7 +50,7 @@ class ColorToDepth:
         self._usable = False  # True once the estimate was accurate enough
         self._given = 0.0 if delay is None else delay
         self._last: tuple[float, Float64] | None = None  # time, s, and pose of the last frame
-        self._step: tuple[float, Float64] | None = None  # time, s, and motion T_last_next of the last step
+        self._step: tuple[float, Float64] | None = None  # duration, s, and motion T_last_next of the last step
 
     @property
     def estimate(self) -> DelayEstimate | None:
@@ -69,7 +69,7 @@ class ColorToDepth:
         return self._registered(frame, np.eye(4), *self._step).frame
 
     def tracked(self, frame: Frame, pose: Pose) -> RegisteredFrame:
-        """Return the frame with color registered by the motion to its pose, and take the pose for later frames."""
+        """Return the frame with color registered by the motion to its pose, and store the pose for later frames."""
         if pose.lost:
             self._last = self._step = None
             if self._estimator is not None:
