@@ -8,9 +8,9 @@ from numba import njit, prange
 from framework.mapping.voxels.voxel_grid_kernels import device, one_more
 from framework.sensors.noise_models_kernels import axial_sigma_single
 
-CHUNKS = 16  # chunks of image rows, summed in order, so that sums do not depend on the number of threads
-BATCH = 160  # points per batch; divides the usual image widths
-LANES = 16  # lanes of a sum; point n of a batch is added to lane n % LANES
+CHUNKS = 16  # number of chunks of image rows, summed in order, so that sums do not depend on the number of threads
+BATCH = 160  # number of points per batch; divides the usual image widths
+LANES = 16  # number of lanes of a sum; point n of a batch is added to lane n % LANES
 ROW = 5  # sums per derivative of the error: products with itself, the next three derivatives and the error
 ENERGY = 6 * ROW  # index of the weighted squared error among the sums of one term of the energy
 COLOR = ENERGY + 1  # index of the first sum of the photometric term, after those of the geometric term

@@ -143,7 +143,8 @@ def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
 def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
     """Return the poses (A, 4, 4) at the times (A,), s, from poses (P, 4, 4) at increasing times (P,), s.
 
-    Translation is linear and rotation spherical linear between neighboring poses, and beyond the first and the last.
+    Translations are interpolated linearly and rotations spherically between neighboring poses, and extrapolated beyond
+    the first and the last pose.
     """
     k = np.clip(np.searchsorted(times, at) - 1, 0, len(times) - 2)
     fractions = (at - times[k]) / (times[k + 1] - times[k])

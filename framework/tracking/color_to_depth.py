@@ -35,7 +35,7 @@ class RegisteredFrame(NamedTuple):
 
     frame: Frame  # with the color at each depth pixel
     T_world_color: Float64  # (4, 4) pose of the color camera
-    color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = own pixel
+    color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = same pixel
 
 
 class ColorToDepth:

@@ -101,7 +101,7 @@ def _intensity(color: UInt8) -> Float32:
 
 
 def model_intensities(view: SurfaceView, levels: int) -> list[Float32]:
-    """Return the view's intensity in [0, 1] at its own resolution and at halvings, -1 = unmapped."""
+    """Return the view's intensity in [0, 1] at its own resolution and at `levels` - 1 halvings, -1 = unmapped."""
     intensity = _intensity(view.color)
     intensity[view.depth == 0] = -1
     pyramid = [intensity]

@@ -51,7 +51,7 @@ SHA256 = {
 }
 STRIDE = 16  # side of a cell of the feature map, px of the resized image
 BINS = 6  # bins of RoIAlign per side
-PRE_NMS_PROPOSALS = 3000  # number of decoded best anchors, as in the graph
+PRE_NMS_PROPOSALS = 3000  # number of best anchors that are decoded, as in the graph
 EXTENT = 1.0  # extent of the boxes; see framework.detection.masks.boxes
 
 log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ class MaskRCNN2Go(Detector):
     devices it computes in float with the same weights. The class distribution of a detection is the box head's softmax
     over 80 classes, renormalized without the background. Its score is the probability of its class, including the
     background. After suppression within a class, `agnostic_nms_iou` removes duplicates across classes, so that an
-    ambiguous object does not start two map instances.
+    ambiguous object does not create two instances.
     """
 
     weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # folder, relative to the working or project folder

@@ -24,7 +24,7 @@ SIGNIFICANCE, MAX_SLANT, MIN_READINGS = 0.4, 85.0, 0.1  # parameters of masks fr
 
 @dataclass
 class OpenVocabulary(Detector):
-    """Text-prompted detection with boxes from OWLv2 and masks from SAM, SAM 2 or EdgeTAM; extra `transformers`.
+    """Boxes from OWLv2 for text queries, and masks from SAM, SAM 2 or EdgeTAM; needs the extra `transformers`.
 
     The classes are the text queries as written, and `something else`. OWLv2 estimates an independent probability p for
     each query. The distribution is proportional to the odds p / (1 - p), with the odds of the threshold for `something

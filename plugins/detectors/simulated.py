@@ -98,7 +98,7 @@ class SimulatedDetector(Detector):
     - Masks are shifted, bleed over the border, have a noisy border and are resampled on a coarse grid.
     - The class becomes a distribution around a confusion kernel of similar classes, often with the same draw for an
       object (`confusion_consistency`).
-    - The score follows mask quality and class certainty.
+    - The score depends on mask quality and class certainty.
     - False detections appear, some repeatedly at the same locations (`recurring_fraction`, if poses are known).
 
     Errors of an object or location do not average out over a video, as with real detectors. Every number is drawn from

@@ -142,7 +142,7 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
     """Return the distributions (Q, C) over the labels, and the probability (Q,) of the best label.
 
     The logits are (Q, K). K = C + 1 means a softmax with no-object as the last label. K = C means independent sigmoids.
-    See the detector.
+    See TransformersSegmentation.
     """
     if logits.shape[1] not in (labels, labels + 1):
         raise DataError(f"detector.model: expected {labels} class logits (as in config.json), got {logits.shape[1]}")
@@ -187,7 +187,7 @@ class Preprocessing:
 
     size: Mapping[str, int] | None  # as in the file; None = original size
     divisor: int  # sides are rounded up to multiples of it
-    pad_to: tuple[int, int] | None  # padded (height, width), black on the right and below
+    pad_to: tuple[int, int] | None  # padded (height, width), black at the right and bottom
     mode: str  # interpolation mode
     factor: float  # factor of the values 0..255
     mean: tuple[float, ...]  # mean, RGB, after the factor

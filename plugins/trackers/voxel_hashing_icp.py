@@ -130,7 +130,7 @@ class VoxelHashingIcp(PoseTracker):
         self._last: FrameFeatures | None = None  # features of the last trusted frame
         self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
         self._raw_keyframe: RawKeyframe | None = None
-        self._scale = DepthScale()  # of the current frame
+        self._scale = DepthScale()  # scale of the current frame
         self._scattered_depth = False  # True if neighbors of many readings have no depth
         self._coarse_depth = False  # True if depth is too coarse for normals from neighboring readings
 
@@ -194,7 +194,7 @@ class VoxelHashingIcp(PoseTracker):
         return levels
 
     def _finest_scale(self, camera: Camera) -> float:
-        """Return the scale of the finest level, at most `finest_side` px large.
+        """Return the scale of the finest level, whose longer side is at most `finest_side` px.
 
         Coarse levels of larger images would be too fine for large motions.
         """

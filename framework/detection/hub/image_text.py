@@ -29,8 +29,8 @@ from framework.files.hashing import path_hash
 from framework.files.json_file import read_json
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-LONGEST_SIDE = 1024  # px, largest input of a model
-HASH_DIGITS = 16  # digits of a local folder's content hash in the name of its space
+LONGEST_SIDE = 1024  # maximum side of a model's input, px
+HASH_DIGITS = 16  # number of digits of a local folder's content hash in the name of its space
 MAX_TOKENS = 64  # maximum length of a text, tokens; the limit is 77 for CLIP and 64 for SigLIP
 GRAY = 128  # gray value of suppressed surroundings
 

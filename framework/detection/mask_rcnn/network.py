@@ -51,7 +51,7 @@ class Architecture:
     pixel_mean: tuple[float, float, float] = (123.675, 116.28, 103.53)  # RGB, 0..255
     pixel_std: tuple[float, float, float] = (58.395, 57.12, 57.375)
     short_side: int = 800  # px, short side of the resized images in training
-    long_side: int = 1333  # px, largest long side
+    long_side: int = 1333  # px, maximum long side of the resized images in training
 
 
 class MaskRCNN(nn.Module):

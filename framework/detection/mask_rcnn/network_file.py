@@ -2,7 +2,7 @@
 
 architecture     the Architecture as JSON
 card             the model card as JSON: data, steps, AP, limits, ...; `domain`: the image domain of the training
-tensors_sha256   of all names, shapes and values, to detect damage
+tensors_sha256   hash of all names, types, shapes and values, to detect damage
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
     Counters are ignored. Raises DataError that names the source `where` if the tensors do not match the architecture.
     """
     try:
-        with torch.device("meta"):  # saves memory and random numbers for weights that are replaced below
+        with torch.device("meta"):  # saves memory and random initialization of weights that are replaced below
             network = MaskRCNN(architecture)
     except (KeyError, ValueError, RuntimeError) as error:
         raise DataError(f"{where}: expected a known architecture, got {in_one_line(error)}") from error

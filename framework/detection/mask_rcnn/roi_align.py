@@ -54,7 +54,7 @@ class Samples:
     counts: Tensor  # (N,) number of samples per bin
     windows: Tensor  # (N,) int64, number of cells in reach of the samples of one bin
     bins: int
-    cells: int  # size of the feature map
+    cells: int  # number of cells of the feature map along the axis
 
     @classmethod
     def along(cls, start: Tensor, end: Tensor, bins: int, cells: int, ratio: int, shortest: float) -> Samples:

@@ -8,7 +8,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def suppress_sorted(boxes, classes, order, iou, extent, limit):
-    """Return the entries of order (N,) for the boxes that remain of boxes (N, 4), which are sorted best first.
+    """Return the entries of order (N,) for the boxes (N, 4) that remain after suppression; boxes are best first.
 
     Each box is compared only with the remaining boxes, at most `limit`.
     """

@@ -10,7 +10,7 @@ from framework.sensors.noise_models_kernels import axial_sigma
 BIN = 0.02  # width of a bin of log depth: 2% of the depth
 NEAREST, FARTHEST = 0.05, 100.0  # m, range of the histogram
 VALLEY = 0.15  # fraction of a mode's peak below which a bin ends the mode
-SIGMAS = 3.0  # standard deviations of the depth noise
+SIGMAS = 3.0  # depth step that noise may cause, in standard deviations
 
 
 @njit(cache=True, nogil=True)
@@ -45,7 +45,10 @@ def _tent(start, end, first, stop):
 
 @njit(cache=True, nogil=True)
 def _foreground(window, weight_x, weight_y, significance):
-    """Return the depth interval (near, far), m, of the nearest significant mode, else of the heaviest mode."""
+    """Return the depth interval (near, far), m, of the nearest significant mode.
+
+    If no mode is significant, return the interval of the mode with the largest weight.
+    """
     bins = int(np.log(FARTHEST / NEAREST) / BIN) + 1
     histogram = np.zeros(bins + 2)
     total = 0.0

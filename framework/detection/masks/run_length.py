@@ -2,7 +2,7 @@
 
 A file contains run lengths as a list of numbers or as a packed string (pycocotools' `rleToString`). A packed string
 consists of groups of five bits, lowest first. From the third number on, it stores the difference from the number two
-positions before. pycocotools packs and decodes. This module validates strings, because pycocotools 2.0.11 leaves the
+positions earlier. pycocotools packs and decodes. This module validates strings, because pycocotools 2.0.11 leaves the
 pixels after a short string uninitialized.
 """
 

@@ -29,7 +29,7 @@ from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
-VOTES_ACROSS = 320  # voting pixels per image row; more pixels take time without a benefit
+VOTES_ACROSS = 320  # number of voting pixels per image row; more pixels take time without a benefit
 
 
 class InstanceSource(Enum):
@@ -52,9 +52,9 @@ class Overlaps:
     """Overlap of N clusters with the M instances visible in the frame."""
 
     instance_ids: Int32  # (M,) ascending
-    visible: Int32  # (M,) pixels of each visible instance
-    sizes: Int32  # (N,) pixels of each cluster
-    votes: Int32  # (N, M) pixels shared by a cluster and an instance
+    visible: Int32  # (M,) number of pixels of each visible instance
+    sizes: Int32  # (N,) number of pixels of each cluster
+    votes: Int32  # (N, M) number of pixels shared by a cluster and an instance
     seen: Int32  # (h, w) instance at every `stride`-th pixel of every `stride`-th row, 0 = none
     stride: int  # px
 
@@ -213,7 +213,7 @@ class Association:
             merge_frames=(1, 2**31),
             merge_agreement=(0.0, 1.0),
         )
-        self._merge_votes: Counter[tuple[int, int]] = Counter()  # number of such frames by pair of instances
+        self._merge_votes: Counter[tuple[int, int]] = Counter()  # votes by pair of instances; see merge_frames
 
     def match(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> tuple[PixelLists, Matches]:
         """Return the clusters over each pixel, and their matches with existing and new instances of the map."""

@@ -36,7 +36,7 @@ class Confirmation:
 
     min_observations: int = 3  # minimum number of frames with a detection to confirm an instance, >= 1
     min_confidence: float = 0.05  # minimum InstanceRecord.confidence to confirm an instance, in [0, 1]
-    min_area: float = 0.01  # minimum surface area of a confirmed instance, m^2, >= 0; a vertex counts voxel_size^2
+    min_area: float = 0.01  # minimum surface area of a confirmed instance, m^2, >= 0; voxel_size^2 per mesh vertex
 
     def __post_init__(self) -> None:
         check_bounds(self, min_observations=(1, 2**31), min_confidence=(0.0, 1.0), min_area=(0.0, 1000.0))

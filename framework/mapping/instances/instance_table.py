@@ -44,7 +44,7 @@ class FrameSet:
 
 @dataclass
 class InstanceRecord:
-    """The history of one instance. `class_evidence` (C,) combines its detections by the fuser's rule."""
+    """The history of one instance. `class_evidence` (C,) combines the evidence of its detections."""
 
     id: int
     class_evidence: Float64
@@ -54,7 +54,7 @@ class InstanceRecord:
     in_view: FrameSet = field(default_factory=FrameSet)  # frames in which the instance is in view
     score_sum: float = 0.0  # sum of the scores of its detections
     detections: int = 0  # number of detections
-    embedding: ObjectEmbedding | None = None  # sum over its detections with an embedding
+    embedding: ObjectEmbedding | None = None  # sum of the embeddings of its detections, None = no embedding
 
     @property
     def observations(self) -> int:

@@ -16,7 +16,7 @@ ARRAYS = ("embedding_ids", "embedding_sums", "embedding_weights", "embedding_cou
 """Arrays of a map file with embeddings: (M,) int32, (M, D) float64, (M,) float64, (M,) int64."""
 
 SPACE = "embedding_space"  # key of the embedding space in a saved table
-MAX_WEIGHT = 1e12  # maximum weight of one object
+MAX_WEIGHT = 1e12  # maximum weight of an embedding
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from numba.extending import intrinsic, overload
 
 from framework.mapping.voxels.voxel_grid_kernels import device
 
-CLASS_SLOTS = 16  # class slots of a voxel in compact storage
+CLASS_SLOTS = 16  # number of class slots of a voxel in compact storage
 NO_CLASS = 255  # class id of a free slot; slots are filled from the front
-NEW_CLASSES = 8  # classes that a cluster names and can add to the slots of a voxel
+NEW_CLASSES = 8  # number of classes that a cluster names and can add to the slots of a voxel
 ALL_NAMED = (1 << NEW_CLASSES) - 1
 
 _OPTIONS = {"forceinline": True, "error_model": "numpy", "_nrt": False}  # the options of `device`

@@ -30,7 +30,7 @@ from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-INSTANCE_SLOTS = 4  # instance slots of a voxel in compact storage
+INSTANCE_SLOTS = 4  # number of instance slots of a voxel in compact storage
 RESERVED = 128  # number of labeled voxels reserved per block of the budget; most blocks have fewer; can grow
 ANY_INSTANCE = np.uint64(2**BITS - 1)
 SLOTS = Evidence._fields[1:]
@@ -66,7 +66,7 @@ class EvidenceRows:
         self.storage = storage
         self.score_scale = score_scale
         self.row_count = 0
-        self.voxel_count = 0  # voxels with slots
+        self.voxel_count = 0  # number of voxels with slots
         self.evicted = 0  # number of slots reassigned to another label
         self._instance_slots = INSTANCE_SLOTS
         self._class_slots = CLASS_SLOTS
@@ -94,7 +94,7 @@ class EvidenceRows:
         return Evidence(self.evidence.labeled[: self.row_count], **slots)
 
     def fill(self, saved: Evidence) -> None:
-        """Copy the evidence of a saved map, or the own evidence from before the instance slots were doubled."""
+        """Copy the evidence of a saved map, or its own evidence from before the instance slots were doubled."""
         self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
         self._free()
         self._reserve(len(saved.labeled), len(saved.instance_ids))
@@ -149,7 +149,7 @@ class EvidenceRows:
 
     def _free(self) -> None:
         self._labeled = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))
-        self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS: a voxel may name instance k
+        self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS = a voxel may have instance k
         scores = np.int16 if self.storage is Storage.COMPACT else np.int64
         shapes = self._instance_slots, self._instance_slots, self._class_slots, self._class_slots
         kinds = zip(SLOTS, (np.int32, np.float32, np.uint8, scores), shapes, strict=True)

@@ -67,10 +67,11 @@ class Measurement(NamedTuple):
 
 
 def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8, UInt8]:
-    """Return the evidence of N clusters over their unnamed classes, their named classes, and the bits of these.
+    """Return the evidence of N clusters over their unnamed classes, their named classes, and the bits of named classes.
 
-    If the evidence is log-likelihoods, a cluster names its NEW_CLASSES best classes, and each unnamed class has the
-    mean evidence of the others. Otherwise a cluster names its best class, and has no evidence for other classes.
+    If the evidence is log-likelihoods, a cluster names its NEW_CLASSES best classes, and each unnamed class gets the
+    mean likelihood of the unnamed classes. Otherwise a cluster names its best class, and has no evidence for other
+    classes.
 
     Returns:
         Evidence (N, C) over the unnamed classes; named classes (N, NEW_CLASSES), in which the first class repeats if

@@ -28,7 +28,7 @@ from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, remove
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VoxelHashing
 
-OTHER_CLASS = 0.3  # largest Bhattacharyya coefficient of the class distributions of different objects
+OTHER_CLASS = 0.3  # largest Bhattacharyya coefficient of the distributions of objects of different classes
 EXACT_BITS = 16  # additional bits of class scores in exact storage
 
 

@@ -67,7 +67,7 @@ def link_points(coordinates, cluster, list_ids, tree):
 
 @njit(cache=True, nogil=True)
 def write_lists(head, parent, offsets, clusters):
-    """Write the clusters of each list into the flat array at `offsets`."""
+    """Write the clusters of each list into the flat array `clusters`, from offsets[list] on."""
     for i in range(offsets.shape[0] - 1):
         list_id = i
         for entry in range(offsets[i], offsets[i + 1]):
@@ -101,7 +101,7 @@ def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kep
 def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
     """Fill new_ids (H, W) with replacement[i, column[k]] for pixels of list i at instance k of the map.
 
-    Counts the pixels that get another list in moved (CHUNKS, lists), which must start at 0.
+    Adds the number of pixels that get each new list to moved (CHUNKS, lists), which must start at 0.
     """
     height, width = list_ids.shape
     for chunk in prange(CHUNKS):

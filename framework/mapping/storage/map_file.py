@@ -26,7 +26,7 @@ from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 DEFLATE_LEVEL = 1  # zlib level; files are at most a tenth larger than at level 6 and take half the time
 
 HEADER = "header"
-LARGEST_HEADER = 2**28  # bytes; an hour with thousands of instances takes about 10 MB
+LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour with thousands of instances takes about 10 MB
 LARGEST_ID = 2**24  # largest instance id
 MAX_EVIDENCE = 1e12  # largest evidence for a class
 MAX_ARRAYS = 100  # maximum number of arrays in the list of a file

@@ -10,7 +10,7 @@ from framework.mapping.voxels.voxel_grid import REGION_BLOCKS, REGION_SIDE
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, NO_KEY, device, pack_key, unpack_key
 from framework.mapping.voxels.voxel_walk import ray_direction
 
-CHUNKS = 32  # chunks of image rows; fixed, so that the order of blocks does not depend on the number of threads
+CHUNKS = 32  # fixed number of chunks of image rows, so that block order does not depend on the number of threads
 WORD = 64  # bits
 RECENT = 1024  # number of recent block keys that a chunk caches, to list each block about once
 PROBES = 4  # number of probed pixels along each side of a block in the image, to detect free space behind it

@@ -23,7 +23,7 @@ from framework.mapping.voxels.voxel_walk import (
 from framework.sensors.noise_models_kernels import axial_sigma_single
 
 TILE = 8  # side of a tile, px; the rays of a tile share blocks in the cache
-REFINEMENTS = 4  # maximum Newton steps of a ray; a plane needs one, a curved surface two or three
+REFINEMENTS = 4  # maximum number of Newton steps of a ray; a plane needs one, a curved surface two or three
 CONVERGED = 0.2  # maximum last Newton step, voxels; the remaining error is a few hundredths of a voxel
 REACH = 3.0  # maximum distance from the start of a refinement to the surface, voxels
 DETAIL = 4.0  # maximum spacing of coarse rays, voxels; maps have few details smaller than the truncation band
@@ -83,7 +83,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
     # step past the border by more than the rounding error of z, because otherwise the ray would not advance
     margin = max(np.float32(1e-3) * step, np.float32(2.5e-7) * far)
     z = near
-    from_front = False  # the previous voxel was in front of a surface
+    from_front = False  # True if the previous voxel was in front of a surface
     while z < far:
         i = np.int32(np.floor(shifted[0] + z * d[0]))
         j = np.int32(np.floor(shifted[1] + z * d[1]))

@@ -159,9 +159,12 @@ class VoxelHashing:
 
     tsdf: Tsdf = field(default_factory=Tsdf)
     truncation_slope: float = 0.01  # increase of the truncation distance with depth, m per m, >= 0
-    max_weight: float = 200.0  # maximum TSDF weight (number of observations), in [1, 255]; limits old data
-    full_weight_depth: float = 1.5  # maximum depth with full weight, m, > 0; beyond it: (full_weight_depth / depth)^2
-    max_blocks: int = 400_000  # maximum number of blocks of 8^3 voxels, > 0; 4.1 KiB each, plus 40 KiB with labels
+    # maximum TSDF weight (number of observations), in [1, 255]; limits the influence of old readings
+    max_weight: float = 200.0
+    # maximum depth with full weight, m, > 0; farther readings have weight (full_weight_depth / depth)^2
+    full_weight_depth: float = 1.5
+    # maximum number of blocks of 8^3 voxels, > 0; 4.1 KiB each, plus about 40 KiB for blocks with labels
+    max_blocks: int = 400_000
 
     def __post_init__(self) -> None:
         check_bounds(
