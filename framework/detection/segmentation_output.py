@@ -204,7 +204,7 @@ def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness:
     fix = f"set detector.objectness={str(not objectness).lower()} or" if other in shape[1:] else "choose"
     return (
         f"detector.label_space: expected {columns} columns for box, classes and {count} coefficients, or "
-        f"{COEFFICIENTS + count} for a network with suppression, got an output of shape {shape}; {fix} another "
+        f"{COEFFICIENTS + count} with suppression in the network, got an output of shape {shape}; {fix} another "
         "detector.label_space"
     )
 
