@@ -176,8 +176,8 @@ def _ssd_boxes(layout: OutputLayout, boxes: Float32, shape: tuple[int, int]) -> 
 def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
     """Return the class scores (K, C) of K boxes with one score and one label each.
 
-    Labels start at 1. The remainder, 1 - score, is distributed evenly over the other classes, but no class exceeds the
-    label. Rows of the background and rows with score 0 (padding) are 0.
+    Labels start at 1. The remainder, 1 - score, is distributed evenly over the other classes, but each gets at most the
+    score. Rows of the background and rows with score 0 (padding) are 0.
     """
     column = np.rint(labels).astype(np.int64) - 1
     used = (column != -1) & (scores > 0)

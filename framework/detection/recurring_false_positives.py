@@ -1,4 +1,4 @@
-"""Locations of recurring false positives: a location has a false positive in every frame that shows it."""
+"""Locations of recurring false positives, which appear in every frame that shows the location."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from framework.data import Frame, Int64
 from framework.geometry import transform
 
-CELL = 0.5  # m, side of a cell
-STEP = 8  # px between the sampled depth readings
+CELL = 0.5  # side of a cell, m
+STEP = 8  # distance between the sampled depth readings, px
 MIN_READINGS = 4  # minimum number of readings in a visible cell
 KEYS = 2**30  # number of keys; negated keys serve as instance ids, which are otherwise positive
 
@@ -28,7 +28,7 @@ class FalsePositiveCell:
 def false_positive_cells(frame: Frame, seed: int, count: int) -> list[FalsePositiveCell]:
     """Return at most `count` visible cells outside of objects of known class, sorted by key.
 
-    Return an empty list if the frame has no pose or no ground truth.
+    The list is empty if the frame has no pose or no ground truth.
     """
     if count == 0 or frame.T_world_camera is None or frame.truth is None:
         return []

@@ -16,11 +16,11 @@ from framework.detection.candidates import Candidates, check_scores, corners, de
 from framework.detection.runtimes.onnx_network import ExportMetadata, Outputs
 from framework.errors import DataError
 
-MIN_ORDERED_CORNERS = 0.9  # fraction of the boxes whose third and fourth number are not below the first two
-MAX_ORDERED_CENTERS = 0.5  # the same fraction of boxes with centers and sizes; typically a few percent
-MIN_ROWS = 20  # minimum number of rows for these fractions
+MIN_ORDERED_CORNERS = 0.9  # minimum fraction of boxes with x2 >= x1 and y2 >= y1, if boxes are corners
+MAX_ORDERED_CENTERS = 0.5  # maximum fraction of such boxes, if boxes are centers and sizes; typically a few percent
+MIN_ROWS = 20  # minimum number of detections for these fractions
 LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
-CONFIDENT = 0.5  # minimum score of a detection with required x1 <= x2, y1 <= y2
+CONFIDENT = 0.5  # minimum score of the detections that must have x1 <= x2 and y1 <= y2
 STRIDES = (8, 16, 32, 64)  # px per cell in the YOLO family, the last only in large networks
 BOXES_PER_CELL = (1, 3)  # 3 up to YOLOv7
 SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, after x1 y1 x2 y2
@@ -57,7 +57,10 @@ class SegmentationLayout:
     unit: bool | None = None  # boxes are in 0..1 of the input's sides, not in px
 
     def read(self, outputs: Outputs) -> SegmentationOutput:
-        """Return the candidates and masks. Raises DataError if the outputs contradict this layout."""
+        """Return the candidates with their mask coefficients, and the prototypes.
+
+        Raises DataError if the outputs contradict this layout.
+        """
         table, prototypes = _table_and_prototypes(outputs)
         rows = self._rows(table)
         maps = np.moveaxis(prototypes[0], -1, 0) if self.channels_last else prototypes[0]
@@ -123,8 +126,8 @@ def detect_layout(
     """Return the layout of a network from its outputs for a black image. Raises DataError if no layout matches.
 
     `shape`: (height, width) px of the input. The shapes of the outputs determine everything except the kind of boxes.
-    The rows determine the kind of boxes, because the cells cover the image. Centers reach almost 1, or the image size
-    in px, and sizes do not exceed them.
+    The rows determine the kind of boxes: the cells cover the image, so most centers are larger than the sizes of their
+    boxes, and few rows could be corners.
     """
     table, prototypes = _table_and_prototypes(outputs)
     channels_last = _is_channels_last(prototypes, shape, input_channels_last, metadata)
@@ -157,7 +160,7 @@ def _table_and_prototypes(outputs: Outputs) -> tuple[Float32, Float32]:
 def _is_channels_last(
     prototypes: Float32, shape: tuple[int, int], input_channels_last: bool, metadata: ExportMetadata
 ) -> bool:
-    """Return True if channels are last.
+    """Return True if the channels of the prototypes are last.
 
     Cells are square, so the prototypes have the input's aspect ratio in only one order of the axes.
     """
@@ -167,11 +170,12 @@ def _is_channels_last(
     if first and last and metadata.author.startswith("Ultralytics"):
         return input_channels_last  # Ultralytics exports transpose both input and output, or neither
     if first == last:
-        why = "ambiguous (1, M, h, w) or (1, h, w, M); export for another size" if first else "another aspect ratio"
-        raise DataError(
-            f"detector.weights: expected prototypes with the aspect ratio of the input {height}x{width}, got "
-            f"{prototypes.shape} with {why}"
-        )
+        expected = f"expected prototypes with the aspect ratio of the input {height}x{width}"
+        found = "with another aspect ratio"
+        if first:
+            expected = "expected prototypes (1, M, h, w) or (1, h, w, M)"
+            found = "with an ambiguous order of axes; export for another size"
+        raise DataError(f"detector.weights: {expected}, got {prototypes.shape} {found}")
     return bool(last)
 
 
@@ -182,8 +186,8 @@ def _are_labels(column: Float32, classes: int) -> bool:
 def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bool:
     """Return True if an ambiguous table contains detections.
 
-    Detections have integer labels, and their number differs from the number of cells. The labels are not sufficient in
-    8-bit networks, where most scores are 0.
+    Detections have integer labels, and their number differs from the number of cells. Labels alone are not
+    sufficient in 8-bit networks, where most scores are 0.
     """
     cells = [-(-shape[0] // stride) * -(-shape[1] // stride) for stride in STRIDES]
     counts = {boxes * sum(cells[:levels]) for boxes in BOXES_PER_CELL for levels in (3, 4)}
@@ -200,7 +204,7 @@ def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness:
     fix = f"set detector.objectness={str(not objectness).lower()} or" if other in shape[1:] else "choose"
     return (
         f"detector.label_space: expected {columns} columns for box, classes and {count} coefficients, or "
-        f"{COEFFICIENTS + count} with suppression inside, got an output of shape {shape}; {fix} another "
+        f"{COEFFICIENTS + count} with suppression in the network, got an output of shape {shape}; {fix} another "
         "detector.label_space"
     )
 

@@ -1,8 +1,8 @@
 """Direction of gravity and height of the floor.
 
-If frames have a sensor direction, the direction of gravity is the mean over all frames. Otherwise it is estimated from
-the surface. Up is then the direction that is perpendicular or parallel to most of the surface. The mean upper edge of
-the images and surface that faces up distinguish floors from walls.
+If the sensor measures the direction of gravity, the mean over all frames is used. Otherwise the direction is estimated
+from the surface: up is perpendicular or parallel to most of the surface. Floors are distinguished from walls by two
+cues: the mean direction of the upper edges of the images, and the surfaces that face up.
 """
 
 from __future__ import annotations
@@ -18,36 +18,39 @@ from framework.interfaces import Gravity
 from framework.mapping.storage.map_header import MapHeader
 
 MAX_FRAMES = 1e9  # maximum number of frames of a map
-AGREED = 0.95  # minimum length of the mean of the sensor's unit vectors, as for vectors within 18 degrees of the mean
-DIGITS = 6  # decimals of a frame's contribution; the last digits of float64 depend on the memory layout
-SAMPLED = 20_000  # triangles that refine a direction; every VOTING-th triangle votes for candidates
+AGREED = 0.95  # minimum length of the mean of the sensor's unit vectors; 0.95 = all are 18 degrees from the mean
+DIGITS = 6  # number of decimals of a frame's contribution; the last digits of float64 depend on the memory layout
+SAMPLED = 20_000  # number of triangles that refine a direction; every VOTING-th of them votes for candidates
 VOTING = 5
-DIRECTIONS = 3000  # candidates on half a sphere, 2.6 degrees apart
-SPREAD = np.radians(4.0)  # standard deviation of the normals of level and upright surfaces
-NEAR = np.radians(10.0)  # maximum angle from the direction for surfaces that refine it
-HELD_WITHIN = np.radians(50.0)  # largest angle between up and the mean upper edge of the images
-FACING_UP = 2.0  # weight of surface that faces up; without it, the three axes of a box-shaped room have equal votes
+DIRECTIONS = 3000  # number of candidate directions on a half-sphere, about 2.6 degrees apart
+SPREAD = np.radians(4.0)  # standard deviation of the normals of level and upright surfaces, rad
+NEAR = np.radians(10.0)  # maximum deviation from level or upright of surfaces that refine the direction, rad
+HELD_WITHIN = np.radians(50.0)  # maximum angle between up and the mean upper edge of the images, rad
+FACING_UP = 2.0  # weight of surfaces that face up; without it, the three axes of a box-shaped room have equal votes
 MIN_FRACTION = 0.15  # minimum fraction of the surface that is level or upright; a heap of objects has less
 LEVEL = np.cos(np.radians(18.0))  # minimum dot product of up and the normal of a floor
 STEP = 0.05  # bin size of heights, m
-FLOOR_FRACTION = 0.05  # minimum fraction of all level surfaces within a step of the floor height
-BELOW_FLOOR = 0.02  # maximum fraction of all surface below the floor: noise, windows and mirrors
+FLOOR_FRACTION = 0.05  # minimum area at the height of the floor, as a fraction of the area of all level surfaces
+BELOW_FLOOR = 0.02  # maximum fraction of the surface below the floor, caused by noise, windows and mirrors
 
 
 log = logging.getLogger(__name__)
 
 
 class GravityEstimator:
-    """Accumulator of the camera's orientation and the sensor's directions over frames."""
+    """Accumulator of camera orientations and of the sensor's gravity directions over frames."""
 
     def __init__(self) -> None:
-        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of the unit vectors to the upper edge of images, world frame
+        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of unit vectors to the upper edges of images, world frame
         self.sensed_up: Float64 = np.zeros(3)  # (3,) sum of the sensor's unit vectors against gravity, world frame
-        self.sensed_frames = 0  # frames with a sensor direction
+        self.sensed_frames = 0  # number of frames with a gravity direction from the sensor
         self._warned = False
 
     def add_frame(self, T_world_camera: Float64, up_camera: Float64 | None = None) -> None:
-        """Add one frame; `up_camera` is the sensor's unit vector (3,) against gravity, None = no sensor."""
+        """Add one frame.
+
+        `up_camera` is the sensor's unit vector (3,) against gravity in the camera frame, None = no sensor.
+        """
         self.camera_up -= np.round(T_world_camera[:3, 1], DIGITS)
         if up_camera is not None:
             self.sensed_up += np.round(T_world_camera[:3, :3] @ up_camera, DIGITS)
@@ -92,9 +95,10 @@ class GravityEstimator:
         return self.sensed_up / length
 
     def estimate(self, vertices: Float32, triangles: Int32) -> Gravity:
-        """Return the sensor's direction, or an estimate from the surface.
+        """Return the direction of gravity from the sensor, or an estimate from the surface.
 
-        The direction is unknown if no surface is level or upright.
+        The surface consists of `vertices` (V, 3), m, in the world frame and `triangles` (T, 3). The direction is
+        unknown if too little of the surface is level or upright.
         """
         sensed = self.sensed()
         if sensed is not None:
@@ -136,7 +140,7 @@ def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float6
 
 
 def half_sphere(count: int) -> Float64:
-    """Return unit vectors (count, 3) evenly spread over half a sphere, in a golden-angle spiral."""
+    """Return unit vectors (count, 3) evenly spread over a half-sphere, in a golden-angle spiral."""
     k = np.arange(count) + 0.5
     z = 1 - k / count
     turn, radius = np.pi * (1 + np.sqrt(5)) * k, np.sqrt(1 - z * z)
@@ -146,7 +150,7 @@ def half_sphere(count: int) -> Float64:
 def level_or_upright(normals: Float64, areas: Float64, directions: Float64, facing_up: float = 1.0) -> Float64:
     """Return the fraction (D,) of the surface that is level or upright, for each candidate up direction.
 
-    Surface that faces the direction counts `facing_up` times.
+    Surfaces that face the direction have the weight `facing_up`.
     """
     signed = normals.astype(np.float32) @ directions.T.astype(np.float32)
     cosines = np.abs(signed)

@@ -39,7 +39,7 @@ LARGEST_SCALE = 2**40  # largest scale of quantized class scores
 
 
 class InstanceMap(InstanceTableMap):
-    """A TSDF with instance and class evidence in its voxels. Only fusers write its parts."""
+    """A TSDF with instance and class evidence in its voxels. Only fusers modify its parts."""
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class InstanceMap(InstanceTableMap):
         super().begin(classes)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """Return the instance at every stride-th depth reading; see `LabeledMap.instances_seen`."""
+        """Return the instance ids (ceil(H / stride), ceil(W / stride)) of a frame; see `LabeledMap.instances_seen`."""
         instance_ids = np.empty(tuple(-(-side // stride) for side in frame.depth.shape), np.int32)
         view = pinhole(frame.camera, T_world_camera)
         look_up_instances(self.volume.voxels.grid, self.labels.evidence, frame.depth, view, stride, instance_ids)

@@ -11,7 +11,7 @@ from framework.data import Bool, Camera, Float32, Float64
 from framework.geometry import inverse, nearest_rotation, transform
 
 COLMAP_PIXEL_CENTER = 0.5  # center of the first pixel in COLMAP; it is 0 here
-REFERENCE_SIDE = 640  # side of images for which max_error holds, px; it grows with the side of larger images
+REFERENCE_SIDE = 640  # longer image side for which max_error holds, px; max_error grows in proportion for larger images
 CONFIDENCE = 0.9999  # confidence of RANSAC
 MAX_DEPTH_ERROR = 0.05  # maximum depth error of an inlier, fraction of its depth
 
@@ -48,10 +48,10 @@ class AbsolutePoseEstimator:
     def estimate(
         self, camera: Camera, pixels: Float32, points_world: Float32, depth: Float32 | None = None
     ) -> AbsolutePose | None:
-        """Return the pose of `camera` from `points_world` (M, 3) at `pixels` (M, 2) with `depth` (M,) m, 0 = unknown.
+        """Return the pose of `camera` from `points_world` (M, 3), m, at `pixels` (M, 2).
 
-        Returns None if there are too few inliers. An inlier is finite, in front of the camera, reprojects within
-        `max_error` and agrees with its depth.
+        `depth` (M,), m, holds the readings at these pixels, 0 = unknown. Returns None if there are too few inliers. An
+        inlier is finite, in front of the camera, reprojects within `max_error` and agrees with its depth.
         """
         import pycolmap
 

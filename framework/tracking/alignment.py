@@ -3,9 +3,9 @@
     E(xi) = sum_i w_i (n_i . (T p_i - q_i))^2 + lambda sum_i v_i (I(pi(T p_i)) - I_frame,i)^2
 
 T = T_view_camera moves the frame's points p_i into the view. The view gives each point its model point q_i with normal
-n_i, and its model intensity. w_i and v_i are Tukey's biweights. Residuals are divided by their expected noise, so both
-terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its noise times depth / FAR. Errors
-of structured-light cameras at this range cover whole image regions and do not average out. `RANGE` is the
+n_i, and its model intensity. w_i and v_i are Tukey's biweights. Residuals are divided by their expected noise, so that
+both terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its noise times depth / FAR.
+Errors of structured-light cameras at this range cover whole image regions and do not average out. `RANGE` is the
 maximum depth of these cameras. Beyond it, standard deviations and gates are those at `RANGE` times depth / RANGE, so
 that the balance of the two terms does not depend on depth. Gauss-Newton steps are twists in the view's frame:
 T <- exp(xi) T.
@@ -90,7 +90,7 @@ def model_view(view: SurfaceView) -> ModelView:
 def smoothed(model: ModelView, level: int) -> ModelView:
     """Return the model for `level` halvings of its resolution, with normals averaged over squares of about this size.
 
-    A new map is noisy. Noise of a normal acts like a surface that resists motion along the real surface.
+    A new map is noisy. Noise in the normals resists motion along the surface.
     """
     if level == 0:
         return model
@@ -102,11 +102,11 @@ def smoothed(model: ModelView, level: int) -> ModelView:
 class Weights(NamedTuple):
     """Weights of residuals and gates of correspondences."""
 
-    max_distance: np.float32  # maximum distance of a point up to RANGE from its model point, m
-    close_distance: np.float32  # m; maximum depth difference for agreement with the model, or 3 standard deviations
+    max_distance: np.float32  # maximum distance of a point from its model point, m; proportional to depth beyond RANGE
+    close_distance: np.float32  # maximum depth difference for agreement with the model, m; at least 3 sigma
     min_normal_dot: np.float32  # minimum cosine between the frame's and the model's normal
-    geometric_scale: np.float32  # zero of Tukey's weight for geometric residuals, standard deviations
-    photometric_scale: np.float32  # zero of Tukey's weight for photometric residuals, standard deviations
+    geometric_scale: np.float32  # geometric residual with Tukey's weight 0, in standard deviations
+    photometric_scale: np.float32  # photometric residual with Tukey's weight 0, in standard deviations
     intensity_noise: np.float32  # standard deviation of an intensity difference; intensities are in [0, 1]
     color_weight: np.float32  # lambda; 0 = geometry only
     depth_weight: np.float32  # weight of the geometric term; 0 = color only
@@ -124,15 +124,15 @@ class NormalEquations(NamedTuple):
 
     A: Float64  # (6, 6)
     b: Float64  # (6,)
-    visible: int  # points on a mapped part of the view
-    matched: int  # visible points with a weight
-    close: int  # visible points at a depth that agrees with the model
-    behind: int  # visible points clearly behind the model, which should hide them
-    A_color: Float64  # (6, 6) the part of the photometric term; 0 for LinearWeights
+    visible: int  # number of points on a mapped part of the view
+    matched: int  # number of visible points with a nonzero weight
+    close: int  # number of visible points at a depth that agrees with the model
+    behind: int  # number of visible points clearly behind the model, which should hide them
+    A_color: Float64  # (6, 6) part of A from the photometric term; 0 for LinearWeights
     energy: float  # sum of w r^2 of the geometric term
-    color_energy: float  # ... of the photometric term
-    matched_colors: int  # visible points with a photometric weight
-    brightness: float  # mean of frame minus model intensity: the change of exposure
+    color_energy: float  # sum of v r^2 of the photometric term
+    matched_colors: int  # number of visible points with a nonzero photometric weight
+    brightness: float  # mean of frame minus model intensity, caused by a change of exposure
 
 
 def linearize(

@@ -8,9 +8,9 @@ from numba import njit, prange
 from framework.mapping.voxels.voxel_grid_kernels import device, one_more
 from framework.sensors.noise_models_kernels import axial_sigma_single
 
-CHUNKS = 16  # chunks of image rows, summed in order, so that sums do not depend on the number of threads
-BATCH = 160  # points per batch; divides the usual image widths
-LANES = 16  # lanes of a sum; point n of a batch is added to lane n % LANES
+CHUNKS = 16  # number of chunks of image rows, summed in order, so that sums do not depend on the number of threads
+BATCH = 160  # number of points per batch; divides the usual image widths
+LANES = 16  # number of lanes of a sum; point n of a batch is added to lane n % LANES
 ROW = 5  # sums per derivative of the error: products with itself, the next three derivatives and the error
 ENERGY = 6 * ROW  # index of the weighted squared error among the sums of one term of the energy
 COLOR = ENERGY + 1  # index of the first sum of the photometric term, after those of the geometric term
@@ -30,7 +30,7 @@ RANGE = 5.0  # largest depth of structured-light cameras, m; errors and gates ar
 NEAREST = 0.05  # minimum depth of projected points in the view, m
 
 
-# Not cv2.blur: other threads that use OpenCV change the split of its running sums, and so the rounding.
+# Not cv2.blur: other threads that use OpenCV change the split of its running sums, and thus the rounding.
 @njit(cache=True, nogil=True, parallel=True)
 def smooth_normals(normals, reach, row_sums, smooth):
     """Set smooth (3, H, W) to unit means of normals over squares of side 2 reach + 1, 0 where all are 0."""
@@ -127,9 +127,10 @@ def _gather_model(depth, normals, size, pixel, points):
 
 @device
 def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
-    """Set the term of point n in J: weight, error, and derivative of the error by a twist of the view's frame.
+    """Set the term of point n in J: weight, error, and derivative with respect to a twist of the view's frame.
 
-    (gx, gy, gz) is the derivative of the error by the point (px, py, pz). Points without a weight may have NaN values.
+    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Points without a weight may have
+    NaN values.
     """
     zero = np.float32(0.0)
     weighted = weight > zero
@@ -171,7 +172,7 @@ def _add_geometry(model, R, weights, linear, noise_model, points, J):
         distance2 = ex * ex + ey * ey + ez * ez
         z = points[DEPTH + n]
         growth = max(one, z * inv_range)
-        if linear is None:  # numba compiles only the branch of the type of `linear`
+        if linear is None:  # numba compiles only the branch for the type of `linear`
             near = mapped & (distance2 <= max_distance2 * growth * growth)
         else:
             near = mapped & (distance2 <= max_distance2)
@@ -305,7 +306,7 @@ def _add_products(J, lanes, first):
 
 @device
 def _add_brightness(J, lanes):
-    """Add a batch's change of brightness to the lanes."""
+    """Add a batch's sum of brightness changes to the lanes."""
     for lane in range(LANES):
         change = np.float32(0.0)
         for step in range(BATCH // LANES):
@@ -325,7 +326,8 @@ def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, line
     shape, level_shape = model.depth.shape, model_intensity.shape
     size = np.int32(model.depth.size)
     flat_depth, flat_normals, flat_intensity = model.depth.ravel(), model.normals.ravel(), model_intensity.ravel()
-    color = COLOR * LANES if linear is None else 0  # equal rounding as one sum, for LinearWeights
+    # LinearWeights add both terms to the same lanes, with the rounding of a single sum
+    color = COLOR * LANES if linear is None else 0
     for chunk in prange(CHUNKS):
         total = np.zeros(TERMS, np.float64)
         lanes = np.zeros(SUMS * LANES, np.float64)

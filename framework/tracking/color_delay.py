@@ -2,15 +2,15 @@
 
 Depth edges of a frame, moved by the camera's motion over a time d, coincide with color edges if d is the time between
 the two images. For each compared frame k, the delay d_k has the largest mean color gradient at the moved depth edges.
-Its error in the image is constant. An inaccurate registration adds a constant offset o. With the mean image motion v_k
-of the edges and its direction n_k, in image widths and s:
+Its error, as a distance in the image, does not depend on the speed. An inaccurate registration adds a constant offset
+o. With the mean image motion v_k of the edges and its direction n_k, in image widths and s:
 
     |v_k| d_k = |v_k| d + n_k . o + noise
 
 Robust regression (Tukey's biweight) over the compared frames gives the delay d, with a normal prior of the offset.
 Errors of nearby frames are correlated: CORRELATED frames count as one, and the standard deviation is at least that of
-a jackknife over blocks of frames. Slow frames are not compared. If a camera turns to one side at a constant rate, only
-the prior separates d from o.
+a jackknife over blocks of frames. Slow frames are not compared. If a camera turns in one direction at a constant
+rate, only the prior separates d from o.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ MAX_RELATIVE_DEVIATION = 0.25  # ... or, if larger, the maximum as a fraction of
 OFFSET_DEVIATION = 0.5 / 640  # image widths, standard deviation of the constant offset of registered images
 CORRELATED = 8  # number of comparisons with one common error
 MIN_NOISE = 0.1 / 640  # image widths, minimum standard deviation of a comparison
-CUT_OFF = 4.685  # standard deviations with weight 0 in Tukey's biweight
-ITERATIONS = 10  # of the robust regression
+CUT_OFF = 4.685  # residual with weight 0 in Tukey's biweight, in standard deviations
+ITERATIONS = 10  # number of iterations of the robust regression
 
 UNKNOWN = DelayEstimate(0.0, np.inf, 0)
 
 
 def is_usable(estimate: DelayEstimate) -> bool:
-    """Return True if the estimate is accurate enough to register color by it."""
+    """Return True if the estimate is accurate enough to register color with it."""
     return estimate.deviation <= max(MAX_DEVIATION, MAX_RELATIVE_DEVIATION * abs(estimate.seconds))
 
 
@@ -60,7 +60,7 @@ class _Tracked(NamedTuple):
 
 
 class DelayEstimator:
-    """Online estimation of the delay of color."""
+    """Online estimator of the delay of color."""
 
     def __init__(self) -> None:
         self.estimate = UNKNOWN
@@ -69,10 +69,10 @@ class DelayEstimator:
         self._compared = 0  # number of compared frames
         # delay, s, and mean image motion (x, y), image widths / s
         self._comparisons: deque[tuple[float, float, float]] = deque(maxlen=MAX_COMPARISONS)
-        self._strengths = np.zeros(len(TESTED_DELAYS))  # sum over the compared frames
+        self._strengths = np.zeros(len(TESTED_DELAYS))  # sums of the mean gradients of all compared frames
 
     def add(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Add a frame that follows the previous one, and update the estimate."""
+        """Add the next frame, and update the estimate."""
         if self._recent and not 0 < frame.depth_time - self._recent[-1].frame.depth_time <= MAX_STEP:
             self.interrupt()
         self._recent.append(_Tracked(frame, T_world_camera))
@@ -85,7 +85,7 @@ class DelayEstimator:
             self.estimate = regress(np.array(self._comparisons), start)
 
     def interrupt(self) -> None:
-        """Forget the recent frames, because the motion to the next frame is unknown."""
+        """Discard the recent frames, because the motion to the next frame is unknown."""
         self._recent.clear()
 
     def _compare(self) -> bool:
@@ -132,7 +132,7 @@ def edge_points(frame: Frame) -> Float32:
 
 
 def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
-    """Return the smoothed color gradient (h, WIDTH) with mean 0 and standard deviation 1, and its scale."""
+    """Return the smoothed color gradient (h, WIDTH) with mean 0 and standard deviation 1, and the image scale."""
     scale = min(WIDTH / frame.camera.width, 1.0)
     small = cv2.resize(frame.color, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
@@ -145,7 +145,8 @@ def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
 def poses_at(times: Float64, poses: Float64, at: Float64) -> Float64:
     """Return the poses (A, 4, 4) at the times (A,), s, from poses (P, 4, 4) at increasing times (P,), s.
 
-    Translation is linear and rotation spherical linear between neighboring poses, and beyond the first and the last.
+    Translations are interpolated linearly and rotations spherically between neighboring poses, and extrapolated beyond
+    the first and the last pose.
     """
     k = np.clip(np.searchsorted(times, at) - 1, 0, len(times) - 2)
     fractions = (at - times[k]) / (times[k + 1] - times[k])
@@ -173,7 +174,7 @@ def regress(comparisons: Float64, start: float) -> DelayEstimate:
         variance = CORRELATED * scale**2
         covariance = variance * np.linalg.inv(_information(X, weights, variance))
         solution = covariance @ X.T @ (weights * shifts) / variance
-    without = []  # delays without one of the blocks
+    without = []  # estimated delays, s, each without one of the blocks
     for block in np.array_split(np.arange(len(delays)), BLOCKS):
         rest = weights.copy()
         rest[block] = 0

@@ -1,11 +1,11 @@
-"""Registration of color to depth that show different times, by the motion of the camera.
+"""Registration of color images to depth images of other times, by the motion of the camera.
 
 Color is taken dt = t_color + delay - t_depth after depth, with the timestamps t_color and t_depth of the images and a
 constant delay. With the last two poses, at the times t_last and t_depth, and constant velocity:
 
     T_world_color = interpolate(T_world_last, T_world_camera, 1 + dt / (t_depth - t_last))
 
-Each depth reading is projected to the color image from there. Depth is not resampled.
+Each depth reading is projected into the color image at this pose. Depth is not resampled.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from framework.tracking.pyramid import intrinsics
 
 MIN_SHIFT = 1.0  # px, minimum image motion between color and depth for a registration
 MAX_CHANGE = 0.5  # px, maximum image motion between the predicted and the tracked pose to keep a registration
-NEAR = 1.0  # m, depth of the points for both
+NEAR = 1.0  # m, assumed depth of the points for these image motions
 STRIDE = 8  # px, step between the depth readings for their median
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ class RegisteredFrame(NamedTuple):
 
     frame: Frame  # with the color at each depth pixel
     T_world_color: Float64  # (4, 4) pose of the color camera
-    color_pixels: Int32 | None = None  # (H, W) flat index of the color pixel of each reading, -1 = none; None = same
+    color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = same pixel
 
 
 class _Registration(NamedTuple):
@@ -58,7 +58,7 @@ class ColorToDepth:
         self._usable = False  # True once the estimate was accurate enough
         self._given = 0.0 if delay is None else delay
         self._last: tuple[float, Float64] | None = None  # time, s, and pose of the last frame
-        self._step: tuple[float, Float64] | None = None  # time, s, and motion T_last_next of the last step
+        self._step: tuple[float, Float64] | None = None  # duration, s, and motion T_last_next of the last step
         self._latest: _Registration | None = None
 
     @property
@@ -78,7 +78,7 @@ class ColorToDepth:
         return self._registered(frame, np.eye(4), *self._step).frame
 
     def tracked(self, frame: Frame, pose: Pose) -> RegisteredFrame:
-        """Return the frame with color registered by the motion to its pose, and take the pose for later frames."""
+        """Return the frame with color registered by the motion to its pose, and store the pose for later frames."""
         if pose.lost:
             self._last = self._step = None
             if self._estimator is not None:
@@ -136,8 +136,8 @@ def _shift(frame: Frame, T_a_b: Float64) -> float:
 def register(frame: Frame, otherwise: np.float32, T_color_depth: Float64) -> tuple[UInt8, Int32]:
     """Return the color (H, W, 3) at each depth pixel, interpolated bilinearly, and its flat index (H, W).
 
-    The index is -1 outside of the color image and without a reading. The color there is that of the nearest pixel, for
-    a depth of `otherwise` m.
+    The index is -1 outside of the color image and without a reading. A pixel outside of the color image gets the color
+    of the nearest pixel. A pixel without a reading gets the color at a depth of `otherwise` m.
     """
     shape = frame.camera.shape
     columns, rows, pixels = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.int32)

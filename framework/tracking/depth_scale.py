@@ -19,7 +19,7 @@ class DepthScale:
     up to RANGE and grow in proportion to depth beyond it, as the errors of readings do.
     """
 
-    depth: float = 1.0  # m, > 0
+    depth: float = 1.0  # typical depth, m, > 0
 
     @classmethod
     def of(cls, depth: Float32) -> DepthScale:

@@ -1,7 +1,7 @@
 """Sparse RootSIFT features with depth at half resolution, and their matching.
 
-SIFT at half resolution matches farther and more blurred views than ORB. At full resolution SIFT is three times slower
-and finds fewer matches, because of blur and sensor noise at the finest scale.
+SIFT at half resolution matches more distant and more blurred views than ORB. At full resolution SIFT is three times
+slower and finds fewer matches, because of blur and sensor noise at the finest scale.
 
 Descriptors are integers, as in COLMAP. So scalar products are exact in float32 in any order of summation, and matches
 do not depend on the number of threads.
@@ -88,7 +88,8 @@ class FrameFeatures:
 def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
     """Return index pairs (M, 2) of mutual nearest neighbors in `query` (Q, 128) and `reference` (R, 128).
 
-    A pair is dropped if its distance is above `max_ratio` times the distance to the second nearest (Lowe 2004).
+    A pair is dropped if its distance is above `max_ratio` times the distance to the second-nearest
+    neighbor (Lowe 2004).
     """
     if len(query) == 0 or len(reference) < 2:
         return np.zeros((0, 2), np.int32)
@@ -107,7 +108,7 @@ def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:
 
 
 def surface_depth(depth: Float32, pixels: Float32) -> Float32:
-    """Return the median depth (F,) of the patches around `pixels` (F, 2), 0 at surface edges and in holes."""
+    """Return the median depth (F,), m, of the patches around `pixels` (F, 2), 0 at surface edges and in holes."""
     height, width = depth.shape
     offsets = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
     u, v = np.rint(pixels).astype(np.intp).T
@@ -135,7 +136,7 @@ def _reduced(gray: UInt8) -> tuple[UInt8, int]:
 
 
 def _root_sift(descriptors: Float32) -> UInt8:
-    """Return RootSIFT: its Euclidean distance is SIFT's Hellinger distance (Arandjelovic and Zisserman 2012)."""
+    """Return RootSIFT descriptors (Arandjelovic and Zisserman 2012): their L2 distance is SIFT's Hellinger distance."""
     total = np.maximum(descriptors.sum(axis=1, keepdims=True), 1)
     rooted: UInt8 = np.minimum(np.rint(DESCRIPTOR_NORM * np.sqrt(descriptors / total)), 255).astype(np.uint8)
     return rooted

@@ -35,7 +35,7 @@ SAVED: Mapping[str, tuple[tuple[int | None, ...], type]] = {
 """Shapes and types of the arrays of saved keyframes."""
 
 MIN_RETRY_SEPARATION = 0.25  # minimum separation from a frame with too few features; 1 = keyframe limit
-WORD_BITS = 12  # 4096 visual words; with fewer, views look alike; with more, few words recur
+WORD_BITS = 12  # 4096 visual words; fewer do not distinguish views, and more rarely recur
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,15 @@ class Keyframe:
 class Keyframes:
     """A bounded database of keyframes.
 
-    Call `add` with every trusted frame. It extracts the features of new views in a background thread. All other methods
-    wait for this thread first, so that results do not depend on timing. The cost of `relocalize` does not depend on the
-    number of keyframes, except for the comparison of bags of words.
+    Call `add` with every trusted frame. It extracts the features of new views in a background thread. A view is new if
+    distance / min_distance + angle / min_angle >= 1 for all keyframes. All other methods wait for the thread first, so
+    that results do not depend on timing. The cost of `relocalize` does not depend on the number of keyframes, except
+    for the comparison of bags of words.
     """
 
     max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed
-    min_distance: float = 0.25  # minimum distance between keyframes, m, > 0; see min_angle
-    min_angle: float = 0.3  # m. angle, rad, > 0; new keyframe if distance / min_distance + angle / min_angle >= 1
+    min_distance: float = 0.25  # minimum distance of a new view without rotation, m, > 0
+    min_angle: float = 0.3  # minimum angle of a new view without translation, rad, > 0
     max_features: int = 800  # maximum number of features of a frame, >= 1
     min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
     candidates: int = 6  # number of keyframes matched with a lost frame, >= 1
@@ -137,7 +138,7 @@ class Keyframes:
         An exception of that thread is raised by the next method that waits for it.
         """
         if self._offered is not None and self._is_retry(self._offered[0], T_world_camera):
-            return  # too near to that frame, even if it has too few features for a keyframe
+            return  # too near to the frame under construction, even if it has too few features for a keyframe
         if not self.is_new(T_world_camera) or self._is_retry(self._barren, T_world_camera):
             return
         worker = ThreadPoolExecutor(1, "keyframe", lower_priority)
@@ -172,7 +173,7 @@ class Keyframes:
         return self.keyframe(frame, features, T_world_camera) if len(features) >= self.min_features else None
 
     def _append(self, keyframe: Keyframe) -> None:
-        """Add a keyframe; above the limit, drop the older keyframe of the nearest pair."""
+        """Add a keyframe; above the limit, remove the older keyframe of the nearest pair."""
         self._keyframes.append(keyframe)
         self._poses = np.concatenate([self._poses, keyframe.T_world_camera[None]])
         if len(self._keyframes) > self.max_keyframes:
@@ -216,7 +217,7 @@ class Keyframes:
         return [self._keyframes[k] for k in order[: self.candidates]]
 
     def nearest(self, T_world_camera: Float64) -> list[Keyframe]:
-        """Return the candidate keyframes nearest to a pose, best first."""
+        """Return the candidate keyframes nearest to a pose, nearest first."""
         self._settle()
         order = np.argsort(self._separation(self._poses, T_world_camera), kind="stable")
         return [self._keyframes[k] for k in order[: self.candidates]]
@@ -266,7 +267,7 @@ def similarity(bag: Float32, bags: Float32) -> Float32:
     document_counts = np.count_nonzero(bags, axis=0)
     idf = np.log((1 + len(bags)) / (1 + document_counts)).astype(np.float32)
     if not idf.any():
-        idf[:] = 1  # one or two images may all contain every word
+        idf[:] = 1  # every word occurs in all images
     weighted, query = bags * idf, bag * idf
     norms = np.linalg.norm(weighted, axis=1) * np.linalg.norm(query)
     return np.asarray((weighted * query).sum(axis=1) / np.maximum(norms, 1e-9), np.float32)

@@ -13,12 +13,12 @@ from framework.tracking.pyramid_kernels import compute_normals, find_distinct, h
 
 SAMPLED = 4  # stride of the depth readings for the quantization estimate, px
 FEWEST_VALUES = 16  # minimum number of distinct depths for the quantization estimate
-SCATTERED = 0.15  # minimum fraction of missing neighbors of depth readings; Kinect images have at most 0.02
-COARSE = 2.5  # largest fine step between depth values, standard deviations of the sensor's depth
+SCATTERED = 0.15  # minimum fraction of missing neighbors of readings in scattered depth; at most 0.02 for Kinects
+COARSE = 2.5  # largest step between depth values of fine depth, in standard deviations of the sensor
 
 
 def intrinsics(camera: Camera) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Return fx, fy, cx, cy, px, in single precision for kernels."""
+    """Return fx, fy, cx and cy (px) in single precision for kernels."""
     return np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx), np.float32(camera.cy)
 
 
@@ -60,8 +60,8 @@ def build_pyramid(
 def is_coarse(depth: Float32, otherwise: bool, sensor: SensorKind = SensorKind.KINECT_V1) -> bool:
     """Return True if depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as with 8 bits.
 
-    Steps are gaps between the values in the nearer half, in standard deviations of the sensor. A Kinect has steps of
-    1.5 to 1.9 at any distance. Returns `otherwise` if too few values occur.
+    Steps are the gaps between distinct values in the nearer half, in standard deviations of the sensor. A Kinect has
+    steps of 1.5 to 1.9 at any distance. Returns `otherwise` if there are too few distinct values.
     """
     values = _distinct(depth[::SAMPLED, ::SAMPLED])
     if len(values) < FEWEST_VALUES:
@@ -102,7 +102,7 @@ def _intensity(color: UInt8) -> Float32:
 
 
 def model_intensities(view: SurfaceView, levels: int) -> list[Float32]:
-    """Return the view's intensity in [0, 1] at its own resolution and at halvings, -1 = unmapped."""
+    """Return the view's intensity in [0, 1] at its own resolution and at `levels` - 1 halvings, -1 = unmapped."""
     intensity = _intensity(view.color)
     intensity[view.depth == 0] = -1
     pyramid = [intensity]

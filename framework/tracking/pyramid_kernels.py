@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-DEPTH_GAP = 0.05  # minimum depth difference between surfaces, fraction of the depth; not averaged across
+DEPTH_GAP = 0.05  # minimum depth difference between surfaces, fraction of the depth; depth is not averaged across it
 MIN_MAPPED = np.float32(2.0)  # minimum number of mapped pixels among four for a mapped mean
 
 

@@ -1,13 +1,14 @@
 """Raw keyframes: a frame as a second model of the alignment, next to the view of the map.
 
-The map rounds off structure below its voxel size, always to the same side. This biases the alignment by a constant, and
-the map follows the camera: a standing camera drifts. A raw keyframe has no such bias. Its normal equations are added to
-those of the map's view. With T_key_view and its adjoint Ad, a twist xi of the view's frame is Ad xi in the keyframe's:
+The map smooths structure below its voxel size, always in the same direction. This biases each alignment by a constant.
+Integration at the biased poses moves the map in turn, so that a standing camera drifts. A raw keyframe has no such
+bias. Its normal equations are added to those of the map's view. With T_key_view and its adjoint Ad, a twist xi of the
+view's frame is Ad xi in the keyframe's frame:
 
     A <- A + w Ad^T A_key Ad,    b <- b + w Ad^T b_key
 
 The keyframe is compared at half the finest resolution, where averaged depth is less noisy and the cost is a quarter. At
-the finest level, w = 4 replaces the missing points. The coarsest level is aligned to the map alone. Beyond
+the finest level, w = 4 compensates for the missing points. The coarsest level is aligned to the map alone. Beyond
 NEW_DISTANCE, w falls to 0 at USED_DISTANCE, so that sparse frames are aligned to the map alone.
 """
 
@@ -25,14 +26,14 @@ from framework.tracking.alignment import LinearWeights, ModelView, NormalEquatio
 from framework.tracking.depth_scale import DepthScale
 from framework.tracking.pyramid import PyramidLevel, intrinsics
 
-NEW_DISTANCE = 0.1  # m and rad from the keyframe, beyond which a frame replaces it
-USED_DISTANCE = 0.15  # m and rad from the keyframe, at which its weight reaches 0
+NEW_DISTANCE = 0.1  # distance at which a frame replaces the keyframe, m and rad
+USED_DISTANCE = 0.15  # distance at which the weight of the keyframe reaches 0, m and rad
 COMPARED = 1  # level at which frames and the keyframe are compared: halvings of the finest resolution
 
 
 @dataclass(frozen=True)
 class RawKeyframe:
-    """A frame at its estimated pose, as a model of later frames."""
+    """A frame at its estimated pose, as a model for the alignment of later frames."""
 
     T_world_camera: Float64  # (4, 4)
     model: ModelView  # at level COMPARED
@@ -40,7 +41,10 @@ class RawKeyframe:
 
     @classmethod
     def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64, scattered: bool = False) -> RawKeyframe:
-        """Return the keyframe of an image pyramid, finest level first. Normals of scattered depth are averaged more."""
+        """Return the keyframe of an image pyramid, finest level first.
+
+        Normals of scattered depth are averaged over squares.
+        """
         level = levels[COMPARED]
         model = smoothed(ModelView(level.depth, level.normals, *intrinsics(level.camera)), int(scattered))
         return cls(T_world_camera, model, np.where(level.depth > 0, level.intensity, np.float32(-1)))
@@ -50,7 +54,7 @@ class KeyframeTerm(NamedTuple):
     """The keyframe's part of one alignment."""
 
     keyframe: RawKeyframe
-    T_key_view: Float64
+    T_key_view: Float64  # (4, 4)
     Ad: Float64  # (6, 6) adjoint of T_key_view
     weight: float  # in [0, 1]
 

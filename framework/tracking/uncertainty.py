@@ -2,7 +2,7 @@
 
 With weights that are inverse variances, the covariance of a least-squares estimate is A^-1. Residuals correct the
 assumed variances: each term's factor is s^2 = sum w r^2 / n for its n matched points. Errors of neighboring pixels are
-correlated, and the errors of a frame are common to the map and the keyframe. CORRELATED points have one common error:
+correlated, and the errors of a frame are common to the map and the keyframe. CORRELATED points count as one:
 
     C = CORRELATED A^-1 (sum over terms of s^2 A_term) A^-1
 
@@ -20,7 +20,7 @@ from framework.geometry import adjoint, inverse
 from framework.tracking.alignment import NormalEquations
 
 CORRELATED = 16.0  # number of points with one common error, from the errors of tracked poses (docs/results/halls.md)
-MIN_VARIANCE = 1e-18  # smallest variance of a motion, m^2 and rad^2, without noise
+MIN_VARIANCE = 1e-18  # minimum variance of a motion, m^2 and rad^2, for data without noise
 
 
 def pose_covariance(terms: Sequence[NormalEquations], T_view_camera: Float64) -> Float64:

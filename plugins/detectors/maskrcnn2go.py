@@ -49,9 +49,9 @@ SHA256 = {
     "graph.json": "e2b06acc9c26fdd62292100ea2a5495f9fd1bd3607276916bdb8440562f401ef",
     "maskrcnn2go_coco_int8.npz": "a79197eba054bdf4e4b1136a3dffbfea951f442682464357d91b2a1abd0d21c9",
 }
-STRIDE = 16  # px of the resized image per cell of the feature map
+STRIDE = 16  # side of a cell of the feature map, px of the resized image
 BINS = 6  # bins of RoIAlign per side
-PRE_NMS_PROPOSALS = 3000  # number of decoded best anchors, as in the graph
+PRE_NMS_PROPOSALS = 3000  # number of best anchors that are decoded, as in the graph
 EXTENT = 1.0  # extent of the boxes; see framework.detection.masks.boxes
 
 log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ class MaskRCNN2Go(Detector):
     devices it computes in float with the same weights. The class distribution of a detection is the box head's softmax
     over 80 classes, renormalized without the background. Its score is the probability of its class, including the
     background. After suppression within a class, `agnostic_nms_iou` removes duplicates across classes, so that an
-    ambiguous object does not start two map instances.
+    ambiguous object does not create two instances.
     """
 
     weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # folder, relative to the working or project folder
@@ -120,9 +120,8 @@ class MaskRCNN2Go(Detector):
 
     @torch.inference_mode()
     def detect(self, frame: Frame) -> Detections:
-        with (
-            one_torch_thread() if self._integers else nullcontext()
-        ):  # other threads build the map or process other frames
+        # other threads build the map or process other frames
+        with one_torch_thread() if self._integers else nullcontext():
             return self._detect(frame)
 
     def _detect(self, frame: Frame) -> Detections:

@@ -39,7 +39,7 @@ class OnnxSegmentation(Detector):
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
     label_space: str = "coco"  # class names: a label space, or a text file with one name per line
     objectness: bool = False  # True = the outputs have an objectness before the class scores, as in YOLOv5
-    box_format: BoxKind = BoxKind.AUTO  # box format; AUTO = detected
+    box_format: BoxKind = BoxKind.AUTO  # box format: CENTER, CORNER or AUTO (detected)
     class_spread: float = 1.0  # fraction of (1 - score) for other classes, if the network reports one class, in [0, 1]
     score_threshold: float = 0.1  # minimum score, in (0, 1); low, because weak detections can update instances
     nms_iou: float = 0.45  # box IoU threshold of non-maximum suppression within a class, in (0, 1]
@@ -105,5 +105,5 @@ class OnnxSegmentation(Detector):
         names = self._network.metadata.names
         different = [(k, a, b) for k, (a, b) in enumerate(zip(names, self._labels, strict=False)) if a != b]
         if different:
-            log.warning("%s: %d of its %d classes differ from detector.label_space=%s: %d is %r, expected %r",
+            log.warning("%s: %d of its %d classes differ from detector.label_space=%s: class %d is %r, expected %r",
                         self.weights.name, len(different), len(names), self.label_space, *different[0])  # fmt: skip

@@ -18,13 +18,13 @@ from framework.detection.stored.fingerprint import fingerprint
 from framework.interfaces import Detector
 
 SOMETHING_ELSE = "something else"
-MAX_WORDS = 500
+MAX_WORDS = 500  # maximum number of text queries
 SIGNIFICANCE, MAX_SLANT, MIN_READINGS = 0.4, 85.0, 0.1  # parameters of masks from depth, as in onnx_boxes
 
 
 @dataclass
 class OpenVocabulary(Detector):
-    """Text-prompted detection with boxes from OWLv2 and masks from SAM, SAM 2 or EdgeTAM; extra `transformers`.
+    """Boxes from OWLv2 for text queries, and masks from SAM, SAM 2 or EdgeTAM; needs the extra `transformers`.
 
     The classes are the text queries as written, and `something else`. OWLv2 estimates an independent probability p for
     each query. The distribution is proportional to the odds p / (1 - p), with the odds of the threshold for `something
@@ -35,7 +35,7 @@ class OpenVocabulary(Detector):
     text_queries: list[str] = field(default_factory=lambda: ["chair", "table", "mug"])  # distinct text queries
     model: str = "google/owlv2-base-patch16-ensemble"  # OWLv2 model: id on huggingface.co or folder
     revision: str = "main"  # branch, tag or commit of the model id
-    mask_model: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2, EdgeTAM: id or folder; "" = masks from depth
+    mask_model: str = "facebook/sam2.1-hiera-tiny"  # SAM, SAM 2 or EdgeTAM: id or folder; "" = masks from depth
     mask_model_revision: str = "main"  # branch, tag or commit of the mask model id
     score_threshold: float = 0.1  # minimum probability of the best query for a box, in (0, 1)
     nms_iou: float = 0.5  # box IoU threshold of non-maximum suppression across queries, in (0, 1]

@@ -67,7 +67,7 @@ class Precomputed(Detector):
             raise DataError(f"{self.path}: expected detections of COCO's classes, got none of {len(stored)}")
         if not known.all():
             lost = sorted({one.label for one, is_known in zip(stored, known, strict=True) if not is_known})
-            log.info("%s: dropped %d of %d detections of classes that COCO does not have: %s",
+            log.info("%s: dropped %d of %d detections of classes without a COCO name: %s",
                      self.path, int((~known).sum()), len(stored), ", ".join(lost))  # fmt: skip
         self._frames = {one.frame for one in stored}
         self._of_frame: dict[int, list[tuple[StoredDetection, Float32]]] = defaultdict(list)

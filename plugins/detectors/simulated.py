@@ -30,10 +30,10 @@ LOOKALIKES = (
 """COCO classes that detectors confuse indoors."""
 
 CLUTTER_CLASSES = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
-"""Classes of detections on things without a COCO class."""
+"""Classes assigned to detections of things without a COCO class."""
 
 LOOKALIKE_FRACTION = 0.8  # fraction of the probability lost by the ground-truth class; the other classes get the rest
-EVEN_FRACTION = 0.01  # weight of the model's mean in each distribution, to avoid zeros as in a softmax
+EVEN_FRACTION = 0.01  # weight of the mean distribution in each distribution; avoids zeros, like a softmax
 FALSE_SIZES = (24.0, 160.0)  # range of the sides of false detections, px, log-uniform
 RECURRING_SIZES = (0.2, 1.2)  # range of the sides of recurring false detections, m, log-uniform
 LARGEST_CLUTTER = 0.25  # maximum size of things detected as objects, fraction of the image; walls are larger
@@ -98,7 +98,7 @@ class SimulatedDetector(Detector):
     - Masks are shifted, bleed over the border, have a noisy border and are resampled on a coarse grid.
     - The class becomes a distribution around a confusion kernel of similar classes, often with the same draw for an
       object (`confusion_consistency`).
-    - The score follows mask quality and class certainty.
+    - The score depends on mask quality and class certainty.
     - False detections appear, some repeatedly at the same locations (`recurring_fraction`, if poses are known).
 
     Errors of an object or location do not average out over a video, as with real detectors. Every number is drawn from
@@ -108,7 +108,8 @@ class SimulatedDetector(Detector):
     seed: int = 0  # seed of the simulated errors, >= 0
     min_pixels: int = 64  # minimum size of a detected instance, px, >= 1
     clutter_rate: float = 0.0  # fraction of objects of unknown class that are detected, in [0, 1]
-    attach_rate: float = 0.0  # probability of a common mask of an object and a touching unknown object, in [0, 1]
+    # probability of a common mask of an object and a touching object of unknown class, in [0, 1]
+    attach_rate: float = 0.0
     merge_rate: float = 0.1  # probability of a common mask of two touching objects, in [0, 1]
     miss_rate: float = 0.1  # probability of missing a large object inside the image, in [0, 1]
     small_side: float = 24.0  # object side with a size-related miss probability of 1/e, px, >= 0; 0 = no effect

@@ -26,7 +26,7 @@ from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coc
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # defaults for files without values
 RESAMPLING = {2: "bilinear", 3: "bicubic"}  # by Pillow's constants
-PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # name of an unnamed class or unused number
+PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # name of an unnamed class or unused id
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class TransformersSegmentation(Detector):
             output = self._network(pixel_values=pixels)
         logits, grids = output[self._family.logits][0].float(), output[self._family.masks][0].float()
         if not (torch.isfinite(logits).all() and torch.isfinite(grids).all()):
-            advice = "; try detector.half_precision=false" if half else ""
+            advice = "; set detector.half_precision=false" if half else ""
             raise DataError(f"detector.model: expected finite outputs of {self.model}, got NaN or infinity{advice}")
         return np.asarray(logits.cpu().numpy(), np.float32), grids
 
@@ -142,7 +142,7 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
     """Return the distributions (Q, C) over the labels, and the probability (Q,) of the best label.
 
     The logits are (Q, K). K = C + 1 means a softmax with no-object as the last label. K = C means independent sigmoids.
-    See the detector.
+    See TransformersSegmentation.
     """
     if logits.shape[1] not in (labels, labels + 1):
         raise DataError(f"detector.model: expected {labels} class logits (as in config.json), got {logits.shape[1]}")
@@ -186,8 +186,8 @@ class Preprocessing:
     """
 
     size: Mapping[str, int] | None  # as in the file; None = original size
-    divisor: int  # divisor of the sides, which are rounded up
-    pad_to: tuple[int, int] | None  # padded (height, width), black on the right and below
+    divisor: int  # sides are rounded up to multiples of it
+    pad_to: tuple[int, int] | None  # padded (height, width), black at the right and bottom
     mode: str  # interpolation mode
     factor: float  # factor of the values 0..255
     mean: tuple[float, ...]  # mean, RGB, after the factor

@@ -27,9 +27,9 @@ class ClassOnlyFusion(MapFuser):
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
-    min_area: float = 0.01  # minimum surface area of an instance in the mesh, m^2, >= 0: voxel_size^2 per vertex
+    min_area: float = 0.01  # minimum surface area of an instance in the mesh, m^2, >= 0; smaller ones are omitted
     class_floor: float = 0.1  # weight of the uniform distribution in a class measurement, in (0, 1)
-    missed: float = 0.7  # likelihood ratio P(no mask | any class) / P(no mask | background), in (0, 1]
+    missed: float = 0.7  # likelihood ratio P(no mask | any class) / P(no mask | background), in (0, 1]; 1 = off
     smoothness: float = 0.0  # log-odds per neighboring vertex of the same class, >= 0; 0 = no regularization
 
     def __post_init__(self) -> None:

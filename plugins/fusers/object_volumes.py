@@ -38,7 +38,8 @@ class ObjectVolumes(MapFuser):
     overlap_rule: OverlapRule = OverlapRule.IOU  # denominator of the overlap
     require_same_class: bool = False  # True = match only objects with the same most likely class, as in MaskFusion
     create_score: float = 0.3  # minimum score of a detection to create an object, in [0, 1]; updates have no minimum
-    create_points: int = 50  # minimum detection size to create an object, px, >= 1; also minimum overlap denominator
+    # minimum detection size to create an object, px, >= 1; also the minimum denominator of the overlap
+    create_points: int = 50
     min_existence: float = 0.1  # minimum existence probability of an object, in [0, 1]; objects below it are removed
     min_observations: int = 3  # minimum number of frames with a detection to confirm an object, >= 1
     min_area: float = 0.01  # minimum surface area of a confirmed object in the mesh, m^2, >= 0
@@ -76,7 +77,7 @@ class ObjectVolumes(MapFuser):
         return count_overlaps(points, seen, stride)
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
-        """Return the matches: the object of largest overlap, or a new object if score and size suffice."""
+        """Return the matches: the object with the largest overlap, or a new object if score and size suffice."""
         ratios = overlaps.by(self.overlap_rule, self.create_points)
         ratios[~self._agree(clusters, overlaps.instance_ids)] = 0
         instance_ids = np.zeros(len(clusters), np.int32)

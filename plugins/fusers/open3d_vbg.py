@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Open3DVoxelBlockGrid(MapFuser):
     """Open3D's TSDF with a majority label per voxel.
 
-    The class distribution of an instance is the product of those of its detections.
+    The class distribution of an instance is the product of the distributions of its detections.
     """
 
     tsdf: Tsdf = field(default_factory=Tsdf)

@@ -20,8 +20,8 @@ class GmmTree(ClusterRefiner):
     """Removal of the points on surface patches outside the object by hierarchical EM.
 
     A tree of mixtures (Eckart et al., CVPR 2016) is fitted to each mask together with the ring around it. Its nodes are
-    surface patches. They do not depend on the mask, because a point on the wrong side at the first level could not
-    return.
+    surface patches. They do not depend on the mask, because a wrong assignment at the first level could not be
+    corrected at later levels.
 
     The mask enters as evidence. Points have the log-odds of `gmm_em`. A node's object fraction maximizes the likelihood
     of its points' evidence, with the parent's fraction as a prior (our choice). A point stays if its leaves and its own

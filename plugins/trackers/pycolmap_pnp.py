@@ -17,15 +17,15 @@ from framework.tracking.keyframes import Keyframes
 class PycolmapPnp(PoseTracker):
     """Feature matching with the nearest keyframes, and pycolmap's PnP with RANSAC.
 
-    If tracking fails, the tracker relocalizes among all keyframes. It does not use the map. See `Keyframes` for the
+    If matching fails, the tracker relocalizes among all keyframes. It does not use the map. See `Keyframes` for the
     parameters.
     """
 
     max_features: int = 800  # maximum number of features of a frame, >= 1
     min_features: int = 30  # minimum number of features with depth of a keyframe, >= 4
     max_keyframes: int = 200  # maximum number of keyframes, >= 1; above it, the most redundant keyframe is removed
-    min_distance: float = 0.15  # minimum distance between keyframes, m, > 0; see min_angle
-    min_angle: float = 0.2  # m. angle, rad, > 0; new keyframe if distance / min_distance + angle / min_angle >= 1
+    min_distance: float = 0.15  # minimum distance of a new view without rotation, m, > 0
+    min_angle: float = 0.2  # minimum angle of a new view without translation, rad, > 0
     candidates: int = 4  # maximum number of keyframes to match with a frame, >= 1
     max_ratio: float = 0.8  # maximum ratio of best to second-best descriptor distance (Lowe's ratio test), in (0, 1]
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0

@@ -26,7 +26,7 @@ class World(Enum):
 
 @dataclass
 class TrajectoryFile(PoseTracker):
-    """Poses in a TUM file nearest in time to the frame. Frames without a pose are skipped.
+    """Poses from a TUM file, the nearest in time for each frame. Frames without a pose are skipped.
 
     By default the trajectory is moved rigidly so that the first frame with a pose defines the world frame, as in
     `PoseTracker`. `world_frame=FILE` keeps the file's world frame. The sequence's ground-truth poses are invalid in the
@@ -35,7 +35,7 @@ class TrajectoryFile(PoseTracker):
     """
 
     path: Path  # trajectory in TUM format
-    max_time_difference: float = 0.02  # maximum time difference from a frame to its pose, s, >= 0; 2/3 frame at 30 Hz
+    max_time_difference: float = 0.02  # maximum time difference from a frame to its pose, s, >= 0; skipped above it
     time_offset: float = 0.0  # offset added to the file's timestamps, s
     world_frame: World = World.FIRST_FRAME  # world frame of the poses
 
@@ -54,8 +54,9 @@ class TrajectoryFile(PoseTracker):
         difference = abs(float(self._timestamps[nearest]) - frame.timestamp)
         if difference > self.max_time_difference:
             raise NoPoseError(
-                f"frame {frame.index}: {self.path.name}: expected a pose within tracker.max_time_difference of "
-                f"{frame.timestamp:.3f} s, got the nearest pose {difference:.3f} s away"
+                f"frame {frame.index}: {self.path.name}: expected a pose within {self.max_time_difference:g} s "
+                f"(tracker.max_time_difference) of {frame.timestamp:.3f} s, got the nearest pose {difference:.3f} s "
+                "away"
             )
         T_file_camera = self._T_file_camera[nearest]
         if self._T_world_file is None:

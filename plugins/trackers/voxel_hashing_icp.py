@@ -30,8 +30,8 @@ STANDING = 1e-3  # maximum motion of a standing camera, m and rad; above it, an 
 SAME_POSE = 0.05  # maximum difference between equal poses, m and rad
 SMALLEST = 8  # minimum side of the coarsest level, px
 CHANGED_SCENE = 0.95  # minimum agreement of the points not behind the map's surface, if an object was removed
-EXPECTED_AGREEMENT = 0.8  # min_agreement near the prediction of a steady motion
-EXPECTED_BEHIND = 0.1  # max_occluded near the prediction of a steady motion
+EXPECTED_AGREEMENT = 0.8  # replaces min_agreement near the prediction of a steady motion
+EXPECTED_BEHIND = 0.1  # replaces max_occluded near the prediction of a steady motion
 STEADY = 5  # minimum number of consecutive frames with a correct prediction in a steady motion
 VISITED = 64  # number of poses that a lost camera tries, one per frame
 VISITED_SEPARATION = 0.1  # minimum separation of these poses, m and rad
@@ -46,13 +46,13 @@ class ResidualWeights(Enum):
 
 
 class Alignment(NamedTuple):
-    """Result of the alignment of a frame. Ratios refer to the points in view unless stated otherwise."""
+    """Result of the alignment of a frame. Fractions are of the points in view unless stated otherwise."""
 
     T_world_camera: Float64
-    matched: float  # ratio of points with a weight
-    agreement: float  # ratio of points that agree with the map
-    behind: float  # ratio of points behind the map's surface
-    agreement_in_front: float  # ratio of points that agree to points not behind the map's surface
+    matched: float  # fraction of points with a nonzero weight
+    agreement: float  # fraction of points that agree with the map
+    behind: float  # fraction of points behind the map's surface
+    agreement_in_front: float  # fraction of the points not behind the map's surface that agree with the map
     reason: str  # reason for rejection, empty if the pose is possible
     doubt: str  # reason for confirmation by a second source, empty without doubt
     covariance: Float64 | None = None  # (6, 6) Pose.covariance; None = unknown
@@ -95,7 +95,8 @@ class VoxelHashingIcp(PoseTracker):
     max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
     min_visible: float = 0.05  # minimum fraction of visible points (in mapped parts of the view), in [0, 1]
     min_matched: float = 0.4  # minimum fraction of the visible points with a weight, in [0, 1]
-    min_information: float = 1e-3  # minimum ratio of smallest to mean eigenvalue without units, in [0, 1]
+    # minimum ratio of smallest to mean eigenvalue of the dimensionless normal matrix, in [0, 1]; doubled while lost
+    min_information: float = 1e-3
     min_agreement: float = 0.92  # minimum fraction of visible points that agree with the map, in [0, 1]; 0 = off
     max_occluded: float = 0.015  # maximum fraction of visible points behind the map's surface, in [0, 1]; 1 = off
     raw_keyframe: bool = True  # True = align to a raw keyframe in addition to the map; False = map only
@@ -129,7 +130,7 @@ class VoxelHashingIcp(PoseTracker):
         self._last: FrameFeatures | None = None  # features of the last trusted frame
         self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
         self._raw_keyframe: RawKeyframe | None = None
-        self._scale = DepthScale()  # of the current frame
+        self._scale = DepthScale()  # scale of the current frame
         self._scattered_depth = False  # True if neighbors of many readings have no depth
         self._coarse_depth = False  # True if depth is too coarse for normals from neighboring readings
 
@@ -193,7 +194,7 @@ class VoxelHashingIcp(PoseTracker):
         return levels
 
     def _finest_scale(self, camera: Camera) -> float:
-        """Return the scale of the finest level, at most `finest_side` px large.
+        """Return the scale of the finest level, whose longer side is at most `finest_side` px.
 
         Coarse levels of larger images would be too fine for large motions.
         """
@@ -203,7 +204,7 @@ class VoxelHashingIcp(PoseTracker):
         return scale
 
     def _loss(self, alignment: Alignment, frame: Frame) -> str:
-        """Return the reason of a loss, with the cause if depth is missing in many single pixels."""
+        """Return the reason for a loss, with the cause if depth is missing in many single pixels."""
         reason = alignment.reason or alignment.doubt
         if not is_scattered(frame.depth):
             return reason
@@ -248,15 +249,17 @@ class VoxelHashingIcp(PoseTracker):
         """Define the world frame by the first frame with enough depth."""
         frame = seen.frame
         if min(frame.camera.shape) * self._finest_scale(frame.camera) < SMALLEST * 2 ** (LEVELS - 1):
+            side = min(frame.camera.shape) * self._finest_scale(frame.camera) / 2 ** (LEVELS - 1)
             raise DataError(
                 f"tracker.finest_scale: expected at least {SMALLEST} px at the coarsest of {LEVELS} levels, got "
-                f"{self.finest_scale:g} for images of {frame.camera.width}x{frame.camera.height} px"
+                f"{side:.3g} px with {self.finest_scale:g} for images of {frame.camera.width}x{frame.camera.height} "
+                "px; raise tracker.finest_scale or use larger images"
             )
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         nearest, farthest = scene.depth_range
         readings = np.mean((frame.depth > 0) & (frame.depth >= nearest) & (frame.depth <= farthest))
         if readings < max(self.min_visible, 1 / frame.depth.size):
-            few = f"depth within {nearest:g} to {farthest:g} m in {readings:.1%} of the pixels only"
+            few = f"only {readings:.1%} of the pixels have depth from {nearest:g} to {farthest:g} m"
             return Pose(T_world_camera, lost=True, reason=few if frame.depth.any() else "the frame has no depth")
         if self.raw_keyframe:
             self._update_raw_keyframe(self._pyramid(frame), T_world_camera)
@@ -375,7 +378,7 @@ class VoxelHashingIcp(PoseTracker):
         # until many frames are mapped, the view of the map is empty where depth is scattered
         if self._scattered_depth and term is not None and own.visible > equations.visible:
             equations, compared = own, levels[COMPARED]
-        # linear weights are no inverse variances
+        # linear weights are not inverse variances
         covariance = pose_covariance(terms, T_view_camera) if linear is None else None
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially

@@ -45,7 +45,7 @@ class RerunViewer(Viewer):
     If drawing is slower than mapping, images are omitted. Poses, times and lost frames are always shown.
     """
 
-    mode: Mode = Mode.RECORD  # output of the viewer
+    mode: Mode = Mode.RECORD  # output: RECORD (file), WINDOW (rerun's viewer) or BROWSER (local web page)
     file: str = ""  # .rrd file; "" = recording.rrd in the run directory for RECORD, none for other modes
     frame_interval: int = 3  # interval between logged images, in frames, >= 1
     mesh_interval: float = 2.0  # minimum interval between mesh snapshots, s, in [0.1, 3600]
@@ -133,7 +133,7 @@ def _server(rr: Any, port: int, memory_limit: str) -> Any:
 
 def _open_window(rr: Any, port: int, memory_limit: str) -> Any:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ConfigError("viewer.mode: expected a screen for WINDOW, got none; set viewer.mode=BROWSER or RECORD")
+        raise ConfigError("viewer.mode: expected a display for WINDOW, got none; set viewer.mode=BROWSER or RECORD")
     with _named_errors("viewer.mode: expected rerun's viewer to start, got an error"):
         open_window(port, memory_limit)
     return rr.GrpcSink(f"rerun+http://{HERE}:{port}/proxy")

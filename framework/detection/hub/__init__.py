@@ -1,1 +1,1 @@
-"""Detectors from the Hugging Face hub."""
+"""Models from the Hugging Face hub."""

@@ -63,7 +63,7 @@ def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
         config = try_to_load_from_cache(model, CONFIG, revision=revision)
     except HFValidationError as error:
         raise DataError(
-            f"detector.model: expected a folder or a model id, got {model}; {in_one_line(error)}"
+            f"detector.model: expected a folder or a model id, got {model} ({in_one_line(error)})"
         ) from error
     if not isinstance(config, str):
         return None
@@ -96,7 +96,7 @@ def _weights(names: Collection[str]) -> list[str]:
 
 
 def _published(more: Sequence[str], names: Collection[str]) -> Sequence[str]:
-    """Return `more`, with the tokenizer files replaced by their older names if the model has only those."""
+    """Return `more`, with the tokenizer files replaced by their older names if the model has only the older ones."""
     older = more == TOKENIZER and TOKENIZER[0] not in names and {*OLDER_TOKENIZER} <= {*names}
     return OLDER_TOKENIZER if older else more
 
@@ -105,8 +105,8 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
     """Download the required files with huggingface_hub, which writes files atomically and shows progress."""
     if variable := forbidden_by():
         raise DataError(
-            f"detector.model: expected a local folder with {variable} set, got {model}; unset {variable} or "
-            "give a folder"
+            f"detector.model: expected a local folder while {variable} disables downloads, got {model}; unset "
+            f"{variable} or set a folder"
         )
     from huggingface_hub import HfApi, constants
 
@@ -129,7 +129,7 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
     except Exception as error:  # huggingface_hub and its HTTP library have no common base class of errors
         raise DataError(
             f"detector.model: expected a local folder or a download of {model} from {constants.ENDPOINT}, "
-            f"got an error ({in_one_line(error)}); check the name and the network, or give a local folder"
+            f"got an error ({in_one_line(error)}); check the name and the network, or set a local folder"
         ) from error
     for name, path in paths.items():
         _check(path, files[name])
@@ -142,14 +142,14 @@ def forbidden_by() -> str:
 
 
 def _check(path: Path, published: Any) -> None:
-    """Raise DataError unless a large file has its listed SHA-256; huggingface_hub checks only the size."""
+    """Raise DataError unless a large file has the published SHA-256; huggingface_hub checks only the size."""
     if published.lfs is None or (found := path_hash(path)) == published.lfs.sha256:
         return
     path.resolve().unlink()  # the content, if the cache uses symbolic links
     path.unlink(missing_ok=True)
     raise DataError(
-        f"detector.model: expected sha256 {published.lfs.sha256} for {path.name}, got {found}; the "
-        "file was deleted, try again"
+        f"detector.model: expected sha256 {published.lfs.sha256} for {path.name}, got {found}; try "
+        "again to download the file"
     )
 
 

@@ -29,10 +29,10 @@ from framework.files.hashing import path_hash
 from framework.files.json_file import read_json
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-LONGEST_SIDE = 1024  # px, largest input of a model
-HASH_DIGITS = 16  # digits of a local folder's content hash in the name of its space
-MAX_TOKENS = 64  # maximum length of a text; the limit is 77 for CLIP and 64 for SigLIP
-GRAY = 128
+LONGEST_SIDE = 1024  # maximum side of a model's input, px
+HASH_DIGITS = 16  # number of digits of a local folder's content hash in the name of its space
+MAX_TOKENS = 64  # maximum length of a text, tokens; the limit is 77 for CLIP and 64 for SigLIP
+GRAY = 128  # gray value of suppressed surroundings
 
 
 class ImageTextFamily(NamedTuple):
@@ -41,7 +41,7 @@ class ImageTextFamily(NamedTuple):
     prompt: str  # template around a class name, as in the published evaluation
     padding: str  # padding of texts, as in training
     lower: bool  # True = texts are converted to lower case
-    mean: tuple[float, ...]  # RGB, default if missing in the preprocessing file
+    mean: tuple[float, ...]  # RGB; default if the preprocessing file has no value
     std: tuple[float, ...]
 
 
@@ -105,7 +105,7 @@ class ImageTextModel:
             [prompt], padding=self._family.padding, max_length=length, truncation=True, return_tensors="pt"
         )
         given = {"input_ids": tokens["input_ids"].to(self._device)}
-        if self._family.padding == "longest":  # SigLIP was trained without attention mask
+        if self._family.padding == "longest":  # SigLIP was trained without an attention mask
             given["attention_mask"] = tokens["attention_mask"].to(self._device)
         return np.asarray(self._unit(self._network.get_text_features(**given))[0])
 

@@ -17,7 +17,7 @@ from framework.detection.runtimes.device import ready
 from framework.errors import ConfigError, DataError
 
 PROMPT = "a photo of a {}"  # Minderer et al. 2023
-MAX_TOKENS = 16  # maximum length of a text, as in the training of OWLv2
+MAX_TOKENS = 16  # maximum length of a text, tokens, as in the training of OWLv2
 PADDING = 128  # gray value right of or below the image in the square input of OWLv2
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 SAM_FAMILY = {

@@ -146,7 +146,7 @@ def _renamed(name: str, where: str) -> str:
 
 
 def _check_input(state: Mapping[str, Tensor], where: str) -> None:
-    """Check the normalization in older checkpoints; other values indicate another backbone."""
+    """Check the normalization, which older checkpoints contain; other values indicate another backbone."""
     for name, expected in (("pixel_mean", PIXEL_MEAN[::-1]), ("pixel_std", PIXEL_STD)):
         if name in state and not torch.allclose(state[name].float().flatten(), torch.tensor(expected), atol=1e-2):
             found = [round(value, 3) for value in state[name].flatten().tolist()]
@@ -154,9 +154,9 @@ def _check_input(state: Mapping[str, Tensor], where: str) -> None:
 
 
 def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
-    """Return the anchor sides in px.
+    """Return the anchor sides in px, one per level.
 
-    Only older checkpoints contain anchors. The default is detectron2's anchor sides.
+    Only older checkpoints contain anchors. The default is the anchor sides of detectron2.
     """
     sides = list(Architecture.anchor_sides)
     for level in range(len(sides)):
@@ -188,4 +188,5 @@ def _depth(tensors: Mapping[str, Tensor], where: str) -> str:
     for name in WITH_BOTTLENECKS:
         if DEPTHS[name][2] == blocks:
             return name
-    raise DataError(f"{where}: expected a known residual network, got {blocks} blocks in res4")
+    known = " or ".join(f"{DEPTHS[name][2]} blocks ({name})" for name in WITH_BOTTLENECKS)
+    raise DataError(f"{where}: expected {known} in res4, got {blocks} blocks")

@@ -27,8 +27,8 @@ from framework.detection.masks.boxes import anchor_grid, clip, decode, suppress_
 
 STRIDES = (4, 8, 16, 32, 64)  # px of the input per cell of a level, P2 to P6
 POOLED_LEVELS = 4  # P2 to P5; only proposals use P6
-BOX_BINS, MASK_BINS = 7, 14  # of RoIAlign, per side
-CANONICAL_SIDE, CANONICAL_LEVEL = 224.0, 2  # px: a box of this side is pooled from P4 (Lin et al. 2017, eq. 1)
+BOX_BINS, MASK_BINS = 7, 14  # bins of RoIAlign per side
+CANONICAL_SIDE, CANONICAL_LEVEL = 224.0, 2  # a box with this side, px, is pooled from P4 (Lin et al. 2017, eq. 1)
 DELTA_WEIGHTS = (10.0, 10.0, 5.0, 5.0)  # factors in the box head's deltas
 PROPOSAL_NMS = 0.7  # IoU
 
@@ -39,7 +39,7 @@ class Architecture:
 
     classes: tuple[str, ...]  # without the background, in the order of the network's columns
     backbone: ResNetShape = field(default_factory=ResNetShape)
-    fpn_channels: int = 256
+    fpn_channels: int = 256  # channels of the feature pyramid
     head_features: int = 1024  # features of the box head
     anchor_sides: tuple[float, ...] = (32.0, 64.0, 128.0, 256.0, 512.0)  # px, one per level
     anchor_ratios: tuple[float, ...] = (0.5, 1.0, 2.0)  # height / width
@@ -51,7 +51,7 @@ class Architecture:
     pixel_mean: tuple[float, float, float] = (123.675, 116.28, 103.53)  # RGB, 0..255
     pixel_std: tuple[float, float, float] = (58.395, 57.12, 57.375)
     short_side: int = 800  # px, short side of the resized images in training
-    long_side: int = 1333  # px, largest long side
+    long_side: int = 1333  # px, maximum long side of the resized images in training
 
 
 class MaskRCNN(nn.Module):
@@ -77,7 +77,7 @@ class MaskRCNN(nn.Module):
         return self.roi_heads.box_predictor.cls_score.weight.dtype
 
     def normalize(self, images: Tensor) -> Tensor:
-        """Return RGB images (N, 3, H, W), 0..255, normalized, and padded on the right and below to multiples of 32."""
+        """Return RGB images (N, 3, H, W), 0..255, normalized, and padded at the right and bottom to multiples of 32."""
         mean, std = (
             torch.tensor(values, device=images.device)[:, None, None]
             for values in (self.architecture.pixel_mean, self.architecture.pixel_std)
@@ -101,7 +101,7 @@ class MaskRCNN(nn.Module):
         )
 
     def anchors(self, pyramid: Sequence[Tensor]) -> list[Float32]:
-        """Return the anchors (A, 4) of each level; repeated calls with equal shapes return the same arrays."""
+        """Return the anchors (A, 4) px of each level; repeated calls with equal shapes return the same arrays."""
         shapes = [(level.shape[2], level.shape[3]) for level in pyramid]
         known, grids = self._grids
         if shapes != known:
@@ -126,7 +126,7 @@ class MaskRCNN(nn.Module):
         return logits
 
     def pool(self, pyramid: Sequence[Tensor], boxes: Tensor, bins: int) -> Tensor:
-        """Return the features (P, C, bins, bins) of the boxes, each pooled from the level for its size (eq. 1)."""
+        """Return the features (P, C, bins, bins) of boxes (P, 4), each pooled from the level for its size (eq. 1)."""
         sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=0).prod(dim=1).sqrt()
         level = torch.floor(CANONICAL_LEVEL + torch.log2(sides / CANONICAL_SIDE) + 1e-6)
         level = level.clamp(0, POOLED_LEVELS - 1)
@@ -219,7 +219,7 @@ def _convolution(channels: int, out: int) -> nn.Sequential:
 
 
 def _anchors(side: float, architecture: Architecture) -> Float32:
-    """Return the anchors (R, 4) of one cell, centered on the origin."""
+    """Return the anchors (R, 4) px of one cell, centered on the origin."""
     ratios = np.array(architecture.anchor_ratios)
     widths, heights = side / np.sqrt(ratios), side * np.sqrt(ratios)
     anchors = np.stack([-widths, -heights, widths, heights], axis=1).astype(np.float64) / 2

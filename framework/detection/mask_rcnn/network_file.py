@@ -2,7 +2,7 @@
 
 architecture     the Architecture as JSON
 card             the model card as JSON: data, steps, AP, limits, ...; `domain`: the image domain of the training
-tensors_sha256   of all names, shapes and values, to detect damage
+tensors_sha256   hash of all names, types, shapes and values, to detect damage
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from framework.files.atomic_write import atomic_write
 from framework.files.json_file import parse_json
 
 Fact = str | int | float | bool | None
-COUNTERS = ".num_batches_tracked"  # of the batch normalization, used only in training
+COUNTERS = ".num_batches_tracked"  # suffix of the counters of batch normalization, used only in training
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: 
 
     Only weights with two or more dimensions become float16. Biases and statistics are few, and variances may exceed the
     range of float16.
+
     Raises DataError if a weight is not finite or the file cannot be written.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in _stored(network).items()}
@@ -87,7 +88,7 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
     Counters are ignored. Raises DataError that names the source `where` if the tensors do not match the architecture.
     """
     try:
-        with torch.device("meta"):  # saves memory and random numbers for weights that are replaced below
+        with torch.device("meta"):  # saves memory and random initialization of weights that are replaced below
             network = MaskRCNN(architecture)
     except (KeyError, ValueError, RuntimeError) as error:
         raise DataError(f"{where}: expected a known architecture, got {in_one_line(error)}") from error
@@ -116,10 +117,15 @@ def _stored(network: MaskRCNN) -> dict[str, Tensor]:
 
 
 def _check_names(expected: typing.AbstractSet[str], found: typing.AbstractSet[str], where: str) -> None:
-    for names, problem in ((expected - found, "missing"), (found - expected, "unknown")):
-        if names:
-            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            raise DataError(f"{where}: expected the weights of this network, got {problem} {min(names)}{more}")
+    if missing := expected - found:
+        raise DataError(f"{where}: expected the weights {_first_of(missing)}, got none")
+    if unknown := found - expected:
+        raise DataError(f"{where}: expected only the weights of this network, got {_first_of(unknown)}")
+
+
+def _first_of(names: typing.AbstractSet[str]) -> str:
+    """Return the first name, and the number of other names."""
+    return f"{min(names)} and {len(names) - 1} more" if len(names) > 1 else min(names)
 
 
 def _check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
@@ -167,12 +173,12 @@ def _parsed(kind: Any, value: Any, name: str) -> Any:
             raise ValueError(f"{name}: expected fields, got {value!r}")
         kinds = typing.get_type_hints(kind)
         if unknown := sorted(value.keys() - kinds.keys()):
-            raise ValueError(f"{name}: expected known fields, got {unknown[0]}; the file may be from a newer version")
+            raise ValueError(f"{name}: expected known fields, got {unknown[0]}; update InstanceMap for newer files")
         fields = {field: _parsed(kinds[field], part, f"{name}.{field}") for field, part in value.items()}
         try:
             return typing.cast(Any, kind)(**fields)
         except TypeError as error:
-            raise ValueError(f"{name}: expected all fields; {error}") from error
+            raise ValueError(f"{name}: expected all required fields, got an error ({error})") from error
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list):
             raise ValueError(f"{name}: expected a list, got {value!r}")

@@ -21,8 +21,8 @@ from framework.files.search_paths import candidates
 OFFLINE = "INSTANCEMAP_OFFLINE"
 """Environment variable that disables downloads if set."""
 
-TIMEOUT = 30.0  # s without a response
-BLOCK = 1 << 20  # bytes
+TIMEOUT = 30.0  # maximum time without a response, s
+BLOCK = 1 << 20  # bytes per read
 
 log = logging.getLogger(__name__)
 

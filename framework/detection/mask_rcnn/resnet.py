@@ -23,8 +23,8 @@ class ResNetShape:
 
     name: str = "resnet50"  # a key of DEPTHS
     width: int = 64  # channels of the stem; 64 in He et al. 2016
-    # convolution with the stride in a bottleneck: True = the first (He et al., Detectron), False = the second
-    # (torchvision, "v1.5")
+    # convolution with the stride in a bottleneck: True = first convolution (He et al., Detectron), False = second
+    # convolution (torchvision, "v1.5")
     stride_in_1x1: bool = False
     norm_eps: float = 1e-5  # epsilon of the batch normalization
 

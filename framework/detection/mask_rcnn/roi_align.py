@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 PRODUCT_SPEED = 10.0  # speed of a multiplication in a matrix product divided by the speed in a weighted sum, on a CPU
-CHUNK = 1 << 22  # weights in memory at once
+CHUNK = 1 << 22  # maximum number of weights in memory at once
 
 
 def roi_align(
@@ -51,10 +51,10 @@ class Samples:
 
     start: Tensor  # (N,) in cells
     size: Tensor  # (N,) in cells
-    counts: Tensor  # (N,) samples per bin
+    counts: Tensor  # (N,) number of samples per bin
     windows: Tensor  # (N,) int64, number of cells in reach of the samples of one bin
     bins: int
-    cells: int  # size of the feature map
+    cells: int  # number of cells of the feature map along the axis
 
     @classmethod
     def along(cls, start: Tensor, end: Tensor, bins: int, cells: int, ratio: int, shortest: float) -> Samples:

@@ -16,7 +16,7 @@ def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], thresh
 
     Pixels above `threshold` after bilinear interpolation are inside a mask. `grids`: (N, G, G) probabilities over each
     box. `borders`: (N, 4) boxes x1 y1 x2 y2 px, pixel centers at integers. A ring of zero cells is added, as in
-    Detectron. It ends an object at the border of a completely filled box.
+    Detectron, so that a mask ends at the border of its box even if all cells are filled.
     """
     ringed = np.pad(grids.astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
     masks = np.zeros((len(grids), *shape), np.bool_)
@@ -56,7 +56,7 @@ def masks_from_prototypes(
 
 
 def tight_boxes(masks: Bool) -> Float32:
-    """Return the boxes (N, 4) of masks (N, H, W): first and last column and row in px; 0 for an empty mask."""
+    """Return the boxes (N, 4) x1 y1 x2 y2 px of masks (N, H, W): first and last pixels inside; 0 for an empty mask."""
     return np.asarray(mask_bounds(masks.view(np.uint8)), np.float32)
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-CONTACT_DEPTH = 0.1  # m, largest difference in depth between neighboring pixels of two instances that touch
+CONTACT_DEPTH = 0.1  # largest difference in depth between neighboring pixels of two touching instances, m
 
 
 @njit(cache=True, nogil=True)
 def mask_bounds(masks):
-    """Return the bounds (N, 4) x1 y1 x2 y2 of masks, 0 for an empty mask.
+    """Return the bounds (N, 4) x1 y1 x2 y2 px of masks (N, H, W), 0 for an empty mask.
 
-    Each row is tested in blocks, because most rows are empty, then scanned from both ends.
+    A vectorized test skips empty rows, because most rows are empty. The other rows are scanned from both ends.
     """
     n, height, width = masks.shape
     bounds = np.zeros((n, 4), np.int64)
@@ -128,7 +128,10 @@ def sample_prototypes(logits, borders, affine, least, masks):
 
 @njit(cache=True, nogil=True)
 def contacts(ids, depth):
-    """Return the pairs (M, 2) of touching instances, smaller id first; pairs may repeat."""
+    """Return the pairs (M, 2) of touching instances in images of ids and depth (H, W), m; pairs may repeat.
+
+    The smaller id of a pair comes first.
+    """
     height, width = ids.shape
     pairs = np.empty((2 * height * width, 2), np.int32)
     n = 0

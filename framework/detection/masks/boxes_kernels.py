@@ -8,9 +8,9 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def suppress_sorted(boxes, classes, order, iou, extent, limit):
-    """Return the indices of the remaining boxes.
+    """Return the entries of order (N,) for the boxes (N, 4) that remain after suppression; boxes are best first.
 
-    Each box is compared only with the remaining boxes. The limit makes these far fewer than all pairs.
+    Each box is compared only with the remaining boxes, at most `limit`.
     """
     survivors = np.empty(min(limit, len(boxes)), np.int32)
     n = 0

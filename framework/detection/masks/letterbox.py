@@ -13,7 +13,7 @@ from framework.data import Float32, UInt8
 
 
 class Placement(Enum):
-    """Position of the resized image in the input; the rest is padding."""
+    """Position of the resized image in the input; the rest of the input is padding."""
 
     top_left = "top_left"
     center = "center"

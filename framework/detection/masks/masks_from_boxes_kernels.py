@@ -7,15 +7,18 @@ from numba import njit
 
 from framework.sensors.noise_models_kernels import axial_sigma
 
-BIN = 0.02  # of log depth: 2% of the depth
+BIN = 0.02  # width of a bin of log depth: 2% of the depth
 NEAREST, FARTHEST = 0.05, 100.0  # m, range of the histogram
 VALLEY = 0.15  # fraction of a mode's peak below which a bin ends the mode
-SIGMAS = 3.0  # standard deviations of the depth noise
+SIGMAS = 3.0  # depth step that noise may cause, in standard deviations
 
 
 @njit(cache=True, nogil=True)
 def fill_masks(borders, windows, depth, significance, step, noise, min_readings, masks):
-    """Write the mask of the object in each box, with holes; `windows` (N, 4) are the boxes in whole pixels."""
+    """Write the masks of the objects in the boxes, with holes; `windows` (N, 4) are the boxes in whole pixels.
+
+    Returns an array (N,), True if a mask was found.
+    """
     found = np.zeros(len(masks), np.bool_)
     for i in range(len(masks)):
         u0, v0, u1, v1 = windows[i]
@@ -42,7 +45,10 @@ def _tent(start, end, first, stop):
 
 @njit(cache=True, nogil=True)
 def _foreground(window, weight_x, weight_y, significance):
-    """Return the depth interval (near, far), m, of the nearest significant mode, else of the mode with most weight."""
+    """Return the depth interval (near, far), m, of the nearest significant mode.
+
+    If no mode is significant, return the interval of the mode with the largest weight.
+    """
     bins = int(np.log(FARTHEST / NEAREST) / BIN) + 1
     histogram = np.zeros(bins + 2)
     total = 0.0
@@ -83,7 +89,7 @@ def _foreground(window, weight_x, weight_y, significance):
 
 @njit(cache=True, nogil=True)
 def _grow(window, weight_x, weight_y, near, far, step, noise, mask):
-    """Write the connected component with most weight, of the pixels between near and far, to `mask`."""
+    """Write the component with the largest weight, of connected pixels at depths from near to far (m), to `mask`."""
     height, width = window.shape
     label = np.zeros((height, width), np.int32)
     stack = np.empty((height * width, 2), np.int32)

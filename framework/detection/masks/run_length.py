@@ -1,9 +1,9 @@
 """Masks as run lengths in COCO's format: the lengths of alternating runs of 0 and 1, column by column.
 
 A file contains run lengths as a list of numbers or as a packed string (pycocotools' `rleToString`). A packed string
-consists of groups of five bits, lowest first. From the third number on, it stores the difference to the number two
-before. pycocotools packs and decodes. This module validates strings, because pycocotools 2.0.11 leaves the pixels after
-a short string uninitialized.
+consists of groups of five bits, lowest first. From the third number on, it stores the difference from the number two
+positions earlier. pycocotools packs and decodes. This module validates strings, because pycocotools 2.0.11 leaves the
+pixels after a short string uninitialized.
 """
 
 from __future__ import annotations

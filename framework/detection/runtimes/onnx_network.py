@@ -30,8 +30,8 @@ CUDA = "CUDAExecutionProvider"
 class OnnxNetwork:
     """A network from one image to named arrays, on the CPU or with CUDA.
 
-    It uses as many threads as OpenCV (`threads` in the config), because the default of onnxruntime is all cores. Idle
-    threads sleep, because mapping runs at the same time.
+    The network uses as many threads as OpenCV (`threads` in the config). The default of onnxruntime would be all cores.
+    Idle threads sleep, because mapping runs at the same time.
     """
 
     def __init__(self, path: Path, sha256: str, device: str, input_size: int) -> None:
@@ -105,9 +105,9 @@ class ImageNetwork:
         require(0 <= detector.input_size <= LONGEST_SIDE, "detector.input_size", detector.input_size, allowed)
         require(0 <= detector.padding <= 255, "detector.padding", detector.padding, "a value in [0, 255]")
         finite = bool(np.isfinite([black, white]).all())
-        require(finite and black != white, "detector.white_level", white, f"a value other than {black}")
+        require(finite and black != white, "detector.white_level", white, f"a finite value, not black_level={black}")
         require(device in ("auto", "cpu", "cuda"), "detector.device", device, "auto, cpu or cuda")
-        onnx = "an ONNX file; convert a .tflite file with tf2onnx (docs/guides/detectors.md)"
+        onnx = "an ONNX file (converted with tf2onnx, see docs/guides/detectors.md)"
         require(path.suffix.lower() != ".tflite", "detector.weights", path, onnx)
         self._network = OnnxNetwork(path, detector.sha256, device, detector.input_size)
         levels = f"{black} and {white}"
@@ -137,7 +137,7 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     if device == "cuda" and not cuda:
         raise ConfigError("detector.device: expected cpu or auto without onnxruntime-gpu and a GPU, got cuda")
     if cuda and device != "cpu":
-        onnxruntime.preload_dlls()  # in nvidia packages from pip, which the dynamic linker does not search
+        onnxruntime.preload_dlls()  # CUDA libraries of pip packages, which the dynamic linker does not search
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = cv2.getNumThreads()
     options.inter_op_num_threads = 1
@@ -229,12 +229,12 @@ class ExportMetadata:
 
     @classmethod
     def parse(cls, texts: Mapping[str, str]) -> ExportMetadata:
-        """Return the metadata in key-value pairs with Python or JSON literals as values."""
+        """Return the metadata from key-value pairs whose values are Python or JSON literals."""
         return cls(_names(texts.get("names", "")), _size(texts.get("imgsz", "")), texts.get("author", ""))
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """Return the class names in {0: "person", ...}; keys are integers or strings of digits."""
+    """Return the class names in a text {0: "person", ...}; keys are integers or strings of digits."""
     names = _literal(text)
     if not isinstance(names, dict):
         return ()
@@ -243,7 +243,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Return the (height, width) in [height, width], or in one number for both."""
+    """Return the (height, width) px in a text [height, width], or in one number for both."""
     sides = _literal(text)
     height, width = sides if isinstance(sides, list) and len(sides) == 2 else (sides, sides)
     if isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0:

@@ -1,4 +1,4 @@
-"""Cache of detections on disk. An ablation over refiners and fusers runs its network only once."""
+"""Cache of detections on disk. Ablations over refiners and fusers run the network only once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 FORMAT = 2  # version of the entries; part of the keys, so that other versions are never read
 CHECKSUM_BYTES = 32  # SHA-256 of an entry's name and content, stored before the content
 SUFFIX = ".detections"
-LARGEST_ENTRY = 2**30  # bytes; 1000 masks with 1 MB of run lengths each
+LARGEST_ENTRY = 2**30  # maximum size of an entry, bytes; 1000 masks with 1 MB of run lengths each
 EMBEDDINGS, SPACE = "embeddings", "embedding_space"  # optional fields of Detections
 FRAME_FIELDS = tuple(field.name for field in fields(Frame))
 KEPT = ("boxes", "scores", "class_probabilities")  # fields of Detections that are stored unchanged

@@ -93,7 +93,8 @@ def _read_entry(
         label = names[entry["category_id"]]
     else:
         raise DataError(
-            f"category_id: expected the id of a label, got {entry.get('category_id')!r}; see detector.category_ids"
+            f"category_id: expected the id of a label, got {entry.get('category_id')!r}; set "
+            "detector.category_ids to the numbering of the file"
         )
     return StoredDetection(
         where=where,
@@ -122,7 +123,9 @@ def _read_box(found: Any) -> Float32 | None:
         return None
     whole = isinstance(found, list) and len(found) == 4
     if not whole or not all(isinstance(x, int | float) and abs(x) <= MAX_PIXELS for x in found) or min(found[2:]) < 0:
-        raise DataError(f"bbox: expected [x, y, width, height] px, at most {MAX_PIXELS}, got {found!r:.200}")
+        raise DataError(
+            f"bbox: expected [x, y, width, height] px, at most {MAX_PIXELS} each, with sizes >= 0, got {found!r:.200}"
+        )
     x, y, width, height = found
     return np.array([x, y, x + width, y + height], np.float32)
 
@@ -152,7 +155,7 @@ def _read_polygons(found: Sequence[Any]) -> Polygons:
         if not isinstance(outline, list) or len(outline) < 6 or len(outline) % 2:
             raise DataError(f"polygon: expected a list x1, y1, x2, y2, ... for at least 3 points, got {outline!r:.100}")
         if not all(isinstance(x, int | float) and np.isfinite(x) for x in outline):
-            raise DataError(f"polygon: expected coordinates in px, got {outline!r:.100}")
+            raise DataError(f"polygon: expected finite coordinates in px, got {outline!r:.100}")
     if not found:
         raise DataError("segmentation: expected a polygon, got none")
     return Polygons(tuple(tuple(float(x) for x in outline) for outline in found))

@@ -67,7 +67,7 @@ class StoredDetection:
 
     where: str  # file and entry, for errors
     frame: int  # Frame.index
-    label: str  # of the file's label space
+    label: str  # name in the file's label space
     score: float  # in [0, 1]
     segmentation: Segmentation
     probabilities: Float32 | None = None  # (C,) distribution over the file's label space; None = label only

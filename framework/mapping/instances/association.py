@@ -29,7 +29,7 @@ from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
-VOTES_ACROSS = 320  # voting pixels per image row; more pixels take time without a benefit
+VOTES_ACROSS = 320  # number of voting pixels per image row; more pixels take time without a benefit
 
 
 class InstanceSource(Enum):
@@ -43,8 +43,8 @@ class OverlapRule(Enum):
     """The denominator of an overlap."""
 
     SMALLER = "size of the cluster or the instance, the smaller one, so that a part of an object matches the whole"
-    IOU = "number of pixels in either"
-    CLUSTER = "size of the cluster: a small part of an object matches it, the reverse may not"
+    IOU = "number of pixels in the cluster or the instance"
+    CLUSTER = "size of the cluster, so that a small part of an object matches it, but not always the reverse"
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ class Overlaps:
     """Overlap of N clusters with the M instances visible in the frame."""
 
     instance_ids: Int32  # (M,) ascending
-    visible: Int32  # (M,) pixels of each visible instance
-    sizes: Int32  # (N,) pixels of each cluster
-    votes: Int32  # (N, M) pixels shared by a cluster and an instance
+    visible: Int32  # (M,) number of pixels of each visible instance
+    sizes: Int32  # (N,) number of pixels of each cluster
+    votes: Int32  # (N, M) number of pixels shared by a cluster and an instance
     seen: Int32  # (h, w) instance at every `stride`-th pixel of every `stride`-th row, 0 = none
-    stride: int
+    stride: int  # px
 
     def by(self, rule: OverlapRule, min_pixels: int) -> npt.NDArray[np.float64]:
         """Return the overlaps (N, M) in [0, 1] by a rule; see `over_smaller` for `min_pixels`."""
@@ -157,8 +157,8 @@ class Matches:
 def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min_pixels: int) -> None:
     """Update the table with the `class_evidence` (N, C) of the clusters.
 
-    An instance is in view if at least `min_pixels` pixels show it, or if it was detected. A frame without detection is
-    ignored.
+    An instance is in view if at least `min_pixels` pixels show it, or if it was detected. Frames without a detector
+    run are ignored.
     """
     if not matches.clusters.detected:
         return
@@ -186,16 +186,21 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 class Association:
     """Association of clusters with instances, and merging of instances detected as one object."""
 
-    association: InstanceSource = InstanceSource.SURFACE_LOOKUP  # source of the instances to compare with
+    # source of the instances that clusters are compared with
+    association: InstanceSource = InstanceSource.SURFACE_LOOKUP
     min_overlap: float = 0.35  # minimum overlap of a cluster and an instance to match, in [0, 1]
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # denominator of the overlap
-    min_class_agreement: float = 0.0  # minimum Bhattacharyya coefficient of the classes to match, in [0, 1]
+    # minimum Bhattacharyya coefficient of the class distributions to match, in [0, 1]; 0 = any classes match
+    min_class_agreement: float = 0.0
     create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; updates have no minimum
-    create_points: int = 50  # minimum cluster size to create an instance, px, >= 1; also minimum overlap denominator
-    split_instances: bool = True  # True = create an instance for the second cluster that matches an instance
+    # minimum cluster size to create an instance, px, >= 1; also the minimum denominator of the overlap
+    create_points: int = 50
+    split_instances: bool = True  # True = create an instance for the second of two clusters that match an instance
     merge_overlap: float = 1.0  # minimum overlap with one cluster to merge two instances, in [0, 1]; 1 = no merging
-    merge_frames: int = 3  # minimum number of frames with a joint cluster minus with separate clusters, to merge, >= 1
-    merge_agreement: float = 0.1  # minimum Bhattacharyya coefficient of the classes to merge, in [0, 1]
+    # minimum number of frames with a joint cluster, minus frames with separate clusters, to merge, >= 1
+    merge_frames: int = 3
+    # minimum Bhattacharyya coefficient of the class distributions to merge, in [0, 1]; 0 = any classes are merged
+    merge_agreement: float = 0.1
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -208,7 +213,7 @@ class Association:
             merge_frames=(1, 2**31),
             merge_agreement=(0.0, 1.0),
         )
-        self._merge_votes: Counter[tuple[int, int]] = Counter()  # frames with a joint cluster, minus other frames
+        self._merge_votes: Counter[tuple[int, int]] = Counter()  # votes by pair of instances; see merge_frames
 
     def match(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> tuple[PixelLists, Matches]:
         """Return the clusters over each pixel, and their matches with existing and new instances of the map."""
@@ -276,7 +281,7 @@ class Association:
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the label space of a map, set by its first frame; `known` is () before.
+    """Return the label space of a map, set by its first frame; `known` is () before it.
 
     Raises DataError if a later frame has a different label space.
     """

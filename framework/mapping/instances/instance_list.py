@@ -36,7 +36,7 @@ class Confirmation:
 
     min_observations: int = 3  # minimum number of frames with a detection to confirm an instance, >= 1
     min_confidence: float = 0.05  # minimum InstanceRecord.confidence to confirm an instance, in [0, 1]
-    min_area: float = 0.01  # minimum surface area of a confirmed instance, m^2, >= 0: voxel_size^2 per mesh vertex
+    min_area: float = 0.01  # minimum surface area of a confirmed instance, m^2, >= 0; voxel_size^2 per mesh vertex
 
     def __post_init__(self) -> None:
         check_bounds(self, min_observations=(1, 2**31), min_confidence=(0.0, 1.0), min_area=(0.0, 1000.0))
@@ -70,7 +70,7 @@ class InstanceTableMap(SceneMap):
     """A map that keeps its instances in a table.
 
     `mesh` and `instances` contain the confirmed instances. `render` also contains the tentative instances. Ids and
-    classes ignore the minimum area, because computing the area takes a mesh.
+    classes ignore the minimum area, because computing the area requires a mesh.
     """
 
     table: InstanceTable
@@ -93,7 +93,7 @@ class InstanceTableMap(SceneMap):
         return {record.id: record.class_evidence for record in confirmed}
 
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Adopt the label space of the first frame. Raises DataError if a later frame has a different label space."""
+        """Set the label space from the first frame. Raises DataError if a later frame has a different label space."""
         self.classes = agreed_classes(self.classes, classes)
 
     def instances(self) -> Mapping[int, Instance]:
@@ -121,8 +121,8 @@ class InstanceTableMap(SceneMap):
 def vertices_of_area(area: float, voxel_size: float) -> int:
     """Return the number of vertices of a surface of `area` m^2, at least MIN_VERTICES.
 
-    A vertex counts voxel_size^2. The area is exact if the surface is parallel to the grid. The mesh has one vertex for
-    each voxel that the surface crosses, so other surfaces have up to sqrt(3) times as many vertices.
+    A vertex counts as voxel_size^2. The area is exact if the surface is parallel to the grid. The mesh has one vertex
+    for each voxel that the surface crosses, so other surfaces have up to sqrt(3) times as many vertices.
     """
     return max(MIN_VERTICES, round(area / voxel_size**2))
 

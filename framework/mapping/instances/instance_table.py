@@ -44,17 +44,17 @@ class FrameSet:
 
 @dataclass
 class InstanceRecord:
-    """The history of one instance. `class_evidence` (C,) combines its detections by the fuser's rule."""
+    """The history of one instance. `class_evidence` (C,) combines the evidence of its detections."""
 
     id: int
     class_evidence: Float64
     first_frame: int = -1
     last_frame: int = -1
     observed_in: set[int] = field(default_factory=set)  # frames with a detection
-    in_view: FrameSet = field(default_factory=FrameSet)  # frames with a possible detection
-    score_sum: float = 0.0  # sum over its detections
-    detections: int = 0
-    embedding: ObjectEmbedding | None = None  # sum over its detections with an embedding
+    in_view: FrameSet = field(default_factory=FrameSet)  # frames in which the instance is in view
+    score_sum: float = 0.0  # sum of the scores of its detections
+    detections: int = 0  # number of detections
+    embedding: ObjectEmbedding | None = None  # sum of the embeddings of its detections, None = no embedding
 
     @property
     def observations(self) -> int:
@@ -76,8 +76,8 @@ class InstanceRecord:
 class InstanceTable:
     """The instances of a map by id; ids start at 1 and are never reused.
 
-    Class evidence is combined by the rule of the voxels. If `logarithmic`, it is log-likelihoods, otherwise
-    proportional.
+    Class evidence is combined by the rule of the voxels. `logarithmic`: True = it is log-likelihoods, False = it is
+    proportional, such as votes.
     """
 
     def __init__(self, combine: Combine = Combine.SUM, logarithmic: bool = True) -> None:

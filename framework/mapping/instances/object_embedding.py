@@ -16,7 +16,7 @@ ARRAYS = ("embedding_ids", "embedding_sums", "embedding_weights", "embedding_cou
 """Arrays of a map file with embeddings: (M,) int32, (M, D) float64, (M,) float64, (M,) int64."""
 
 SPACE = "embedding_space"  # key of the embedding space in a saved table
-MAX_WEIGHT = 1e12  # maximum weight of one object
+MAX_WEIGHT = 1e12  # maximum weight of an embedding
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class ObjectEmbedding:
     def __add__(self, other: ObjectEmbedding) -> ObjectEmbedding:
         if self.sum.shape != other.sum.shape:
             raise DataError(
-                f"embeddings of one space: expected equal lengths, got {len(self.sum)} and {len(other.sum)} "
-                "numbers; map again with one model"
+                f"embeddings of one space: expected equal lengths, got {len(self.sum)} and {len(other.sum)} numbers; "
+                "map again with one model"
             )
         return ObjectEmbedding(self.sum + other.sum, self.weight + other.weight, self.count + other.count)
 
@@ -60,7 +60,7 @@ def added(known: ObjectEmbedding | None, new: ObjectEmbedding | None) -> ObjectE
 
 
 def agreed_space(known: str, found: str) -> str:
-    """Return the embedding space of a map, set by its first embeddings; `known` is "" before.
+    """Return the embedding space of a map, set by its first embeddings; `known` is "" before them.
 
     Raises DataError if later embeddings are from another space.
     """
@@ -94,7 +94,7 @@ def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, d
         raise DataError(f"{plain.name}.{SPACE}: expected 1 to {LONGEST_SPACE} characters, got {space!r:.60}")
     missing = [name for name in ARRAYS if name not in arrays]
     if missing:
-        raise DataError(f"expected {', '.join(missing)} with an embedding space, got none")
+        raise DataError(f"expected the arrays {', '.join(missing)} for the embedding space {space}, got none")
     ids, sums, weights, counts = (arrays[name] for name in ARRAYS)
     n = len(ids) if ids.ndim else 0
     dimension = sums.shape[1] if sums.ndim == 2 else 0
@@ -111,7 +111,9 @@ def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, d
             f"embedding_weights: expected values in (0, {MAX_WEIGHT:g}], got {weights.min()} to {weights.max()}"
         )
     if n and not (counts.min() >= 1 and counts.max() <= LARGEST_COUNT):
-        raise DataError(f"embedding_counts: expected at least 1, got {counts.min()}")
+        raise DataError(
+            f"embedding_counts: expected values in [1, {LARGEST_COUNT}], got {counts.min()} to {counts.max()}"
+        )
     with np.errstate(over="ignore"):  # invalid values may overflow
         lengths = np.linalg.norm(sums / weights[:, None], axis=1)
     if n and lengths.max() > 1 + 1e-3:

@@ -1,8 +1,8 @@
 """Operations on all class slots of a voxel.
 
 The sixteen slots of compact storage are one SIMD vector. LLVM unrolls such a short loop before it can vectorize it. So
-these intrinsics emit vector instructions, which LLVM maps to any little-endian processor. Exact storage has other types
-and more slots, and uses loops with the same results.
+these intrinsics emit vector instructions, which LLVM compiles for any little-endian processor. Exact storage has other
+types and more slots, and uses loops with the same results.
 
 A quantized score is a log-odds (or a vote) times the scale of the label rule, rounded. Each entry of `cluster_scores`
 (NO_CLASS + 1,) holds the score of a class in the upper bits. The lowest NEW_CLASSES bits mark its index among the
@@ -20,9 +20,9 @@ from numba.extending import intrinsic, overload
 
 from framework.mapping.voxels.voxel_grid_kernels import device
 
-CLASS_SLOTS = 16  # class slots of a voxel in compact storage
+CLASS_SLOTS = 16  # number of class slots of a voxel in compact storage
 NO_CLASS = 255  # class id of a free slot; slots are filled from the front
-NEW_CLASSES = 8  # classes that a cluster names and can add to the slots of a voxel
+NEW_CLASSES = 8  # number of classes that a cluster names and can add to the slots of a voxel
 ALL_NAMED = (1 << NEW_CLASSES) - 1
 
 _OPTIONS = {"forceinline": True, "error_model": "numpy", "_nrt": False}  # the options of `device`

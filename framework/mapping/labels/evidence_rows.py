@@ -30,8 +30,8 @@ from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-INSTANCE_SLOTS = 4  # instance slots of a voxel in compact storage
-RESERVED = 128  # labeled voxels reserved per block of the budget; most blocks have fewer, and the array can grow
+INSTANCE_SLOTS = 4  # number of instance slots of a voxel in compact storage
+RESERVED = 128  # number of labeled voxels reserved per block of the budget; most blocks have fewer; can grow
 ANY_INSTANCE = np.uint64(2**BITS - 1)
 SLOTS = Evidence._fields[1:]
 
@@ -46,7 +46,7 @@ class Storage(Enum):
 class NewVoxels(NamedTuple):
     """Voxels of A seen blocks that get slots in this frame."""
 
-    counts: Int32  # (A,) new voxels of each block
+    counts: Int32  # (A,) number of new voxels of each block
     rows: Int32  # (A,) evidence row of each block
     starts: Int32  # (A,) index of each block's first new voxel among the labeled voxels
 
@@ -59,14 +59,14 @@ class EvidenceRows:
         voxels: VoxelGrid,
         combine: Combine = Combine.SUM,
         storage: Storage = Storage.COMPACT,
-        score_scale: int = 64,  # quantized class score of evidence 1
+        score_scale: int = 64,  # quantized class score for evidence of 1
     ) -> None:
         self.voxels = voxels
         self.combine = combine
         self.storage = storage
         self.score_scale = score_scale
         self.row_count = 0
-        self.voxel_count = 0  # voxels with slots
+        self.voxel_count = 0  # number of voxels with slots
         self.evicted = 0  # number of slots reassigned to another label
         self._instance_slots = INSTANCE_SLOTS
         self._class_slots = CLASS_SLOTS
@@ -149,7 +149,7 @@ class EvidenceRows:
 
     def _free(self) -> None:
         self._labeled = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))
-        self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS: a voxel may name instance k
+        self._row_bits = np.empty(len(self._labeled), np.uint64)  # bit k % BITS = a voxel may have instance k
         scores = np.int16 if self.storage is Storage.COMPACT else np.int64
         shapes = self._instance_slots, self._instance_slots, self._class_slots, self._class_slots
         kinds = zip(SLOTS, (np.int32, np.float32, np.uint8, scores), shapes, strict=True)

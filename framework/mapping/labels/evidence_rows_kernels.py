@@ -66,7 +66,8 @@ def find_list_bits(offsets, clusters, instance_id, list_bits):
 def update_rows(grid, seen, evidence, measurement, list_bits, row_bits, new, evicted):
     """Update the near voxels with slots in the seen blocks, and the bits of their rows, row_bits (R,).
 
-    Counts near voxels without slots and with clusters in their list in new (A,), and evictions in evicted (A,).
+    Sets new (A,) to the number of near voxels without slots and with clusters in their list, and evicted (A,) to the
+    number of evictions.
     """
     list_ids = measurement.list_ids.ravel()
     blocks = seen.blocks.shape[0]
@@ -164,7 +165,7 @@ def _merge_voxel(ids, values, kept, dropped, combine):
 
 @njit(cache=True, nogil=True, parallel=True)
 def merge_instances(evidence, row_bits, kept, dropped, combine):
-    """Merge two instances in rows with the dropped instance in row_bits (R,), and set the bit of the kept instance."""
+    """Merge two instances in the rows whose row_bits (R,) have the dropped one's bit, and set the kept one's bit."""
     for row in prange(row_bits.shape[0]):
         if row_bits[row] & _instance_bit(dropped):
             row_bits[row] |= _instance_bit(kept)

@@ -5,8 +5,9 @@ The paper's rule is a voxel-wise Bayesian update by two independent recursions, 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t)
 
 In log space the update is a sum of log-likelihoods, from a uniform start. Only ratios matter. So a voxel stores the
-log-odds of each label over the unnamed labels, that is, labels that no cluster named there. Other rules (counts,
-latest, most confident) store other values and combine new evidence with old evidence differently; see `Combine`.
+log-odds of each label over the unnamed labels. A label is unnamed if no cluster named it at this voxel. Other rules
+(counts, latest, most confident) store other values and combine new evidence with old evidence differently; see
+`Combine`.
 
 A block has an evidence row once one of its voxels has labels. Each labeled voxel has slots.
 
@@ -32,14 +33,14 @@ from framework.mapping.labels.class_slots import NEW_CLASSES, NO_CLASS
 
 Integers = npt.NDArray[Any]  # of int16, int32 or int64
 MAX_SCORE = 30_000  # largest quantized class score in compact storage; a larger score reduces all scores by the excess
-MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # largest score that a cluster adds without overflow of int16
+MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # largest score of a cluster; a larger one could overflow int16
 
 
 class Evidence(NamedTuple):
     """Label evidence of all voxels, see the diagram above.
 
-    Voxels are visited in any order. So the slots of a voxel are contiguous, 80 bytes in compact storage: the arrays of
-    slots are views of one structured array.
+    Voxels are visited in any order. So the slots of a voxel are contiguous: the arrays of slots are views of one
+    structured array. In compact storage, the slots of a voxel take 80 bytes.
     """
 
     labeled: Int32  # (R, 512) index of a voxel among the voxels with slots, -1 = no slots
@@ -66,10 +67,11 @@ class Measurement(NamedTuple):
 
 
 def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8, UInt8]:
-    """Return the clusters' evidence relative to their unnamed classes, and their named classes with bits.
+    """Return the evidence of N clusters over their unnamed classes, their named classes, and the bits of named classes.
 
-    If the evidence is log-likelihoods, a cluster names its NEW_CLASSES best classes, and each unnamed class has the
-    mean evidence of the others. Otherwise a cluster names its best class, and has no evidence for other classes.
+    If the evidence is log-likelihoods, a cluster names its NEW_CLASSES best classes, and each unnamed class gets the
+    mean likelihood of the unnamed classes. Otherwise a cluster names its best class, and has no evidence for other
+    classes.
 
     Returns:
         Evidence (N, C) over the unnamed classes; named classes (N, NEW_CLASSES), in which the first class repeats if

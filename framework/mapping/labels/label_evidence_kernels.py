@@ -72,7 +72,7 @@ def best_class(evidence, voxel):
 
 @device
 def add_evidence(labels, values, free, label, added, combine, limit):
-    """Combine evidence with a label's slot, up to `limit`. A new label gets a free slot or the least likely slot.
+    """Combine evidence with a label's value, within +-`limit`. A new label gets a free slot or the least likely slot.
 
     Returns 1 if a label was evicted.
     """
@@ -102,7 +102,7 @@ def add_evidence(labels, values, free, label, added, combine, limit):
 
 @device
 def best_first(labels, values, free):
-    """Move the most likely label to slot 0. Ties go to the smaller label, so that the result ignores slot order."""
+    """Move the most likely label to slot 0. Ties go to the smaller label, so that slot order has no effect."""
     best = 0
     for s in range(1, len(labels)):
         if labels[s] == free:  # slots are filled from the front
@@ -128,7 +128,7 @@ def sum_classes(classes, scores, measurement, k):
     """Add the evidence of cluster k to the class slots of a voxel. Returns the number of evictions."""
     limit, cluster_scores = measurement.max_score, measurement.class_scores[k]
     known, filled, excess = add_scores(classes, scores, cluster_scores, limit)
-    for s in range(filled if excess > 0 else 0):  # keeps the differences and the most likely class
+    for s in range(filled if excess > 0 else 0):  # preserves the differences between scores
         scores[s] = max(scores[s] - excess, -limit)
     evicted = 0
     rejected = False

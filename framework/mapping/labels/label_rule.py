@@ -28,7 +28,7 @@ from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, remove
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VoxelHashing
 
-OTHER_CLASS = 0.3  # largest Bhattacharyya coefficient of the class distributions of different objects
+OTHER_CLASS = 0.3  # largest Bhattacharyya coefficient of the distributions of objects of different classes
 EXACT_BITS = 16  # additional bits of class scores in exact storage
 
 
@@ -37,10 +37,10 @@ class LabelRule(NamedTuple):
 
     combine: Combine  # rule for combining new evidence with old evidence
     logarithmic: bool  # True = evidence is log-likelihoods; False = evidence is proportional, such as votes
-    score_scale: int = 64  # quantized class score of evidence 1 in compact storage
+    score_scale: int = 64  # quantized class score for evidence of 1 in compact storage
 
     def quantization(self, storage: Storage) -> int:
-        """Return the quantized class score of evidence 1."""
+        """Return the quantized class score for evidence of 1."""
         return self.score_scale if storage is Storage.COMPACT else self.score_scale << EXACT_BITS
 
 
@@ -71,7 +71,7 @@ def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidenc
 
 @dataclass
 class LabeledVoxels:
-    """Voxel blocks with label evidence."""
+    """Parameters of voxel blocks with label evidence."""
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
@@ -109,12 +109,13 @@ class LabeledVoxels:
                     f"{name}: expected {stored} (as in the stored map), got {given}; set {name}={stored}, or map into "
                     "an empty folder"
                 )
-        stored_rule = (scene.table.combine.name, scene.table.logarithmic, scene.labels.score_scale)
-        given_rule = (rule.combine.name, rule.logarithmic, own.labels.score_scale)
+        described = "combine={}, logarithmic={}, score_scale={}".format
+        stored_rule = described(scene.table.combine.name, scene.table.logarithmic, scene.labels.score_scale)
+        given_rule = described(rule.combine.name, rule.logarithmic, own.labels.score_scale)
         if stored_rule != given_rule:
             raise ConfigError(
-                f"fuser: expected the label rule of the stored map {stored_rule}, got {given_rule}; choose the fuser "
-                "that made the map"
+                f"fuser: expected the label rule of the stored map ({stored_rule}), got {given_rule}; choose the "
+                "fuser that made the map"
             )
         scene.confirmation = self.confirmation
         scene.instance_class = self.instance_class
@@ -156,9 +157,9 @@ class LabeledVoxels:
     def supported_instances(self, table: InstanceTable, matches: Matches) -> Bool:
         """Return an array (N, ids + 1), True if a cluster's object supports an instance, as a table supports a book.
 
-        A supported instance is confirmed and of another class. Most of its visible part is under the cluster, in at
-        most half of the cluster's pixels. The mask of the large object covers the instance, but is no evidence for its
-        voxels.
+        A supported instance is confirmed and of another class. Most of its visible part is inside the cluster's mask,
+        and it is at most half as large as the cluster. The mask of the large object covers the instance, but is no
+        evidence for its voxels.
         """
         overlaps, clusters = matches.overlaps, matches.clusters
         supported = np.zeros((len(clusters), table.last_id + 1), np.bool_)

@@ -71,7 +71,7 @@ def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> Pix
 
 
 def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> PixelLists:
-    """Return the lists without clusters that have no instance or lie below much smaller clusters.
+    """Return the lists without clusters that have no instance or are much larger than another cluster of the pixel.
 
     Large masks are coarse and cover small objects, such as a book on a couch. So a pixel keeps only clusters that are
     at most 1 / `area_ratio` times as large as its smallest cluster. If `area_ratio` is 0, a pixel keeps all clusters.

@@ -7,13 +7,13 @@ from numba import njit, prange
 
 from framework.mapping.voxels.voxel_grid_kernels import device
 
-CHUNKS = 16  # chunks of image rows
+CHUNKS = 16  # number of chunks of image rows
 
 
 @device
 def _are_inside(coordinates, width, height):
-    """Return True if all pixels (2 P,), alternating u and v, are in the image; unsigned, negative numbers are large."""
-    right = bottom = np.uint32(0)
+    """Return True if all pixels (2 P,), alternating u and v, are in the image."""
+    right = bottom = np.uint32(0)  # negative coordinates become large unsigned numbers
     for p in range(coordinates.shape[0] // 2):
         right = max(right, np.uint32(coordinates[2 * p]))
         bottom = max(bottom, np.uint32(coordinates[2 * p + 1]))
@@ -24,7 +24,8 @@ def _are_inside(coordinates, width, height):
 def link_points(coordinates, cluster, list_ids, tree):
     """Fill list_ids (H, W) and the ListTree, which has a capacity of one list per point plus one.
 
-    The coordinates (2 P,) of the points alternate u and v. Returns the number of lists, 0 if a point is outside.
+    The coordinates (2 P,) of the points alternate u and v. Returns the number of lists, 0 if a point is
+    outside the image.
     """
     head, parent, child, sibling, pixel_count, length = tree
     width = list_ids.shape[1]
@@ -35,7 +36,7 @@ def link_points(coordinates, cluster, list_ids, tree):
     pixel_count[0], child[0], length[0] = list_ids.size, 0, 0
     lists = np.int32(1)
     p = cluster.shape[0] - 1
-    while p >= 0:  # a run of points of one cluster at pixels with the same list
+    while p >= 0:  # each pass: a run of points of one cluster at pixels with the same list
         k, last = cluster[p], p
         if k < 0:
             p -= 1
@@ -66,7 +67,7 @@ def link_points(coordinates, cluster, list_ids, tree):
 
 @njit(cache=True, nogil=True)
 def write_lists(head, parent, offsets, clusters):
-    """Write the clusters of each list into the flat array at `offsets`."""
+    """Write the clusters of each list into the flat array `clusters`, from offsets[list] on."""
     for i in range(offsets.shape[0] - 1):
         list_id = i
         for entry in range(offsets[i], offsets[i + 1]):
@@ -76,7 +77,7 @@ def write_lists(head, parent, offsets, clusters):
 
 @njit(cache=True, nogil=True)
 def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kept_offsets, kept):
-    """Fill kept_offsets (L + 1,) and the first kept_offsets[L] entries of `kept`, which is as long as `clusters`."""
+    """Write the lists of keep_on_top() to kept_offsets (L + 1,) and kept; `kept` is as long as `clusters`."""
     sizes = np.zeros(instance_ids.shape[0], np.float64)
     for i in range(pixel_counts.shape[0]):
         for entry in range(offsets[i], offsets[i + 1]):
@@ -100,7 +101,7 @@ def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kep
 def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
     """Fill new_ids (H, W) with replacement[i, column[k]] for pixels of list i at instance k of the map.
 
-    Counts the pixels that get another list in moved (CHUNKS, lists), which must be 0 at first.
+    Adds the number of pixels that get each new list to moved (CHUNKS, lists), which must start at 0.
     """
     height, width = list_ids.shape
     for chunk in prange(CHUNKS):

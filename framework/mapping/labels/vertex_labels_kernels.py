@@ -17,7 +17,7 @@ from framework.mapping.voxels.voxel_grid_kernels import (
 from framework.mapping.voxels.voxel_walk import voxel_number
 
 CORNERS = 8  # number of voxels around a vertex
-REACH = 2.0  # voxels; farther voxels were seen by other pixels and do not vote
+REACH = 2.0  # maximum distance of voting voxels from the surface, voxels; farther ones were seen by other pixels
 CHUNK = 1024  # number of vertices that share scratch arrays
 
 

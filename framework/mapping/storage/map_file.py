@@ -26,10 +26,10 @@ from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 DEFLATE_LEVEL = 1  # zlib level; files are at most a tenth larger than at level 6 and take half the time
 
 HEADER = "header"
-LARGEST_HEADER = 2**28  # bytes; an hour with thousands of instances takes about 10 MB
+LARGEST_HEADER = 2**28  # maximum size of the header, bytes; an hour with thousands of instances takes about 10 MB
 LARGEST_ID = 2**24  # largest instance id
 MAX_EVIDENCE = 1e12  # largest evidence for a class
-MAX_ARRAYS = 100  # maximum number of arrays that a file lists
+MAX_ARRAYS = 100  # maximum number of arrays in the list of a file
 MAX_MEMORY_FRACTION = 0.5  # maximum fraction of the machine's memory for a loaded map
 
 
@@ -60,7 +60,7 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
             raise DataError(f"expected map format {expected_format}, got {found!r:.60}")
         damaged = archive.testzip()
         if damaged is not None:
-            raise DataError(f"{damaged}: expected the stored CRC-32 checksum, got another")
+            raise DataError(f"{damaged}: expected the stored CRC-32 checksum, got a different checksum")
         there = set(archive.namelist())
         optional = [name for name in ARRAYS if f"{name}.npy" in there]
         return header, {name: _array(archive, name) for name in dict.fromkeys((*names, *optional))}
@@ -97,10 +97,10 @@ def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
     check_regular(Path(path))
     with zipfile.ZipFile(path) as archive:
         unpacked = sum(info.file_size for info in archive.infolist())
-        if unpacked > MAX_MEMORY_FRACTION * machine_memory():
+        limit = MAX_MEMORY_FRACTION * machine_memory()
+        if unpacked > limit:
             raise DataError(
-                f"expected at most half of this machine's {machine_memory()} bytes of memory, got {unpacked} "
-                "unpacked bytes"
+                f"expected at most {limit:.0f} unpacked bytes (half of this machine's memory), got {unpacked} bytes"
             )
         yield archive
 
@@ -139,7 +139,7 @@ def machine_memory() -> int:
 
 
 def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], length: int, prefix: str = "") -> None:
-    """Raise DataError unless the arrays have the expected types and shapes, except for their `length`."""
+    """Raise DataError unless the arrays have `length` rows, and the types and row shapes of the `expected` arrays."""
     for name, like in expected.items():
         check_array(prefix + name, arrays[prefix + name], (length, *like.shape[1:]), like.dtype)
 
@@ -152,7 +152,7 @@ def check_known(name: str, array: Array, known: Iterable[int]) -> None:
 
 
 def check_numbers(name: str, numbers: Array, count: int) -> None:
-    """Raise DataError unless the array contains each number from 0 to `count` - 1 once, and otherwise -1."""
+    """Raise DataError unless the array contains each number from 0 to `count` - 1 once, and otherwise only -1."""
     used = numbers[numbers != -1]
     beyond = used[(used < 0) | (used >= count)]
     if beyond.size:

@@ -48,7 +48,7 @@ class MapHeader:
         return found
 
     def number(self, key: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> float:
-        """Return a finite number in [low, high], with a tolerance of 1e-6 for float32 rounding."""
+        """Return a finite number in [low, high], with a relative tolerance of 1e-6 for float32 rounding."""
         found, (low, high) = self._value(key), bounds
         is_number = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
         if not is_number or not low - 1e-6 * abs(low) <= found <= high + 1e-6 * abs(high):
@@ -78,7 +78,8 @@ class MapHeader:
         found = self.items("classes")
         names = [name for name in found if isinstance(name, str) and len(name) <= LONGEST_NAME]
         if len(names) < len(found) or len(found) > MAX_CLASSES:
-            raise self._error("classes", f"at most {MAX_CLASSES} names of {LONGEST_NAME} characters", found)
+            expected = f"at most {MAX_CLASSES} names of at most {LONGEST_NAME} characters each"
+            raise self._error("classes", expected, found)
         return tuple(names)
 
     def _value(self, key: str) -> Any:

@@ -18,9 +18,9 @@ from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, FARTHEST_BLOCK
 
-MAX_SAMPLES = 4096  # maximum samples along the band of a reading, half a block apart; 6 by default
-REPEATS = 8  # maximum mean number of reports of a block by a chunk, which remembers recent blocks
-MIN_KEYS = 2**20  # minimum key capacity for a frame, 8 MB; the block budget limits smaller requests
+MAX_SAMPLES = 4096  # maximum number of samples along the band of a reading, half a block apart; 6 by default
+REPEATS = 8  # maximum mean number of entries of a block in the lists of all chunks
+MIN_KEYS = 2**20  # number of keys that every frame may have, 8 MB; above it, the block budget is the limit
 
 
 class Allocator:
@@ -56,7 +56,7 @@ class Allocator:
         """Allocate and return the blocks (N,), with repeats, along the truncation bands of `depth` (H, W) m.
 
         Raises:
-            MapFullError: If the block budget is reached, or if a single frame exceeds it; no memory is allocated then.
+            MapFullError: If the block budget is reached. No memory is allocated if a single frame exceeds the budget.
             FrameError: If the pose is outside the range of block coordinates.
         """
         return self.voxels.allocate(self._surface_coords(camera, depth, T_world_camera))
@@ -80,7 +80,8 @@ class Allocator:
         if reach >= FARTHEST_BLOCK * block_size:
             raise FrameError(
                 f"tracker: expected surfaces within {FARTHEST_BLOCK * block_size:.6g} m of the origin "
-                f"(fuser.voxel_size={self.voxels.grid.voxel_size:g} m), got {reach:.6g} m"
+                f"(fuser.voxel_size={self.voxels.grid.voxel_size:g} m), got {reach:.6g} m; check the poses, or raise "
+                "fuser.voxel_size"
             )
         counts, view, size = np.zeros(CHUNKS, np.int64), pinhole(camera, T_world_camera), np.float32(block_size)
         while True:

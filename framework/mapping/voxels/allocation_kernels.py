@@ -10,10 +10,10 @@ from framework.mapping.voxels.voxel_grid import REGION_BLOCKS, REGION_SIDE
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, NO_KEY, device, pack_key, unpack_key
 from framework.mapping.voxels.voxel_walk import ray_direction
 
-CHUNKS = 32  # chunks of image rows; fixed, so that the order of blocks does not depend on the number of threads
+CHUNKS = 32  # fixed number of chunks of image rows, so that block order does not depend on the number of threads
 WORD = 64  # bits
-RECENT = 1024  # number of block keys that a chunk remembers, to report each block about once
-PROBES = 4  # probed pixels along each side of a block in the image, to detect free space behind it
+RECENT = 1024  # number of recent block keys that a chunk caches, to list each block about once
+PROBES = 4  # number of probed pixels along each side of a block in the image, to detect free space behind it
 
 
 @device
@@ -94,7 +94,7 @@ def unpack(keys, coords):
 
 @device
 def _extent(camera, size, margin):
-    """Return half the sides, m, of the box along the camera axes around a cube along the world axes."""
+    """Return the half sides, m, of the box along the camera axes around a cube along the world axes, plus `margin`."""
     half = np.float32(0.5) * size
     return (
         half * (abs(camera.R[0, 0]) + abs(camera.R[0, 1]) + abs(camera.R[0, 2])) + margin,
@@ -179,9 +179,9 @@ def _sees_through(depth, sensor, z0, pixels):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame, active):
-    """Write the blocks `found` (N,) and the blocks in free space to `active`, each once. Returns their number.
+    """Write the blocks `found` (N,) and the existing blocks in front of the surface to `active`. Returns their number.
 
-    `camera` holds T_camera_world.
+    Each block is written once. `camera` holds T_camera_world.
     """
     n = 0
     for i in range(found.shape[0]):
@@ -190,7 +190,7 @@ def choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame
             stamp[block] = frame
             active[n] = block
             n += 1
-    # blocks without a surface need no carving
+    # only blocks with a surface need updates of free space
     blocks, depths, pixels = solid_blocks_in_view(
         grid, region_count, stamp.shape[0], camera, sensor.min_depth, sensor.max_depth, depth.shape
     )

@@ -1,4 +1,4 @@
-"""Slices of a block, 8 x 8 voxels, stored as the bits of a word: voxel (x, y) is bit 8 y + x.
+"""Slices of 8 x 8 voxels of a block as the bits of a 64-bit word: voxel (x, y) is bit 8 y + x.
 
 Shifted words compare 64 voxels with their neighbors at once.
 """
@@ -34,23 +34,23 @@ def lowest_bit(word):
 
 @device
 def ahead_x(word, beyond):
-    """Return the bits (x + 1, y) of a slice; `beyond` is the slice of the next block along x."""
+    """Return the slice with bit (x + 1, y) of `word` at (x, y); `beyond` is the slice of the next block along x."""
     return ((word & ~_FIRST_COLUMN) >> ONE) | ((beyond & _FIRST_COLUMN) << _TO_LAST_COLUMN)
 
 
 @device
 def ahead_y(word, beyond):
-    """Return the bits (x, y + 1) of a slice; `beyond` is the slice of the next block along y."""
+    """Return the slice with bit (x, y + 1) of `word` at (x, y); `beyond` is the slice of the next block along y."""
     return (word >> _EIGHT) | (beyond << _TO_LAST_ROW)
 
 
 @device
 def behind_x(word, before):
-    """Return the bits (x - 1, y) of a slice; `before` is the slice of the previous block along x."""
+    """Return the slice with bit (x - 1, y) of `word` at (x, y); `before` is the slice of the previous block along x."""
     return ((word & ~_LAST_COLUMN) << ONE) | ((before & _LAST_COLUMN) >> _TO_LAST_COLUMN)
 
 
 @device
 def behind_y(word, before):
-    """Return the bits (x, y - 1) of a slice; `before` is the slice of the previous block along y."""
+    """Return the slice with bit (x, y - 1) of `word` at (x, y); `before` is the slice of the previous block along y."""
     return (word << _EIGHT) | (before >> _TO_LAST_ROW)

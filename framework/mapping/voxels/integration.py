@@ -1,8 +1,8 @@
 """Integration of depth images into the running averages of the visible voxels.
 
 The signed distance is projective, along z. Its running average is the TSDF of Curless and Levoy (1996). The truncation
-distance increases with depth like the sensor noise. The weight of an observation falls with depth squared, beyond the
-depth up to which the noise of the sensor is nearly constant.
+distance increases with depth like the sensor noise. Observations have full weight up to the depth at which sensor noise
+starts to increase. Beyond it, the weight falls with the square of the depth.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from framework.mapping.voxels.integration_parameters import Sensor, pinhole
 from framework.mapping.voxels.voxel_grid import VoxelGrid, reserved
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-GOLDEN = 0.6180339887498949  # equidistributed rounding offsets frac(k * GOLDEN) avoid a bias of rounded averages
+GOLDEN = 0.6180339887498949  # equidistributed rounding offsets frac(k * GOLDEN) avoid bias in rounded averages
 
 
 class SeenBlocks(NamedTuple):
     """The A blocks updated by a frame and their voxels near the measured surface, valid until the next frame.
 
-    The voxels of a block are contiguous. There are gaps between GROUPs of blocks.
+    The near voxels of a block are contiguous. There are gaps between GROUPs of blocks.
     """
 
     blocks: Int32  # (A,) block indices
@@ -37,7 +37,7 @@ class SeenBlocks(NamedTuple):
 
 
 def _near_lists(blocks: int) -> tuple[UInt16, Int32]:
-    """Return near_voxel and near_pixel for a number of blocks."""
+    """Return uninitialized arrays near_voxel and near_pixel for a number of blocks."""
     return np.empty(blocks * BLOCK_VOXELS, np.uint16), np.empty(blocks * BLOCK_VOXELS, np.int32)
 
 
@@ -74,7 +74,7 @@ class Integrator:
         return self._update(frame, T_world_camera, near_band, np.arange(self.voxels.block_count, dtype=np.int32))
 
     def _sensor_of(self, frame: Frame) -> Sensor:
-        """Return the parameters with the depth up to which the noise of the frame's sensor is nearly constant."""
+        """Return the parameters, with full_weight_depth raised to the value of the frame's sensor if that is larger."""
         full_weight_depth = max(self.sensor.full_weight_depth, np.float32(frame.sensor.noise.full_weight_depth))
         return self.sensor._replace(full_weight_depth=full_weight_depth)
 
@@ -83,7 +83,7 @@ class Integrator:
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
         view = pinhole(frame.camera, inverse(T_world_camera))
         n = len(active) * BLOCK_VOXELS
-        if len(self._near_pixel) < n:  # if reserving costs memory, or after pickling; copies nothing
+        if len(self._near_pixel) < n:  # without reserved memory, or after pickling; old contents are not needed
             self._near_voxel, self._near_pixel = _near_lists(len(active) * 9 // 8 + 1)
         starts, counts = np.empty(len(active), np.int64), np.empty(len(active), np.int32)
         seen = SeenBlocks(active, starts, counts, self._near_voxel[:n], self._near_pixel[:n])

@@ -86,8 +86,9 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         band = sensor.truncation + sensor.truncation_slope * d
         sdf = d - scratch[n]
         seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
-        # Behind the surface the weight falls with the distance, because observations from behind contradict it. The
-        # band widens with the noise, and only its far end loses weight. Otherwise noise would displace surfaces.
+        # Behind the surface the weight falls with the distance, because observations from the other side contradict
+        # these voxels. The band widens with the noise, and only its far end loses weight. Otherwise noise would
+        # displace surfaces.
         behind = max(least, min((band + sdf) * ramp, one))
         w_new = max(one, weight_one * behind * min(one, full2 / max(d * d, np.float32(1e-6))))
         w_old = np.float32(weight[n])

@@ -24,8 +24,8 @@ class Sensor(NamedTuple):
 
     truncation: np.float32  # truncation distance at depth 0, m
     truncation_slope: np.float32  # increase of the truncation distance with depth, m per m
-    min_depth: np.float32  # m
-    max_depth: np.float32  # m
+    min_depth: np.float32  # minimum depth of integrated readings, m
+    max_depth: np.float32  # maximum depth of integrated readings, m
     max_weight: np.float32  # maximum weight, in observations
     full_weight_depth: np.float32  # m; a depth reading has weight min(1, (full_weight_depth / depth)^2)
 
@@ -41,14 +41,14 @@ class Sensor(NamedTuple):
 
 
 class Pinhole(NamedTuple):
-    """A camera and its pose, float32."""
+    """A camera (fx, fy, cx, cy in px) and its pose, in single precision."""
 
     fx: np.float32
     fy: np.float32
     cx: np.float32
     cy: np.float32
     R: Float32  # (3, 3)
-    t: Float32  # (3,)
+    t: Float32  # (3,) m
 
 
 def pinhole(camera: Camera, T: Float64) -> Pinhole:

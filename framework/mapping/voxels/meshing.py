@@ -8,9 +8,9 @@ Compared with dual contouring, the vertices are farther from sharp edges, and cl
 Few voxels are near the surface, so the search tests 64 voxels at once as bits of a word. Only cells with a vertex are
 visited individually. The index of a vertex is the number of set bits before its own bit.
 
-A block stores 192 bytes of words and 32 bytes of indices between updates. Its vertices are placed again if one of its
-voxels changed, or a voxel of the next blocks that share its cells. The other vertices are copied. The result depends
-on the grid alone.
+A block stores 192 bytes of words and 32 bytes of indices between updates. Its vertices are computed again after a
+change of its voxels, or of voxels of the next blocks that its cells share. The other vertices are copied. The result
+depends on the grid alone.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ from framework.mapping.voxels.meshing_kernels import (
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE
 
-# Largest difference between the corners of a cell, voxels of distance. Above it the cell is on a silhouette, between
-# truncated free space and hidden space. The bound is wide because surfaces reach 1 / cos of the viewing angle.
+# Largest difference between the corners of a cell, voxels of distance. Cells with a larger difference are on a
+# silhouette, between truncated free space and hidden space. The limit is high, because projective distances on oblique
+# surfaces are larger by 1 / cos of the viewing angle.
 MAX_JUMP = 8.0
 
 
@@ -41,7 +42,7 @@ class UnlabeledMesh(NamedTuple):
     """A mesh without colors and labels."""
 
     vertices: Float32  # (V, 3) m, world frame
-    triangles: Int32  # (F, 3), facing the seen side
+    triangles: Int32  # (F, 3) vertex indices; faces point to the observed side
     voxels: Int32  # (V,) nearest voxel, as block * 512 + index in the block
 
 
@@ -59,7 +60,7 @@ class SurfaceNets:
         self._surface = UnlabeledMesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.int32))
 
     def changed(self, blocks: Int32) -> None:
-        """Mark blocks with written voxels. Blocks added since `extract` are always marked."""
+        """Mark `blocks` (A,) with changed voxels. Blocks added since the last `extract` are always marked."""
         known = blocks[blocks < len(self._changed)]
         self._changed[known] = True
 

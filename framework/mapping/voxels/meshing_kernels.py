@@ -21,7 +21,7 @@ def _blocks_before(grid, block, out):
 
 @njit(cache=True, nogil=True, parallel=True)
 def pack(tsdf, blocks, inside, seen):
-    """Pack flags of the blocks' negative voxels into `inside` (B + 1, 8), and of the seen voxels into `seen`."""
+    """Pack flags of the blocks' negative voxels into `inside` (B + 1, 8), and of observed voxels into `seen`."""
     for b in prange(len(blocks)):
         block = blocks[b]
         for z in range(BLOCK_SIDE):
@@ -48,7 +48,7 @@ def mark_stale(grid, changed, stale):
 
 @device
 def _any_and_all(words, around, z):
-    """Return two words for the cells of slice z: cells with any, and with all, of their four corners in z set."""
+    """Return two words for the cells of slice z: those with any, and those with all, of their corners in z set."""
     up = 4 * (z >> 3)
     z &= 7
     here, block_x = words[around[up], z], words[around[up + 1], z]
@@ -68,7 +68,10 @@ def _cell_corners(tsdf, around, x, y, z, corners):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_cells(grid, blocks, inside, seen, most_jump, cells):
-    """Pack flags of the blocks' cells with a vertex into `cells` (B + 1, 8)."""
+    """Pack flags of the blocks' cells with a vertex into `cells` (B + 1, 8).
+
+    `most_jump` is MAX_JUMP in stored units.
+    """
     tsdf = grid.tsdf
     for b in prange(len(blocks)):
         block = blocks[b]

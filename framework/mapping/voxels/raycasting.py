@@ -2,12 +2,12 @@
 
 1. Project the blocks in view to image tiles. This bounds the depths that the rays of each tile search.
 2. Cast a ray every few pixels. The ray skips absent regions and blocks in one step each and advances by the stored
-   distance. The surface is at a change of the field from positive to negative.
+   distance. The surface is where the field changes from positive to negative.
 3. If neighboring rays meet one surface, interpolate the depths of the pixels between them. Refine these depths on the
    trilinear field by Newton's method, one image row at a time. If this fails, run a full search for the pixel.
 
 Interpolation could miss a surface narrower than the spacing of the coarse rays. So the spacing is kept below the size
-of the map's details. All pixels are searched at depths with a larger spacing.
+of the map's details. At depths where the spacing is larger, all pixels are searched.
 
 Rays are in voxels: o + z * d with d in voxels per m of depth z.
 """
@@ -62,7 +62,7 @@ def cast_view(
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
     stride = _stride(camera, float(voxels.grid.voxel_size), float(sensor.max_depth))
-    rays_y, rays_x = (max(1, -(-(side - 1) // stride)) + 1 for side in camera.shape)  # with the last row, column
+    rays_y, rays_x = (max(1, -(-(side - 1) // stride)) + 1 for side in camera.shape)  # with last row and column
     coarse = np.empty((rays_y, rays_x), np.float32)
     if readings is None:
         limits = np.full(camera.shape, sensor.max_depth)

@@ -22,19 +22,19 @@ from framework.mapping.voxels.voxel_walk import (
 )
 from framework.sensors.noise_models_kernels import axial_sigma_single
 
-TILE = 8  # px; the rays of a tile share blocks in the cache
-REFINEMENTS = 4  # maximum Newton steps of a ray; a plane needs one, a curved surface two or three
-CONVERGED = 0.2  # voxels; the field is nearly linear, so the error after a shorter step is a few hundredths of a voxel
+TILE = 8  # side of a tile, px; the rays of a tile share blocks in the cache
+REFINEMENTS = 4  # maximum number of Newton steps of a ray; a plane needs one, a curved surface two or three
+CONVERGED = 0.2  # maximum last Newton step, voxels; the remaining error is a few hundredths of a voxel
 REACH = 3.0  # maximum distance from the start of a refinement to the surface, voxels
-DETAIL = 4.0  # maximum spacing of coarse rays, voxels; maps have few details below the truncation band
+DETAIL = 4.0  # maximum spacing of coarse rays, voxels; maps have few details smaller than the truncation band
 MARGIN = 8.0  # maximum protrusion of a surface between the coarse rays that meet it, voxels
 STEEPEST = 24.0  # maximum depth difference of coarse rays on one surface, voxels; reached by a distant floor
-MAX_SHIFT = 10.0  # maximum distance between a depth reading and the measured surface of the map, voxels
+MAX_SHIFT = 10.0  # maximum distance between a depth reading and the surface of the map, voxels
 
 
 @device
 def _ray(view, scale, u, v):
-    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth (m) of a voxel along the ray."""
+    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth step (m) of one voxel."""
     dx, dy, dz = ray_direction(view, u, v)
     dx, dy, dz = dx * scale, dy * scale, dz * scale
     return (dx, dy, dz), np.float32(1.0) / np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -42,9 +42,10 @@ def _ray(view, scale, u, v):
 
 @device
 def _refined(grid, o, d, step, z, reach, key, region):
-    """Return (z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` of depth z, m; z = 0 = none.
+    """Return (z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` m of depth z; z = 0 = none.
 
-    (nx, ny, nz) is the gradient, stored units per voxel. A zero is a back face if the field rises along the ray.
+    (nx, ny, nz) is the gradient, stored units per voxel. A zero where the field rises along the ray is a back face and
+    is ignored.
     """
     zero = np.float32(0.0)
     nx = ny = nz = zero
@@ -79,10 +80,10 @@ def _first_surface(grid, o, d, step, near, far, key, region):
     inverse_d = inverses(d)
     # the nearest voxel to a point is the cell of the point shifted by half a voxel
     shifted = (o[0] + half, o[1] + half, o[2] + half)
-    # step past the border by more than the rounding of z, because otherwise the ray would not advance
+    # step past the border by more than the rounding error of z, because otherwise the ray would not advance
     margin = max(np.float32(1e-3) * step, np.float32(2.5e-7) * far)
     z = near
-    from_front = False  # the previous voxel was in front of a surface
+    from_front = False  # True if the previous voxel was in front of a surface
     while z < far:
         i = np.int32(np.floor(shifted[0] + z * d[0]))
         j = np.int32(np.floor(shifted[1] + z * d[1]))
@@ -110,7 +111,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
 
 @njit(cache=True, nogil=True)
 def bound_tiles(depths, pixels, tile_near, tile_far):
-    """Extend tile_near and tile_far (Y, X) m to the depths of the blocks along the rays of a tile."""
+    """Extend tile_near and tile_far (Y, X) m to the `depths` (N, 2) m of blocks at `pixels` (N, 4), u0 u1 v0 v1."""
     for n in range(depths.shape[0]):
         u0, u1, v0, v1 = pixels[n]
         for ty in range(v0 // TILE, v1 // TILE + 1):
@@ -144,7 +145,7 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
     """Bound the search in the cells (X,) of pixels between two rows of coarse depths (X + 1,) m, -1 = not searched.
 
     near and far get the depth range, m, of a surface in the cell; far 0 = no surface. corners (4, X) gets the inverse
-    depths of the surface, in row order, if there is exactly one surface; otherwise 0.
+    depths of the surface, in row order, if the cell has exactly one surface; otherwise 0.
     """
     zero, one, none = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
     margin, rise = np.float32(MARGIN) * voxel, np.float32(STEEPEST) * voxel
@@ -242,7 +243,7 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
                             last = min(far[x], limits[v, u])
                             z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near[x], last, key, region)
                     norm = np.sqrt(nx * nx + ny * ny + nz * nz)
-                    norm = one / norm if z > zero else zero  # not 0, because the field falls along the ray
+                    norm = one / norm if z > zero else zero  # at a surface the norm is not 0
                     row[u] = z
                     gradients[0, u], gradients[1, u], gradients[2, u] = nx * norm, ny * norm, nz * norm
                 normals[v, u, 0] = gradients[0, u]
@@ -254,7 +255,8 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
 def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, depth):
     """Fill depth like cast_coarse(), starting at the camera's depth readings (H, W) m.
 
-    No pixel is searched beyond its limit (H, W) m. At limit 0 the depth is -1, because neighbors may be searched.
+    No pixel is searched beyond its limit (H, W) m. At limit 0 the depth is -1 (not searched), because
+    neighboring pixels may still be searched.
 
     Depth readings are noisy, and a wrong pose displaces them. So the search starts at the extrapolation of the two
     previous rays if the reading agrees with it. Otherwise it starts at the reading plus the last displacement.
@@ -294,7 +296,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, noise, 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def paint(grid, view, depth, color):
-    """Fill color (H, W, 3) with the map's color at the surface at `depth` (H, W) m from `view`."""
+    """Fill color (H, W, 3) with the map's color at the surface at `depth` (H, W) m, seen from `view`."""
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
     for v in prange(height):
@@ -320,7 +322,7 @@ def voxel_seen(grid, view, u, v, z, key, region):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label(grid, evidence, view, depth, instance_ids, class_ids):
-    """Fill instance_ids and class_ids (H, W) with the labels of the nearest voxels to the surface at `depth`."""
+    """Fill instance_ids and class_ids (H, W) from the voxels nearest to the surface at `depth` (H, W) m."""
     height, width = depth.shape
     for v in prange(height):
         key, region = NO_LOOK_UP

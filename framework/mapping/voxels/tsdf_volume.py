@@ -62,7 +62,7 @@ class TsdfVolume:
         return seen
 
     def changed(self, blocks: Int32 | None = None) -> None:
-        """Invalidate derived data after writing the voxels of `blocks` (A,), None = any blocks."""
+        """Invalidate derived data after a change of the voxels of `blocks` (A,); None = of any blocks."""
         self._mesh = self._gravity = None
         if blocks is None:
             self._nets = None
@@ -122,7 +122,7 @@ class TsdfVolume:
         return volume
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Copy the voxels of a map file, whose types and shapes are checked, into an empty volume."""
+        """Copy the arrays of a map file into an empty volume. Their types and shapes must be checked before."""
         coords = arrays["block_coords"]
         check_blocks(coords)
         self.voxels.allocate(coords)
@@ -134,7 +134,7 @@ class TsdfVolume:
 
 @dataclass
 class Tsdf:
-    """A truncated signed distance field with labels near the measured surface."""
+    """Parameters of a truncated signed distance field with labels near the measured surface."""
 
     voxel_size: float = 0.01  # side of a voxel, m, > 0
     truncation: float = 4.0  # truncation distance at depth 0, in voxels, >= 1
@@ -155,13 +155,16 @@ class Tsdf:
 
 @dataclass
 class VoxelHashing:
-    """A truncated signed distance field in voxel blocks."""
+    """Parameters of a truncated signed distance field in voxel blocks."""
 
     tsdf: Tsdf = field(default_factory=Tsdf)
-    truncation_slope: float = 0.01  # increase of the truncation distance with depth, m per m, >= 0; as in VoxelHashing
-    max_weight: float = 200.0  # maximum TSDF weight (number of observations), in [1, 255]; limits old readings
-    full_weight_depth: float = 1.5  # maximum depth with full weight, m, > 0; farther: (full_weight_depth / depth)^2
-    max_blocks: int = 400_000  # maximum number of blocks of 8^3 voxels, > 0: 1.7 GB, about 1000 m^2 of surface at 1 cm
+    truncation_slope: float = 0.01  # increase of the truncation distance with depth, m per m, >= 0
+    # maximum TSDF weight (number of observations), in [1, 255]; limits the influence of old readings
+    max_weight: float = 200.0
+    # maximum depth with full weight, m, > 0; farther readings have weight (full_weight_depth / depth)^2
+    full_weight_depth: float = 1.5
+    # maximum number of blocks of 8^3 voxels, > 0; 4.1 KiB each, plus about 40 KiB for blocks with labels
+    max_blocks: int = 400_000
 
     def __post_init__(self) -> None:
         check_bounds(

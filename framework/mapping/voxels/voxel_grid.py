@@ -1,11 +1,12 @@
-"""Voxel hashing: blocks of 8^3 voxels in a hash table, allocated near seen surfaces.
+"""Voxel hashing: blocks of 8^3 voxels in a hash table, allocated near observed surfaces.
 
 After Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table holds regions
-of 8^3 blocks. A region is a dense table of block indices. Neighboring look-ups along a ray or a row of voxels are in
-the same region. So nearly all look-ups cost one comparison and one load, and a ray skips unmapped space by region.
+of 8^3 blocks. A region is a dense table of block indices. Neighboring look-ups along a ray or a row of voxels are
+usually in the same region. So nearly all look-ups cost one comparison and one load, and a ray skips unmapped space by
+region.
 
-Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory x runs fastest: voxel (x, y, z)
-of a block has the index (z * 8 + y) * 8 + x.
+Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory, x varies fastest: voxel
+(x, y, z) of a block has the index (z * 8 + y) * 8 + x.
 
 A voxel takes 8 bytes (distance 2, weight 2, color 4), and 8.15 bytes including the tables of blocks and regions. Label
 evidence takes additional memory; see evidence_rows.py.
@@ -55,7 +56,7 @@ class Grid(NamedTuple):
     label_row: Int32  # (B,) row of the block in the label evidence, -1 = none
 
 
-OF_BLOCKS = Grid._fields[Grid._fields.index("block_coords") :]  # (B, ...)
+OF_BLOCKS = Grid._fields[Grid._fields.index("block_coords") :]  # fields of shape (B, ...)
 
 
 def _free_blocks(count: int) -> dict[str, Any]:
@@ -130,7 +131,7 @@ class VoxelGrid:
             if self.block_count == self.max_blocks:
                 raise MapFullError(
                     f"the map is full: expected at most {self.max_blocks} blocks of {BLOCK_SIDE}^3 voxels "
-                    f"({self.byte_count / 2**20:.0f} MiB), got a request for up to {len(coords) - done} more; "
+                    f"({self.byte_count / 2**20:.0f} MiB), got up to {self.block_count + len(coords) - done}; "
                     "raise fuser.max_blocks or fuser.voxel_size"
                 )
             self._grow()

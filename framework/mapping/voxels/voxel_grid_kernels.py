@@ -11,18 +11,19 @@ UNSEEN = -32768  # stored distance of an unobserved voxel; avoids loading the we
 NO_KEY = -1
 NO_LOOK_UP = (np.int64(-2), np.int32(-1))  # key and region before the first find_block()
 
-# Decorator for functions in inner loops of kernels. No reference counts (_nrt), because threads would wait on updates.
+# Decorator for functions in inner loops of kernels. Arrays have no reference counts (_nrt), because threads would wait
+# for their updates.
 device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
 
 
 @device
 def one_more(count, condition):
-    """Return count + condition as int32. Numba would add 64-bit integers, of which half as many fit into a vector."""
+    """Return count + condition as int32. Numba would add in 64 bits, and half as many fit into a vector."""
     return np.int32(count + (np.int32(1) if condition else np.int32(0)))
 
 
 _KEY_BITS = 21  # bits of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
-FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # range of a map from the origin along an axis, blocks
+FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # maximum distance of a block from the origin along an axis, in blocks
 _KEY_OFFSET = FARTHEST_BLOCK
 _KEY_MASK = (1 << _KEY_BITS) - 1
 

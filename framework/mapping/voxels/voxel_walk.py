@@ -42,18 +42,19 @@ def seen_point(view, u, v, z):
 
 @device
 def _leave_slab(z, start, d, inverse_d, size, inverse_size):
-    """Return the exit parameter of leave_cell() along one axis."""
+    """Return the parameter at which the ray leaves its cell along one axis; see leave_cell()."""
     cell = np.floor((start + z * d) * inverse_size)
-    if inverse_d > np.float32(0.0):  # not d: a ray along the slab has a huge inverse_d and leaves the slab far ahead
+    # not d: a ray parallel to the slab has a huge inverse_d and leaves the slab far away
+    if inverse_d > np.float32(0.0):
         cell += np.float32(1.0)
     return (cell * size - start) * inverse_d
 
 
 @device
 def leave_cell(z, start, d, inverse_d, size, inverse_size):
-    """Return the parameter at which the ray start + z * d leaves the grid cell, of side `size`, that it is in at z.
+    """Return the parameter at which the ray start + z * d leaves the grid cell that contains its point at z.
 
-    `start`, `d` and `inverse_d` are triples. `inverse_d` is 1 / d, a huge number if d is 0.
+    Cells have the side `size`. `start`, `d` and `inverse_d` are triples. `inverse_d` is 1 / d, a huge number if d is 0.
     """
     exit_x = _leave_slab(z, start[0], d[0], inverse_d[0], size, inverse_size)
     exit_y = _leave_slab(z, start[1], d[1], inverse_d[1], size, inverse_size)
@@ -63,7 +64,7 @@ def leave_cell(z, start, d, inverse_d, size, inverse_size):
 
 @device
 def inverses(d):
-    """Return 1 / d of a triple, with tiny values instead of zeros."""
+    """Return 1 / d for each entry of a triple; entries near 0 are replaced by a tiny value."""
     tiny = np.float32(1e-12)
     x = d[0] if abs(d[0]) > tiny else tiny
     y = d[1] if abs(d[1]) > tiny else tiny
@@ -101,7 +102,7 @@ def corners(grid, values, block, i, j, k, missing):
             values[here, np.uint32(n + 72)],
             values[here, np.uint32(n + 73)],
         )
-    # the carry of each coordinate into the next block is the bit of the coordinate in the neighbor's index
+    # the carry of a coordinate into the next block is the bit of this coordinate in the neighbor's index
     next_x, next_y, next_z = (x + 1) & 7, ((y + 1) & 7) * 8, ((z + 1) & 7) * 64
     over_x, over_y, over_z = (x + 1) >> 3, ((y + 1) >> 3) << 1, ((z + 1) >> 3) << 2
     y *= 8
@@ -120,7 +121,7 @@ def corners(grid, values, block, i, j, k, missing):
 
 @device
 def interpolate(s, fx, fy, fz):
-    """Return (value, d/dx, d/dy, d/dz) between eight corners, x fastest, at fractions (fx, fy, fz) of a voxel."""
+    """Return (value, d/dx, d/dy, d/dz) at fractions (fx, fy, fz) of a voxel between eight corners `s`, x fastest."""
     x00, x10, x01, x11 = np.float32(s[0]), np.float32(s[2]), np.float32(s[4]), np.float32(s[6])
     dx00, dx10 = np.float32(s[1]) - x00, np.float32(s[3]) - x10
     dx01, dx11 = np.float32(s[5]) - x01, np.float32(s[7]) - x11
@@ -213,7 +214,8 @@ def prefetch_row(array, row):
 def directions(view, scale, v):
     """Return the ray of pixel (0, v), voxels per m of depth, and its change per pixel; `scale` is in voxels per m."""
     x, y, z = ray_direction(view, 0, v)
-    change = scale / view.fx  # the rounding of a difference of two rays would accumulate along the row
+    # not the difference of two rays, because its rounding error would accumulate along the row
+    change = scale / view.fx
     return (x * scale, y * scale, z * scale), (view.R[0, 0] * change, view.R[1, 0] * change, view.R[2, 0] * change)
 
 
@@ -234,7 +236,7 @@ def points_of_row(view, scale, v, depth, points):
 def gather_corners(grid, values, depth, points, missing, found):
     """Fill found (8, W) with `values` (B, 512) of the eight voxels around each point (3, W).
 
-    Values are `missing` without a block, or if the pixel has no depth.
+    Values are `missing` where no block is allocated or the pixel has no depth.
     """
     key, region = NO_LOOK_UP
     for n in range(depth.shape[0]):
@@ -261,8 +263,8 @@ def step_to_surface(view, scale, v, found, points, converged, reach, limits, dep
     """Move each depth (W,) m by one Newton step along its ray to the zero of the trilinear field.
 
     `found` (8, W) holds the distances around `points` (3, W). A depth becomes 0 if the field is unknown, if it does not
-    fall along the ray, or if the zero is farther than `reach` voxels. A depth is negated if the step is longer than
-    `converged` voxels. normals (3, W) gets the direction of the gradient.
+    fall along the ray, or if the zero is farther than `reach` voxels or beyond limits (W,) m. A depth is negated if the
+    step is longer than `converged` voxels. normals (3, W) gets the direction of the gradient.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     origin, change = directions(view, scale, v)

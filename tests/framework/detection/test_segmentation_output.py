@@ -148,7 +148,9 @@ def test_detect_layout_given_box_format_is_kept():
 def test_detect_layout_ambiguous_prototype_axes_raise():
     square = {"shape": (16, 16), "maps": np.zeros((1, 4, 4, 4), np.float32)}
     boxes = cells() / 6
-    with pytest.raises(DataError, match=r"ambiguous \(1, M, h, w\) or \(1, h, w, M\)"):
+    with pytest.raises(
+        DataError, match=r"expected prototypes \(1, M, h, w\) or \(1, h, w, M\), got .* ambiguous order of axes"
+    ):
         seen(dense(boxes), **square)
     assert not seen(dense(boxes), **square, metadata=ULTRALYTICS)[0].channels_last
     assert seen(dense(boxes), **square, metadata=ULTRALYTICS, input_channels_last=True)[0].channels_last

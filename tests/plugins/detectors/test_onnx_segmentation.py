@@ -87,7 +87,7 @@ def test_onnx_segmentation_channels_last_export_is_decoded(tmp_path):
 
 
 def test_onnx_segmentation_tflite_file_error_names_converter(tmp_path):
-    with pytest.raises(ConfigError, match=r"detector\.weights: expected an ONNX file; .* tf2onnx .*n\.tflite"):
+    with pytest.raises(ConfigError, match=r"weights: expected an ONNX file \(converted with tf2onnx.*n\.tflite"):
         OnnxSegmentation(weights=tmp_path / "n.tflite", device="cpu")
 
 

@@ -282,7 +282,7 @@ def test_transformers_missing_model_offline_raises_with_advice(monkeypatch, vari
     monkeypatch.setenv(variable, "1")
     with pytest.raises(
         DataError,
-        match=rf"expected a local folder with {variable} set, got someone/missing; unset {variable} or give a folder",
+        match=rf"while {variable} disables downloads, got someone/missing; unset {variable} or set a folder",
     ) as caught:
         built("someone/missing")
     assert one_line(caught)

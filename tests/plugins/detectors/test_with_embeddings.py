@@ -188,7 +188,5 @@ def test_with_embeddings_model_id_offline_raises_one_line_error(
 ) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(
-        DataError, match="expected a local folder with HF_HUB_OFFLINE set, got google/siglip2-base-patch16-224"
-    ):
+    with pytest.raises(DataError, match="while HF_HUB_OFFLINE disables downloads, got google/siglip2-base-patch16-224"):
         registered.built("detector", "with_embeddings")

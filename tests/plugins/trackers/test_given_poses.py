@@ -43,7 +43,7 @@ TRACKERS = pytest.mark.parametrize(
         (true_poses, "frame 0: expected a ground-truth pose at 0.000 s, got none"),
         (
             poses_of_a_file,
-            "frame 0: poses.txt: expected a pose within tracker.max_time_difference of 0.000 s, "
+            "frame 0: poses.txt: expected a pose within 0.02 s (tracker.max_time_difference) of 0.000 s, "
             "got the nearest pose 0.033 s away",
         ),
     ],

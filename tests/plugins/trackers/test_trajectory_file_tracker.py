@@ -40,7 +40,7 @@ def test_trajectory_file_frame_without_pose_raises_with_reason(path: Path) -> No
     with pytest.raises(NoPoseError) as caught:
         tracker.track(CornerRoom()[3], SCENE)
     why = (
-        "frame 3: other_slam.txt: expected a pose within tracker.max_time_difference of 0.100 s, "
+        "frame 3: other_slam.txt: expected a pose within 0.02 s (tracker.max_time_difference) of 0.100 s, "
         "got the nearest pose 0.029 s away"
     )
     assert str(caught.value) == why

@@ -268,7 +268,7 @@ def test_voxel_hashing_icp_depth_out_of_range_is_lost() -> None:
     poses, scene = run(VoxelHashingIcp(finest_scale=1.0), far)
     assert scene.statistics.voxels == 0
     assert all(pose.lost for pose in poses)
-    assert poses[-1].reason == "depth within 0.2 to 4 m in 0.0% of the pixels only"
+    assert poses[-1].reason == "only 0.0% of the pixels have depth from 0.2 to 4 m"
 
 
 def test_voxel_hashing_icp_continues_after_object_is_removed() -> None:
@@ -294,7 +294,7 @@ def test_voxel_hashing_icp_jump_resets_motion_prediction() -> None:
 def test_voxel_hashing_icp_too_small_image_raises() -> None:
     camera = Camera(30, 23, 25.0, 25.0, 14.5, 11.0)
     frame = Frame(0, 0.0, np.zeros((23, 30, 3), np.uint8), np.ones((23, 30), np.float32), camera)
-    with pytest.raises(DataError, match=r"tracker\.finest_scale: expected .*, got 0\.5 for images of 30x23 px"):
+    with pytest.raises(DataError, match=r"finest_scale: expected .*, got 2\.88 px with 0\.5 for images of 30x23 px"):
         VoxelHashingIcp(finest_scale=0.5).track(frame, BayesianTsdf().scene)
 
 

@@ -285,7 +285,7 @@ def test_rerun_window_mode_without_display_raises(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(ConfigError, match=r"viewer\.mode: expected a screen for WINDOW, got none"):
+    with pytest.raises(ConfigError, match=r"viewer\.mode: expected a display for WINDOW, got none"):
         begun(RerunViewer(mode=Mode.WINDOW), tmp_path)
 
 

@@ -152,7 +152,7 @@ def test_hub_model_with_wrong_hash_is_discarded(hub):
 @pytest.mark.parametrize("value", ["1", "true"])
 def test_hub_model_offline_makes_no_requests(hub, monkeypatch, value):
     monkeypatch.setenv("HF_HUB_OFFLINE", value)
-    assert "unset HF_HUB_OFFLINE or give a folder" in fault()
+    assert "unset HF_HUB_OFFLINE or set a folder" in fault()
     assert not hub.sent
     monkeypatch.setenv("HF_HUB_OFFLINE", "0")
     folder = find_model("somebody/something", "main")
