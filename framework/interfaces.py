@@ -156,6 +156,12 @@ class PoseTracker(ABC):
             NoPoseError: The tracker requires the poses of the sequence, but this frame has none. The frame is skipped.
         """
 
+    def renew_colors(self) -> None:  # noqa: B027  # optional
+        """Forget images of earlier frames, because their color was displaced against depth. By default, keep them.
+
+        Called once, when the estimated delay of color is used for the first time.
+        """
+
     def keyframes(self) -> Mapping[str, Array]:
         """Return the arrays of the keyframes, for `load_keyframes`; empty if the tracker has no keyframes."""
         return {}
@@ -203,6 +209,12 @@ class MapFuser(ABC):
 
         Raises:
             MapFullError: The block budget of the map is reached.
+        """
+
+    def renew_colors(self) -> None:  # noqa: B027  # optional
+        """Let later observations replace the colors of the map, which were displaced. By default, average both.
+
+        Called once, when the estimated delay of color is used for the first time.
         """
 
     def resume(self, scene: SceneMap) -> None:

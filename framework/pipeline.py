@@ -247,6 +247,9 @@ class Pipeline:
             if not isinstance(cast(object, pose), Pose):
                 raise DataError(f"frame {frame.index}: expected a Pose from the tracker, got {type(pose).__name__}")
             frame, self.T_world_color, color_pixels = self.color_to_depth.tracked(frame, pose)
+            if self.color_to_depth.displaced_before:
+                self.tracker.renew_colors()
+                self.fuser.renew_colors()
         journal.frame_tracked(frame, pose)
         if pose.lost:
             return pose

@@ -27,6 +27,7 @@ from framework.tracking.pyramid import intrinsics
 MIN_SHIFT = 1.0  # px, minimum image motion between color and depth for a registration
 MAX_CHANGE = 0.5  # px, maximum image motion between the predicted and the tracked pose to keep a registration
 NEAR = 1.0  # m, assumed depth of the points for these image motions
+MIN_DISPLACING_DELAY = 0.003  # s, minimum delay with a visible effect on the colors of earlier frames
 STRIDE = 8  # px, step between the depth readings for their median
 
 log = logging.getLogger(__name__)
@@ -60,6 +61,7 @@ class ColorToDepth:
         self._last: tuple[float, Float64] | None = None  # time, s, and pose of the last frame
         self._step: tuple[float, Float64] | None = None  # duration, s, and motion T_last_next of the last step
         self._latest: _Registration | None = None
+        self.displaced_before = False  # True = the delay is used from the last frame on, and moves its color
 
     @property
     def estimate(self) -> DelayEstimate | None:
@@ -79,6 +81,7 @@ class ColorToDepth:
 
     def tracked(self, frame: Frame, pose: Pose) -> RegisteredFrame:
         """Return the frame with color registered by the motion to its pose, and store the pose for later frames."""
+        self.displaced_before = False
         if pose.lost:
             self._last = self._step = None
             if self._estimator is not None:
@@ -100,6 +103,7 @@ class ColorToDepth:
         if self._usable or not is_usable(estimate):
             return
         self._usable = True
+        self.displaced_before = abs(estimate.seconds) >= MIN_DISPLACING_DELAY
         message = "frame %d: color is %.1f ms after depth with equal timestamps (standard deviation %.1f ms)"
         log.info(message, frame.index, 1e3 * estimate.seconds, 1e3 * estimate.deviation)
 

@@ -40,6 +40,9 @@ class BayesianTsdf(MapFuser):
     def resume(self, scene: SceneMap) -> None:
         self.scene = self.voxels.continued(scene, RULE)
 
+    def renew_colors(self) -> None:
+        self.scene.volume.renew_colors()
+
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
         with timer("association"):

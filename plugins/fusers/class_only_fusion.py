@@ -37,6 +37,9 @@ class ClassOnlyFusion(MapFuser):
         elections = Elections(self.missed, self.min_area, self.smoothness)
         self.scene: SemanticMap = SemanticMap(self.hashing.new_volume(), elections)
 
+    def renew_colors(self) -> None:
+        self.scene.volume.renew_colors()
+
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
         with timer("update"):

@@ -44,6 +44,9 @@ class LabelVote(MapFuser):
     def resume(self, scene: SceneMap) -> None:
         self.scene = self.voxels.continued(scene, RULES[self.vote])
 
+    def renew_colors(self) -> None:
+        self.scene.volume.renew_colors()
+
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
         with timer("association"):

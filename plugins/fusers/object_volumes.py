@@ -55,6 +55,9 @@ class ObjectVolumes(MapFuser):
         confirmation = Confirmation(self.min_observations, min_confidence=0.0, min_area=self.min_area)
         self.scene: ObjectMap = ObjectMap(self.hashing.new_volume(), confirmation)
 
+    def renew_colors(self) -> None:
+        self.scene.background.renew_colors()
+
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters, timer: StageTimer = untimed) -> None:
         self.scene.begin(clusters.classes)
         require_pixels_inside(clusters, frame.depth.shape)

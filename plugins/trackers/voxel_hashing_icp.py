@@ -177,6 +177,9 @@ class VoxelHashingIcp(PoseTracker):
             return alignment
         return alignment._replace(T_world_camera=self._T_world_last)
 
+    def renew_colors(self) -> None:
+        self._raw_keyframe = None
+
     def keyframes(self) -> Mapping[str, Array]:
         return self._keyframes.saved()
 

@@ -11,6 +11,7 @@ from framework.mapping.voxels.voxel_grid_kernels import (
     BLOCK_SIDE,
     BLOCK_VOXELS,
     COLORED,
+    OUTDATED,
     device,
     is_solid,
     one_more,
@@ -118,12 +119,12 @@ def _average_colors(packed, color, pixel, start, rounding, scratch, seen):
     """
     byte, one_byte, two_bytes = np.int32(255), np.int32(8), np.int32(16)
     zero, one, four, brightest = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(4 * 255)
-    no_color = np.uint32(0)
     for n in range(LAYER_VOXELS):
         seen[n] = color[np.uint32(pixel[start + n])]
     for n in range(LAYER_VOXELS):
         old, weight = packed[start + n], scratch[start + n + BLOCK_VOXELS]
-        fresh = (weight > zero) & ((old & COLORED) == no_color)  # free space has weight, but no color
+        current = (old & (COLORED | OUTDATED)) == COLORED
+        fresh = (weight > zero) & (not current)  # free space has weight, but no color
         weight = one if fresh else weight
         new = np.int32(seen[n])
         red, green, blue = unpack_color(old)

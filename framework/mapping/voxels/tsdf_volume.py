@@ -19,7 +19,7 @@ from framework.mapping.voxels.integration_parameters import BOUNDS, Sensor
 from framework.mapping.voxels.meshing import SurfaceNets, UnlabeledMesh
 from framework.mapping.voxels.raycasting import render_surface
 from framework.mapping.voxels.voxel_grid import MAX_BLOCKS, VoxelGrid
-from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, find_solid_blocks
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, find_solid_blocks, mark_outdated
 from framework.sensors.noise_models import SensorKind
 
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # saved arrays of the grid
@@ -60,6 +60,10 @@ class TsdfVolume:
         self.gravity_estimator.add_frame(T_world_camera, frame.up)
         self.changed(seen.blocks)
         return seen
+
+    def renew_colors(self) -> None:
+        """Let the next observation of each voxel replace its color."""
+        mark_outdated(self.voxels.grid.color, self.voxels.block_count)
 
     def changed(self, blocks: Int32 | None = None) -> None:
         """Invalidate derived data after a change of the voxels of `blocks` (A,); None = of any blocks."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 BLOCK_SIDE = 8  # voxels
 BLOCK_VOXELS = BLOCK_SIDE**3
@@ -155,12 +155,22 @@ _CHANNEL = np.int32(1023)
 _GREEN = np.int32(10)
 _BLUE = np.int32(20)
 COLORED = np.uint32(1 << 30)  # marker bit of a color
+OUTDATED = np.uint32(1 << 31)  # marker bit of a color that the next observation replaces
 
 
 @device
 def pack_color(red, green, blue):
     """Return a packed color from channels in quarters of a level, 0 to 1020. Ten bits let averages converge."""
     return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def mark_outdated(color, blocks):
+    """Mark the packed colors (B, 512) of the first `blocks` blocks as outdated."""
+    for block in prange(blocks):
+        for n in range(BLOCK_VOXELS):
+            packed = color[block, n]
+            color[block, n] = packed | OUTDATED if packed & COLORED else packed
 
 
 @device

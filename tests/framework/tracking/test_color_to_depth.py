@@ -116,12 +116,24 @@ def test_color_to_depth_slow_camera_keeps_frame() -> None:
 def test_color_to_depth_estimated_delay_is_used_and_logged(caplog: pytest.LogCaptureFixture) -> None:
     registration = ColorToDepth(None)
     with caplog.at_level(logging.INFO):
+        displaced = []
         for frame, pose in delayed_frames(0.03):
             found = registration.tracked(frame, Pose(pose))
+            displaced.append(registration.displaced_before)
     assert registration.delay == pytest.approx(0.03, abs=0.002)
     assert found.color_pixels is not None
+    assert sum(displaced) == 1  # at the first use of the estimate
     assert len(caplog.messages) == 1
     assert "ms after depth with equal timestamps" in caplog.messages[0]
+
+
+def test_color_to_depth_short_delay_does_not_displace_colors() -> None:
+    registration = ColorToDepth(None)
+    for frame, pose in delayed_frames(0.0):
+        registration.tracked(frame, Pose(pose))
+        assert not registration.displaced_before
+    assert registration.estimate is not None
+    assert registration.estimate.known
 
 
 def test_register_identity_returns_same_image() -> None:

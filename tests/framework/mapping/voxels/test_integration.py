@@ -15,7 +15,7 @@ from framework.mapping.voxels.integration_kernels import MIN_WEIGHT_BEHIND
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import VoxelHashing
 from framework.mapping.voxels.voxel_grid import TSDF_MAX, WEIGHT_ONE, VoxelGrid
-from framework.mapping.voxels.voxel_grid_kernels import UNSEEN
+from framework.mapping.voxels.voxel_grid_kernels import OUTDATED, UNSEEN, mark_outdated
 from framework.registry import assemble
 from framework.sensors.noise_models import SensorKind
 from tests.support.scenes.analytic_scene import CAMERA, pose, room, walk
@@ -213,6 +213,31 @@ def test_integration_does_not_average_color_of_free_space() -> None:
     packed = grid.color[: integrator.voxels.block_count]
     assert (packed == 0).any()
     assert np.abs(channels(packed[packed > 0]) - 200).max() <= 0.25
+
+
+def test_integration_replaces_outdated_colors_at_next_observation() -> None:
+    """The first colors are replaced at the first later observation, which is averaged with those after it."""
+    integrator = new_integrator()
+    wall = np.full(CAMERA.shape, 1.5, np.float32)
+    wall[:, CAMERA.width // 2 :] = 0  # seen by the first frames only
+    whole = np.full(CAMERA.shape, 1.5, np.float32)
+
+    def integrate(depth: np.ndarray, level: int) -> None:
+        color = np.full((*CAMERA.shape, 3), level, np.uint8)
+        integrator.integrate(Frame(0, 0.0, color, depth, CAMERA), np.eye(4), VOXEL)
+
+    for _ in range(20):
+        integrate(whole, 200)
+    grid, blocks = integrator.voxels.grid, integrator.voxels.block_count
+    mark_outdated(grid.color, blocks)
+    assert np.abs(channels(grid.color[:blocks][grid.color[:blocks] > 0]) - 200).max() <= 0.25
+    integrate(wall, 40)
+    levels = channels(grid.color[:blocks][grid.color[:blocks] > 0])[:, 0]
+    assert set(np.round(levels)) == {40, 200}
+    integrate(wall, 80)
+    averaged = channels(grid.color[:blocks][(grid.color[:blocks] > 0) & (grid.color[:blocks] < OUTDATED)])[:, 0]
+    assert (averaged > 40).all()
+    assert (averaged < 60).all()  # the weight of depth is not reset
 
 
 def test_integration_limits_weight_to_maximum() -> None:
