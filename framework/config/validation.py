@@ -81,7 +81,7 @@ def checked_rows(node: Any) -> dict[str, list[str]]:
         listed = isinstance(overrides, Sequence) and not isinstance(overrides, str)
         if not listed or not all(isinstance(one, str) for one in overrides):
             raise ConfigError(
-                f"rows.{name}: expected a list of overrides, got {overrides!r}; write for example [refiner=identity]"
+                f"rows.{name}: expected a list of overrides, got {overrides!r}; write, for example, [refiner=identity]"
             )
     return {name: list(overrides) for name, overrides in rows.items()}
 

@@ -20,7 +20,7 @@ SOURCE_TIMEOUT_S = 30.0
 
 
 class SealedPage:
-    """Server of the page on `port` of 127.0.0.1, until `close`. The page may connect only to `data_port`.
+    """HTTP server of the page at 127.0.0.1:`port`. `close` stops it. The page may connect only to `data_port`.
 
     Raises OSError if the port is in use or the page is not available.
     """

@@ -44,7 +44,7 @@ def spread_out(count: int, most: int = LOOKS) -> list[int]:
 def sightings(
     mesh: InstanceMesh, labels: Int32, poses: Float64, camera: Camera, clarity: Mapping[int, float]
 ) -> Sightings:
-    """Return the views of a mesh from the poses (P, 4, 4), rendered at evenly spaced poses.
+    """Return the views of a mesh, rendered at an evenly spaced subset of the poses (P, 4, 4).
 
     Args:
         mesh: Mesh of the map.

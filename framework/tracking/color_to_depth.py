@@ -25,7 +25,7 @@ from framework.tracking.color_delay_kernels import locate_colors
 from framework.tracking.pyramid import intrinsics
 
 MIN_SHIFT = 1.0  # px, minimum image motion between color and depth for a registration
-MAX_CHANGE = 0.5  # px, maximum image motion between the predicted and the tracked pose to keep a registration
+MAX_CHANGE = 1.0  # px, maximum image motion between the predicted and the tracked pose to keep a registration
 NEAR = 1.0  # m, assumed depth of the points for these image motions
 MIN_DISPLACING_DELAY = 0.003  # s, minimum delay with a visible effect on the colors of earlier frames
 STRIDE = 8  # px, step between the depth readings for their median

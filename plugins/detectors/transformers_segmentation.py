@@ -70,7 +70,7 @@ class TransformersSegmentation(Detector):
     """
 
     model: str = "facebook/mask2former-swin-tiny-coco-instance"  # model: id on huggingface.co or folder
-    revision: str = "main"  # branch, tag or commit of the model id
+    revision: str = "main"  # branch, tag or commit of the model repository
     score_threshold: float = 0.1  # minimum score, in [0, 1); low, because weak detections can update instances
     agnostic_nms_iou: float = 0.6  # mask IoU threshold of non-maximum suppression across classes, in (0, 1]; 1 = off
     max_detections: int = 100  # maximum number of detections per image, >= 1

@@ -20,7 +20,7 @@ class WithEmbeddings(Detector):
 
     detector: Detector  # wrapped detector; replace it with detector@detector.detector=NAME
     model: str = "google/siglip2-base-patch16-224"  # CLIP or SigLIP model: id on huggingface.co or folder
-    revision: str = "main"  # branch, tag or commit of the model id
+    revision: str = "main"  # branch, tag or commit of the model repository
     frame_interval: int = 1  # interval between embedded frames, in frames, >= 1; 1 = every frame
     min_score: float = 0.3  # minimum score of an embedded detection, in [0, 1]; weaker detections are wrong too often
     min_pixels: int = 200  # minimum mask size of an embedded detection, px, >= 1

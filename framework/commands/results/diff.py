@@ -25,11 +25,11 @@ def main() -> None:
     """Run the command `instancemap diff`."""
     parser = argparse.ArgumentParser(
         description="List the objects that appeared, vanished or moved between two runs, with probabilities. Both runs "
-        "need the same world frame: run the second with localize_in=FIRST, or both with given poses."
+        "need the same world frame: run the second with localize_in=FIRST, or both with tracker=ground_truth."
     )
     parser.add_argument("before", metavar="FIRST", type=Path, help="run directory of the first visit")
     parser.add_argument("after", metavar="SECOND", type=Path, help="run directory of the second visit")
-    unchanged = "also list objects that stayed and objects that the other run did not see"
+    unchanged = "also list unchanged objects and objects not observed in the other run"
     parser.add_argument("--all", action="store_true", help=unchanged)
     parser.add_argument("--out", metavar="FILE", type=Path, help="JSON file for all changes; default: none")
     parsed = arguments(parser)
@@ -38,7 +38,7 @@ def main() -> None:
         if not in_world(parsed.after, parsed.before):
             message = (
                 "%s: expected the world frame of %s, got another or an unknown frame; map it again with "
-                "localize_in=%s, or map both with given poses"
+                "localize_in=%s, or map both with tracker=ground_truth"
             )
             log.warning(message, parsed.after, parsed.before, parsed.before)
         found = changes(visit_of(parsed.before), visit_of(parsed.after))

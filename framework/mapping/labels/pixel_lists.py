@@ -31,7 +31,7 @@ from framework.mapping.labels.pixel_lists_kernels import (
 
 
 class PixelLists(NamedTuple):
-    """L lists of N clusters; the clusters of list i are clusters[offsets[i] : offsets[i + 1]]."""
+    """L lists with N clusters in total; the clusters of list i are clusters[offsets[i] : offsets[i + 1]]."""
 
     list_ids: Int32  # (H, W) list of each pixel; list 0 is empty
     pixel_counts: Int32  # (L,) number of pixels of each list

@@ -254,7 +254,7 @@ def board_group(rng: Rng) -> Group:
 
 
 def laden(name: str, support: Furniture, rng: Rng) -> Group:
-    """Return a group of `support`, a cupboard or another tall object, with objects on top."""
+    """Return a group of objects on top of `support` (a cupboard or another tall object)."""
     group = single(name, support)
     strew_on(group, group.pieces[0], rng, small_things.some(rng, small_things.ON_TOPS, 2))
     return group

@@ -42,7 +42,7 @@ def refrigerator(rng: Rng) -> Furniture:
 
 
 def tv(rng: Rng) -> Furniture:
-    """Return a flat-screen television on a foot."""
+    """Return a flat-screen television on a stand."""
     piece = Furniture("tv", "tv")
     width = rng.uniform(0.90, 1.20)
     height = width * 9 / 16

@@ -99,7 +99,7 @@ def test_run_source_changed_truth_is_rejected_with_reason(directory: Path) -> No
     assert "the ground-truth instances differ from those used in the run" in why
 
 
-def test_footage_has_images_true_positions_and_clarity(mapped: Path) -> None:
+def test_footage_has_images_true_poses_and_sharpness(mapped: Path) -> None:
     recording = RunSource.of(RunContents.read(mapped))
     assert recording.camera is not None
     footage = Footage.of(recording, [0, 3], recording.camera)

@@ -207,7 +207,7 @@ def test_gmm_frame_fit_on_subset_assigns_all_points() -> None:
     assert abs(np.bincount(refined.cluster) - np.bincount(truth)).max() < 40
 
 
-def test_gmm_frame_empty_mask_and_empty_frame_are_kept() -> None:
+def test_gmm_frame_empty_mask_or_frame_gives_no_points() -> None:
     points, masks, _ = three_objects(8)
     refined = GmmFrame().refine(clusters_of(points, masks * 2, (0.9, 0.8, 0.7, 0.6, 0.5)), FRAME)
     assert set(np.unique(refined.cluster)) == {0, 2, 4}

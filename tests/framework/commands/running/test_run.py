@@ -122,7 +122,7 @@ def test_run_error_before_first_frame_leaves_no_record(tmp_path: Path) -> None:
     assert {path.name for path in place.iterdir()}.isdisjoint({*MAPPED, "metrics.partial.json", "metrics.json"})
 
 
-def test_run_stage_system_exit_leaves_partial_record(tmp_path: Path) -> None:
+def test_run_stage_system_exit_writes_partial_outputs(tmp_path: Path) -> None:
     """A preempted submitit job raises SystemExit."""
     place = tmp_path / "run"
     status, _ = end(begin(tmp_path, "detector=faulty", "detector.kind=SystemExit", f"hydra.run.dir={place}"))
