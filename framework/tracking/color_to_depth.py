@@ -61,7 +61,7 @@ class ColorToDepth:
         self._last: tuple[float, Float64] | None = None  # time, s, and pose of the last frame
         self._step: tuple[float, Float64] | None = None  # duration, s, and motion T_last_next of the last step
         self._latest: _Registration | None = None
-        self.displaced_before = False  # True = the delay is used from the last frame on, and moves its color
+        self.displaced_before = False  # True = estimate first used in the last frame; earlier colors are displaced
 
     @property
     def estimate(self) -> DelayEstimate | None:

@@ -74,7 +74,10 @@ class KeyframeTerm(NamedTuple):
         self, levels: Sequence[PyramidLevel], level: int, T_view_camera: Float64, weights: Weights, brightness: float,
         linear: LinearWeights | None,
     ) -> NormalEquations:  # fmt: skip
-        """Return the weighted equations of the keyframe for an alignment at `level`, for twists of the view's frame."""
+        """Return the weighted equations of the keyframe for twists of the view's frame.
+
+        `level` is the level of the alignment, at most COMPARED.
+        """
         own = linearize(
             levels[COMPARED], self.keyframe.model, self.keyframe.intensity, self.T_key_view @ T_view_camera, weights,
             brightness, linear,
