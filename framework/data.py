@@ -18,6 +18,7 @@ Later stages do not check them again.
 
 from __future__ import annotations
 
+import copy
 import math
 import threading
 from collections.abc import Callable, Mapping
@@ -208,6 +209,16 @@ class Frame:
             raise DataError(f"{where}truth: expected a FrameTruth, got {type(self.truth).__name__}")
         if self.truth is not None and self.truth.shape != self.camera.shape:
             raise DataError(f"{where}truth.instance_ids: expected shape {self.camera.shape}, got {self.truth.shape}")
+
+    def with_color(self, color: UInt8) -> Frame:
+        """Return the frame with another color image (H, W, 3) of the same size. Depth is shared.
+
+        Raises DataError for another shape or dtype.
+        """
+        check_array(f"frame {self.index}: color", color, (*self.camera.shape, 3), np.uint8)
+        frame = copy.copy(self)
+        object.__setattr__(frame, "color", np.require(color, requirements=("C", "W")))
+        return frame
 
     @property
     def color_time(self) -> float:

@@ -7,7 +7,6 @@ import math
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from framework.data import Camera, Float32, Float64, Int32, PointClusters
 from framework.errors import DataError

@@ -6,27 +6,30 @@ constant delay. With the last two poses, at the times t_last and t_depth, and co
     T_world_color = interpolate(T_world_last, T_world_camera, 1 + dt / (t_depth - t_last))
 
 Each depth reading is projected into the color image at this pose. Depth is not resampled.
+
+The tracker gets color registered at the mean velocity of the last PREDICTING_STEPS steps. With the velocity of a single
+step, poses that depend on color oscillate: errors e_1 and e_2 of successive poses displace the next color image by
+(e_2 - e_1) dt / (t_2 - t_1), and thus the next pose in the opposite direction.
 """
 
 from __future__ import annotations
 
 import logging
 import math
-from dataclasses import replace
+from collections import deque
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from framework.data import DelayEstimate, Float64, Frame, Int32, Pose, UInt8
 from framework.geometry import interpolate, inverse, rotation_angle
 from framework.tracking.color_delay import MAX_STEP, DelayEstimator, is_usable
-from framework.tracking.color_delay_kernels import locate_colors
+from framework.tracking.color_to_depth_kernels import register_colors
 from framework.tracking.pyramid import intrinsics
 
 MIN_SHIFT = 1.0  # px, minimum image motion between color and depth for a registration
-MAX_CHANGE = 1.0  # px, maximum image motion between the predicted and the tracked pose to keep a registration
-NEAR = 1.0  # m, assumed depth of the points for these image motions
+PREDICTING_STEPS = 2  # number of steps in the velocity of a prediction; a single step amplifies errors of poses
+NEAR = 1.0  # m, assumed depth of the points for this image motion
 MIN_DISPLACING_DELAY = 0.003  # s, minimum delay with a visible effect on the colors of earlier frames
 STRIDE = 8  # px, step between the depth readings for their median
 
@@ -41,12 +44,6 @@ class RegisteredFrame(NamedTuple):
     color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = same pixel
 
 
-class _Registration(NamedTuple):
-    source: Frame  # the frame before registration
-    T_depth_color: Float64  # (4, 4)
-    result: RegisteredFrame
-
-
 class ColorToDepth:
     """Registration of color to depth, with a given or an estimated delay.
 
@@ -58,9 +55,7 @@ class ColorToDepth:
         self._estimator = DelayEstimator() if delay is None else None
         self._usable = False  # True once the estimate was accurate enough
         self._given = 0.0 if delay is None else delay
-        self._last: tuple[float, Float64] | None = None  # time, s, and pose of the last frame
-        self._step: tuple[float, Float64] | None = None  # duration, s, and motion T_last_next of the last step
-        self._latest: _Registration | None = None
+        self._poses: deque[tuple[float, Float64]] = deque(maxlen=PREDICTING_STEPS + 1)  # time, s, and T_world_camera
         self.displaced_before = False  # True = estimate first used in the last frame; earlier colors are displaced
 
     @property
@@ -74,29 +69,35 @@ class ColorToDepth:
         return self._given if self._estimator is None or not self._usable else self._estimator.estimate.seconds
 
     def predicted(self, frame: Frame) -> Frame:
-        """Return the frame with color registered by the last velocity, for tracking."""
-        if self._last is None or self._step is None or not 0 < frame.depth_time - self._last[0] <= MAX_STEP:
+        """Return the frame with color registered by the mean velocity of the last steps, for tracking."""
+        if not self._is_next(frame):
             return frame
-        return self._registered(frame, np.eye(4), *self._step).frame
+        T_depth_color = self._motion_to_color(frame, PREDICTING_STEPS)
+        if T_depth_color is None or _shift(frame, T_depth_color) < MIN_SHIFT:
+            return frame
+        return frame.with_color(register(frame, inverse(T_depth_color))[0])
 
     def tracked(self, frame: Frame, pose: Pose) -> RegisteredFrame:
         """Return the frame with color registered by the motion to its pose, and store the pose for later frames."""
         self.displaced_before = False
+        if pose.lost or not self._is_next(frame):
+            self._poses.clear()
         if pose.lost:
-            self._last = self._step = None
             if self._estimator is not None:
                 self._estimator.interrupt()
             return RegisteredFrame(frame, pose.T_world_camera)
-        last, self._last = self._last, (frame.depth_time, pose.T_world_camera)
-        self._step = None
-        if last is not None and 0 < frame.depth_time - last[0] <= MAX_STEP:
-            self._step = frame.depth_time - last[0], inverse(last[1]) @ pose.T_world_camera
+        self._poses.append((frame.depth_time, pose.T_world_camera))
         if self._estimator is not None:
             self._estimator.add(frame, pose.T_world_camera)
             self._use(frame, self._estimator.estimate)
-        if self._step is None:
+        T_depth_color = self._motion_to_color(frame, 1)
+        if T_depth_color is None:
             return RegisteredFrame(frame, pose.T_world_camera)
-        return self._registered(frame, pose.T_world_camera, *self._step)
+        T_world_color = pose.T_world_camera @ T_depth_color
+        if _shift(frame, T_depth_color) < MIN_SHIFT:
+            return RegisteredFrame(frame, T_world_color)
+        color, pixels = register(frame, inverse(T_depth_color))
+        return RegisteredFrame(frame.with_color(color), T_world_color, pixels)
 
     def _use(self, frame: Frame, estimate: DelayEstimate) -> None:
         """Use the estimate from its first accurate value on, and log this value."""
@@ -107,29 +108,20 @@ class ColorToDepth:
         message = "frame %d: color is %.1f ms after depth with equal timestamps (standard deviation %.1f ms)"
         log.info(message, frame.index, 1e3 * estimate.seconds, 1e3 * estimate.deviation)
 
-    def _registered(
-        self, frame: Frame, T_world_camera: Float64, seconds: float, T_last_next: Float64
-    ) -> RegisteredFrame:
-        """Return the registered frame for the motion of a step of this duration."""
+    def _is_next(self, frame: Frame) -> bool:
+        """Return True if the frame follows the last one at most MAX_STEP later."""
+        return bool(self._poses) and 0 < frame.depth_time - self._poses[-1][0] <= MAX_STEP
+
+    def _motion_to_color(self, frame: Frame, steps: int) -> Float64 | None:
+        """Return the motion T_depth_color (4, 4) at the mean velocity of the last `steps` steps; None = unknown."""
+        if len(self._poses) < 2:
+            return None
+        (start, T_world_start), (end, T_world_end) = self._poses[-min(steps + 1, len(self._poses))], self._poses[-1]
         dt = frame.color_time + self.delay - frame.depth_time
         if dt == 0.0:
-            return RegisteredFrame(frame, T_world_camera)
-        T_depth_color = inverse(T_last_next) @ interpolate(np.eye(4), T_last_next, 1 + dt / seconds)
-        T_world_color = T_world_camera @ T_depth_color
-        if _shift(frame, T_depth_color) < MIN_SHIFT:
-            return RegisteredFrame(frame, T_world_color)
-        if self._latest is not None and self._latest.source is frame:
-            change = inverse(self._latest.T_depth_color) @ T_depth_color
-            if _shift(frame, change) < MAX_CHANGE:
-                return self._latest.result._replace(T_world_color=T_world_color)
-        readings = frame.depth[::STRIDE, ::STRIDE]
-        readings = readings[readings > 0]
-        if not len(readings):
-            return RegisteredFrame(frame, T_world_color)
-        color, pixels = register(frame, np.median(readings), inverse(T_depth_color))
-        registered = RegisteredFrame(replace(frame, color=color), T_world_color, pixels)
-        self._latest = _Registration(frame, T_depth_color, registered)
-        return registered
+            return np.eye(4)
+        T_start_end = inverse(T_world_start) @ T_world_end
+        return inverse(T_start_end) @ interpolate(np.eye(4), T_start_end, 1 + dt / (end - start))
 
 
 def _shift(frame: Frame, T_a_b: Float64) -> float:
@@ -137,15 +129,16 @@ def _shift(frame: Frame, T_a_b: Float64) -> float:
     return frame.camera.fx * (rotation_angle(T_a_b[:3, :3]) + math.hypot(*T_a_b[:3, 3]) / NEAR)
 
 
-def register(frame: Frame, otherwise: np.float32, T_color_depth: Float64) -> tuple[UInt8, Int32]:
-    """Return the color (H, W, 3) at each depth pixel, interpolated bilinearly, and its flat index (H, W).
+def register(frame: Frame, T_color_depth: Float64) -> tuple[UInt8, Int32]:
+    """Return the nearest color (H, W, 3) of each depth pixel, and its flat index (H, W) in the color image.
 
     The index is -1 outside of the color image and without a reading. A pixel outside of the color image gets the color
-    of the nearest pixel. A pixel without a reading gets the color at a depth of `otherwise` m.
+    of the nearest pixel. A pixel without a reading gets the color at the median depth.
     """
-    shape = frame.camera.shape
-    columns, rows, pixels = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.int32)
+    color, pixels = np.empty_like(frame.color), np.empty(frame.camera.shape, np.int32)
+    readings = frame.depth[::STRIDE, ::STRIDE]
+    readings = readings[readings > 0]
+    median = np.float32(np.median(readings) if len(readings) else NEAR)
     T = np.ascontiguousarray(T_color_depth[:3], np.float32)
-    locate_colors(frame.depth, otherwise, intrinsics(frame.camera), T, columns, rows, pixels)
-    color = cv2.remap(frame.color, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(color, np.uint8), pixels
+    register_colors(frame.depth, median, intrinsics(frame.camera), T, frame.color, color, pixels)
+    return color, pixels

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -136,38 +137,63 @@ def test_color_to_depth_short_delay_does_not_displace_colors() -> None:
     assert registration.estimate.known
 
 
-def test_register_identity_returns_same_image() -> None:
-    rng = np.random.default_rng(0)
-    camera = Camera(40, 30, 35.0, 35.0, 19.5, 14.5)
+def random_frame(seed: int) -> Frame:
+    """Return a frame with random colors and depths."""
+    rng = np.random.default_rng(seed)
     color = rng.integers(0, 256, (30, 40, 3), np.uint8)
-    depth = rng.uniform(1, 2, (30, 40)).astype(np.float32)
-    depth[3, 4] = 0
-    registered, pixels = register(Frame(0, 0.0, color, depth, camera), np.float32(1.5), np.eye(4))
-    np.testing.assert_array_equal(registered, color)
+    return Frame(0, 0.0, color, rng.uniform(1, 2, (30, 40)).astype(np.float32), Camera(40, 30, 35.0, 36.0, 19.5, 14.0))
+
+
+def test_registration_identity_returns_same_image() -> None:
+    frame = random_frame(0)
+    frame.depth[3, 4] = 0
+    color, pixels = register(frame, np.eye(4))
+    np.testing.assert_array_equal(color, frame.color)
     expected = np.arange(1200, dtype=np.int32).reshape(30, 40)
     expected[3, 4] = -1
     np.testing.assert_array_equal(pixels, expected)
 
 
-def test_register_equals_bilinear_reference() -> None:
-    rng = np.random.default_rng(1)
-    camera = Camera(40, 30, 35.0, 36.0, 19.5, 14.0)
-    color = rng.integers(0, 256, (30, 40, 3), np.uint8)
-    depth = rng.uniform(1, 2, (30, 40)).astype(np.float32)
+def test_registration_without_depth_returns_image() -> None:
+    frame = random_frame(0)
+    frame.depth[:] = 0
+    color, pixels = register(frame, np.eye(4))
+    np.testing.assert_array_equal(color, frame.color)
+    assert (pixels == -1).all()
+
+
+def test_registration_equals_reference() -> None:
+    frame = random_frame(1)
+    camera, color = frame.camera, frame.color
     T_color_depth = exp_se3(np.array([0.02, -0.01, 0.03, 0.03, -0.05, 0.02]))
-    registered, pixels = register(Frame(0, 0.0, color, depth, camera), np.float32(1.5), T_color_depth)
+    registered, pixels = register(frame, T_color_depth)
     inside = 0
     for v in range(30):
         for u in range(40):
-            x = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]) * depth[v, u]
+            x = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0]) * frame.depth[v, u]
             column, row = project(camera, (T_color_depth[:3, :3] @ x + T_color_depth[:3, 3])[None])[0]
             if not (0 <= column < 39 and 0 <= row < 29):
                 continue
             inside += 1
             assert pixels[v, u] == round(row) * 40 + round(column)
-            a, b, i, j = column % 1, row % 1, int(column), int(row)
-            corners = color[j : j + 2, i : i + 2].astype(float)
-            expected = (1 - b) * ((1 - a) * corners[0, 0] + a * corners[0, 1])
-            expected += b * ((1 - a) * corners[1, 0] + a * corners[1, 1])
-            np.testing.assert_allclose(registered[v, u], expected, atol=255 / 32 + 0.5)  # positions in 1/32 px
+            np.testing.assert_array_equal(registered[v, u], color[round(row), round(column)])
     assert inside > 900
+
+
+def test_predicted_color_damps_pose_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pose error displaces the next color image, and thus the next pose. The errors must not grow."""
+    registration = ColorToDepth(0.04)
+    errors = [0.0, 0.002]  # m, along x of the camera
+    for k in range(30):
+        frame = frame_at(k / 30, 0.04, k)
+        if k == len(errors):
+            with monkeypatch.context() as patch:
+                spy = Mock(wraps=register)
+                patch.setattr("framework.tracking.color_to_depth.register", spy)
+                registration.predicted(frame)
+            T_depth_color = inverse(moving(k / 30)) @ moving(k / 30 + 0.04)
+            errors.append(float(T_depth_color[0, 3] - inverse(spy.call_args.args[1])[0, 3]))
+        T_world_camera = moving(k / 30)
+        T_world_camera[:3, 3] += T_world_camera[:3, 0] * errors[k]
+        registration.tracked(frame, Pose(T_world_camera))
+    assert max(map(abs, errors[-5:])) < 1e-3
