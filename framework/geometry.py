@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from framework.data import Camera, Float32, Float64, Int32, PointClusters
 from framework.errors import DataError
 
-RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| due to rounding; published poses have six digits, lost poses R = 0
+RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| of a rounded pose; files have 6 digits or more, lost poses R = 0
 EXACT_WITHIN = 1e-12  # maximum entry of |R R^T - I| of a float64 rotation, which is not changed
 
 
@@ -45,7 +45,7 @@ def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray
 
 
 def skew(v: Float64) -> Float64:
-    """Return the skew-symmetric matrix S (3, 3) of v, with S @ w = v x w."""
+    """Return the skew-symmetric matrix S (3, 3) of a vector v (3,), with S @ w = v x w."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -103,7 +103,7 @@ def nearest_rotation(R: Float64) -> Float64:
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """Return a pose (4, 4) without the rounding errors of its rotation. Raises DataError if it is not rigid."""
+    """Return a pose (4, 4) with its rotation corrected for rounding errors. Raises DataError if it is not rigid."""
     if not np.isfinite(matrix).all():
         raise DataError("pose: expected finite values, got NaN or infinity")
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
@@ -120,7 +120,10 @@ def nearest_rigid(matrix: Float64) -> Float64:
 
 
 def interpolate(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
-    """Return the pose (4, 4) at a fraction in [0, 1] between a and b: linear translation, slerp of rotation."""
+    """Return the pose (4, 4) at a fraction of the motion from a (0) to b (1); other fractions extrapolate.
+
+    Translations are interpolated linearly, and rotations by slerp.
+    """
     R_a, R_b = T_world_a[:3, :3], T_world_b[:3, :3]
     T = np.eye(4)
     T[:3, :3] = R_a @ Rotation.from_rotvec(fraction * Rotation.from_matrix(R_a.T @ R_b).as_rotvec()).as_matrix()

@@ -13,7 +13,7 @@ SEARCHED_ROWS = 120  # number of searched rows of an image
 
 @njit(cache=True, nogil=True)
 def find_edges(depth, edges):
-    """Write (u, v, z) of the pixels on the nearer side of depth steps to edges (N, 3). Return their number, <= N."""
+    """Write (u, v, z), px and m, of pixels on the nearer side of depth steps to edges (N, 3). Return their number."""
     height, width = depth.shape
     count = 0
     for v in range(REACH, height - REACH, max(height // SEARCHED_ROWS, 1)):
@@ -74,7 +74,7 @@ def locate_colors(depth, otherwise, intrinsics, T_color_depth, columns, rows, pi
     """Set columns and rows (H, W), px, to the position in the color image of each pixel of `depth`.
 
     `pixels` (H, W) is set to the flat index of the nearest color pixel, -1 outside of the color image and without a
-    reading. Positions outside are moved to the border. Without a reading, the depth is `otherwise` m.
+    reading. Positions outside are moved to the border. Pixels without a reading have an assumed depth `otherwise`, m.
     """
     fx, fy, cx, cy = intrinsics
     R, t = T_color_depth[:, :3], T_color_depth[:, 3]

@@ -1,4 +1,4 @@
-"""Registration of color images to depth images of other times, by the motion of the camera.
+"""Registration of color images to depth images taken at other times, from the camera's motion.
 
 Color is taken dt = t_color + delay - t_depth after depth, with the timestamps t_color and t_depth of the images and a
 constant delay. With the last two poses, at the times t_last and t_depth, and constant velocity:
@@ -28,7 +28,7 @@ MIN_SHIFT = 1.0  # px, minimum image motion between color and depth for a regist
 MAX_CHANGE = 1.0  # px, maximum image motion between the predicted and the tracked pose to keep a registration
 NEAR = 1.0  # m, assumed depth of the points for these image motions
 MIN_DISPLACING_DELAY = 0.003  # s, minimum delay with a visible effect on the colors of earlier frames
-STRIDE = 8  # px, step between the depth readings for their median
+STRIDE = 8  # px, step between the depth readings used for their median
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 class RegisteredFrame(NamedTuple):
     """A frame with color registered to depth."""
 
-    frame: Frame  # with the color at each depth pixel
+    frame: Frame  # with the color of each depth pixel
     T_world_color: Float64  # (4, 4) pose of the color camera
     color_pixels: Int32 | None = None  # (H, W) flat index of each reading's color pixel, -1 = none; None = same pixel
 
@@ -110,7 +110,7 @@ class ColorToDepth:
     def _registered(
         self, frame: Frame, T_world_camera: Float64, seconds: float, T_last_next: Float64
     ) -> RegisteredFrame:
-        """Return the registered frame for the motion of a step of this duration."""
+        """Return the frame registered by the motion T_last_next of a step with a duration of `seconds`."""
         dt = frame.color_time + self.delay - frame.depth_time
         if dt == 0.0:
             return RegisteredFrame(frame, T_world_camera)
@@ -133,7 +133,7 @@ class ColorToDepth:
 
 
 def _shift(frame: Frame, T_a_b: Float64) -> float:
-    """Return the image motion, px, of points at NEAR for a small motion of the camera."""
+    """Return the image motion, px, of points at the depth NEAR for a small motion of the camera."""
     return frame.camera.fx * (rotation_angle(T_a_b[:3, :3]) + math.hypot(*T_a_b[:3, 3]) / NEAR)
 
 
