@@ -126,8 +126,8 @@ def detect_layout(
     """Return the layout of a network from its outputs for a black image. Raises DataError if no layout matches.
 
     `shape`: (height, width) px of the input. The shapes of the outputs determine everything except the kind of boxes.
-    The rows determine the kind of boxes: the cells cover the image, so most centers are larger than the sizes of their
-    boxes, and few rows could be corners.
+    The values of the boxes determine their kind. Cells cover the image, so most centers are larger than the sizes of
+    their boxes, and few of these boxes could be corners.
     """
     table, prototypes = _table_and_prototypes(outputs)
     channels_last = _is_channels_last(prototypes, shape, input_channels_last, metadata)
@@ -170,11 +170,11 @@ def _is_channels_last(
     if first and last and metadata.author.startswith("Ultralytics"):
         return input_channels_last  # Ultralytics exports transpose both input and output, or neither
     if first == last:
-        expected = f"expected prototypes with the aspect ratio of the input {height}x{width}"
+        expected = f"expected prototypes with the aspect ratio of the input, height:width = {height}:{width}"
         found = "with another aspect ratio"
         if first:
             expected = "expected prototypes (1, M, h, w) or (1, h, w, M)"
-            found = "with an ambiguous order of axes; export for another size"
+            found = "with an ambiguous order of axes; export for another input size"
         raise DataError(f"detector.weights: {expected}, got {prototypes.shape} {found}")
     return bool(last)
 
@@ -198,7 +198,7 @@ def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness:
     if both:
         return (
             f"detector.weights: expected different numbers of candidates and columns, got {columns} for both; "
-            "export for another size"
+            "export for another input size"
         )
     other = columns - 1 if objectness else columns + 1
     fix = f"set detector.objectness={str(not objectness).lower()} or" if other in shape[1:] else "choose"
@@ -241,7 +241,7 @@ def _is_unit(boxes: Float32, shape: tuple[int, int], suppressed: bool) -> bool |
     # cells cover the input, but detections may not
     if not suppressed and (boxes[:, 0].max() < shape[1] / 4 or boxes[:, 1].max() < shape[0] / 4):
         raise DataError(
-            f"detector.weights: expected boxes in px of the input {shape[0]}x{shape[1]} or in 0..1, got "
+            f"detector.weights: expected boxes in px of the input {shape[1]}x{shape[0]} or in 0..1, got "
             f"x, y of at most {boxes[:, 0].max():.3g}, {boxes[:, 1].max():.3g}; export with decoded boxes"
         )
     return False

@@ -44,7 +44,7 @@ def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
         cached = _cached(model, revision, more)
     if cached is None:
         raise DataError(
-            f"detector.model: expected a complete cache after the download of {model}, got missing files; try again"
+            f"detector.model: expected a complete cache after the download of {model}, got missing files; run again"
         )
     return cached
 
@@ -148,8 +148,8 @@ def _check(path: Path, published: Any) -> None:
     path.resolve().unlink()  # the content, if the cache uses symbolic links
     path.unlink(missing_ok=True)
     raise DataError(
-        f"detector.model: expected sha256 {published.lfs.sha256} for {path.name}, got {found}; try "
-        "again to download the file"
+        f"detector.model: expected sha256 {published.lfs.sha256} for {path.name}, got {found}; run again to "
+        "download the file again"
     )
 
 

@@ -163,7 +163,7 @@ MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells()
     ("table", "given", "message"),
     [
         (dense(MIXED), {}, r"got ambiguous boxes \(.* could be corners\); set detector\.box_format=CENTER or CORNER"),
-        (dense(cells() / 8), {}, r"detector\.weights: expected boxes in px of the input 64x96 or in 0\.\.1"),
+        (dense(cells() / 8), {}, r"detector\.weights: expected boxes in px of the input 96x64 or in 0\.\.1"),
         (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 126\); set detector.objectness=true"),
         (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 126\); set detector.objectness=false"),
         (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression .*another detector\.label_space"),
