@@ -38,7 +38,7 @@ def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray
         points_b: The points (..., 3) in frame b.
 
     Returns:
-        The points (..., 3) in frame a, with the same dtype.
+        The points (..., 3) in frame a, with the dtype of `points_b`.
     """
     moved = points_b @ T_a_b[:3, :3].T.astype(points_b.dtype) + T_a_b[:3, 3].astype(points_b.dtype)
     return np.asarray(moved, points_b.dtype)
@@ -139,7 +139,7 @@ def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDAr
         points_camera: The points (..., 3) in the camera frame, m.
 
     Returns:
-        The pixel coordinates (u, v) (..., 2).
+        The pixel coordinates (u, v), px, as an array (..., 2).
     """
     x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
@@ -150,7 +150,7 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
 
     Args:
         camera: The camera.
-        pixels: The pixel coordinates (u, v) (P, 2).
+        pixels: The pixel coordinates (u, v), px, as an array (P, 2).
         depth: The depths (P,) along z, m.
 
     Returns:

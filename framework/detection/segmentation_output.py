@@ -230,7 +230,7 @@ def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
 
 
 def _is_unit(boxes: Float32, shape: tuple[int, int], suppressed: bool) -> bool | None:
-    """Return True if boxes (K, 4) are in 0..1, False if they are in px, None without boxes.
+    """Return True if boxes (K, 4) are in 0..1, False if they are in px, None if there are no boxes.
 
     Raises DataError for other units.
     """

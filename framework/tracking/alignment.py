@@ -57,7 +57,7 @@ MATRIX_SUMS = _matrix_sums()
 
 
 class ModelView(NamedTuple):
-    """The target view of the map for the alignment of frames."""
+    """A view of the map, to which frames are aligned."""
 
     depth: Float32  # (H, W) m, 0 = nothing mapped
     normals: Float32  # (3, H, W) in the view's camera frame

@@ -35,7 +35,7 @@ NEAREST = 0.05  # minimum depth of projected points in the view, m
 def smooth_normals(normals, reach, row_sums, smooth):
     """Set smooth (3, H, W) to the normalized means of normals (3, H, W) over squares of side 2 reach + 1 px.
 
-    The mean of zero normals is 0.
+    The result is 0 where all normals of a square are 0.
     """
     _, height, width = normals.shape
     for v in prange(height):
@@ -232,7 +232,7 @@ def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
 
 @device
 def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J):
-    """Set the photometric terms (frame minus model intensity) of a batch in J; return counts (matched, compared)."""
+    """Set the photometric terms (model minus frame intensity) of a batch in J; return counts (matched, compared)."""
     one, zero = np.float32(1.0), np.float32(0.0)
     noise, scale = weights.intensity_noise, weights.photometric_scale
     strength = weights.color_weight / (noise * noise)
@@ -322,8 +322,9 @@ def _add_brightness(J, lanes):
 def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, linear, noise_model, brightness, sums):
     """Sum the normal equations over a FrameView by chunks of rows into sums (CHUNKS, TERMS).
 
-    `R` and `t` are T_view_camera. `inverse_scale` is the width of model_intensity divided by the width of the view.
-    `linear` is a LinearWeights, or None for Tukey's weights. `noise_model` is the DepthNoise of the frame's sensor.
+    `R` (3, 3) and `t` (3,), m, are the rotation and the translation of T_view_camera. `inverse_scale` is the width of
+    model_intensity divided by the width of the view. `linear` is a LinearWeights, or None for Tukey's weights.
+    `noise_model` is the DepthNoise of the frame's sensor.
     """
     height, width = frame.depth.shape
     shape, level_shape = model.depth.shape, model_intensity.shape

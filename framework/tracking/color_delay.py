@@ -60,7 +60,7 @@ class _Tracked(NamedTuple):
 
 
 class DelayEstimator:
-    """Online estimator of the delay of color."""
+    """Online estimator of the delay of color relative to depth."""
 
     def __init__(self) -> None:
         self.estimate = UNKNOWN
@@ -72,7 +72,7 @@ class DelayEstimator:
         self._strengths = np.zeros(len(TESTED_DELAYS))  # sums of the mean gradients of all compared frames
 
     def add(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Add the next frame, and update the estimate."""
+        """Add the next frame with its tracked pose, and update the estimate."""
         if self._recent and not 0 < frame.depth_time - self._recent[-1].frame.depth_time <= MAX_STEP:
             self.interrupt()
         self._recent.append(_Tracked(frame, T_world_camera))

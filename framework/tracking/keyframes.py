@@ -93,7 +93,7 @@ class Keyframes:
         return len(self._keyframes)
 
     def saved(self) -> dict[str, Array]:
-        """Return the arrays for `restore`; empty without keyframes."""
+        """Return the keyframes as arrays for `restore`; empty if there are none."""
         self._settle()
         if not self._keyframes:
             return {}

@@ -58,7 +58,7 @@ def build_pyramid(
 
 
 def is_coarse(depth: Float32, otherwise: bool, sensor: SensorKind = SensorKind.KINECT_V1) -> bool:
-    """Return True if depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as with 8 bits.
+    """Return True if depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as in 8 bits.
 
     Steps are the gaps between distinct values in the nearer half, in standard deviations of the sensor. A Kinect has
     steps of 1.5 to 1.9 at any distance. Returns `otherwise` if there are too few distinct values.

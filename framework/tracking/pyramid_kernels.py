@@ -58,7 +58,7 @@ def halve(depth, intensity, half_depth, half_intensity):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def compute_normals(depth, intrinsics, normals):
-    """Set normals (3, H, W) from each pixel's four neighbors; 0 at the border or if a neighbor is off the surface.
+    """Set normals (3, H, W) from each pixel's four neighbors; 0 unless all of them are on the same surface.
 
     The loop over a row has no branches, so that the compiler vectorizes it.
     """

@@ -60,7 +60,7 @@ class KeyframeTerm(NamedTuple):
 
     @classmethod
     def at(cls, keyframe: RawKeyframe | None, T_world_view: Float64, scale: DepthScale) -> KeyframeTerm | None:
-        """Return the term of an alignment that starts at a view; None if the keyframe is too far away."""
+        """Return the term of an alignment to the view at T_world_view; None if the keyframe is too far away."""
         if keyframe is None:
             return None
         distance = scale.distance(keyframe.T_world_camera, T_world_view)

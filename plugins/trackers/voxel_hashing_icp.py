@@ -46,7 +46,7 @@ class ResidualWeights(Enum):
 
 
 class Alignment(NamedTuple):
-    """Result of the alignment of a frame. Fractions are of the points in view unless stated otherwise."""
+    """Result of the alignment of a frame. Fractions are relative to the visible points unless stated otherwise."""
 
     T_world_camera: Float64
     matched: float  # fraction of points with a nonzero weight
@@ -240,7 +240,7 @@ class VoxelHashingIcp(PoseTracker):
         return alignment
 
     def _align_lost(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
-        """Align from the last trusted pose, and from the doubted pose of the last frame."""
+        """Align from the last trusted pose, then from the unconfirmed pose of the last frame, if any."""
         assert self._T_world_last is not None
         alignment = self._align_twice(levels, scene, self._T_world_last)
         if alignment.trusted or self._T_world_doubted is None:

@@ -154,12 +154,12 @@ def _check(path: Path, published: Any) -> None:
 
 
 def imported_transformers() -> Any:
-    """Import transformers. Raises ConfigError that names the extra if transformers is not installed."""
+    """Import transformers. Raises ConfigError with the required extra if transformers is not installed."""
     return import_optional("transformers", "loads models of huggingface.co", "transformers")
 
 
 def read_part(parameter: str, folder: Path, what: str, auto_class: Any, **options: Any) -> Any:
-    """Load a part of a model from a folder. Raises DataError that names `parameter` if loading fails."""
+    """Load `what`, a part of a model, from a folder. Raises DataError for `parameter` if loading fails."""
     try:
         return auto_class.from_pretrained(str(folder), local_files_only=True, **options)
     except Exception as error:  # transformers, tokenizers and safetensors raise many types for invalid files

@@ -87,7 +87,8 @@ def from_torchvision(
 
     `classes`: the labels after the background; None = COCO's 91 labels. The rows of unused COCO ids, which were trained
     only as negatives, are removed. `norm_eps`: 0 for torchvision's published checkpoint, 1e-5 for networks trained with
-    the default. Raises DataError that names the source `where` for other networks.
+    the default. `where`: the source of the state_dict, for errors. Raises DataError if it is not from a Mask R-CNN with
+    a feature pyramid.
     """
     tensors = {_newer_name(name): tensor for name, tensor in state.items()}
     labels = len(required(tensors, "roi_heads.box_predictor.cls_score.bias", where))

@@ -56,9 +56,10 @@ NOT_WEIGHTS = r"(pixel_mean|pixel_std|.*\.cell_anchors\.\d+|.*\.num_batches_trac
 
 
 def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str, ...] | None = None) -> MaskRCNN:
-    """Return the network from a detectron2 state_dict; `classes`: None = COCO's 80 classes.
+    """Return the network from a detectron2 state_dict.
 
-    Raises DataError that names the source `where` for other networks.
+    `where`: the source of the state_dict, for errors. `classes`: None = COCO's 80 classes. Raises DataError if the
+    state_dict is not from a Mask R-CNN with ResNet-FPN.
     """
     _check_input(state, where)
     tensors = {_renamed(name, where): tensor for name, tensor in state.items() if not re.fullmatch(NOT_WEIGHTS, name)}

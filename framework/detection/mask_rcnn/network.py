@@ -203,7 +203,7 @@ class RoiHeads(nn.Module):
 
 
 class BoxPredictor(nn.Module):
-    """A distribution over the labels, and a box for each label."""
+    """Predictor of the logit and the box deltas of each label."""
 
     def __init__(self, features: int, labels: int) -> None:
         super().__init__()

@@ -85,7 +85,8 @@ def describe_network(path: Path) -> NetworkDescription:
 def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str) -> MaskRCNN:
     """Build a network with these weights, in float32 and inference mode.
 
-    Counters are ignored. Raises DataError that names the source `where` if the tensors do not match the architecture.
+    Counters are ignored. `where`: the source of the tensors, for errors. Raises DataError if the tensors do not match
+    the architecture.
     """
     try:
         with torch.device("meta"):  # saves memory and random initialization of weights that are replaced below
@@ -106,7 +107,7 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
 
 
 def required(tensors: Mapping[str, Tensor], name: str, where: str) -> Tensor:
-    """Return the tensor `name`. Raises DataError that names the source `where` if the tensor is missing."""
+    """Return the tensor `name` of the source `where`. Raises DataError if the tensor is missing."""
     if name not in tensors:
         raise DataError(f"{where}: expected the weights {name} of a Mask R-CNN with a feature pyramid, got none")
     return tensors[name]

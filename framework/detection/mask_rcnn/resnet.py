@@ -62,7 +62,10 @@ def _layer(channels: int, out: int, stride: int, blocks: int, shape: ResNetShape
 
 
 class Block(nn.Module):
-    """Convolutions with a shortcut: two 3x3, or a bottleneck of 1x1, 3x3 and 1x1 with a quarter of the channels."""
+    """A residual block: two 3x3 convolutions, or a bottleneck of 1x1, 3x3 and 1x1 convolutions.
+
+    The inner convolutions of a bottleneck have a quarter of the output channels.
+    """
 
     def __init__(self, channels: int, out: int, stride: int, shape: ResNetShape) -> None:
         super().__init__()
