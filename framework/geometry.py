@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -126,7 +127,8 @@ def interpolate(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Floa
     """
     R_a, R_b = T_world_a[:3, :3], T_world_b[:3, :3]
     T = np.eye(4)
-    T[:3, :3] = R_a @ Rotation.from_rotvec(fraction * Rotation.from_matrix(R_a.T @ R_b).as_rotvec()).as_matrix()
+    rotation_vector, _ = cv2.Rodrigues(R_a.T @ R_b)  # ten times as fast as SciPy's conversions
+    T[:3, :3] = R_a @ cv2.Rodrigues(fraction * rotation_vector)[0]
     T[:3, 3] = (1 - fraction) * T_world_a[:3, 3] + fraction * T_world_b[:3, 3]
     return T
 
