@@ -18,7 +18,7 @@ from framework.errors import DataError
 
 MIN_ORDERED_CORNERS = 0.9  # minimum fraction of boxes with x2 >= x1 and y2 >= y1, if boxes are corners
 MAX_ORDERED_CENTERS = 0.5  # maximum fraction of such boxes, if boxes are centers and sizes; typically a few percent
-MIN_ROWS = 20  # minimum number of detections for these fractions
+MIN_ROWS = 20  # minimum number of detections to evaluate these fractions
 LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
 CONFIDENT = 0.5  # minimum score of the detections that must have x1 <= x2 and y1 <= y2
 STRIDES = (8, 16, 32, 64)  # px per cell in the YOLO family, the last only in large networks
@@ -48,13 +48,13 @@ class SegmentationLayout:
     """The layout of a network's two outputs; None = undetermined by the outputs for a black image."""
 
     classes: int  # C
-    objectness: bool  # the class scores follow an objectness score
+    objectness: bool  # True = the class scores follow an objectness score
     shape: tuple[int, int]  # (height, width) px of the network's input
-    suppressed: bool  # rows x1 y1 x2 y2, score, label, coefficients; one for each detection
-    rows_first: bool  # the table is (1, K, columns), not (1, columns, K)
-    channels_last: bool  # prototypes are (1, h, w, M), not (1, M, h, w)
+    suppressed: bool  # True = one row per detection: x1 y1 x2 y2, score, label, coefficients
+    rows_first: bool  # True = the table is (1, K, columns), False = (1, columns, K)
+    channels_last: bool  # True = prototypes are (1, h, w, M), False = (1, M, h, w)
     boxes: BoxKind | None = None  # CENTER or CORNER
-    unit: bool | None = None  # boxes are in 0..1 of the input's sides, not in px
+    unit: bool | None = None  # True = boxes are in 0..1 of the input's sides, False = in px
 
     def read(self, outputs: Outputs) -> SegmentationOutput:
         """Return the candidates with their mask coefficients, and the prototypes.

@@ -11,7 +11,7 @@ from framework.data import Bool, Camera, Float32, Float64
 from framework.geometry import inverse, nearest_rotation, transform
 
 COLMAP_PIXEL_CENTER = 0.5  # coordinate of the first pixel's center in COLMAP, px; it is 0 in this project
-REFERENCE_SIDE = 640  # longer image side at which max_error is defined, px; max_error scales with larger sides
+REFERENCE_SIDE = 640  # longer image side up to which max_error applies, px; max_error is proportional to larger sides
 CONFIDENCE = 0.9999  # RANSAC's probability of a sample without outliers
 MAX_DEPTH_ERROR = 0.05  # maximum depth error of an inlier, fraction of its depth
 

@@ -34,7 +34,7 @@ from framework.synthetic.rgbd_camera import noisy_color
 from framework.synthetic.room import Room, RoomKind, furnish
 from framework.synthetic.walk import look
 
-STREAM = 0x7261_696E  # differs from the random streams of all datasets
+STREAM = 0x7261_696E  # key of the random streams of rooms; differs from those of all datasets
 WIDTH, HEIGHT = 320, 240  # size of the images, px
 FOCAL = (0.7, 1.0)  # range of the focal length, in image widths
 EYE_HEIGHT = (0.9, 1.75)  # m, range of the camera height

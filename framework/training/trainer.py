@@ -140,7 +140,7 @@ class Trainer:
 
     @torch.no_grad()
     def _average(self) -> None:
-        keep = min(self.schedule.ema_decay, (1 + self.step) / (10 + self.step))  # faster average at the start
+        keep = min(self.schedule.ema_decay, (1 + self.step) / (10 + self.step))  # adapts faster at the start
         for name, value in self.network.state_dict().items():
             if value.is_floating_point():
                 self.averaged[name].lerp_(value, 1 - keep)

@@ -32,8 +32,8 @@ LOOKALIKES = (
 CLUTTER_CLASSES = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
 """Classes assigned to detections of things without a COCO class."""
 
-LOOKALIKE_FRACTION = 0.8  # fraction of the probability lost by the ground-truth class; the other classes get the rest
-EVEN_FRACTION = 0.01  # weight of the mean distribution in each distribution; avoids zeros, like a softmax
+LOOKALIKE_FRACTION = 0.8  # fraction of the probability of wrong classes for similar classes; other classes get the rest
+EVEN_FRACTION = 0.01  # weight of the mean distribution in each distribution; avoids zeros, as a softmax does
 FALSE_SIZES = (24.0, 160.0)  # range of the sides of false detections, px, log-uniform
 RECURRING_SIZES = (0.2, 1.2)  # range of the sides of recurring false detections, m, log-uniform
 LARGEST_CLUTTER = 0.25  # maximum size of things detected as objects, fraction of the image; walls are larger

@@ -54,7 +54,7 @@ class Alignment(NamedTuple):
     behind: float  # fraction of points behind the map's surface
     agreement_in_front: float  # fraction of the points not behind the map's surface that agree with the map
     reason: str  # reason for rejection, empty if the pose is possible
-    doubt: str  # reason for confirmation by a second source, empty without doubt
+    doubt: str  # reason to require confirmation by a second source, empty if it is not required
     covariance: Float64 | None = None  # (6, 6) Pose.covariance; None = unknown
 
     @property
@@ -126,7 +126,7 @@ class VoxelHashingIcp(PoseTracker):
         self._steady_frames = 0  # number of consecutive frames with a correct prediction
         self._keyframes = Keyframes(seed=self.seed)
         self._visited: deque[Float64] = deque(maxlen=VISITED)
-        self._T_world_doubted: Float64 | None = None  # pose of the last frame if it was lost because of doubt only
+        self._T_world_doubted: Float64 | None = None  # pose of the last frame if only its confirmation failed
         self._last: FrameFeatures | None = None  # features of the last trusted frame
         self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
         self._raw_keyframe: RawKeyframe | None = None
