@@ -11,7 +11,7 @@ import numpy.typing as npt
 from framework.data import Camera, Float32, Float64, Int32, PointClusters
 from framework.errors import DataError
 
-RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| due to rounding; published poses have six digits, lost poses R = 0
+RIGID_WITHIN = 1e-2  # maximum entry of |R R^T - I| of a rounded pose; files have 6 digits or more, lost poses R = 0
 EXACT_WITHIN = 1e-12  # maximum entry of |R R^T - I| of a float64 rotation, which is not changed
 
 
@@ -38,14 +38,14 @@ def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray
         points_b: The points (..., 3) in frame b.
 
     Returns:
-        The points (..., 3) in frame a, with the same dtype.
+        The points (..., 3) in frame a, with the dtype of `points_b`.
     """
     moved = points_b @ T_a_b[:3, :3].T.astype(points_b.dtype) + T_a_b[:3, 3].astype(points_b.dtype)
     return np.asarray(moved, points_b.dtype)
 
 
 def skew(v: Float64) -> Float64:
-    """Return the skew-symmetric matrix S (3, 3) of v, with S @ w = v x w."""
+    """Return the skew-symmetric matrix S (3, 3) of a vector v (3,), with S @ w = v x w."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -103,7 +103,7 @@ def nearest_rotation(R: Float64) -> Float64:
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """Return a pose (4, 4) without the rounding errors of its rotation. Raises DataError if it is not rigid."""
+    """Return a pose (4, 4) with its rotation corrected for rounding errors. Raises DataError if it is not rigid."""
     if not np.isfinite(matrix).all():
         raise DataError("pose: expected finite values, got NaN or infinity")
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
@@ -120,7 +120,10 @@ def nearest_rigid(matrix: Float64) -> Float64:
 
 
 def interpolate(T_world_a: Float64, T_world_b: Float64, fraction: float) -> Float64:
-    """Return the pose (4, 4) at a fraction in [0, 1] between a and b: linear translation, slerp of rotation."""
+    """Return the pose (4, 4) at a fraction of the motion from a (0) to b (1); other fractions extrapolate.
+
+    Translations are interpolated linearly, and rotations by slerp.
+    """
     R_a, R_b = T_world_a[:3, :3], T_world_b[:3, :3]
     T = np.eye(4)
     rotation_vector, _ = cv2.Rodrigues(R_a.T @ R_b)  # ten times as fast as SciPy's conversions
@@ -137,7 +140,7 @@ def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDAr
         points_camera: The points (..., 3) in the camera frame, m.
 
     Returns:
-        The pixel coordinates (u, v) (..., 2).
+        The pixel coordinates (u, v), px, as an array (..., 2).
     """
     x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
@@ -148,7 +151,7 @@ def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Flo
 
     Args:
         camera: The camera.
-        pixels: The pixel coordinates (u, v) (P, 2).
+        pixels: The pixel coordinates (u, v), px, as an array (P, 2).
         depth: The depths (P,) along z, m.
 
     Returns:

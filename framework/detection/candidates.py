@@ -1,6 +1,7 @@
 """Box candidates: the output layouts of common box detectors, and the selection of the best candidates.
 
-Boxes are borders x1 y1 x2 y2 in px of the network's input: 0 is the left border of the first pixel.
+Boxes are the positions x1 y1 x2 y2 of their borders, in px of the network's input. The left border of the first pixel
+is at 0.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ class OutputLayout(Enum):
 
     yolox = "yolox"  # (K, 5 + C): dx, dy, log w, log h in cells; objectness; C class scores
     yolo = "yolo"  # (4 + C, K) or (K, 4 + C): center x, y, width, height in px; C class scores (Ultralytics, from v8)
-    yolo_objectness = "yolo_objectness"  # (K, 5 + C) or (5 + C, K): objectness before the class scores (YOLOv5, v7)
-    ssd_tensorflow = "ssd_tensorflow"  # boxes (K, 4) y1 x1 y2 x2 in 0..1; scores, and labels or scores by class
-    ssd_torchvision = "ssd_torchvision"  # boxes (K, 4) x1 y1 x2 y2 in px; scores, and labels or scores by class
-    ssd_unit = "ssd_unit"  # boxes (K, 4) x1 y1 x2 y2 in 0..1; scores, and labels or scores by class
+    yolo_objectness = "yolo_objectness"  # (K, 5 + C) or (5 + C, K): as yolo, with objectness before the class scores
+    ssd_tensorflow = "ssd_tensorflow"  # boxes (K, 4) y1 x1 y2 x2 in 0..1; scores and labels, or class scores
+    ssd_torchvision = "ssd_torchvision"  # boxes (K, 4) x1 y1 x2 y2 in px; scores and labels, or class scores
+    ssd_unit = "ssd_unit"  # boxes (K, 4) x1 y1 x2 y2 in 0..1; scores and labels, or class scores
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Candidates:
     def best(self, threshold: float, nms: float, limit: int) -> Int32:
         """Return the indices of at most `limit` candidates with scores above `threshold`, best first.
 
-        `nms`: A candidate is suppressed if its IoU with a better candidate of the same best class exceeds `nms`.
+        A candidate is suppressed if its IoU with a better candidate of the same best class exceeds `nms`.
         """
         scores = self.class_scores.max(axis=1)
         x1, y1, x2, y2 = self.boxes.T
@@ -127,7 +128,7 @@ def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
     cell, stride_of = np.concatenate(cells), np.concatenate(strides)
     if len(cell) != len(rows):
         raise DataError(
-            f"detector.layout: expected {len(cell)} candidates of a YOLOX with input {shape[0]}x{shape[1]}, "
+            f"detector.layout: expected {len(cell)} candidates of a YOLOX with input {shape[1]}x{shape[0]} px, "
             f"got {len(rows)}; choose another layout"
         )
     centers = (rows[:, :2] + cell) * stride_of
@@ -140,8 +141,8 @@ def _decode_ssd(
 ) -> Candidates:
     """Return the candidates of an SSD.
 
-    The class scores are outputs of the network, or derived from one score and one label per box. Outputs are identified
-    by name. TensorFlow's object detection API uses detection_boxes, detection_classes, detection_scores and
+    The class scores are outputs of the network or are derived from one score and one label per box. Outputs are
+    identified by name. TensorFlow's object detection API uses detection_boxes, detection_classes, detection_scores and
     detection_multiclass_scores. torchvision's models.detection uses boxes, labels and scores. Label 0 and the first of
     C + 1 scores are the background.
     """
@@ -159,8 +160,8 @@ def _decode_ssd(
         if not by_class and len(scores) == len(labels) == 1:
             return _checked(_ssd_boxes(layout, boxes[0], shape), _spread(scores[0], labels[0], classes))
     raise DataError(
-        f"detector.layout: expected outputs boxes (K, 4) and either scores (K, {classes} or "
-        f"{classes + 1}), or scores (K,) and labels (K,) for {layout.value}, got {described(outputs)}"
+        f"detector.layout: expected outputs boxes (K, 4) and either scores (K, {classes}) or (K, {classes + 1}), or "
+        f"scores (K,) and labels (K,), for {layout.value}, got {described(outputs)}; choose another layout"
     )
 
 

@@ -18,7 +18,7 @@ from framework.errors import DataError
 
 MIN_ORDERED_CORNERS = 0.9  # minimum fraction of boxes with x2 >= x1 and y2 >= y1, if boxes are corners
 MAX_ORDERED_CENTERS = 0.5  # maximum fraction of such boxes, if boxes are centers and sizes; typically a few percent
-MIN_ROWS = 20  # minimum number of detections for these fractions
+MIN_ROWS = 20  # minimum number of detections to evaluate these fractions
 LARGEST_UNIT = 2.0  # boxes in 0..1 may slightly exceed the image; boxes in px are never all within 2 px of its corner
 CONFIDENT = 0.5  # minimum score of the detections that must have x1 <= x2 and y1 <= y2
 STRIDES = (8, 16, 32, 64)  # px per cell in the YOLO family, the last only in large networks
@@ -48,13 +48,13 @@ class SegmentationLayout:
     """The layout of a network's two outputs; None = undetermined by the outputs for a black image."""
 
     classes: int  # C
-    objectness: bool  # the class scores follow an objectness score
+    objectness: bool  # True = the class scores follow an objectness score
     shape: tuple[int, int]  # (height, width) px of the network's input
-    suppressed: bool  # rows x1 y1 x2 y2, score, label, coefficients; one for each detection
-    rows_first: bool  # the table is (1, K, columns), not (1, columns, K)
-    channels_last: bool  # prototypes are (1, h, w, M), not (1, M, h, w)
+    suppressed: bool  # True = one row per detection: x1 y1 x2 y2, score, label, coefficients
+    rows_first: bool  # True = the table is (1, K, columns), False = (1, columns, K)
+    channels_last: bool  # True = prototypes are (1, h, w, M), False = (1, M, h, w)
     boxes: BoxKind | None = None  # CENTER or CORNER
-    unit: bool | None = None  # boxes are in 0..1 of the input's sides, not in px
+    unit: bool | None = None  # True = boxes are in 0..1 of the input's sides, False = in px
 
     def read(self, outputs: Outputs) -> SegmentationOutput:
         """Return the candidates with their mask coefficients, and the prototypes.
@@ -126,8 +126,8 @@ def detect_layout(
     """Return the layout of a network from its outputs for a black image. Raises DataError if no layout matches.
 
     `shape`: (height, width) px of the input. The shapes of the outputs determine everything except the kind of boxes.
-    The rows determine the kind of boxes: the cells cover the image, so most centers are larger than the sizes of their
-    boxes, and few rows could be corners.
+    The values of the boxes determine their kind. Cells cover the image, so most centers are larger than the sizes of
+    their boxes, and few of these boxes could be corners.
     """
     table, prototypes = _table_and_prototypes(outputs)
     channels_last = _is_channels_last(prototypes, shape, input_channels_last, metadata)
@@ -170,11 +170,11 @@ def _is_channels_last(
     if first and last and metadata.author.startswith("Ultralytics"):
         return input_channels_last  # Ultralytics exports transpose both input and output, or neither
     if first == last:
-        expected = f"expected prototypes with the aspect ratio of the input {height}x{width}"
+        expected = f"expected prototypes with the aspect ratio of the input, height:width = {height}:{width}"
         found = "with another aspect ratio"
         if first:
             expected = "expected prototypes (1, M, h, w) or (1, h, w, M)"
-            found = "with an ambiguous order of axes; export for another size"
+            found = "with an ambiguous order of axes; export for another input size"
         raise DataError(f"detector.weights: {expected}, got {prototypes.shape} {found}")
     return bool(last)
 
@@ -198,7 +198,7 @@ def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness:
     if both:
         return (
             f"detector.weights: expected different numbers of candidates and columns, got {columns} for both; "
-            "export for another size"
+            "export for another input size"
         )
     other = columns - 1 if objectness else columns + 1
     fix = f"set detector.objectness={str(not objectness).lower()} or" if other in shape[1:] else "choose"
@@ -230,7 +230,7 @@ def _box_kind(boxes: Float32, suppressed: bool) -> BoxKind | None:
 
 
 def _is_unit(boxes: Float32, shape: tuple[int, int], suppressed: bool) -> bool | None:
-    """Return True if boxes (K, 4) are in 0..1, False if they are in px, None without boxes.
+    """Return True if boxes (K, 4) are in 0..1, False if they are in px, None if there are no boxes.
 
     Raises DataError for other units.
     """
@@ -241,7 +241,7 @@ def _is_unit(boxes: Float32, shape: tuple[int, int], suppressed: bool) -> bool |
     # cells cover the input, but detections may not
     if not suppressed and (boxes[:, 0].max() < shape[1] / 4 or boxes[:, 1].max() < shape[0] / 4):
         raise DataError(
-            f"detector.weights: expected boxes in px of the input {shape[0]}x{shape[1]} or in 0..1, got "
+            f"detector.weights: expected boxes in px of the input {shape[1]}x{shape[0]} or in 0..1, got "
             f"x, y of at most {boxes[:, 0].max():.3g}, {boxes[:, 1].max():.3g}; export with decoded boxes"
         )
     return False

@@ -26,7 +26,7 @@ class TrueInstances:
 def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) -> TrueInstances:
     """Return the ground-truth instances of `frame` with a known class and at least `min_pixels` pixels.
 
-    Raises DataError if the sequence has no instance ground truth, or if a class is missing in `classes`.
+    Raises DataError if the sequence has no instance ground truth, or if one of its classes is missing in `classes`.
     """
     if frame.truth is None:
         raise DataError(
@@ -38,7 +38,9 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
     names = {i: name for i, name in frame.truth.class_names.items() if i != 0 and name is not None}
     unknown = sorted({name for name in names.values() if name not in index})
     if unknown:
-        raise DataError(f"detector: expected the classes of the ground truth, got none for {', '.join(unknown)}")
+        raise DataError(
+            f"detector: expected classes for all ground-truth objects, got no class for {', '.join(unknown)}"
+        )
 
     found, areas = np.unique(frame.truth.instance_ids, return_counts=True)
     chosen = np.array([i in names for i in found.tolist()], np.bool_) & (areas >= min_pixels)

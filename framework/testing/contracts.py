@@ -35,7 +35,7 @@ from framework.testing.corner_room import (
 
 
 class OptionContract:
-    """Tests of an option. They build the plugin as in a run. Use this class as the first base of a test class."""
+    """Tests of an option. They build the plugin as in a run. Use this class as the first base class of a test class."""
 
     stage: str  # set by the contract of the stage
     option: str
@@ -68,13 +68,13 @@ class OptionContract:
 
 
 class SequenceContract:
-    """Tests of a recording with poses."""
+    """Tests of a sequence with poses."""
 
     stage = "dataset"
 
     def plugin(self) -> RGBDSequence:
         raise NotImplementedError(
-            "SequenceContract.plugin: expected an override, got none; return the recording under test from plugin()"
+            "SequenceContract.plugin: expected an override, got none; return the sequence under test from plugin()"
         )
 
     def test_dataset_returns_frames_of_its_camera(self) -> None:
@@ -82,7 +82,7 @@ class SequenceContract:
         assert sequence.name
         assert len(sequence) > 0
         frame = sequence[0]
-        assert frame.T_world_camera is not None, "the tested recording must have poses"
+        assert frame.T_world_camera is not None, "the tested sequence must have poses"
         assert frame.camera == sequence.camera
         assert (frame.depth > 0).any()
         assert same(frame, sequence[0])
@@ -160,7 +160,7 @@ def assert_valid(found: Detections, detector: Detector, frame: Frame) -> None:
 
 
 class TrackerContract:
-    """Tests of a tracker. The map is frozen, so writing to it raises."""
+    """Tests of a tracker. The map is immutable, so that changes of the map raise an error."""
 
     stage = "tracker"
 

@@ -17,7 +17,7 @@ from framework.interfaces import Viewer
 from framework.testing.contracts import same
 from framework.testing.corner_room import CAMERA, RoomMap, frame_at, pose_at, spheres_in
 
-FRAMES = 8  # number of frames
+FRAMES = 8  # number of frames of a test run
 LOST, SKIPPED, NOTHING_FOUND, BLIND = 2, 3, 4, 5  # indices of the special frames; see `show_run`, `frame_with_found`
 STAGE_MS = {  # stage times of a frame, ms
     "reading": 1.0,
@@ -61,7 +61,7 @@ class WatchedMap(RoomMap):
 
     @contextmanager
     def call(self) -> Iterator[None]:
-        """Allow reads of the map in the body."""
+        """Allow reads of the map in the body of the with statement."""
         self.within_a_call.set()
         yield
         self.within_a_call.clear()

@@ -10,9 +10,9 @@ from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64
 from framework.geometry import inverse, nearest_rotation, transform
 
-COLMAP_PIXEL_CENTER = 0.5  # center of the first pixel in COLMAP; it is 0 here
-REFERENCE_SIDE = 640  # longer image side for which max_error holds, px; max_error grows in proportion for larger images
-CONFIDENCE = 0.9999  # confidence of RANSAC
+COLMAP_PIXEL_CENTER = 0.5  # coordinate of the first pixel's center in COLMAP, px; it is 0 in this project
+REFERENCE_SIDE = 640  # longer image side up to which max_error applies, px; max_error is proportional to larger sides
+CONFIDENCE = 0.9999  # RANSAC's probability of a sample without outliers
 MAX_DEPTH_ERROR = 0.05  # maximum depth error of an inlier, fraction of its depth
 
 
@@ -26,10 +26,10 @@ class AbsolutePose:
 
 @dataclass
 class AbsolutePoseEstimator:
-    """Estimator of an `AbsolutePose` from matches; equal matches give equal poses."""
+    """Deterministic estimator of an `AbsolutePose` from 2D-3D matches."""
 
-    max_error: float = 4.0  # maximum reprojection error of an inlier, px of an image 640 px wide or smaller, > 0
-    min_inliers: int = 15  # minimum number of inliers, >= 4; wrong matches reach 4 to 8
+    max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0, for images of at most 640 px
+    min_inliers: int = 15  # minimum number of inliers, >= 4; wrong poses have 4 to 8
     min_inlier_ratio: float = 0.25  # minimum fraction of inliers among the matches, in (0, 1]
     seed: int = 0  # random seed, >= 0
 
@@ -48,10 +48,11 @@ class AbsolutePoseEstimator:
     def estimate(
         self, camera: Camera, pixels: Float32, points_world: Float32, depth: Float32 | None = None
     ) -> AbsolutePose | None:
-        """Return the pose of `camera` from `points_world` (M, 3), m, at `pixels` (M, 2).
+        """Return the pose of `camera` from M matches of `points_world` (M, 3), m, with `pixels` (M, 2).
 
-        `depth` (M,), m, holds the readings at these pixels, 0 = unknown. Returns None if there are too few inliers. An
-        inlier is finite, in front of the camera, reprojects within `max_error` and agrees with its depth.
+        `depth` (M,), m, contains the readings at these pixels, 0 = no reading. Returns None if there are too few
+        inliers. An inlier has finite coordinates, is in front of the camera, reprojects within `max_error` and agrees
+        with its depth reading.
         """
         import pycolmap
 
@@ -95,7 +96,7 @@ class AbsolutePoseEstimator:
         T_camera_world: Float64,
         max_error: float,
     ) -> Bool:
-        """Return an array (M,), True for matches that agree with the pose; non-finite matches are False."""
+        """Return a mask (M,), True for matches that agree with the pose and have finite coordinates."""
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             x, y, z = transform(T_camera_world, points_world.astype(np.float64)).T
             u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy

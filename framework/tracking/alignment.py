@@ -6,9 +6,8 @@ T = T_view_camera moves the frame's points p_i into the view. The view gives eac
 n_i, and its model intensity. w_i and v_i are Tukey's biweights. Residuals are divided by their expected noise, so that
 both terms are in standard deviations. Beyond `FAR` the standard deviation of a depth is its noise times depth / FAR.
 Errors of structured-light cameras at this range cover whole image regions and do not average out. `RANGE` is the
-maximum depth of these cameras. Beyond it, standard deviations and gates are those at `RANGE` times depth / RANGE, so
-that the balance of the two terms does not depend on depth. Gauss-Newton steps are twists in the view's frame:
-T <- exp(xi) T.
+maximum depth of these cameras. Beyond it, standard deviations and gates are proportional to depth, so that the
+balance of the two terms does not depend on depth. Gauss-Newton steps are twists in the view's frame: T <- exp(xi) T.
 
 `LinearWeights` replaces Tukey's weights by the weights in VoxelHashing's published code, for residuals in m and in
 [0, 1]. With the distance d of p_i from q_i, the depth z of p_i and the intensity difference dI:
@@ -17,8 +16,8 @@ T <- exp(xi) T.
     v_i = max(0, 1 - |dI| / max_intensity_difference)
 
 The kernels process points in batches of a fixed size. Branch-free loops over fields of one array are vectorized by the
-compiler. Separate loops only fetch from images. Ignored points have weight 0. Sums are kept in lanes, so that vector
-code needs no reordered additions (fast math) and every compilation rounds identically.
+compiler. Image values are fetched in separate loops. Ignored points have weight 0. Sums are kept in lanes, so that
+vector code needs no reordered additions (fast math) and every compilation rounds identically.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ from framework.tracking.pyramid import PyramidLevel, intrinsics
 
 
 def _matrix_sums() -> npt.NDArray[np.int64]:
-    """Return the position (6, 6) of each element of the symmetric matrix A in the array of sums."""
+    """Return the indices (6, 6) of the elements of the symmetric matrix A in the array of sums."""
     indices = np.empty((6, 6), np.int64)
     for row in range(6):
         columns = (row + np.arange(4)) % 6
@@ -58,7 +57,7 @@ MATRIX_SUMS = _matrix_sums()
 
 
 class ModelView(NamedTuple):
-    """The target view of the map for the alignment of frames."""
+    """A view of the map, to which frames are aligned."""
 
     depth: Float32  # (H, W) m, 0 = nothing mapped
     normals: Float32  # (3, H, W) in the view's camera frame
@@ -69,7 +68,7 @@ class ModelView(NamedTuple):
 
 
 class FrameView(NamedTuple):
-    """One pyramid level of the frame. Flat, because parallel kernels do not accept nested tuples."""
+    """One pyramid level of the frame. The tuple is flat, because parallel kernels do not accept nested tuples."""
 
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
@@ -81,16 +80,16 @@ class FrameView(NamedTuple):
 
 
 def model_view(view: SurfaceView) -> ModelView:
-    """Return the model of a view of the map, with normals in its camera frame."""
+    """Return the `ModelView` of a view of the map, with normals rotated to the view's camera frame."""
     normals = np.empty((3, *view.depth.shape), np.float32)
     turn_normals(view.normals_world, np.ascontiguousarray(view.T_world_camera[:3, :3].T, np.float32), normals)
     return ModelView(view.depth, normals, *intrinsics(view.camera))
 
 
 def smoothed(model: ModelView, level: int) -> ModelView:
-    """Return the model for `level` halvings of its resolution, with normals averaged over squares of about this size.
+    """Return the model for pyramid level `level`, with normals averaged over squares of side 2^(level + 1) - 1 px.
 
-    A new map is noisy. Noise in the normals resists motion along the surface.
+    The resolution stays the same. In a new map, normals are noisy. Noisy normals penalize motion along the surface.
     """
     if level == 0:
         return model
@@ -127,12 +126,12 @@ class NormalEquations(NamedTuple):
     visible: int  # number of points on a mapped part of the view
     matched: int  # number of visible points with a nonzero weight
     close: int  # number of visible points at a depth that agrees with the model
-    behind: int  # number of visible points clearly behind the model, which should hide them
+    behind: int  # number of visible points clearly behind the model, which should occlude them
     A_color: Float64  # (6, 6) part of A from the photometric term; 0 for LinearWeights
     energy: float  # sum of w r^2 of the geometric term
     color_energy: float  # sum of v r^2 of the photometric term
     matched_colors: int  # number of visible points with a nonzero photometric weight
-    brightness: float  # mean of frame minus model intensity, caused by a change of exposure
+    brightness: float  # mean of frame minus model intensity; nonzero after a change of exposure
 
 
 def linearize(
@@ -142,6 +141,7 @@ def linearize(
     """Return the normal equations of E at T_view_camera for one pyramid level of the frame.
 
     `model_intensity` (h, w) is the view's intensity at that level's resolution, negative where nothing is mapped.
+    `brightness` is the difference of frame and model intensity to compensate. `linear` = None selects Tukey's weights.
     """
     sums = np.empty((CHUNKS, TERMS))
     scale = 1 << round(math.log2(model.depth.shape[1] / model_intensity.shape[1]))  # halving drops odd columns

@@ -11,12 +11,12 @@ from framework.sensors.noise_models_kernels import axial_sigma_single
 CHUNKS = 16  # number of chunks of image rows, summed in order, so that sums do not depend on the number of threads
 BATCH = 160  # number of points per batch; divides the usual image widths
 LANES = 16  # number of lanes of a sum; point n of a batch is added to lane n % LANES
-ROW = 5  # sums per derivative of the error: products with itself, the next three derivatives and the error
+ROW = 5  # number of sums per derivative of the error: products with itself, the next three and the error
 ENERGY = 6 * ROW  # index of the weighted squared error among the sums of one term of the energy
 COLOR = ENERGY + 1  # index of the first sum of the photometric term, after those of the geometric term
 BRIGHTNESS = 2 * COLOR  # index of the change of brightness
-SUMS = BRIGHTNESS + 1  # sums over points, in lanes
-TERMS = SUMS + 6  # terms of a chunk: its sums, then its six counts
+SUMS = BRIGHTNESS + 1  # number of sums over points, each of LANES lanes
+TERMS = SUMS + 6  # number of values of a chunk: its sums, then its six counts
 # offsets of a batch's point fields: in the frame, in the view, and in the model ...
 DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00, I10, I01, I11 = (
     field * BATCH for field in range(21)
@@ -33,7 +33,10 @@ NEAREST = 0.05  # minimum depth of projected points in the view, m
 # Not cv2.blur: other threads that use OpenCV change the split of its running sums, and thus the rounding.
 @njit(cache=True, nogil=True, parallel=True)
 def smooth_normals(normals, reach, row_sums, smooth):
-    """Set smooth (3, H, W) to unit means of normals over squares of side 2 reach + 1, 0 where all are 0."""
+    """Set smooth (3, H, W) to the normalized means of normals (3, H, W) over squares of side 2 reach + 1 px.
+
+    The result is 0 where all normals of a square are 0.
+    """
     _, height, width = normals.shape
     for v in prange(height):
         for i in range(3):
@@ -56,7 +59,7 @@ def smooth_normals(normals, reach, row_sums, smooth):
 
 @njit(cache=True, nogil=True, parallel=True)
 def turn_normals(normals_world, R, normals):
-    """Set normals (3, H, W) to R n of the normals n in normals_world (H, W, 3)."""
+    """Set normals (3, H, W) to the normals_world (H, W, 3) rotated by R (3, 3)."""
     for v in prange(normals.shape[1]):
         for u in range(normals.shape[2]):
             x, y, z = normals_world[v, u, 0], normals_world[v, u, 1], normals_world[v, u, 2]
@@ -74,7 +77,7 @@ def _tukey(r, scale):
 
 @device
 def _load(frame, v, u0, points):
-    """Copy the batch from pixel (u0, v) on into `points`; the depth is 0 past the end of the row."""
+    """Copy the batch of pixels that starts at (u0, v) to `points`; depth is 0 past the end of the row."""
     depth, intensity, normals = frame.depth, frame.intensity, frame.normals
     for n in range(BATCH):
         u = u0 + n
@@ -87,7 +90,7 @@ def _load(frame, v, u0, points):
 
 @device
 def _project(frame, v, u0, model, shape, R, t, points, pixel):
-    """Set a batch's points in the view, m and px, and the flat pixel indices (BATCH,), -1 = outside."""
+    """Set a batch's points in the view (m and px) and their flat pixel indices (BATCH,), -1 = outside."""
     fx, fy, cx, cy = frame.fx, frame.fy, frame.cx, frame.cy
     one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
     width = np.int32(shape[1])
@@ -129,8 +132,8 @@ def _gather_model(depth, normals, size, pixel, points):
 def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
     """Set the term of point n in J: weight, error, and derivative with respect to a twist of the view's frame.
 
-    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Points without a weight may have
-    NaN values.
+    (gx, gy, gz) is the derivative of the error with respect to the point (px, py, pz). Values of points with
+    weight 0 may be NaN.
     """
     zero = np.float32(0.0)
     weighted = weight > zero
@@ -229,7 +232,7 @@ def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
 
 @device
 def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J):
-    """Set the photometric terms (frame minus model intensity) of a batch in J; return counts (matched, compared)."""
+    """Set the photometric terms (model minus frame intensity) of a batch in J; return counts (matched, compared)."""
     one, zero = np.float32(1.0), np.float32(0.0)
     noise, scale = weights.intensity_noise, weights.photometric_scale
     strength = weights.color_weight / (noise * noise)
@@ -262,7 +265,7 @@ def _add_photometry(model, inverse_scale, weights, linear, brightness, points, J
 
 @device
 def _multiply(J, a, b, c, d, row):
-    """Sum a batch's weighted products of the derivative at offset `a` with a, b, c, d and the error."""
+    """Sum a batch's weighted products of the derivative at offset `a` with those at a, b, c, d and the error."""
     zero = np.float32(0.0)
     added = ADDED + row * ROW * LANES
     for lane in range(LANES):
@@ -319,14 +322,15 @@ def _add_brightness(J, lanes):
 def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, linear, noise_model, brightness, sums):
     """Sum the normal equations over a FrameView by chunks of rows into sums (CHUNKS, TERMS).
 
-    `R` and `t` are T_view_camera. `inverse_scale` is the width of model_intensity over the width of the view. `linear`
-    is a LinearWeights, or None for Tukey's weights. `noise_model` is the DepthNoise of the frame's sensor.
+    `R` (3, 3) and `t` (3,), m, are the rotation and the translation of T_view_camera. `inverse_scale` is the width of
+    model_intensity divided by the width of the view. `linear` is a LinearWeights, or None for Tukey's weights.
+    `noise_model` is the DepthNoise of the frame's sensor.
     """
     height, width = frame.depth.shape
     shape, level_shape = model.depth.shape, model_intensity.shape
     size = np.int32(model.depth.size)
     flat_depth, flat_normals, flat_intensity = model.depth.ravel(), model.normals.ravel(), model_intensity.ravel()
-    # LinearWeights add both terms to the same lanes, with the rounding of a single sum
+    # with LinearWeights, both terms are added to the same lanes and round like a single sum
     color = COLOR * LANES if linear is None else 0
     for chunk in prange(CHUNKS):
         total = np.zeros(TERMS, np.float64)

@@ -2,12 +2,12 @@
 
 Depth edges of a frame, moved by the camera's motion over a time d, coincide with color edges if d is the time between
 the two images. For each compared frame k, the delay d_k has the largest mean color gradient at the moved depth edges.
-Its error, as a distance in the image, does not depend on the speed. An inaccurate registration adds a constant offset
-o. With the mean image motion v_k of the edges and its direction n_k, in image widths and s:
+Its error, measured as a distance in the image, does not depend on the speed. An inaccurate registration adds a constant
+offset o in the image. With the mean image motion v_k of the edges and its direction n_k, in image widths and s:
 
     |v_k| d_k = |v_k| d + n_k . o + noise
 
-Robust regression (Tukey's biweight) over the compared frames gives the delay d, with a normal prior of the offset.
+Robust regression (Tukey's biweight) over the compared frames gives the delay d, with a normal prior on the offset.
 Errors of nearby frames are correlated: CORRELATED frames count as one, and the standard deviation is at least that of
 a jackknife over blocks of frames. Slow frames are not compared. If a camera turns in one direction at a constant
 rate, only the prior separates d from o.
@@ -32,16 +32,16 @@ HISTORY = 7  # number of successive frames with known motion; the frame in the m
 MAX_STEP = 0.2  # s, maximum time between successive frames
 WIDTH = 320  # px, width of the compared images
 MAX_GRADIENT = 200.0  # Sobel units; stronger gradients are clipped, so that lamps do not dominate
-MIN_EDGES, MAX_EDGES = 100, 1500  # number of edge points of a compared frame
+MIN_EDGES, MAX_EDGES = 100, 1500  # minimum and maximum number of edge points of a compared frame
 MIN_SPEED = 0.125  # minimum image motion of a compared frame, image widths per s
-DENSE_COMPARISONS, LATER_STRIDE = 60, 8  # number of successive comparisons; after them, every 8th frame is compared
-MIN_COMPARISONS, MAX_COMPARISONS = 16, 512  # number of latest comparisons for an estimate
+DENSE_COMPARISONS, LATER_STRIDE = 60, 8  # number of comparisons of successive frames; later, every 8th is compared
+MIN_COMPARISONS, MAX_COMPARISONS = 16, 512  # minimum and maximum number of recent comparisons for an estimate
 PERIOD = 4  # number of comparisons from one estimate to the next
 BLOCKS = 8  # number of blocks of the jackknife
 MAX_DEVIATION = 0.002  # s, maximum standard deviation of a usable estimate ...
 MAX_RELATIVE_DEVIATION = 0.25  # ... or, if larger, the maximum as a fraction of the estimate
 OFFSET_DEVIATION = 0.5 / 640  # image widths, standard deviation of the constant offset of registered images
-CORRELATED = 8  # number of comparisons with one common error
+CORRELATED = 8  # number of comparisons with a common error
 MIN_NOISE = 0.1 / 640  # image widths, minimum standard deviation of a comparison
 CUT_OFF = 4.685  # residual with weight 0 in Tukey's biweight, in standard deviations
 ITERATIONS = 10  # number of iterations of the robust regression
@@ -60,7 +60,7 @@ class _Tracked(NamedTuple):
 
 
 class DelayEstimator:
-    """Online estimator of the delay of color."""
+    """Online estimator of the delay of color relative to depth."""
 
     def __init__(self) -> None:
         self.estimate = UNKNOWN
@@ -72,7 +72,7 @@ class DelayEstimator:
         self._strengths = np.zeros(len(TESTED_DELAYS))  # sums of the mean gradients of all compared frames
 
     def add(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Add the next frame, and update the estimate."""
+        """Add the next frame with its tracked pose, and update the estimate."""
         if self._recent and not 0 < frame.depth_time - self._recent[-1].frame.depth_time <= MAX_STEP:
             self.interrupt()
         self._recent.append(_Tracked(frame, T_world_camera))
@@ -89,7 +89,10 @@ class DelayEstimator:
         self._recent.clear()
 
     def _compare(self) -> bool:
-        """Compare color and depth of the frame in the middle. Return False if it is slow or has too few edges."""
+        """Compare color and depth of the middle frame of the recent frames. Return False without a result.
+
+        There is no result if the frame is slow, has too few edges, or has a delay outside of the tested range.
+        """
         before, (frame, T_world_camera), after = (self._recent[HISTORY // 2 + k] for k in (-1, 0, 1))
         camera = frame.camera
         seconds = after.frame.depth_time - before.frame.depth_time
@@ -132,7 +135,10 @@ def edge_points(frame: Frame) -> Float32:
 
 
 def normalized_gradient(frame: Frame) -> tuple[Float32, float]:
-    """Return the smoothed color gradient (h, WIDTH) with mean 0 and standard deviation 1, and the image scale."""
+    """Return the smoothed color gradient (h, w), w <= WIDTH, and its scale relative to the image.
+
+    The gradient has mean 0 and standard deviation 1.
+    """
     scale = min(WIDTH / frame.camera.width, 1.0)
     small = cv2.resize(frame.color, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
@@ -184,6 +190,6 @@ def regress(comparisons: Float64, start: float) -> DelayEstimate:
 
 
 def _information(X: Float64, weights: Float64, variance: float) -> Float64:
-    """Return X^T W X (3, 3) with the prior of the offset, for residuals with a variance, squared image widths."""
+    """Return X^T W X (3, 3) with the prior on the offset, for residuals of this variance (squared image widths)."""
     prior = np.array([0.0, 1.0, 1.0]) * variance / OFFSET_DEVIATION**2
     return np.asarray((X * weights[:, None]).T @ X + np.diag(prior))

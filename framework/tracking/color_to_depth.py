@@ -31,7 +31,7 @@ MIN_SHIFT = 1.0  # px, minimum image motion between color and depth for a regist
 PREDICTING_STEPS = 2  # number of steps in the velocity of a prediction; a single step amplifies errors of poses
 NEAR = 1.0  # m, assumed depth of the points for this image motion
 MIN_DISPLACING_DELAY = 0.003  # s, minimum delay with a visible effect on the colors of earlier frames
-STRIDE = 8  # px, step between the depth readings for their median
+STRIDE = 8  # px, step between the depth readings used for their median
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ class ColorToDepth:
         log.info(message, frame.index, 1e3 * estimate.seconds, 1e3 * estimate.deviation)
 
     def _is_next(self, frame: Frame) -> bool:
-        """Return True if the frame follows the last one at most MAX_STEP later."""
+        """Return True if the frame is at most MAX_STEP later than the last tracked frame."""
         return bool(self._poses) and 0 < frame.depth_time - self._poses[-1][0] <= MAX_STEP
 
     def _motion_to_color(self, frame: Frame, steps: int) -> Float64 | None:

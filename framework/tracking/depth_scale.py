@@ -1,4 +1,4 @@
-"""Scale of lengths in a frame: limits in meters that grow with depth, and measures without units."""
+"""Scale of lengths in a frame: limits in meters that grow with depth, and dimensionless measures."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ class DepthScale:
 
     @property
     def growth(self) -> float:
-        """The factor of limits in m, >= 1."""
+        """The factor by which limits in m grow, >= 1."""
         return max(1.0, self.depth / RANGE)
 
     def length(self, xi: Float64) -> float:
-        """Return the largest entry of a twist (6,), m and rad; meters are divided by the growth."""
+        """Return the largest absolute entry of a twist (6,), m and rad; translations are divided by `growth`."""
         return float(max(np.abs(xi[:3]).max() / self.growth, np.abs(xi[3:]).max()))
 
     def distance(self, T_world_a: Float64, T_world_b: Float64) -> float:
-        """Return the larger of translation, m, divided by the growth, and rotation, rad, between two poses."""
+        """Return the larger of translation (m, divided by `growth`) and rotation (rad) between two poses."""
         T_a_b = inverse(T_world_a) @ T_world_b
         return max(float(np.linalg.norm(T_a_b[:3, 3])) / self.growth, rotation_angle(T_a_b[:3, :3]))
 
     def near(self, T_world_a: Float64, T_world_b: Float64, limit: float) -> bool:
-        """Return True if two poses are within `limit` m and rad of each other."""
+        """Return True if the `distance` between two poses is below `limit` (m and rad)."""
         return self.distance(T_world_a, T_world_b) < limit
 
     def without_units(self, A: Float64) -> Float64:
-        """Return the information matrix (6, 6) of translations in units of the depth and of rotations."""
+        """Return the information matrix A (6, 6) with translations in units of the typical depth instead of m."""
         units = np.array([self.depth] * 3 + [1.0] * 3)
         return A * np.outer(units, units)

@@ -20,14 +20,14 @@ from framework.data import Float32, Frame, Int32, UInt8
 
 DESCRIPTOR_LENGTH = 128
 DESCRIPTOR_NORM = 512.0  # norm of a RootSIFT descriptor before rounding, so that entries fit into a byte
-FINEST_WIDTH = 400  # maximum image width, px; wider images are halved
+FINEST_WIDTH = 400  # maximum image width, px; wider images are halved repeatedly
 PATCH_RADIUS = 2  # radius of the patch around a feature that must lie on one surface, px
 DEPTH_GAP = 0.05  # minimum depth difference between surfaces in a patch, fraction of the depth
 
 
 @dataclass(frozen=True)
 class Features:
-    """F image features, strongest first."""
+    """The F features of an image, strongest first."""
 
     pixels: Float32  # (F, 2) (u, v) in the full-resolution image
     depth: Float32  # (F,) m along z, 0 = no reading or at the edge of a surface
@@ -37,7 +37,7 @@ class Features:
         return len(self.pixels)
 
     def with_depth(self) -> Features:
-        """Return the features with depth."""
+        """Return the features that have depth."""
         found = self.depth > 0
         return Features(self.pixels[found], self.depth[found], self.descriptors[found])
 
@@ -81,7 +81,7 @@ class FrameFeatures:
 
     @property
     def known(self) -> bool:
-        """True if the features are extracted."""
+        """True if the features have been extracted."""
         return "found" in self.__dict__
 
 
@@ -126,7 +126,7 @@ def surface_depth(depth: Float32, pixels: Float32) -> Float32:
 
 
 def _reduced(gray: UInt8) -> tuple[UInt8, int]:
-    """Return the image halved to a width of at most FINEST_WIDTH, and the scale of its pixels."""
+    """Return the image, halved until its width is at most FINEST_WIDTH, and the total reduction factor."""
     scale = 1
     while gray.shape[1] > FINEST_WIDTH:
         height, width = gray.shape[0] // 2, gray.shape[1] // 2

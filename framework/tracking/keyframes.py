@@ -34,7 +34,7 @@ SAVED: Mapping[str, tuple[tuple[int | None, ...], type]] = {
 }
 """Shapes and types of the arrays of saved keyframes."""
 
-MIN_RETRY_SEPARATION = 0.25  # minimum separation from a frame with too few features; 1 = keyframe limit
+MIN_RETRY_SEPARATION = 0.25  # minimum separation from a frame with too few features; 1 = limit for new keyframes
 WORD_BITS = 12  # 4096 visual words; fewer do not distinguish views, and more rarely recur
 
 
@@ -67,8 +67,8 @@ class Keyframes:
     max_ratio: float = 0.8  # maximum ratio of best to second-best descriptor distance (Lowe's ratio test), in (0, 1]
     max_error: float = 4.0  # maximum reprojection error of an inlier, px, > 0
     min_inliers: int = 20  # minimum number of inliers, >= 4
-    min_inlier_ratio: float = 0.15  # minimum fraction of inliers, in (0, 1]; low, because candidates may not overlap
-    seed: int = 0
+    min_inlier_ratio: float = 0.15  # minimum fraction of inliers, in (0, 1]; low: candidates may not overlap
+    seed: int = 0  # seed of RANSAC and of the visual words, >= 0
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -84,7 +84,7 @@ class Keyframes:
         self._offered: tuple[Float64, Future[Keyframe | None]] | None = None  # pose and keyframe under construction
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for pickling without the thread."""
+        """Wait for the background thread, which cannot be pickled, and return the state."""
         self._settle()
         return vars(self)
 
@@ -93,7 +93,7 @@ class Keyframes:
         return len(self._keyframes)
 
     def saved(self) -> dict[str, Array]:
-        """Return the arrays for `restore`; empty without keyframes."""
+        """Return the keyframes as arrays for `restore`; empty if there are none."""
         self._settle()
         if not self._keyframes:
             return {}
@@ -112,7 +112,7 @@ class Keyframes:
         if not arrays:
             raise ConfigError("resume_from or localize_in: expected a run with stored keyframes, got no keyframes")
         if set(arrays) != set(SAVED):
-            raise DataError(f"keyframes: expected {', '.join(SAVED)}, got {', '.join(arrays) or 'nothing'}")
+            raise DataError(f"keyframes: expected the arrays {list(SAVED)}, got {list(arrays)}")
         for name, (shape, kind) in SAVED.items():
             check_array(name, arrays[name], shape, kind)
         counts, poses = np.asarray(arrays["counts"], np.int64), np.asarray(arrays["poses"], np.float64)
@@ -120,8 +120,8 @@ class Keyframes:
         total = len(points) if len(points) == len(descriptors) else -1
         if len(counts) != len(poses) or counts.min(initial=0) < 0 or counts.sum() != total:
             raise DataError(
-                f"keyframe counts: expected {len(poses)} counts for {len(points)} points with {len(descriptors)} "
-                f"descriptors, got {counts.tolist()!s:.60}"
+                f"keyframe counts: expected {len(poses)} counts >= 0 with the sum {len(points)} (number of points) and "
+                f"{len(descriptors)} (number of descriptors), got {counts.tolist()!s:.60}"
             )
         self._settle()
         for k, end in enumerate(np.cumsum(counts)):
@@ -138,7 +138,7 @@ class Keyframes:
         An exception of that thread is raised by the next method that waits for it.
         """
         if self._offered is not None and self._is_retry(self._offered[0], T_world_camera):
-            return  # too near to the frame under construction, even if it has too few features for a keyframe
+            return  # too close to the frame under construction, even if that frame has too few features for a keyframe
         if not self.is_new(T_world_camera) or self._is_retry(self._barren, T_world_camera):
             return
         worker = ThreadPoolExecutor(1, "keyframe", lower_priority)
@@ -192,12 +192,12 @@ class Keyframes:
         return Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag)
 
     def is_new(self, T_world_camera: Float64) -> bool:
-        """Return True if no keyframe is near this pose."""
+        """Return True if no keyframe is too close to this pose."""
         self._settle()
         return bool((self._separation(self._poses, T_world_camera) >= 1).all())
 
     def _is_retry(self, T_world_other: Float64 | None, T_world_camera: Float64) -> bool:
-        """Return True if a pose is too near to another pose (None = none) to extract features again."""
+        """Return True if a pose is too close to another pose (None = no pose) to extract features again."""
         if T_world_other is None:
             return False
         return bool(self._separation(T_world_other[None], T_world_camera)[0] < MIN_RETRY_SEPARATION)
@@ -223,7 +223,7 @@ class Keyframes:
         return [self._keyframes[k] for k in order[: self.candidates]]
 
     def locate(self, frame: Frame, features: Features, keyframes: Sequence[Keyframe]) -> AbsolutePose | None:
-        """Return the pose of `frame` from its joint matches with all keyframes; None if it is not determined."""
+        """Return the pose of `frame` from its matches with all `keyframes`; None if they do not determine it."""
         if not keyframes:
             return None
         matches = [match(features.descriptors, keyframe.descriptors, self.max_ratio) for keyframe in keyframes]
@@ -241,7 +241,7 @@ class Keyframes:
 
 
 class VisualWords:
-    """A fixed random vocabulary with a `seed`.
+    """A vocabulary of visual words that depends only on a random seed.
 
     The word of a feature consists of the signs of its descriptor's scalar products with a few random vectors
     (locality-sensitive hashing, Charikar 2002). Images are compared by tf-idf (Sivic and Zisserman 2003).
@@ -279,7 +279,7 @@ def write_keyframes(path: Path, keyframes: Mapping[str, Array]) -> None:
 
 
 def read_keyframes(path: Path) -> dict[str, Array]:
-    """Return the arrays written by `write_keyframes`; empty without a file. Raises DataError for an invalid file."""
+    """Return the arrays written by `write_keyframes`; empty if there is no file. Raises DataError if it is invalid."""
     if not path_exists(path):
         return {}
     with map_file_errors(path):

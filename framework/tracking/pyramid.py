@@ -1,4 +1,4 @@
-"""Depth and intensity at halved resolutions."""
+"""Image pyramids of depth and intensity, with normals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from framework.tracking.pyramid_kernels import compute_normals, find_distinct, h
 
 SAMPLED = 4  # stride of the depth readings for the quantization estimate, px
 FEWEST_VALUES = 16  # minimum number of distinct depths for the quantization estimate
-SCATTERED = 0.15  # minimum fraction of missing neighbors of readings in scattered depth; at most 0.02 for Kinects
+SCATTERED = 0.15  # minimum fraction of missing neighbors of readings in scattered depth; Kinects have at most 0.02
 COARSE = 2.5  # largest step between depth values of fine depth, in standard deviations of the sensor
 
 
@@ -29,7 +29,7 @@ class PyramidLevel:
     camera: Camera
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
-    normals: Float32  # (3, H, W) of the surface, towards the camera, in its frame; 0 at edges
+    normals: Float32  # (3, H, W) surface normals towards the camera, in the camera frame; 0 at edges
     sensor: SensorKind = SensorKind.KINECT_V1  # kind of the depth sensor
 
 
@@ -39,7 +39,7 @@ def build_pyramid(
 ) -> list[PyramidLevel]:  # fmt: skip
     """Return the image at `finest` times its size and at levels - 1 further halvings, finest first.
 
-    `finest` is 1 or a power of 1/2. Intensities average all pixels. Depths average the pixels of one surface.
+    `finest` is 1 or a power of 1/2. Intensities are averaged over all pixels, and depths over pixels of one surface.
     """
     intensity = _intensity(color)
     pyramid: list[PyramidLevel] = []
@@ -58,7 +58,7 @@ def build_pyramid(
 
 
 def is_coarse(depth: Float32, otherwise: bool, sensor: SensorKind = SensorKind.KINECT_V1) -> bool:
-    """Return True if depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as with 8 bits.
+    """Return True if depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as in 8 bits.
 
     Steps are the gaps between distinct values in the nearer half, in standard deviations of the sensor. A Kinect has
     steps of 1.5 to 1.9 at any distance. Returns `otherwise` if there are too few distinct values.
@@ -72,14 +72,17 @@ def is_coarse(depth: Float32, otherwise: bool, sensor: SensorKind = SensorKind.K
 
 
 def is_scattered(depth: Float32) -> bool:
-    """Return True if neighbors of many readings in depth (H, W) m have no depth, as with single missing pixels."""
+    """Return True if neighbors of many readings in depth (H, W) m have no depth, as with isolated missing pixels."""
     known = depth[::SAMPLED] > 0
     pairs = np.count_nonzero(known[:, :-1]) + np.count_nonzero(known[:, 1:])
     return bool(np.count_nonzero(known[:, :-1] ^ known[:, 1:]) > SCATTERED * pairs)
 
 
 def _distinct(depth: Float32) -> Float32:
-    """Return the distinct readings in ascending order; a hash table is faster than np.unique for few values."""
+    """Return the distinct readings (N,), m, in ascending order.
+
+    For few distinct values, a hash table is faster than np.unique.
+    """
     bits = np.ascontiguousarray(depth).view(np.int32)
     table = np.zeros(1 << (2 * bits.size).bit_length(), np.int32)
     found = np.empty(bits.size, np.int32)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 DEPTH_GAP = 0.05  # minimum depth difference between surfaces, fraction of the depth; depth is not averaged across it
-MIN_MAPPED = np.float32(2.0)  # minimum number of mapped pixels among four for a mapped mean
+MIN_MAPPED = np.float32(2.0)  # minimum number of mapped pixels among four for a mean intensity
 
 
 @njit(cache=True, nogil=True)
@@ -32,7 +32,7 @@ def find_distinct(bits, table, found):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve(depth, intensity, half_depth, half_intensity):
-    """Average intensity over 2x2 pixels, and depth over the pixels on the nearest surface."""
+    """Average intensity over 2x2 pixels, and depth over those of the 2x2 pixels on the nearest surface."""
     for v in prange(half_depth.shape[0]):
         for u in range(half_depth.shape[1]):
             total = np.float32(0.0)
@@ -58,7 +58,7 @@ def halve(depth, intensity, half_depth, half_intensity):
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def compute_normals(depth, intrinsics, normals):
-    """Set normals (3, H, W) from each pixel's four neighbors; 0 at the border or if a neighbor is off the surface.
+    """Set normals (3, H, W) from each pixel's four neighbors; 0 unless all of them are on the same surface.
 
     The loop over a row has no branches, so that the compiler vectorizes it.
     """
@@ -91,7 +91,7 @@ def compute_normals(depth, intrinsics, normals):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve_mapped(intensity, half):
-    """Average the mapped intensities of 2x2 pixels, -1 = too few; a new map has many holes of one pixel."""
+    """Average the mapped intensities of 2x2 pixels, -1 = too few. A new map has many holes of one pixel."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for v in prange(half.shape[0]):
         for u in range(half.shape[1]):

@@ -1,9 +1,9 @@
 """Raw keyframes: a frame as a second model of the alignment, next to the view of the map.
 
 The map smooths structure below its voxel size, always in the same direction. This biases each alignment by a constant.
-Integration at the biased poses moves the map in turn, so that a standing camera drifts. A raw keyframe has no such
-bias. Its normal equations are added to those of the map's view. With T_key_view and its adjoint Ad, a twist xi of the
-view's frame is Ad xi in the keyframe's frame:
+Integration at the biased poses moves the map in turn, so that the pose of a stationary camera drifts. A raw keyframe
+has no such bias. Its normal equations are added to those of the map's view. With T_key_view and its adjoint Ad, a twist
+xi of the view's frame is Ad xi in the keyframe's frame:
 
     A <- A + w Ad^T A_key Ad,    b <- b + w Ad^T b_key
 
@@ -43,7 +43,7 @@ class RawKeyframe:
     def of(cls, levels: Sequence[PyramidLevel], T_world_camera: Float64, scattered: bool = False) -> RawKeyframe:
         """Return the keyframe of an image pyramid, finest level first.
 
-        Normals of scattered depth are averaged over squares.
+        With `scattered` depth, normals are averaged over 3x3 px.
         """
         level = levels[COMPARED]
         model = smoothed(ModelView(level.depth, level.normals, *intrinsics(level.camera)), int(scattered))
@@ -60,7 +60,7 @@ class KeyframeTerm(NamedTuple):
 
     @classmethod
     def at(cls, keyframe: RawKeyframe | None, T_world_view: Float64, scale: DepthScale) -> KeyframeTerm | None:
-        """Return the term of an alignment that starts at a view; None if the keyframe is too far away."""
+        """Return the term of an alignment to the view at T_world_view; None if the keyframe is too far away."""
         if keyframe is None:
             return None
         distance = scale.distance(keyframe.T_world_camera, T_world_view)

@@ -19,7 +19,7 @@ from framework.data import Float64
 from framework.geometry import adjoint, inverse
 from framework.tracking.alignment import NormalEquations
 
-CORRELATED = 16.0  # number of points with one common error, from the errors of tracked poses (docs/results/halls.md)
+CORRELATED = 16.0  # number of points with a common error, from the errors of tracked poses (docs/results/halls.md)
 MIN_VARIANCE = 1e-18  # minimum variance of a motion, m^2 and rad^2, for data without noise
 
 
@@ -42,7 +42,7 @@ def is_significant(T_a_b: Float64, covariance: Float64) -> bool:
     """Return True if a small motion exceeds its uncertainty: xi^T C^-1 xi > 6, the expected value for noise alone.
 
     Args:
-        T_a_b: The motion exp(xi).
+        T_a_b: The motion exp(xi) (4, 4).
         covariance: The covariance C (6, 6) of xi.
     """
     R = T_a_b[:3, :3]

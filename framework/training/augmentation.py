@@ -18,7 +18,7 @@ BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # fractions of blurred, noisy and gray im
 
 
 def augmented(example: Example, rng: np.random.Generator) -> Example:
-    """Return a randomly mirrored, zoomed, relit, blurred and noisy image, without objects outside of the crop."""
+    """Return a randomly mirrored, zoomed, recolored, blurred and noisy example, without objects outside of the crop."""
     color, masks = example.color, example.masks
     if rng.uniform() < 0.5:
         color, masks = color[:, ::-1], masks[:, :, ::-1]
@@ -33,7 +33,7 @@ def augmented(example: Example, rng: np.random.Generator) -> Example:
 
 
 def _zoomed(color: UInt8, masks: np.ndarray, rng: np.random.Generator) -> tuple[UInt8, np.ndarray, float]:
-    """Return a random crop resized to the image size, its masks and the scale factor of areas."""
+    """Return a random crop resized to the image size (H, W, 3), its masks (N, H, W) and the scale factor of areas."""
     height, width = color.shape[:2]
     fraction = rng.uniform(*ZOOM)
     h, w = round(fraction * height), round(fraction * width)

@@ -17,7 +17,7 @@ from torch.nn import functional
 from framework.detection.mask_rcnn.network import DELTA_WEIGHTS, MaskRCNN, propose
 from framework.detection.mask_rcnn.roi_align import roi_align
 
-BETA = 1.0 / 9.0  # error at the transition of the smooth L1 loss from quadratic to linear
+BETA = 1.0 / 9.0  # absolute error at which the smooth L1 loss changes from quadratic to linear
 ANCHORS = 256  # number of sampled anchors per image
 ANCHORS_POSITIVE = 0.5  # maximum fraction of anchors with an object
 PROPOSALS_POSITIVE = 0.25  # maximum fraction of proposals with an object
@@ -48,7 +48,10 @@ class Budget:
 def losses(
     network: MaskRCNN, images: Tensor, objects: Sequence[Objects], budget: Budget, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Return the five terms of the loss, means over the images (N, 3, H, W), RGB 0..255; the loss is their sum."""
+    """Return the five terms of the loss by name, each the mean over the `images` (N, 3, H, W), RGB 0..255.
+
+    The loss is the sum of the terms.
+    """
     shape = (images.shape[2], images.shape[3])
     pyramid = network.extract(network.normalize(images))
     objectness, deltas = (output.float() for output in network.score_anchors(pyramid))
@@ -120,7 +123,7 @@ def match(iou: Tensor, foreground: float, background: float, each_object: bool) 
     """Return `own` (N,), the object assigned to each box by `iou` (N, M).
 
     A box gets its best object at an IoU of at least `foreground`, BACKGROUND below `background`, otherwise IGNORED.
-    With `each_object`, the boxes with the highest IoU of an object also get their best object, if the IoU is above 0.
+    With `each_object`, the boxes with the highest IoU with an object also get their best object, if this IoU is > 0.
     """
     if iou.shape[1] == 0:
         return torch.full((len(iou),), BACKGROUND, device=iou.device)

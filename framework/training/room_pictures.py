@@ -34,14 +34,14 @@ from framework.synthetic.rgbd_camera import noisy_color
 from framework.synthetic.room import Room, RoomKind, furnish
 from framework.synthetic.walk import look
 
-STREAM = 0x7261_696E  # differs from the random streams of all datasets
+STREAM = 0x7261_696E  # key of the random streams of rooms; differs from those of all datasets
 WIDTH, HEIGHT = 320, 240  # size of the images, px
 FOCAL = (0.7, 1.0)  # range of the focal length, in image widths
 EYE_HEIGHT = (0.9, 1.75)  # m, range of the camera height
 CLEAR = 0.35  # m, minimum distance of the camera to furniture and walls
 TINT = 0.5  # logarithm of the maximum factor for the colors of a surface
 TINTED = 0.7  # fraction of the images with changed colors
-STUDIOS = 0.5  # fraction of rooms with all classes, because some classes occur only in studios
+STUDIOS = 0.5  # fraction of studios among the rooms; some classes occur only in studios
 QUALITY = 93  # JPEG quality of the images
 MIN_PIXELS = 100  # px, minimum area of objects in an image
 TRIES = 20  # maximum number of candidate views for each image
@@ -137,7 +137,10 @@ def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> F
 
 
 def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Multiply the colors of each material by random factors, in a fraction TINTED of the calls; return the table."""
+    """Return the material table with the colors of each material multiplied by random factors.
+
+    The colors stay the same in a fraction 1 - TINTED of the calls.
+    """
     if rng.uniform() > TINTED:
         return table
     gains = np.exp(rng.uniform(-TINT, TINT, (len(table), 1)) + rng.uniform(-TINT, TINT, (len(table), 3)))
@@ -148,7 +151,7 @@ def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 class RoomPictures:
-    """Images of rendered rooms, read on demand."""
+    """Training images of rendered rooms, read on demand."""
 
     def __init__(self, folder: Path, first: int, rooms: int) -> None:
         self.files: list[Path] = []

@@ -72,7 +72,7 @@ class Trainer:
         self.schedule = schedule
         self.folder = folder
         self.step = 0
-        self.history: list[dict[str, float]] = []  # terms of the loss in each step
+        self.history: list[dict[str, float]] = []  # terms of the loss by name, for each step
         self.averaged = {name: value.detach().clone() for name, value in network.state_dict().items()}
         decayed = [p for p in network.parameters() if p.ndim > 1]
         rest = [p for p in network.parameters() if p.ndim <= 1]  # biases and normalization parameters
@@ -140,7 +140,7 @@ class Trainer:
 
     @torch.no_grad()
     def _average(self) -> None:
-        keep = min(self.schedule.ema_decay, (1 + self.step) / (10 + self.step))  # the first weights decay faster
+        keep = min(self.schedule.ema_decay, (1 + self.step) / (10 + self.step))  # adapts faster at the start
         for name, value in self.network.state_dict().items():
             if value.is_floating_point():
                 self.averaged[name].lerp_(value, 1 - keep)

@@ -30,7 +30,7 @@ OTHER_SPELLINGS = {"grey": "gray", "violet": "purple", "turquoise": "blue", "tea
 
 
 def lab(srgb: Float32) -> Float32:
-    """Return sRGB colors (N, 3) in [0, 1] as CIELAB (N, 3), where distances are approximately perceptual."""
+    """Return sRGB colors (N, 3) in [0, 1] as CIELAB (N, 3), in which distances are approximately perceptual."""
     return np.asarray(cv2.cvtColor(srgb.reshape(1, -1, 3).astype(np.float32), cv2.COLOR_RGB2LAB)[0], np.float32)
 
 

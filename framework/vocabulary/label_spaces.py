@@ -20,7 +20,7 @@ _OTHER_NAMES = "other_names"  # section for spellings outside of all spaces
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the compiled loader is ten times as fast, but optional
 _SECTIONS: dict[str, dict[str, str | None]] = yaml.load(Path(__file__).with_suffix(".yaml").read_text("utf-8"), _LOADER)
-"""Section -> name -> COCO name; None = no object class of COCO."""
+"""COCO name by section and name; None = no object class of COCO."""
 
 SPACES: Mapping[str, tuple[str, ...]] = {k: tuple(names) for k, names in _SECTIONS.items() if k != _OTHER_NAMES}
 """Names of each label space, in the label order of detectors trained on the space."""
@@ -47,7 +47,7 @@ class LabelMapping:
     meaning: Int32  # (C,) index of each label in `classes`; -1 = no object class of COCO
 
     def apply(self, probabilities: Float32) -> tuple[Float32, Bool]:
-        """Return the float32 distributions (N, C') over `classes` for `probabilities` (N, C) of labels.
+        """Return the float32 distributions (N, C') over `classes` from `probabilities` (N, C) of the labels.
 
         The probabilities of labels with the same meaning are summed, labels without a meaning are removed, and the
         result is normalized. Also return a mask (N,) of the rows whose best label has a meaning. A row without any
@@ -87,8 +87,8 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
 def to_coco(labels: Sequence[str]) -> LabelMapping:
     """Map `labels` to COCO names with `label_spaces.yaml`.
 
-    Case, outer spaces and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises ConfigError that
-    names all unknown labels, and ConfigError if no label is an object class of COCO.
+    Case, outer spaces and text after a comma are ignored: "Sofa, couch, lounge" is "sofa". Raises ConfigError with all
+    unknown labels, or if no label is an object class of COCO.
     """
     keys = [label.partition(",")[0].strip().lower() for label in labels]
     unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]

@@ -1,4 +1,4 @@
-"""Ground truth as detections: the upper bound for detectors."""
+"""Ground truth as detections, the upper bound of detection accuracy."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ SHA256 = {
     "maskrcnn2go_coco_int8.npz": "a79197eba054bdf4e4b1136a3dffbfea951f442682464357d91b2a1abd0d21c9",
 }
 STRIDE = 16  # side of a cell of the feature map, px of the resized image
-BINS = 6  # bins of RoIAlign per side
+BINS = 6  # number of bins of RoIAlign per side
 PRE_NMS_PROPOSALS = 3000  # number of best anchors that are decoded, as in the graph
 EXTENT = 1.0  # extent of the boxes; see framework.detection.masks.boxes
 
@@ -88,7 +88,7 @@ class MaskRCNN2Go(Detector):
         check_count("detector.proposals", self.proposals, MAX_PROPOSALS)
         check_count("detector.max_detections", self.max_detections, MAX_DETECTIONS)
         require(self.short_side >= 32, "detector.short_side", self.short_side, "at least 32 px")
-        allowed = f"at least {self.short_side} px and at most {LONGEST_SIDE}"
+        allowed = f"a value in [{self.short_side}, {LONGEST_SIDE}] px"
         require(self.short_side <= self.long_side <= LONGEST_SIDE, "detector.long_side", self.long_side, allowed)
         self._device = torch_device(self.device)
         self.classes = COCO

@@ -27,7 +27,7 @@ class OnnxBoxes(Detector):
 
     The class distribution of a detection is its class scores times the objectness, normalized. Its score is the largest
     of these products before normalization. A mask is the connected foreground of its box, see
-    `framework.detection.masks.masks_from_boxes`. A box with too little depth is dropped and counted in
+    `framework.detection.masks.masks_from_boxes`. A box with too few depth readings is dropped and counted in
     `boxes_without_depth`. The defaults match Megvii's YOLOX.
     """
 
@@ -89,7 +89,7 @@ class OnnxBoxes(Detector):
         self.boxes_without_depth += missing
         log.log(
             level,
-            "frame %d: dropped %d of %d boxes with too little depth for a mask, %d so far",
+            "frame %d: dropped %d of %d boxes with too few depth readings for a mask, %d so far",
             frame.index,
             missing,
             len(found),

@@ -27,7 +27,7 @@ class OnnxSegmentation(Detector):
     (1, 4 + C + M, K) or its transpose, and (1, M, h, w) or (1, h, w, M). If suppression is part of the network (exports
     with `nms=True`, networks without duplicates), the first output is (1, K, 6 + M), with x1 y1 x2 y2, score and label.
     Boxes are in px of the input or in 0..1. The layout is detected from shapes and from the outputs for a black image,
-    see `framework.detection.segmentation_output`. Ambiguous layouts are errors.
+    see `framework.detection.segmentation_output`. An ambiguous layout raises DataError.
 
     The class distribution of a detection is its normalized class scores. Its score is the largest class score before
     normalization. Suppression in the network discards the other scores. Then the other classes get equal parts of
@@ -38,7 +38,7 @@ class OnnxSegmentation(Detector):
     weights: Path  # ONNX file, relative to the working or project folder
     sha256: str = ""  # expected SHA-256 of the file; "" = not checked
     label_space: str = "coco"  # class names: a label space, or a text file with one name per line
-    objectness: bool = False  # True = the outputs have an objectness before the class scores, as in YOLOv5
+    objectness: bool = False  # True = an objectness score precedes the class scores in the outputs, as in YOLOv5
     box_format: BoxKind = BoxKind.AUTO  # box format: CENTER, CORNER or AUTO (detected)
     class_spread: float = 1.0  # fraction of (1 - score) for other classes, if the network reports one class, in [0, 1]
     score_threshold: float = 0.1  # minimum score, in (0, 1); low, because weak detections can update instances

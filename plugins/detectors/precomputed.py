@@ -128,12 +128,12 @@ class Precomputed(Detector):
         if index > last:
             raise DataError(
                 f"detector.path: expected detections of this sequence, got {has} and none for the frames "
-                f"requested so far, up to {index}; check that the file is of this sequence"
+                f"requested so far, up to {index}; check that the file belongs to this sequence"
             )
         if len(self._requested) == FRAMES_IN_DOUBT:
             log.warning(
                 "detector.path: expected detections of this sequence, got %s and none for the first %d frames; "
-                "check that the file is of this sequence",
+                "check that the file belongs to this sequence",
                 has,
                 FRAMES_IN_DOUBT,
             )

@@ -32,8 +32,8 @@ LOOKALIKES = (
 CLUTTER_CLASSES = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
 """Classes assigned to detections of things without a COCO class."""
 
-LOOKALIKE_FRACTION = 0.8  # fraction of the probability lost by the ground-truth class; the other classes get the rest
-EVEN_FRACTION = 0.01  # weight of the mean distribution in each distribution; avoids zeros, like a softmax
+LOOKALIKE_FRACTION = 0.8  # fraction of the probability of wrong classes for similar classes; other classes get the rest
+EVEN_FRACTION = 0.01  # weight of the mean distribution in each distribution; avoids zeros, as a softmax does
 FALSE_SIZES = (24.0, 160.0)  # range of the sides of false detections, px, log-uniform
 RECURRING_SIZES = (0.2, 1.2)  # range of the sides of recurring false detections, m, log-uniform
 LARGEST_CLUTTER = 0.25  # maximum size of things detected as objects, fraction of the image; walls are larger
@@ -56,7 +56,7 @@ INTERVALS = {
 
 
 class Draw(IntEnum):
-    """The purpose of a random number. Each purpose has its own stream, so that errors are independent of each other."""
+    """The purpose of a random number. Each has its own random stream, so that errors are independent of each other."""
 
     MERGE = 0
     MISS = 1
@@ -95,7 +95,7 @@ class SimulatedDetector(Detector):
     - Objects are missed, more often if small (`small_side`) or cut by the image border. Some objects are missed nearly
       always and others never (`miss_spread`).
     - Objects are split in two (`split_rate`).
-    - Masks are shifted, bleed over the border, have a noisy border and are resampled on a coarse grid.
+    - Masks are shifted, extend beyond the object, have a noisy border and are resampled on a coarse grid.
     - The class becomes a distribution around a confusion kernel of similar classes, often with the same draw for an
       object (`confusion_consistency`).
     - The score depends on mask quality and class certainty.
@@ -248,7 +248,7 @@ class SimulatedDetector(Detector):
         return halves
 
     def _reshape(self, candidate: Candidate, frame: Frame) -> Candidate:
-        """Return the candidate with a network-like mask: shifted, bleeding, noisy and coarse."""
+        """Return the candidate with the mask errors of a network: shift, bleeding, noise and coarse resolution."""
         if not candidate.mask.any():
             return candidate
         random = self._random(Draw.SHAPE, frame.index, candidate.instance, candidate.part)

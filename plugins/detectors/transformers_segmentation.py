@@ -36,7 +36,7 @@ class Family:
     auto_class: str  # auto class of transformers
     logits: str  # output with the class logits, (1, Q, C or C + 1)
     masks: str  # output with the mask logits, (1, Q, h, w)
-    any_size: bool  # support for images of any size
+    any_size: bool  # True = the network accepts images of any size
     mask_quality: bool  # True = the score is multiplied by the mean probability of the mask's pixels, as published
 
 
@@ -86,7 +86,7 @@ class TransformersSegmentation(Detector):
         check_count("detector.max_detections", self.max_detections, MAX_DETECTIONS)
         short, long = self.short_side, self.long_side
         require(short == 0 or short >= 32, "detector.short_side", short, "0 (as published) or at least 32 px")
-        allowed = f"at least {short} px and at most {LONGEST_SIDE}" if short else "0 if short_side is 0"
+        allowed = f"a value in [{short}, {LONGEST_SIDE}] px" if short else "0 if short_side is 0"
         require(short <= long <= (LONGEST_SIDE if short else 0), "detector.long_side", long, allowed)
         self._device = torch_device(self.device)
         checkpoint = Checkpoint(self.model, self.revision)
@@ -160,8 +160,8 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
 def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int, int]) -> Tensor:
     """Return the mask logits (N, H, W) at the pixels of an image of `shape`, interpolated from (N, h, w).
 
-    `covered` holds the fractions of the input's height and width covered by the image, from the upper left. The rest is
-    padding.
+    `covered` contains the fractions of the input's height and width covered by the image, from the upper left. The rest
+    is padding.
     """
     axes = [
         (torch.arange(size, device=grids.device, dtype=torch.float32) + 0.5) * (2 * fraction / size) - 1
@@ -186,7 +186,7 @@ class Preprocessing:
     """
 
     size: Mapping[str, int] | None  # as in the file; None = original size
-    divisor: int  # sides are rounded up to multiples of it
+    divisor: int  # px; sides are rounded up to multiples of it
     pad_to: tuple[int, int] | None  # padded (height, width), black at the right and bottom
     mode: str  # interpolation mode
     factor: float  # factor of the values 0..255
@@ -198,8 +198,8 @@ class Preprocessing:
         """Return the settings in the content of a file. Raises DataError for missing or unsupported settings."""
         if content.get("do_split_image"):
             raise DataError(
-                f"{where}: expected an instance model, got a model that splits images for semantic segmentation; "
-                "choose another model"
+                f"{where}: expected an instance segmentation model, got a model for semantic segmentation "
+                "(do_split_image); choose another model"
             )
         if content.get("pad_size"):
             raise DataError(f"{where}: pad_size: expected no value, got {content['pad_size']}")
@@ -256,7 +256,7 @@ class Preprocessing:
 
 
 def _with_short_side(shape: tuple[int, int], short: int, long: int) -> tuple[int, int]:
-    """Return the aspect-preserving shape for these sides, rounded as in DETR's transforms and in training."""
+    """Return the resized (height, width) with the aspect ratio of `shape`, rounded as in DETR's transforms."""
     smaller, larger = min(shape), max(shape)
     exact: float = short
     if larger / smaller * short > long:

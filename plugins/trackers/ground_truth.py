@@ -1,4 +1,4 @@
-"""Ground-truth poses: the upper bound for trackers."""
+"""Ground-truth poses, the upper bound of tracking accuracy."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Reference(Enum):
 
 @dataclass(frozen=True)
 class _Seen:
-    """A frame as an Open3D image with its pose."""
+    """The Open3D image of a frame and its pose."""
 
     image: o3d.t.geometry.RGBDImage
     T_world_camera: Float64  # (4, 4)

@@ -15,7 +15,7 @@ from framework.tracking.keyframes import Keyframes
 
 @dataclass
 class PycolmapPnp(PoseTracker):
-    """Feature matching with the nearest keyframes, and pycolmap's PnP with RANSAC.
+    """Feature matching with the nearest keyframes and pose estimation by pycolmap's PnP with RANSAC.
 
     If matching fails, the tracker relocalizes among all keyframes. It does not use the map. See `Keyframes` for the
     parameters.

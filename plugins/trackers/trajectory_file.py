@@ -30,8 +30,8 @@ class TrajectoryFile(PoseTracker):
 
     By default the trajectory is moved rigidly so that the first frame with a pose defines the world frame, as in
     `PoseTracker`. `world_frame=FILE` keeps the file's world frame. The sequence's ground-truth poses are invalid in the
-    file's world frame. Raises DataError that names the file and the line for poses that are not finite or not rigid,
-    and for timestamps that do not increase.
+    file's world frame. Raises DataError with the file and the line for poses that are not finite or not rigid, and for
+    timestamps that do not increase.
     """
 
     path: Path  # trajectory in TUM format

@@ -25,15 +25,15 @@ from framework.tracking.raw_keyframe import COMPARED, NEW_DISTANCE, KeyframeTerm
 from framework.tracking.uncertainty import is_significant, pose_covariance
 
 LEVELS = 3
-CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; four times as long at each coarser level
-STANDING = 1e-3  # maximum motion of a standing camera, m and rad; above it, an uncertain motion is better than none
+CONVERGED = 1e-4  # maximum last step of the finest level, m and rad; the limit is four times larger per coarser level
+STANDING = 1e-3  # maximum motion of a possibly stationary camera, m and rad; larger motions are used even if uncertain
 SAME_POSE = 0.05  # maximum difference between equal poses, m and rad
 SMALLEST = 8  # minimum side of the coarsest level, px
 CHANGED_SCENE = 0.95  # minimum agreement of the points not behind the map's surface, if an object was removed
 EXPECTED_AGREEMENT = 0.8  # replaces min_agreement near the prediction of a steady motion
 EXPECTED_BEHIND = 0.1  # replaces max_occluded near the prediction of a steady motion
 STEADY = 5  # minimum number of consecutive frames with a correct prediction in a steady motion
-VISITED = 64  # number of poses that a lost camera tries, one per frame
+VISITED = 64  # number of visited poses that are tried for a lost camera, one per frame
 VISITED_SEPARATION = 0.1  # minimum separation of these poses, m and rad
 RECOVERY_INFORMATION = 2.0  # factor of min_information for a lost camera
 
@@ -46,7 +46,7 @@ class ResidualWeights(Enum):
 
 
 class Alignment(NamedTuple):
-    """Result of the alignment of a frame. Fractions are of the points in view unless stated otherwise."""
+    """Result of the alignment of a frame. Fractions are relative to the visible points unless stated otherwise."""
 
     T_world_camera: Float64
     matched: float  # fraction of points with a nonzero weight
@@ -54,7 +54,7 @@ class Alignment(NamedTuple):
     behind: float  # fraction of points behind the map's surface
     agreement_in_front: float  # fraction of the points not behind the map's surface that agree with the map
     reason: str  # reason for rejection, empty if the pose is possible
-    doubt: str  # reason for confirmation by a second source, empty without doubt
+    doubt: str  # reason to require confirmation by a second source, empty if it is not required
     covariance: Float64 | None = None  # (6, 6) Pose.covariance; None = unknown
 
     @property
@@ -94,7 +94,7 @@ class VoxelHashingIcp(PoseTracker):
     max_translation: float = 0.3  # maximum translation between frames, m, > 0; proportional to depth beyond 5 m (TUKEY)
     max_rotation: float = 0.35  # maximum rotation between frames, rad, > 0; lost above it
     min_visible: float = 0.05  # minimum fraction of visible points (in mapped parts of the view), in [0, 1]
-    min_matched: float = 0.4  # minimum fraction of the visible points with a weight, in [0, 1]
+    min_matched: float = 0.4  # minimum fraction of the visible points with a nonzero weight, in [0, 1]
     # minimum ratio of smallest to mean eigenvalue of the dimensionless normal matrix, in [0, 1]; doubled while lost
     min_information: float = 1e-3
     min_agreement: float = 0.92  # minimum fraction of visible points that agree with the map, in [0, 1]; 0 = off
@@ -126,7 +126,7 @@ class VoxelHashingIcp(PoseTracker):
         self._steady_frames = 0  # number of consecutive frames with a correct prediction
         self._keyframes = Keyframes(seed=self.seed)
         self._visited: deque[Float64] = deque(maxlen=VISITED)
-        self._T_world_doubted: Float64 | None = None  # pose of the last frame if it was lost because of doubt only
+        self._T_world_doubted: Float64 | None = None  # pose of the last frame if only its confirmation failed
         self._last: FrameFeatures | None = None  # features of the last trusted frame
         self._stored_scene: SceneMap | None = None  # map to relocalize in; None after success
         self._raw_keyframe: RawKeyframe | None = None
@@ -166,7 +166,7 @@ class VoxelHashingIcp(PoseTracker):
     def _held(self, alignment: Alignment) -> Alignment:
         """Return the alignment at the last pose if the motion from there is small and does not exceed its uncertainty.
 
-        The last pose is that of the last significant motion, so that slow motion adds up until it is significant.
+        The last pose is that of the last significant motion, so that slow motions add up until they are significant.
         """
         assert self._T_world_last is not None
         if self._lost_frames or alignment.covariance is None:
@@ -207,7 +207,7 @@ class VoxelHashingIcp(PoseTracker):
         return scale
 
     def _loss(self, alignment: Alignment, frame: Frame) -> str:
-        """Return the reason for a loss, with the cause if depth is missing in many single pixels."""
+        """Return the reason for a loss, with the cause if many isolated pixels have no depth."""
         reason = alignment.reason or alignment.doubt
         if not is_scattered(frame.depth):
             return reason
@@ -240,7 +240,7 @@ class VoxelHashingIcp(PoseTracker):
         return alignment
 
     def _align_lost(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
-        """Align from the last trusted pose, and from the doubted pose of the last frame."""
+        """Align from the last trusted pose, then from the unconfirmed pose of the last frame, if any."""
         assert self._T_world_last is not None
         alignment = self._align_twice(levels, scene, self._T_world_last)
         if alignment.trusted or self._T_world_doubted is None:
@@ -254,9 +254,9 @@ class VoxelHashingIcp(PoseTracker):
         if min(frame.camera.shape) * self._finest_scale(frame.camera) < SMALLEST * 2 ** (LEVELS - 1):
             side = min(frame.camera.shape) * self._finest_scale(frame.camera) / 2 ** (LEVELS - 1)
             raise DataError(
-                f"tracker.finest_scale: expected at least {SMALLEST} px at the coarsest of {LEVELS} levels, got "
-                f"{side:.3g} px with {self.finest_scale:g} for images of {frame.camera.width}x{frame.camera.height} "
-                "px; raise tracker.finest_scale or use larger images"
+                f"tracker.finest_scale: expected at least {SMALLEST} px for the shorter side of the coarsest of "
+                f"{LEVELS} levels, got {side:.3g} px with {self.finest_scale:g} for images of "
+                f"{frame.camera.width}x{frame.camera.height} px; increase tracker.finest_scale or use larger images"
             )
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         nearest, farthest = scene.depth_range
@@ -295,7 +295,7 @@ class VoxelHashingIcp(PoseTracker):
     def _relocalized(
         self, alignment: Alignment, seen: FrameFeatures, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
-        """Return the alignment confirmed or replaced by features. A lost camera also tries a visited pose."""
+        """Return the alignment confirmed or replaced by features. For a lost camera, a visited pose is also tried."""
         if not self.relocalize:
             return alignment
         found = self._pose_from_features(seen)
@@ -336,7 +336,7 @@ class VoxelHashingIcp(PoseTracker):
         return found
 
     def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
-        """Align from a pose, and again to the view from the result. Agreement shows that the pose is determined."""
+        """Align from a pose, then from the result. If both results agree, the pose is determined."""
         alignment = self._align(levels, scene, T_world_from, T_world_from)
         if not alignment.trusted or self.min_agreement == 0:
             return alignment
@@ -348,7 +348,10 @@ class VoxelHashingIcp(PoseTracker):
     def _align(
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
     ) -> Alignment:
-        """Align a frame to the view of the map at T_world_view, coarse to fine. The last pose is T_world_from."""
+        """Align a frame to the view of the map at T_world_view, coarse to fine.
+
+        The step is limited relative to the last pose T_world_from.
+        """
         view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth, levels[0].sensor)
         model, intensities = model_view(view), model_intensities(view, LEVELS)
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
@@ -440,9 +443,10 @@ class VoxelHashingIcp(PoseTracker):
         return ""
 
     def _is_determined(self, equations: NormalEquations) -> bool:
-        """Return True if all motions are determined, by eigenvalues of A for lengths in units of the typical depth.
+        """Return True if the points determine the motion in all six degrees of freedom.
 
-        Color counts in full, without lambda, because noise of normals adds false information to geometry only.
+        The test uses the eigenvalues of A with translations in units of the typical depth. Color counts in full,
+        without lambda, because noise of normals adds false information to geometry only.
         """
         color = (1 / self.color_weight - 1) * equations.A_color if self.color_weight > 0 else 0.0
         information = np.linalg.eigvalsh(self._scale.without_units(equations.A + color))

@@ -44,7 +44,7 @@ def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
         cached = _cached(model, revision, more)
     if cached is None:
         raise DataError(
-            f"detector.model: expected a complete cache after the download of {model}, got missing files; try again"
+            f"detector.model: expected a complete cache after the download of {model}, got missing files; run again"
         )
     return cached
 
@@ -148,18 +148,18 @@ def _check(path: Path, published: Any) -> None:
     path.resolve().unlink()  # the content, if the cache uses symbolic links
     path.unlink(missing_ok=True)
     raise DataError(
-        f"detector.model: expected sha256 {published.lfs.sha256} for {path.name}, got {found}; try "
-        "again to download the file"
+        f"detector.model: expected sha256 {published.lfs.sha256} for {path.name}, got {found}; run again to "
+        "download the file again"
     )
 
 
 def imported_transformers() -> Any:
-    """Import transformers. Raises ConfigError that names the extra if transformers is not installed."""
+    """Import transformers. Raises ConfigError with the required extra if transformers is not installed."""
     return import_optional("transformers", "loads models of huggingface.co", "transformers")
 
 
 def read_part(parameter: str, folder: Path, what: str, auto_class: Any, **options: Any) -> Any:
-    """Load a part of a model from a folder. Raises DataError that names `parameter` if loading fails."""
+    """Load `what`, a part of a model, from a folder. Raises DataError for `parameter` if loading fails."""
     try:
         return auto_class.from_pretrained(str(folder), local_files_only=True, **options)
     except Exception as error:  # transformers, tokenizers and safetensors raise many types for invalid files

@@ -30,7 +30,7 @@ from framework.files.json_file import read_json
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 LONGEST_SIDE = 1024  # maximum side of a model's input, px
-HASH_DIGITS = 16  # number of digits of a local folder's content hash in the name of its space
+HASH_DIGITS = 16  # number of digits of a local folder's content hash in the name of the embedding space
 MAX_TOKENS = 64  # maximum length of a text, tokens; the limit is 77 for CLIP and 64 for SigLIP
 GRAY = 128  # gray value of suppressed surroundings
 
@@ -50,7 +50,7 @@ FAMILIES = {
     # https://huggingface.co/docs/transformers/model_doc/siglip2: padded to 64 tokens, in lower case
     "siglip": ImageTextFamily("This is a photo of {}.", "max_length", True, (0.5,) * 3, (0.5,) * 3),
 }
-"""Families by `model_type` of config.json. SigLIP 2 with a fixed image size also has the type `siglip`."""
+"""Families by `model_type` of config.json. SigLIP 2 with a fixed image size also has the `model_type` `siglip`."""
 
 
 class ImageTextModel:

@@ -18,7 +18,7 @@ from framework.errors import ConfigError, DataError
 
 PROMPT = "a photo of a {}"  # Minderer et al. 2023
 MAX_TOKENS = 16  # maximum length of a text, tokens, as in the training of OWLv2
-PADDING = 128  # gray value right of or below the image in the square input of OWLv2
+PADDING = 128  # gray value of the padding to the right of or below the image in OWLv2's square input
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 SAM_FAMILY = {
     "sam": ("SamModel", False),
@@ -54,7 +54,7 @@ class TextPromptedBoxes:
 
     @torch.inference_mode()
     def __call__(self, color: UInt8) -> tuple[Float32, Float32]:
-        """Return the boxes (P, 4) x1 y1 x2 y2 px, pixel centers at integers, and the probabilities (P, texts)."""
+        """Return boxes (P, 4) x1 y1 x2 y2 px, pixel centers at integers, and the probabilities (P, T) of T texts."""
         long = max(color.shape[:2])
         square = np.full((long, long, 3), PADDING, np.uint8)
         square[: color.shape[0], : color.shape[1]] = color

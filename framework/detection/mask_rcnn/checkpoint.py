@@ -74,7 +74,9 @@ def _read_torch(path: Path) -> dict[str, Tensor]:
         ) from error
     state = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(tensor, Tensor) for tensor in state.values()):
-        raise DataError(f"{path}: expected a state_dict of tensors, alone or as `model`, got {type(content).__name__}")
+        raise DataError(
+            f"{path}: expected a state_dict of tensors, alone or under the key `model`, got {type(content).__name__}"
+        )
     return state
 
 
@@ -85,14 +87,15 @@ def from_torchvision(
 
     `classes`: the labels after the background; None = COCO's 91 labels. The rows of unused COCO ids, which were trained
     only as negatives, are removed. `norm_eps`: 0 for torchvision's published checkpoint, 1e-5 for networks trained with
-    the default. Raises DataError that names the source `where` for other networks.
+    the default. `where`: the source of the state_dict, for errors. Raises DataError if it is not from a Mask R-CNN with
+    a feature pyramid.
     """
     tensors = {_newer_name(name): tensor for name, tensor in state.items()}
     labels = len(required(tensors, "roi_heads.box_predictor.cls_score.bias", where))
     if classes is None:
         if labels != len(COCO_BY_ID):
             raise DataError(
-                f"{where}: expected COCO's {len(COCO_BY_ID)} labels, got {labels}; give the classes with --classes"
+                f"{where}: expected COCO's {len(COCO_BY_ID)} labels, got {labels}; set the classes with --classes"
             )
         tensors, classes = _without_gaps(tensors), COCO
     elif len(classes) != labels - 1:
@@ -137,5 +140,6 @@ def _backbone(tensors: Mapping[str, Tensor], norm_eps: float, where: str) -> Res
         if expected == depths and (name in WITH_BOTTLENECKS) == bottlenecks:
             width = len(required(tensors, "backbone.body.conv1.weight", where))
             return ResNetShape(name, width, norm_eps=norm_eps)
+    known = ", ".join(f"{name} {blocks}" for name, blocks in DEPTHS.items())
     found = f"{depths} blocks {'with' if bottlenecks else 'without'} bottlenecks"
-    raise DataError(f"{where}: expected the blocks of {', '.join(DEPTHS)}, got {found}")
+    raise DataError(f"{where}: expected the numbers of blocks of {known}, got {found}")

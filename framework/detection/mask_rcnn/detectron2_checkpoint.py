@@ -56,15 +56,16 @@ NOT_WEIGHTS = r"(pixel_mean|pixel_std|.*\.cell_anchors\.\d+|.*\.num_batches_trac
 
 
 def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str, ...] | None = None) -> MaskRCNN:
-    """Return the network from a detectron2 state_dict; `classes`: None = COCO's 80 classes.
+    """Return the network from a detectron2 state_dict.
 
-    Raises DataError that names the source `where` for other networks.
+    `where`: the source of the state_dict, for errors. `classes`: None = COCO's 80 classes. Raises DataError if the
+    state_dict is not from a Mask R-CNN with ResNet-FPN.
     """
     _check_input(state, where)
     tensors = {_renamed(name, where): tensor for name, tensor in state.items() if not re.fullmatch(NOT_WEIGHTS, name)}
     found = len(required(tensors, "roi_heads.mask_predictor.mask_fcn_logits.bias", where))
     if classes is None and found != len(COCO):
-        raise DataError(f"{where}: expected COCO's {len(COCO)} classes, got {found}; give the classes with --classes")
+        raise DataError(f"{where}: expected COCO's {len(COCO)} classes, got {found}; set the classes with --classes")
     classes = classes or COCO
     if len(classes) != found:
         raise DataError(f"{where}: expected {found} classes, got {len(classes)}")
@@ -108,7 +109,7 @@ def read_pickle(path: Path) -> dict[str, Tensor]:
 
 
 class ArraysOnly(pickle.Unpickler):
-    """Unpickler of numpy arrays that rejects all other calls in a pickle."""
+    """Unpickler of numpy arrays that rejects all other objects in a pickle."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (allowed := ALLOWED.get((module.replace("numpy._core", "numpy.core"), name))) is None:

@@ -27,7 +27,7 @@ from framework.detection.masks.boxes import anchor_grid, clip, decode, suppress_
 
 STRIDES = (4, 8, 16, 32, 64)  # px of the input per cell of a level, P2 to P6
 POOLED_LEVELS = 4  # P2 to P5; only proposals use P6
-BOX_BINS, MASK_BINS = 7, 14  # bins of RoIAlign per side
+BOX_BINS, MASK_BINS = 7, 14  # number of bins of RoIAlign per side
 CANONICAL_SIDE, CANONICAL_LEVEL = 224.0, 2  # a box with this side, px, is pooled from P4 (Lin et al. 2017, eq. 1)
 DELTA_WEIGHTS = (10.0, 10.0, 5.0, 5.0)  # factors in the box head's deltas
 PROPOSAL_NMS = 0.7  # IoU
@@ -39,14 +39,14 @@ class Architecture:
 
     classes: tuple[str, ...]  # without the background, in the order of the network's columns
     backbone: ResNetShape = field(default_factory=ResNetShape)
-    fpn_channels: int = 256  # channels of the feature pyramid
-    head_features: int = 1024  # features of the box head
+    fpn_channels: int = 256  # number of channels of the feature pyramid
+    head_features: int = 1024  # number of features of the box head
     anchor_sides: tuple[float, ...] = (32.0, 64.0, 128.0, 256.0, 512.0)  # px, one per level
     anchor_ratios: tuple[float, ...] = (0.5, 1.0, 2.0)  # height / width
-    rounded_anchors: bool = True  # anchors are rounded to whole pixels, as in torchvision
+    rounded_anchors: bool = True  # True = anchors are rounded to whole pixels, as in torchvision
     # True = the stride of P6 is the input size divided by the size of P6, rounded down: 61 at 800 px (torchvision)
     truncated_strides: bool = False
-    sampling_ratio: int = 2  # samples per side of a bin in RoIAlign; 0 = one sample per cell
+    sampling_ratio: int = 2  # number of samples per side of a bin in RoIAlign; 0 = one sample per cell
     half_pixel: bool = False  # convention of RoIAlign; True = "aligned"
     pixel_mean: tuple[float, float, float] = (123.675, 116.28, 103.53)  # RGB, 0..255
     pixel_std: tuple[float, float, float] = (58.395, 57.12, 57.375)
@@ -92,7 +92,7 @@ class MaskRCNN(nn.Module):
         return levels
 
     def score_anchors(self, pyramid: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the objectness (N, A) and deltas (N, A, 4) of all levels' anchors, in the order of `anchors`."""
+        """Return the objectness logits (N, A) and deltas (N, A, 4) of all levels, in the order of `anchors`."""
         objectness, deltas = zip(*(self.rpn["head"](level) for level in pyramid), strict=True)
         n = len(pyramid[0])
         return (
@@ -126,7 +126,7 @@ class MaskRCNN(nn.Module):
         return logits
 
     def pool(self, pyramid: Sequence[Tensor], boxes: Tensor, bins: int) -> Tensor:
-        """Return the features (P, C, bins, bins) of boxes (P, 4), each pooled from the level for its size (eq. 1)."""
+        """Return the features (P, C, bins, bins) of boxes (P, 4), each from the level for its size (Lin, eq. 1)."""
         sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=0).prod(dim=1).sqrt()
         level = torch.floor(CANONICAL_LEVEL + torch.log2(sides / CANONICAL_SIDE) + 1e-6)
         level = level.clamp(0, POOLED_LEVELS - 1)
@@ -173,7 +173,7 @@ class ProposalHead(nn.Module):
 
 
 class RoiHeads(nn.Module):
-    """The heads for pooled regions."""
+    """The box head and the mask head, which process pooled regions."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
@@ -203,7 +203,7 @@ class RoiHeads(nn.Module):
 
 
 class BoxPredictor(nn.Module):
-    """A distribution over the labels, and a box for each label."""
+    """Predictor of the logit and the box deltas of each label."""
 
     def __init__(self, features: int, labels: int) -> None:
         super().__init__()
@@ -237,8 +237,8 @@ def propose(
 ) -> Float32:
     """Return the box proposals (P, 4) for one image of `shape` (height, width), best first.
 
-    `anchors`: (A, 4) of each level. `objectness` (A,) and `deltas` (A, 4): of all levels in order. `before_nms` anchors
-    of each level are decoded, and `after_nms` boxes of all levels are kept.
+    `anchors`: (A, 4) of each level. `objectness` (A,) and `deltas` (A, 4): of all levels in order. At most `before_nms`
+    anchors of each level are decoded, and at most `after_nms` boxes of all levels are kept.
     """
     boxes, scores, levels = [], [], []
     start = 0

@@ -63,7 +63,7 @@ def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: 
 
 
 def load_network(path: Path) -> MaskRCNN:
-    """Read the network in `path`, in float32 and inference mode. Raises DataError for other files."""
+    """Read the network in `path`, in float32 and inference mode. Raises DataError if it is not a valid network file."""
     with _opened(path) as file:
         description = _description(file.metadata(), path)
         names = file.keys()
@@ -85,7 +85,8 @@ def describe_network(path: Path) -> NetworkDescription:
 def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str) -> MaskRCNN:
     """Build a network with these weights, in float32 and inference mode.
 
-    Counters are ignored. Raises DataError that names the source `where` if the tensors do not match the architecture.
+    Counters are ignored. `where`: the source of the tensors, for errors. Raises DataError if the tensors do not match
+    the architecture.
     """
     try:
         with torch.device("meta"):  # saves memory and random initialization of weights that are replaced below
@@ -106,7 +107,7 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
 
 
 def required(tensors: Mapping[str, Tensor], name: str, where: str) -> Tensor:
-    """Return the tensor `name`. Raises DataError that names the source `where` if the tensor is missing."""
+    """Return the tensor `name` of the source `where`. Raises DataError if the tensor is missing."""
     if name not in tensors:
         raise DataError(f"{where}: expected the weights {name} of a Mask R-CNN with a feature pyramid, got none")
     return tensors[name]
@@ -157,7 +158,7 @@ def _opened(path: Path) -> Any:
 
 def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescription:
     if not metadata or "architecture" not in metadata:
-        raise DataError(f"{path}: expected an architecture in the metadata, got none; choose a network file")
+        raise DataError(f"{path}: expected an architecture in the metadata, got none; choose a network of InstanceMap")
     try:
         card = parse_json(path, metadata.get("card", "{}"))
         architecture = parse_json(path, metadata["architecture"])
@@ -170,7 +171,7 @@ def _parsed(kind: Any, value: Any, name: str) -> Any:
     """Convert a JSON value to the annotated type `kind`. Raises ValueError for other types."""
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
-            raise ValueError(f"{name}: expected fields, got {value!r}")
+            raise ValueError(f"{name}: expected a JSON object, got {value!r}")
         kinds = typing.get_type_hints(kind)
         if unknown := sorted(value.keys() - kinds.keys()):
             raise ValueError(f"{name}: expected known fields, got {unknown[0]}; update InstanceMap for newer files")
@@ -178,7 +179,7 @@ def _parsed(kind: Any, value: Any, name: str) -> Any:
         try:
             return typing.cast(Any, kind)(**fields)
         except TypeError as error:
-            raise ValueError(f"{name}: expected all required fields, got an error ({error})") from error
+            raise ValueError(f"{name}: expected all required fields, got only {', '.join(fields) or 'none'}") from error
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, list):
             raise ValueError(f"{name}: expected a list, got {value!r}")

@@ -14,7 +14,7 @@ DEPTHS = {
     "resnet101": (3, 4, 23, 3),
 }
 WITH_BOTTLENECKS = ("resnet50", "resnet101")
-EXPANSION = 4  # output channels per inner channel of a bottleneck
+EXPANSION = 4  # number of output channels per inner channel of a bottleneck
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class ResNetShape:
     """The parameters of a residual network."""
 
     name: str = "resnet50"  # a key of DEPTHS
-    width: int = 64  # channels of the stem; 64 in He et al. 2016
+    width: int = 64  # number of channels of the stem; 64 in He et al. 2016
     # convolution with the stride in a bottleneck: True = first convolution (He et al., Detectron), False = second
     # convolution (torchvision, "v1.5")
     stride_in_1x1: bool = False
@@ -30,7 +30,7 @@ class ResNetShape:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """Numbers of channels of the four levels."""
+        """The number of channels of each of the four levels."""
         factor = EXPANSION if self.name in WITH_BOTTLENECKS else 1
         return tuple(self.width * 2**level * factor for level in range(4))
 
@@ -62,7 +62,10 @@ def _layer(channels: int, out: int, stride: int, blocks: int, shape: ResNetShape
 
 
 class Block(nn.Module):
-    """Convolutions with a shortcut: two 3x3, or a bottleneck of 1x1, 3x3 and 1x1 with a quarter of the channels."""
+    """A residual block: two 3x3 convolutions, or a bottleneck of 1x1, 3x3 and 1x1 convolutions.
+
+    The inner convolutions of a bottleneck have a quarter of the output channels.
+    """
 
     def __init__(self, channels: int, out: int, stride: int, shape: ResNetShape) -> None:
         super().__init__()

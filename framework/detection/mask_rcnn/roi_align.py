@@ -23,7 +23,7 @@ def roi_align(
     sampling_ratio: int = 0,
     half_pixel: bool = False,
 ) -> Tensor:
-    """Return the pooled features (N, C, bins, bins) of each box, channels last.
+    """Return the pooled features (N, C, bins, bins) of N boxes, in channels-last memory format.
 
     A bin is the mean of bilinear samples on a regular grid. `features`: (1, C, H, W). `boxes`: (N, 4) x1 y1 x2 y2 px of
     the image. `spatial_scale`: cells per pixel. `sampling_ratio`: samples per side of a bin, 0 = one per covered cell.
@@ -92,14 +92,17 @@ class Samples:
 
 
 def _products(cells: Tensor, x: Samples, y: Samples) -> Tensor:
-    """Return A_y F A_x^T of each box."""
+    """Return the pooled features (N, C, bins, bins) as A_y F A_x^T of each box."""
     rows = y.matrices().to(cells.dtype).reshape(-1, y.cells) @ cells.reshape(y.cells, -1)
     pooled = x.matrices().to(cells.dtype)[:, None] @ rows.view(-1, y.bins, x.cells, cells.shape[1])
     return pooled.permute(0, 3, 1, 2)
 
 
 def _sums(cells: Tensor, x: Samples, y: Samples) -> Tensor:
-    """Return the sums over windows. Chunks have windows of similar width, because the widest determines the cost."""
+    """Return the pooled features (N, C, bins, bins) as sums over windows.
+
+    A chunk contains windows of similar size, because the largest one determines the cost.
+    """
     sizes = x.windows * y.windows
     largest = int(sizes.max()) if len(sizes) else 1
     at_once = max(1, CHUNK // (x.bins * y.bins * largest))

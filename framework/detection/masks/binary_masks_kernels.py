@@ -57,9 +57,9 @@ def shared_pixels(masks, bounds):
 
 @njit(cache=True, nogil=True)
 def _grid_cells(start, end, cells, pixels):
-    """Return the first pixel in reach of a grid along one axis, and per pixel a cell and the weight of the next cell.
+    """Return the first pixel of a grid along one axis, and for each pixel a cell and the weight of the next cell.
 
-    `cells` excludes the ring of zeros. Pixels are in reach inside the box and up to half a cell outside of it.
+    `cells` excludes the ring of zeros. The pixels are those inside the box and up to half a cell outside of it.
     """
     cell = (end - start) / cells  # px
     first = max(0, int(np.ceil(start - 0.5 * cell)))
@@ -77,7 +77,10 @@ def _grid_cells(start, end, cells, pixels):
 
 @njit(cache=True, nogil=True)
 def paste(ringed, borders, threshold, masks):
-    """Write the masks of grids with a zero ring. Interpolation along y comes first and is shared by a row of pixels."""
+    """Write the masks (N, H, W) of the grids `ringed` (N, G + 2, G + 2), which have a ring of zeros.
+
+    Interpolation along y comes first and is shared by a row of pixels.
+    """
     n, height, width = masks.shape
     cells = ringed.shape[1] - 2
     row = np.empty(cells + 2, np.float32)
@@ -97,7 +100,7 @@ def paste(ringed, borders, threshold, masks):
 
 @njit(cache=True, nogil=True)
 def _prototype_cells(start, end, pixels, scale, shift, cells):
-    """Return the first pixel inside a box along one axis, and per pixel a cell and the weight of the next cell."""
+    """Return the first pixel of a box along one axis, and for each pixel a cell and the weight of the next cell."""
     first, stop = max(0, int(np.ceil(start))), min(pixels, int(np.ceil(end)))
     n = max(0, stop - first)
     lower = np.empty(n, np.int64)
@@ -111,7 +114,10 @@ def _prototype_cells(start, end, pixels, scale, shift, cells):
 
 @njit(cache=True, nogil=True)
 def sample_prototypes(logits, borders, affine, least, masks):
-    """Write the masks of prototype logits. Interpolation along y comes first and is shared by a row of pixels."""
+    """Write the masks (N, H, W) of prototype logits (N, h, w) above `least`.
+
+    Interpolation along y comes first and is shared by a row of pixels.
+    """
     n, height, width = masks.shape
     rows, columns = logits.shape[1:]
     for i in range(n):

@@ -12,7 +12,7 @@ from framework.data import Float32, Int32
 from framework.detection.masks.boxes_kernels import suppress_sorted
 
 LARGEST_LOG_SCALE = float(np.log(1000.0 / 16.0))
-"""Limit of the log scale of a box against overflow (Girshick et al., github.com/facebookresearch/Detectron)."""
+"""Maximum log scale of a box, to prevent overflow (Girshick et al., github.com/facebookresearch/Detectron)."""
 
 
 def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple[float, float]) -> Float32:
@@ -27,7 +27,7 @@ def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple
 
 
 def decode(boxes: Float32, deltas: Float32, extent: float = 1.0) -> Float32:
-    """Apply deltas dx dy dw dh (N, 4), relative to centers and sizes, to boxes (N, 4).
+    """Return boxes (N, 4), px, moved and scaled by deltas dx dy dw dh (N, 4) relative to their centers and sizes.
 
     Source: Girshick et al., "Rich feature hierarchies ...", 2014, appendix C, with Detectron's pixel conventions.
     """

@@ -89,7 +89,7 @@ def _foreground(window, weight_x, weight_y, significance):
 
 @njit(cache=True, nogil=True)
 def _grow(window, weight_x, weight_y, near, far, step, noise, mask):
-    """Write the component with the largest weight, of connected pixels at depths from near to far (m), to `mask`."""
+    """Write the connected component with the largest weight, at depths from near to far (m), to `mask` (h, w)."""
     height, width = window.shape
     label = np.zeros((height, width), np.int32)
     stack = np.empty((height * width, 2), np.int32)

@@ -65,7 +65,7 @@ def unpack(counts: bytes) -> Int64:
     position = np.arange(len(codes)) - np.repeat(starts, ends - starts + 1)
     if position.max() >= MAX_CHARACTERS:
         raise DataError(
-            f"run lengths: expected numbers of at most {MAX_CHARACTERS} characters, got {position.max() + 1} characters"
+            f"run lengths: expected at most {MAX_CHARACTERS} characters per number, got {position.max() + 1} characters"
         )
     numbers = np.add.reduceat((codes & (MORE - 1)) << (BITS * position), starts)
     numbers -= np.where(codes[ends] & SIGN, 1 << (BITS * (position[ends] + 1)), 0)

@@ -16,9 +16,9 @@ _before: list[int] = []  # previous number of torch threads, once for each threa
 
 
 def torch_device(device: str, name: str = "detector.device") -> torch.device:
-    """Return the torch device for auto, cpu or cuda; auto = cuda if available.
+    """Return the torch device for `device` auto, cpu or cuda; auto = cuda if available.
 
-    Raises ConfigError that names the parameter for other values and for cuda without a GPU.
+    Raises ConfigError with the key `name` for other values, and for cuda without a GPU.
     """
     require(device in ("auto", "cpu", "cuda"), name, device, "auto, cpu or cuda")
     available = torch.cuda.is_available()

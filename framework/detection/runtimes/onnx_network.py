@@ -105,7 +105,9 @@ class ImageNetwork:
         require(0 <= detector.input_size <= LONGEST_SIDE, "detector.input_size", detector.input_size, allowed)
         require(0 <= detector.padding <= 255, "detector.padding", detector.padding, "a value in [0, 255]")
         finite = bool(np.isfinite([black, white]).all())
-        require(finite and black != white, "detector.white_level", white, f"a finite value, not black_level={black}")
+        require(
+            finite and black != white, "detector.white_level", white, f"a finite value other than black_level={black}"
+        )
         require(device in ("auto", "cpu", "cuda"), "detector.device", device, "auto, cpu or cuda")
         onnx = "an ONNX file (converted with tf2onnx, see docs/guides/detectors.md)"
         require(path.suffix.lower() != ".tflite", "detector.weights", path, onnx)

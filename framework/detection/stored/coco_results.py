@@ -56,8 +56,8 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
     """Read the detections from a result file, in the order of the file.
 
     `segmentation`: run lengths (packed or a list) or polygons. `image_id`: `Frame.index`, as a number or as the file
-    name of the image ("color/000012.png"). `category_id` is used only without `category_name`. Raises DataError that
-    names file and entry for an invalid entry.
+    name of the image ("color/000012.png"). `category_id` is used only without `category_name`. Raises DataError with
+    the file and the entry for an invalid entry.
     """
     entries = read_json(path)
     if not isinstance(entries, list):

@@ -46,8 +46,8 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
     """Read the detections from a mask folder.
 
     NNNNNN is `Frame.index`. The PNG has one channel of 16 bits. The JSON is a list of {"id", "class", "score"} and
-    optionally "class_probabilities". Unlisted ids are not detections. Masks cannot overlap. Raises DataError that names
-    file and entry for an invalid entry.
+    optionally "class_probabilities". Unlisted ids are not detections. Masks cannot overlap. Raises DataError with the
+    file and the entry for an invalid entry.
     """
     index = {name: k for k, name in enumerate(labels)}
     found: list[StoredDetection] = []

@@ -15,7 +15,7 @@ from framework.detection.masks.run_length import decode
 from framework.errors import DataError
 
 ROUNDED_SUM = 0.05  # largest |sum - 1| of probabilities with rounded digits
-MAX_PROBABILITY = 1e6  # largest accepted probability before the check of the sum
+MAX_PROBABILITY = 1e6  # maximum of a single value, checked before the sum to prevent overflow
 
 
 class Segmentation(ABC):
@@ -104,7 +104,7 @@ def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
         unknown = [name for name in found if name not in index]
         if unknown:
             raise DataError(
-                f"class_probabilities: expected the {len(index)} names in detector.label_space, got "
+                f"class_probabilities: expected only the {len(index)} names in detector.label_space, got "
                 f"{', '.join(map(repr, unknown))}"
             )
         given: Sequence[Any] = [found.get(name, 0.0) for name in index]

@@ -163,14 +163,14 @@ MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells()
     ("table", "given", "message"),
     [
         (dense(MIXED), {}, r"got ambiguous boxes \(.* could be corners\); set detector\.box_format=CENTER or CORNER"),
-        (dense(cells() / 8), {}, r"detector\.weights: expected boxes in px of the input 64x96 or in 0\.\.1"),
+        (dense(cells() / 8), {}, r"detector\.weights: expected boxes in px of the input 96x64 or in 0\.\.1"),
         (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 126\); set detector.objectness=true"),
         (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 126\); set detector.objectness=false"),
         (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression .*another detector\.label_space"),
         (detections(as_corners(cells()), 0.9, 3), {}, r"label_space: expected labels 0 to 2 .*, got 3 to 3"),
         (detections(as_corners(cells()), 1.5, 1), {}, r"detector\.layout: expected scores in \[0, 1\], got 0 to 1\.5"),
         (np.zeros((1, 11, 11)), {}, "expected different numbers of candidates and columns, got 11 for both"),
-        (dense(cells()), {"maps": np.zeros((1, 4, 16, 16))}, r"64x96, got .*16, 16\) with another aspect ratio"),
+        (dense(cells()), {"maps": np.zeros((1, 4, 16, 16))}, r"= 64:96, got .*16, 16\) with another aspect ratio"),
         (dense(cells())[0], {}, r"expected two outputs, .*, got output0 \(11, 126\)"),
     ],
 )  # fmt: skip

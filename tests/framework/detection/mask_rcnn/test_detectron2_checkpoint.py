@@ -334,5 +334,5 @@ def test_pth_with_invalid_content_raises(tmp_path):
     ):
         read_network(path)
     torch.save([1], path)
-    with pytest.raises(DataError, match=r"expected a state_dict of tensors, alone or as `model`, got list"):
+    with pytest.raises(DataError, match=r"expected a state_dict of tensors, alone or under the key `model`, got list"):
         read_network(path)

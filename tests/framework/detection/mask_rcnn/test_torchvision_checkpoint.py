@@ -86,14 +86,14 @@ def test_torchvision_new_names_and_custom_classes_are_read():
 
 def test_torchvision_invalid_checkpoints_raise():
     state = tiny_network().state_dict()
-    with pytest.raises(DataError, match=r"^here: expected COCO's 91 labels, got 4; give the classes with --classes$"):
+    with pytest.raises(DataError, match=r"^here: expected COCO's 91 labels, got 4; set the classes with --classes$"):
         from_torchvision(state, "here")
     with pytest.raises(DataError, match=r"^here: expected 3 classes, got 2$"):
         from_torchvision(state, "here", ("chair", "couch"))
     with pytest.raises(DataError, match=r"^here: expected the weights roi_heads.box_predictor.cls_score.bias"):
         from_torchvision({k: v for k, v in state.items() if "roi_heads" not in k}, "here", TINY.classes)
     blocks = {k: v for k, v in state.items() if "layer3.1" not in k}
-    with pytest.raises(DataError, match=r"expected the blocks of resnet.*, got \(2, 2, 1, 2\) blocks without"):
+    with pytest.raises(DataError, match=r"expected the numbers of blocks .*, got \(2, 2, 1, 2\) blocks without"):
         from_torchvision(blocks, "here", TINY.classes)
 
 

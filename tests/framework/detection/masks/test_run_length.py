@@ -63,7 +63,7 @@ def test_run_length_without_masks_is_empty() -> None:
         (b"1", "got 1 px"),
         (b"!!", "packed string"),
         (b"04o", "packed string"),  # ends in the middle of a number
-        (b"0" + b"o" * 30 + b"0", "run lengths: expected numbers of at most 7 characters, got 31 characters"),
+        (b"0" + b"o" * 30 + b"0", "run lengths: expected at most 7 characters per number, got 31 characters"),
         (b"O8I", "negative"),
     ],
 )
