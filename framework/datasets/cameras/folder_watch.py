@@ -88,7 +88,7 @@ class FolderWatch(LiveVideo):
             except DataError as error:
                 if time.monotonic() > deadline:
                     raise DataError(
-                        f"{error}; write it within dataset.camera_timeout={self.camera_timeout:g} s"
+                        f"{error}; write this file within dataset.camera_timeout={self.camera_timeout:g} s"
                     ) from error
             yield None
             time.sleep(self.poll_interval)
@@ -154,7 +154,7 @@ class NewImages:
         self._first: Path | None = None
 
     def look(self) -> None:
-        """Add the new images. Raises DataError if their names have no unique order."""
+        """Add the new images. Raises DataError if their names differ in more than one number (ambiguous order)."""
         try:
             with os.scandir(self.folder) as entries:
                 names = {entry.name for entry in entries}

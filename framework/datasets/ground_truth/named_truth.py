@@ -116,7 +116,7 @@ def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
 
 def _class_of(where: str, entry: Any) -> str | None:
     if not isinstance(entry, dict) or "class" not in entry:
-        expected = '{"name": ..., "class": name, or null if unknown}'
+        expected = '{"name": "...", "class": a COCO name, or null if unknown}'
         raise DataError(f"{where}: expected {expected}, got {entry!r:.60}")
     name = entry["class"]
     if name is None or (isinstance(name, str) and name in COCO):

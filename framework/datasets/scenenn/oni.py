@@ -185,7 +185,8 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
         status = openni.oniWaitForAnyStream(waited, len(handles), ctypes.byref(which), PATIENCE)
         if status == TIME_OUT:
             reached = ", ".join(f"{stream.name.lower()} {last[stream]} of {streams[stream].last}" for stream in Stream)
-            raise DataError(f"expected an intact recording, got a stall of OpenNI 2 at {reached}; download it again")
+            found = f"got a stall of OpenNI 2 after images {reached}"
+            raise DataError(f"expected an intact recording, {found}; download it again")
         _check(status, openni, "play the recording")
         stream = list(Stream)[which.value]
         frame = ctypes.POINTER(_Frame)()

@@ -69,7 +69,7 @@ class OniContents:
 
 
 def read_contents(path: Path) -> OniContents:
-    """Return the streams and image counts of a recording, without pixels.
+    """Return the streams and image counts of a recording, without decoding the images.
 
     Raises DataError if the file is not a recording, or if it has no depth images or no color images.
     """

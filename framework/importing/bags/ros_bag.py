@@ -152,7 +152,7 @@ def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> l
 
 
 def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:
-    """Yield the frames in the order of their second image."""
+    """Yield the frames. A frame is yielded as soon as both of its images are read."""
     topics = device.topics
     partner = {topics.color: {pair.color: pair for pair in pairs}, topics.depth: {pair.depth: pair for pair in pairs}}
     counts = {topics.color: 0, topics.depth: 0}

@@ -32,7 +32,7 @@ from framework.sensors.noise_models import SensorKind
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # first columns of odometry.csv
 INTRINSICS = ("fx", "fy", "cx", "cy")  # next columns, in newer versions
-# type of MP4 and QuickTime files; other types may make FFmpeg open other files
+# bytes that identify MP4 and QuickTime files; for other file types, FFmpeg might open further files
 KIND_AT, KIND = 4, b"ftyp"
 QUIET = "-8"  # FFmpeg's AV_LOG_QUIET; damage is reported by DataError instead
 LAST_FRAME = 10**6 - 1  # largest frame number of six digits

@@ -69,7 +69,7 @@ def test_import_existing_output_raises_before_reading(
     assert ended.value.code == 1
     assert (
         capsys.readouterr().err
-        == f"error: {tmp_path}/out: expected a new or empty folder, got an existing path; remove it or set another\n"
+        == f"error: {tmp_path}/out: expected a new or empty folder, got a file or non-empty folder; remove it or set another\n"
     )
 
 

@@ -137,7 +137,7 @@ def test_trajectory_log_empty_file_has_no_poses(path):
 @pytest.mark.parametrize(
     ("line", "new", "message"),
     [
-        (1, "0 0", "line 1: expected the header of a frame, frame frame frame.1, got '0 0'"),
+        (1, "0 0", "line 1: expected a frame header `frame frame frame.1`, got '0 0'"),
         (1, "0 0 1 2", "line 1: expected the header"),
         (1, "-1 -1 0", "line 1: expected the header"),
         (6, "6.5 6 7", "line 6: expected the header"),

@@ -114,7 +114,7 @@ SPOILT_CAMERAS = {
             lambda c: c.update(intrinsics=[0] * 9),
             "Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy =",
         ),
-        (lambda c: c.update(time="now"), "time: expected a number, got now"),
+        (lambda c: c.update(time="now"), "time: expected a number, got 'now'"),
     ],
     "Polycam": [
         (lambda c: c.pop("fx"), "expected a key 'fx'"),
