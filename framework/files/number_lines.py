@@ -54,7 +54,7 @@ def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> li
 
 
 def read_gravity(path: Path) -> list[Float64 | None]:
-    """Read the up direction of each frame, in the camera: `x y z` per line, `nan nan nan` = unknown.
+    """Read the up direction of each frame in the camera frame: `x y z` per line, `nan nan nan` = unknown.
 
     Returns unit vectors (3,), None = unknown. Empty lines, and comments after `#`, are skipped. Raises DataError.
     """
@@ -63,7 +63,7 @@ def read_gravity(path: Path) -> list[Float64 | None]:
 
 
 def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
-    """Write the up direction (3,) of each frame, None = unknown, in the format of `read_gravity`."""
+    """Write the up direction (3,) of each frame in the camera frame, for `read_gravity`; None = unknown."""
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for up in ups:
             file.write("nan nan nan\n" if up is None else " ".join(f"{value:.9f}" for value in up) + "\n")

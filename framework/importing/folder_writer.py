@@ -75,7 +75,8 @@ def check_new(directory: Path) -> None:
     if directory.is_dir() and not any(directory.iterdir()):
         return
     if directory.exists() or directory.is_symlink():
-        raise DataError(f"{directory}: expected a new or empty folder, got a file or non-empty folder; remove it or set another")
+        found = "got a file or non-empty folder; remove it or set another"
+        raise DataError(f"{directory}: expected a new or empty folder, {found}")
 
 
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:

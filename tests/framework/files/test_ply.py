@@ -193,7 +193,7 @@ def test_ply_written_file_is_read_by_open3d(tmp_path):
         (b"1 0 0 2", b"1 0 0 2 5", "line 12: 'vertex' 1: .*4 numbers.* 5"),
         (b"1 0 0 2", b"1 0 0 256", "line 12: label: .*uint8.* 256"),
         (b"1 0 0 2", b"1 0 0 2.5", "line 12: label: .*uint8.* 2.5"),
-        (b"1 0 0 2", b"1 0 x 2", "line 12: expected numbers, .*'x'"),
+        (b"1 0 0 2", b"1 0 x 2", "line 12: expected numbers, got '1 0 x 2'"),
         (b"1 0 0 2", b"1 nan 0 2", "line 12: vertex 1: expected finite coordinates, got 1 nan 0"),
         (b"1 0 0 2", b"\n1 1e39 0 2", "line 13: vertex 1: expected finite coordinates, got 1 inf 0"),
         (b"1 0 0 2", b"1" * 2**20 + b"0 0 0 2", "line 12: .*1048576 bytes"),

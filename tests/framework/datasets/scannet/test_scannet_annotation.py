@@ -178,7 +178,7 @@ def test_scannet_annotation_invalid_segments_raise(tmp_path: Path, segments: Any
     [
         (b"", "expected valid JSON"),
         (b"[" * 100000, "expected JSON with at most 50 nested lists"),
-        (b'{"segGroups": [' + b"9" * 5000 + b"]}", "expected valid JSON"),
+        (b'{"segGroups": [' + b"9" * 5000 + b"]}", "expected integers of at most 63 bits"),
         (b"\xff\xfe", "expected valid JSON"),
         (b"[]", "expected a JSON object"),
     ],
