@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, Int64
 
-OBJECTS_FRACTION = 0.5  # fraction of the triangles for objects
+OBJECTS_FRACTION = 0.5  # minimum fraction of the triangle limit that is reserved for objects
 MIN_TRIANGLES = 4  # minimum number of triangles of a closed surface
 QUADRIC_STEP = 2.5  # maximum reduction by quadric decimation alone, as a factor; its time is quadratic in the factor
 LEFT_TO_QUADRIC = 1.8  # ratio of the triangles after clustering to the triangles after quadric decimation
@@ -43,7 +43,7 @@ def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Return the decimated mesh, in which objects are finer than the background.
+    """Return the mesh with about `triangles` triangles at most; objects are finer than the background.
 
     Objects and background are decimated separately to preserve their border. Vertices outside objects get the label 0.
     """
@@ -73,7 +73,10 @@ def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_o
 
 
 def triangle_labels(triangles: Int32, labels: Int32) -> Int32:
-    """Return the label (F,) of most corners, or of the first corner if all differ; triangles (F, 3), labels (V,)."""
+    """Return the majority label (F,) of the corners, or that of the first corner if all differ.
+
+    `triangles` (F, 3) contains vertex indices, and `labels` (V,) the label of each vertex.
+    """
     corners = labels[triangles]
     return np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])
 
@@ -140,7 +143,7 @@ def _nearest(places: Float32 | Float64, queries: Float32 | Float64) -> Int64:
 
 
 def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
-    """Return the mesh of the vertices in `kept` (V,) and of `triangles` (F,); None = all triangles between them."""
+    """Return the mesh of the masked vertices `kept` (V,) and triangles (F,); None = all triangles of these vertices."""
     number = np.cumsum(kept, dtype=np.int32) - 1
     chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
     return InstanceMesh(
@@ -154,7 +157,7 @@ def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> In
 
 
 def corners_of(mesh: InstanceMesh, triangles: Bool) -> Bool:
-    """Return the mask (V,) of the corners of the triangles in the mask (F,)."""
+    """Return the mask (V,) of the corners of the masked `triangles` (F,)."""
     used = np.zeros(len(mesh.vertices), np.bool_)
     used[mesh.triangles[triangles]] = True
     return used

@@ -1,7 +1,7 @@
 """Binary glTF 2.0: one node per object, with its data in `extras`, and one node for the rest of the room.
 
-y is up. Colors are linear. Appearance is unlit (KHR_materials_unlit), because image colors already contain the
-lighting. Instance and class colors are lit. The rest of the room is one-sided, so its inside is visible from outside.
+y is up. Colors are linear. Image colors are unlit (KHR_materials_unlit), because they already contain the lighting.
+Instance and class colors are lit. The rest of the room is one-sided, so that its inside is visible from outside.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _node(part: Part, colors: UInt8) -> Node:
 
 
 def extras(part: Part) -> dict[str, Any]:
-    """Return the data of an object; empty for the rest of the room."""
+    """Return the id, class, probability and confidence of an object; empty for the rest of the room."""
     one = part.object
     if one is None:
         return {}

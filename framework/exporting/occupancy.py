@@ -53,7 +53,7 @@ class Plan:
         return self.free.shape[0], self.free.shape[1]
 
     def cells(self, xy: Float64) -> Int64:
-        """Return the row and column (P, 2) of points (P, 2) m. Points outside get the nearest cell."""
+        """Return the row and column (P, 2) of points (P, 2), m, room frame. Points outside get the nearest cell."""
         columns, rows = np.floor((xy - self.origin) / self.resolution).astype(np.int64).T
         return np.stack([np.clip(rows, 0, self.shape[0] - 1), np.clip(columns, 0, self.shape[1] - 1)], axis=1)
 
@@ -126,7 +126,7 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
 
 
 def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
-    """Return the mask (cells,) of cells where vertical surfaces outside of objects have at least WALL_SPAN height."""
+    """Return the mask (cells,) of cells where vertical surfaces outside of objects are at least WALL_SPAN high."""
     chosen = found.upright & (found.owner == 0)
     step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)
     lowest, highest = step.min(initial=0), step.max(initial=0)

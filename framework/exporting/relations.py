@@ -1,7 +1,7 @@
 """Spatial relations between objects by geometry alone: on, in, next to, attached to a wall.
 
 Contact surfaces are occluded: the table under a cup is not in the map. An object is therefore on another object in two
-cases: the top of the other object has the height of the base, or a level surface around the foot has this height.
+cases: the top of the other object is at the height of its base, or a level surface around its foot is at this height.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ COVERED = 0.35  # minimum fraction of the ring with a level surface at the base
 STACKED = 0.5  # minimum fraction of the foot above the support
 WITHIN = 0.9  # minimum fraction of a surface in the box of its container
 SECTORS = 36  # number of sectors around an object; the legs of a table fill only a few
-ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in a bowl, and on a covered shelf
+ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in an open container, and on a covered shelf
 MAX_NEIGHBOR_DISTANCE = 0.3  # maximum distance of neighbors, m
 ON_WALL = 0.10  # maximum distance from a wall, m
 HANGING = 0.7  # minimum fraction of points near a wall
-STRAY = 2.0  # %, points ignored as noise at the lower and at the upper end of a surface
+STRAY = 2.0  # %, fraction of the points ignored as noise at the lower and at the upper end of a surface
 MAX_POINTS = 3000  # maximum number of points of an object for distances
 
 

@@ -83,12 +83,12 @@ class RoomObject:
 class UprightRoom:
     """The surface and objects of a stored run."""
 
-    mesh: InstanceMesh  # in the room frame, with the labels of all objects, including objects not in `objects`
+    mesh: InstanceMesh  # in the room frame; labels of all objects of the run, including those not in `objects`
     objects: tuple[RoomObject, ...]  # sorted by id
     poses: Float64  # (F, 4, 4) T_room_camera of the mapped frames
     T_room_world: Float64  # (4, 4)
-    up_known: bool  # False: up is the world's z axis
-    floor_known: bool  # False: z = 0 as in the world frame
+    up_known: bool  # False = unknown; the world's z axis is used
+    floor_known: bool  # False = unknown; z = 0 as in the world frame
 
     @cached_property
     def surface(self) -> Surface:
@@ -207,7 +207,7 @@ def facing(box: Box) -> Box:
 
 
 def upright(up: Float64, floor: float) -> Float64:
-    """Return the T_room_world (4, 4) that rotates `up` (unit) to z by the smallest angle and moves `floor` (m) to 0."""
+    """Return T_room_world (4, 4), which rotates `up` (unit vector) to z and moves the floor height `floor` (m) to 0."""
     T = np.eye(4)
     across, cosine = skew(np.cross(up, UP)), float(up @ UP)
     T[:3, :3] += across + across @ across / (1 + cosine) if cosine > -1 + 1e-9 else np.diag([0.0, -2.0, -2.0])

@@ -147,7 +147,7 @@ def _color(mesh: Any, colors: UInt8) -> None:
 
 
 def convex_hull(vertices: Float32) -> tuple[Float32, Int32] | None:
-    """Return the vertices (H, 3) and outward triangles of the convex hull of points (M, 3) m; None without volume."""
+    """Return the convex hull of points (M, 3), m: vertices (H, 3) and outward triangles (F, 3). None = no volume."""
     try:
         hull = ConvexHull(vertices.astype(np.float64))
     except (QhullError, ValueError):

@@ -58,7 +58,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Visit:
-    """A map, and the poses (F, 4, 4) of its camera."""
+    """A map, and the poses T_world_camera (F, 4, 4) of its frames."""
 
     scene: SceneMap
     poses: Float64
@@ -129,9 +129,9 @@ def _observe(visit: Visit, other: Visit) -> list[_Object]:
 
 
 def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
-    """Return two masks (P,) of world points (P, 3) m: points on an observed surface, and in observed free space.
+    """Return two masks (P,) of world points (P, 3), m: points on an observed surface, and in observed free space.
 
-    A point is free space if it is free from at least one pose, regardless of the other poses.
+    A point is in free space if it is observed as free from at least one pose, regardless of the other poses.
     """
     there, through = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
     for k in np.unique(np.linspace(0, len(visit.poses) - 1, LOOKS).round().astype(int)):

@@ -132,7 +132,7 @@ class Journal:
 
     @contextmanager
     def timed(self, frame: int, stage: str) -> Iterator[None]:
-        """Record the time of the body, if it succeeds."""
+        """Record the time of the body for a frame index and a stage, if the body succeeds."""
         started = time.perf_counter()
         yield
         self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
@@ -192,7 +192,7 @@ class Journal:
         return self.frames_skipped - self.without_pose
 
     def frame_tracked(self, frame: Frame, pose: Pose) -> None:
-        """Record a pose; log the depth sensor, and when tracking is lost and recovered."""
+        """Record a pose. Log a change of the depth sensor, and the loss and recovery of tracking."""
         if frame.sensor is not self.sensor:
             self.sensor = frame.sensor
             log.info("depth sensor: %s", frame.sensor)
