@@ -228,7 +228,8 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
 def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
     """Return the finding about the motion between neighboring frames.
 
-    `steps` contains the motion of each matched pair as a fraction of `width` (px). `neighbors` is the number of pairs.
+    `steps` contains the motion of each matched pair as a fraction of `width` (px). `neighbors` is the number of all
+    pairs.
     """
     if not neighbors:
         return Finding(Verdict.UNKNOWN, "motion", "unknown with a single frame")

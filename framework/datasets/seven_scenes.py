@@ -64,7 +64,7 @@ def _color_pose(path: Path) -> Float64:
 
 
 def register(raw: UInt16) -> UInt16:
-    """Return the depth (H, W), mm, registered to the color camera. Each pixel has the nearest of its depth readings.
+    """Return the depth (H, W), mm, registered to the color camera. The nearest of several readings in a pixel is kept.
 
     An image of another size is returned unchanged, so that the reader rejects its size. The color camera has a shorter
     focal length and a wider field of view. The border therefore has no readings, and the interior has no holes.

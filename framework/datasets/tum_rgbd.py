@@ -132,7 +132,7 @@ Timed = TypeVar("Timed", ListedImage, TumLine)
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Ground-truth poses, interpolated in time."""
+    """Stored poses, interpolated in time."""
 
     lines: Sequence[TumLine]  # in order of time; poses may be invalid
     timestamps: Float64  # (L,) s, of the lines

@@ -43,7 +43,7 @@ def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Return the mesh with about `triangles` triangles at most; objects are finer than the background.
+    """Decimate a mesh to at most about `triangles` triangles. Objects are finer than the background.
 
     Objects and background are decimated separately to preserve their border. Vertices outside objects get the label 0.
     """
@@ -61,7 +61,7 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_of_triangle: int) -> InstanceMesh:
-    """Return the mesh, with vertices clustered until it has at most `most_bytes` bytes.
+    """Cluster the vertices of a mesh until its stored size is at most `most_bytes` bytes.
 
     Unlike edge collapse, clustering also merges triangles without a common edge.
     """
@@ -136,14 +136,17 @@ def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
 
 
 def _nearest(places: Float32 | Float64, queries: Float32 | Float64) -> Int64:
-    """Return the index (N,) of the nearest position (M, 3) to each query position (N, 3)."""
+    """Return the indices (N,) of the positions (M, 3) that are nearest to the query positions (N, 3)."""
     if not len(queries):
         return np.zeros(0, np.int64)
     return np.asarray(cKDTree(places, balanced_tree=False).query(queries)[1])
 
 
 def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
-    """Return the mesh of the masked vertices `kept` (V,) and triangles (F,); None = all triangles of these vertices."""
+    """Return the part of a mesh with the vertices in the mask `kept` (V,).
+
+    `triangles` is the mask (F,) of its triangles; None = all triangles between these vertices.
+    """
     number = np.cumsum(kept, dtype=np.int32) - 1
     chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
     return InstanceMesh(
@@ -157,14 +160,14 @@ def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> In
 
 
 def corners_of(mesh: InstanceMesh, triangles: Bool) -> Bool:
-    """Return the mask (V,) of the corners of the masked `triangles` (F,)."""
+    """Return the mask (V,) of the corners of the triangles in the mask `triangles` (F,)."""
     used = np.zeros(len(mesh.vertices), np.bool_)
     used[mesh.triangles[triangles]] = True
     return used
 
 
 def joined(meshes: Sequence[InstanceMesh]) -> InstanceMesh:
-    """Return the union of one or more meshes of a map."""
+    """Return the union of one or more meshes with the same classes."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return InstanceMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

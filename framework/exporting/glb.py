@@ -38,7 +38,7 @@ class Node:
 
 
 def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> bytes:
-    """Return parts of a room as a GLB file. The result is deterministic."""
+    """Return the content of a GLB file with parts of a room. The result is deterministic."""
     return glb_of(
         [_node(part, colors) for part, colors in zip(shown, part_colors(shown, coloring), strict=True)],
         lit=coloring is not Coloring.APPEARANCE,
@@ -46,7 +46,7 @@ def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> byte
 
 
 def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
-    """Return lit or unlit nodes as a GLB file. The result is deterministic."""
+    """Return the content of a GLB file with lit or unlit nodes. The result is deterministic."""
     scene: Any = trimesh.Scene(base_frame="world")
     for node in nodes:
         extras = dict(node.extras)

@@ -39,7 +39,7 @@ MAX_POINTS = 3000  # maximum number of points of an object for distances
 
 @dataclass(frozen=True)
 class Relation:
-    """A relation `name` of object `source` to `target`: an object id, "floor" or "walls"."""
+    """A relation of the object with id `source` to `target`, which is an object id, "floor" or "walls"."""
 
     source: int
     name: str  # "on", "in", "next_to", "attached_to"
@@ -175,6 +175,6 @@ def _hangs(thing: _Thing, plan: Plan) -> bool:
 
 
 def _cells(xy: Float32 | Float64) -> set[tuple[int, int]]:
-    """Return the footprint cells of points (P, 2) m."""
+    """Return the grid cells, with sides of CELL, that contain points (P, 2), m."""
     numbers: Int64 = np.unique(np.floor(xy / CELL).astype(np.int64), axis=0)
     return set(map(tuple, numbers.tolist()))

@@ -42,7 +42,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if the path exists, even as a broken link or a folder, so that reading an optional file fails."""
+    """Return True if the path of an optional file exists, even as a broken link, which then fails to be read."""
     return os.path.lexists(path)
 
 

@@ -99,5 +99,5 @@ def holder(directory: Path) -> str:
 
 
 def holder_name(process: int | None) -> str:
-    """Return the name of a process in the format of `holder`."""
+    """Return the name of the process with this id, in the format of `holder`."""
     return f"process {process} on {socket.gethostname()}"

@@ -17,7 +17,7 @@ MAX_BITS = 63  # maximum size of an integer, bits; libraries have this limit; ti
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write `content` atomically, with floats in full precision."""
+    """Write `content` atomically, with floats in full precision; NaN and infinity become null."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 

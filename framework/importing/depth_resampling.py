@@ -23,7 +23,7 @@ class DepthRegistration:
 
     @property
     def target(self) -> Camera:
-        """The color camera, at the resolution of the depth camera."""
+        """The color camera, at about the resolution of the depth camera."""
         return self.color.scaled(min(1.0, FINEST * min(self.depth.fx / self.color.fx, self.depth.fy / self.color.fy)))
 
     def apply(self, depth: Float32) -> Float32:

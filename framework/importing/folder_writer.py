@@ -50,7 +50,7 @@ class Writing:
         return Turn(self.rotate // QUARTER)
 
     def camera(self, stored: Camera) -> Camera:
-        """Return the camera of the written images before rotation."""
+        """Return the camera of the written images before rotation, for the camera of the stored images."""
         factor = self.width / stored.width if self.width else LONGER_SIDE / max(stored.width, stored.height)
         return stored.scaled(min(1.0, factor))
 
@@ -71,7 +71,7 @@ class Written:
 
 
 def check_new(directory: Path) -> None:
-    """Raise DataError if the directory exists and is not empty."""
+    """Raise DataError if the path exists and is not an empty folder."""
     if directory.is_dir() and not any(directory.iterdir()):
         return
     if directory.exists() or directory.is_symlink():

@@ -45,7 +45,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Change:
-    """One object of the first visit, the second, or both."""
+    """The change of an object that exists in the first visit, the second visit, or both."""
 
     kind: Kind
     name: str  # name of its class

@@ -18,7 +18,7 @@ from framework.mapping.gravity import floor_height
 
 
 class Map:
-    """Thread-safe queries of the map of any fuser."""
+    """Thread-safe queries of a map, independent of the fuser."""
 
     scene: SceneMap
     lock: threading.RLock  # held during a query and while a frame is mapped

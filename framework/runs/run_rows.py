@@ -103,8 +103,8 @@ def rows_of(
     """Group `records` into rows: first the rows in `overrides`, then other rows by name.
 
     Records of an experiment are grouped by their config key `row`. Other records are grouped by their differing options
-    and parameters. Ignored are the averaged keys `over` and keys that always have the same value as one of them, such
-    as dataset.seed and seed. `overrides` contains the overrides of each row by name.
+    and parameters, except for the averaged keys `over` and keys that always have the same value as one of them, such as
+    dataset.seed and seed. `overrides` contains the overrides of each row by name.
 
     A row of an experiment is split by differences within it, by data folder and by annotation. It is also split by
     differences between rows that no override causes, such as the pose source or the number of frames. The later of two

@@ -31,7 +31,7 @@ def lower_priority() -> None:
 def parallel_kernels_are_thread_safe() -> bool:
     """Return True if two threads may run parallel kernels at the same time.
 
-    numba's workqueue layer aborts the process in that case. numba selects a layer when it starts its threads, which
+    numba's workqueue layer aborts the process if they do. numba selects a layer when it starts its threads, which
     this function triggers.
     """
     numba.get_num_threads()
@@ -40,7 +40,7 @@ def parallel_kernels_are_thread_safe() -> bool:
 
 @contextmanager
 def kernel_threads(threads: int) -> Iterator[None]:
-    """Set the number of threads of the kernels that the calling thread runs in the body."""
+    """Set the number of threads for kernels that the calling thread runs in the body."""
     before = numba.get_num_threads()
     numba.set_num_threads(threads)
     try:

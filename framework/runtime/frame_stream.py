@@ -150,7 +150,7 @@ class Turns:
 
     @contextmanager
     def turn(self, number: int) -> Iterator[None]:
-        """Wait for the end of all turns with smaller numbers."""
+        """Run the body after all turns with smaller numbers have ended."""
         with self._changed:
             self._changed.wait_for(lambda: self._next == number)
         try:

@@ -66,9 +66,9 @@ class RunResult:
     frames_skipped: int  # number of frames that are unreadable, inconsistent or without a required pose
     tracked: tuple[TrackedFrame, ...]  # including lost frames
     timings: tuple[StageTime, ...]
-    seconds: float  # wall clock of the whole loop
+    seconds: float  # wall-clock time of the whole loop
     stopped_by: BaseException | None = None  # reason for an early end; None = completed
-    intervals: tuple[float, ...] = ()  # wall clock between frames, s
+    intervals: tuple[float, ...] = ()  # wall-clock time between frames, s
     pose_source: str = PoseTracker.pose_source
     live: LiveFigures | None = None  # None = a recording
     keyframes: Mapping[str, Array] = field(default_factory=dict)  # of the tracker
@@ -81,7 +81,7 @@ class RunResult:
 
     @property
     def fps(self) -> float:
-        """Return the frames per second of wall clock, including reading and detection."""
+        """Return the frames per second of wall-clock time, including reading and detection."""
         return self.frames / self.seconds
 
     @property
@@ -206,7 +206,7 @@ class Journal:
             self.lost_for = 0
 
     def frame_fused(self, frame: Frame) -> None:
-        """Record the latency of a frame of a live video."""
+        """Record the latency of a frame if the video is live."""
         if self.frames_expected is None:
             self.latencies.append(time.time() - frame.timestamp)
 

@@ -80,7 +80,7 @@ class Interruption:
 
 
 def _print(text: str) -> None:
-    """Write to stderr directly. The signal may have interrupted its buffer or the log."""
+    """Write to stderr directly, because the signal may have interrupted a buffered write or the log."""
     if sys.__stderr__ is not None:
         with suppress(OSError, ValueError):
             os.write(sys.__stderr__.fileno(), text.encode())

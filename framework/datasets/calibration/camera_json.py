@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class StoredCamera(NamedTuple):
-    """Calibration of a recording."""
+    """Calibration of a recording: camera, depth scale, lens distortion and kind of the depth sensor."""
 
     camera: Camera
     depth_scale: float  # units per meter
@@ -94,7 +94,7 @@ def number_list(where: Path | str, values: Any, count: int) -> list[float]:
 
 
 def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> list[float]:
-    """Return the finite numbers under `keys`. Raises DataError that names `where` and the key."""
+    """Return the finite numbers under `keys` in `content`. Raises DataError that names `where` and the key."""
     for key in keys:
         if key not in content:
             raise DataError(f"{where}: expected a key {key!r}, got none")

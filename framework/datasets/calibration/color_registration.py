@@ -17,7 +17,7 @@ LONGEST_SIDE = 2**15 - 2  # px, limit of OpenCV's warp
 
 @dataclass(frozen=True)
 class ColorRegistration:
-    """Warp from the color camera to the depth camera. Raises DataError if the intermediate image is too large."""
+    """Warp of color images to the depth camera. Raises DataError if the intermediate image is too large."""
 
     color: Camera
     depth: Camera
@@ -58,7 +58,7 @@ class ColorRegistration:
 
 
 def registered_images(images: StoredImages, registration: ColorRegistration) -> StoredImages:
-    """Return the images of a frame with color that is registered to the depth camera when it is read."""
+    """Return the images of a frame. Color is registered to the depth camera when it is read."""
     return replace(images, color=partial(_registered_color, images, registration))
 
 

@@ -17,7 +17,7 @@ NO_READING = 65535  # uint16, written by some sensors instead of 0
 
 
 def check_max_depth(max_depth: float) -> None:
-    """Raise ConfigError for an invalid maximum depth."""
+    """Raise ConfigError for a maximum depth (m) that is negative or not finite."""
     require(
         math.isfinite(max_depth) and max_depth >= 0,
         "dataset.max_depth",

@@ -68,7 +68,7 @@ class Undistortion:
         self._u, self._v = source.T.reshape(2, *camera.shape).astype(np.float32)
 
     def smooth(self, image: UInt8) -> UInt8:
-        """Return the undistorted colors (H, W, 3), interpolated bilinearly."""
+        """Return the undistorted colors (H, W, 3), with bilinear interpolation."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR), np.uint8)
 
     def exact(self, image: NDArray[Value]) -> NDArray[Value]:

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class DepthCamera(LiveVideo):
-    """A camera with factory calibration. The library registers depth to color."""
+    """A depth camera with factory calibration. The vendor's library registers depth to color."""
 
     brand: ClassVar[str]
     default_sensor: ClassVar[SensorKind]  # kind of the depth sensor in devices with unknown names

@@ -104,8 +104,8 @@ class Contents:
 class Recording(RGBDSequence):
     """An RGB-D video on disk. A subclass lists the stored frames (`open`) and provides the recording's ground truth.
 
-    `ground_truth` replaces the recording's own ground truth. It is the whole mesh, independent of the frame selection.
-    The instances in a frame are rendered from this mesh.
+    `ground_truth` replaces the recording's own ground truth by a complete mesh, independent of the frame selection. The
+    ground-truth instances in a frame are rendered from this mesh.
 
     Errors of the whole recording raise DataError when the recording is opened. Errors of one frame raise FrameError
     when the frame is read. The pipeline counts and skips such frames.

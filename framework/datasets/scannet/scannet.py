@@ -154,7 +154,7 @@ def _color_camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _fits(camera: Camera) -> bool:
-    """Return True if the principal point is near the middle of the image."""
+    """Return True if the principal point is near the image center."""
     u, v = camera.cx / camera.width, camera.cy / camera.height
     return max(abs(u - 0.5), abs(v - 0.5)) <= 1 / 8
 

@@ -133,7 +133,7 @@ def read_label_table(path: Path) -> Mapping[str, str]:
 
 
 def _spellings(nyu40: Mapping[str, str]) -> dict[str, str]:
-    """Return the known name of each spelling. Spellings are the name itself, and its letters and digits only."""
+    """Return the known name for each spelling: the name itself, and the name reduced to letters and digits."""
     names = {**nyu40, **MEANINGS, **dict.fromkeys(UNNAMED)}
     return {_letters(name): name for name in names} | {name: name for name in names}
 

@@ -30,7 +30,7 @@ LARGEST_FIELDS = 2**20  # bytes; OpenNI reads the fields into a buffer of 5.8 MB
 
 
 class OniRecord(IntEnum):
-    """Record types."""
+    """Record types of the format."""
 
     NODE_ADDED_1_0_0_4 = 0x02
     NEW_DATA = 0x0A
@@ -147,7 +147,7 @@ def _read_contents(path: Path, file: BinaryIO) -> OniContents:
 def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
     """Return the struct layouts of a file position and a record header.
 
-    A header contains the magic, kind, node, two sizes and a file position.
+    A header contains the magic number, kind, node, two sizes and a file position.
     """
     position = "Q" if wide else "I"
     return struct.Struct(f"<{position}"), struct.Struct(f"<4s4I{position}")

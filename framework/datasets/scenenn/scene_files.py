@@ -53,8 +53,8 @@ class _Line(NamedTuple):
 def read_trajectory_log(path: Path) -> TrajectoryLog:
     """Return the poses of a trajectory.log.
 
-    A frame with two poses is unusable, and so is a truncated last frame. Raises DataError that names the file and the
-    line for other invalid lines.
+    A frame with two different poses is unusable, and so is a truncated last frame. Raises DataError that names the file
+    and the line for other invalid lines.
     """
     content = read_bytes(path, MAX_TEXT).removeprefix(BOM_UTF8)
     numbered = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))

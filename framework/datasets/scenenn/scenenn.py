@@ -82,7 +82,11 @@ class SceneNN(LabeledRecording):
 def _recorded(
     images: StoredImages, pose_id: int, poses: TrajectoryLog | None, times: tuple[float, float] | None
 ) -> RecordedFrame:
-    """Return a frame with its timestamps of color and depth (s); None = unknown."""
+    """Return a frame with its pose and timestamps.
+
+    `pose_id` is the id of its pose in trajectory.log. `times` contains the timestamps of color and depth (s); None =
+    unknown.
+    """
     color, depth = times or (None, None)
     timestamp = pose_id / FRAME_RATE if depth is None else depth
     T_world_camera = poses.poses.get(pose_id) if poses else None

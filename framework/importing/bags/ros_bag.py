@@ -212,7 +212,7 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
 
 
 def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistration | None:
-    """Return the registration of depth to color, None = already registered.
+    """Return the registration of depth to color; None = depth is registered already, or its camera is unknown.
 
     Raises DataError if the bag has no extrinsics for the registration.
     """
