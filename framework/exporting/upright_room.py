@@ -207,7 +207,10 @@ def facing(box: Box) -> Box:
 
 
 def upright(up: Float64, floor: float) -> Float64:
-    """Return T_room_world (4, 4), which rotates `up` (unit vector) to z and moves height `floor` (m) to 0."""
+    """Return T_room_world (4, 4) for an up direction and a floor height in the world frame.
+
+    It rotates `up` (unit vector) to z by the smallest angle and moves the floor from height `floor` (m) to z = 0.
+    """
     T = np.eye(4)
     across, cosine = skew(np.cross(up, UP)), float(up @ UP)
     T[:3, :3] += across + across @ across / (1 + cosine) if cosine > -1 + 1e-9 else np.diag([0.0, -2.0, -2.0])

@@ -95,7 +95,7 @@ def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> 
     assert one is not None
     root = UsdGeom.Xform.Define(stage, f"/World/{part.name}")
     prim = root.GetPrim()
-    root.AddTransformOp().Set(Gf.Matrix4d(part.T_room_part.T.tolist()))  # USD transposes matrices
+    root.AddTransformOp().Set(Gf.Matrix4d(part.T_room_part.T.tolist()))  # USD uses row vectors
     Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
     UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr(Vt.TokenArray([one.class_name]))
     prim.SetCustomDataByKey("instancemap:id", one.id)

@@ -76,7 +76,7 @@ class _Object:
     name: str  # name of its class
     seen: float  # observed fraction of the surface in the other visit
     gone: float  # probability of absence in the other visit
-    match: int | None  # object of the other visit at the same position
+    match: int | None  # id of the object of the other visit at the same position; None = no object
 
     @property
     def is_gone(self) -> bool:

@@ -135,7 +135,7 @@ def _labels_of(path: Path, ply: PlyMesh) -> Int32:
     if not len(ply.triangles):
         raise DataError(f"{path}: expected faces to render masks from, got none; set {KEY} to a mesh with faces")
     if labels.min() < 0 or labels.max() > LARGEST_ID:
-        raise DataError(f"{path}: {LABELS}: expected 0 to {LARGEST_ID}, got {labels.min()} to {labels.max()}")
+        raise DataError(f"{path}: {LABELS}: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     return labels.astype(np.int32)
 
 

@@ -18,7 +18,7 @@ from typing import BinaryIO, NamedTuple
 from framework.errors import DataError
 from framework.files.atomic_write import check_regular
 
-FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic, version (four numbers), largest time, largest node
+FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic number, version (four numbers), largest time, largest node
 FILE_MAGIC = b"NI10"
 LARGEST_NODE_AT = FILE_HEADER.size - 4
 VERSIONS = (1, 0, 0, 4), (1, 0, 1, 0)  # first and last version that OpenNI 2 supports

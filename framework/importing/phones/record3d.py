@@ -155,7 +155,7 @@ class R3dFile:
 def _source(where: Path | str, content: Mapping[str, Any], files: ExrFolder | R3dFile) -> Source:
     poses = content.get("poses")
     if not isinstance(poses, list) or not poses:
-        raise DataError(f"{where}: poses: expected a list of poses, got {str(poses)[:60]}")
+        raise DataError(f"{where}: poses: expected a list of poses, got {poses!r:.60}")
     size = numbers_of(where, content, "w", "h")
     cameras = [pinhole(where, *size, *of_frame) for of_frame in _intrinsics(where, content, len(poses))]
     shape = _depth_shape(where, content, cameras[0])

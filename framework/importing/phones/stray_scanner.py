@@ -94,7 +94,8 @@ def _row_or_error(path: Path, number: int, words: list[str], camera: Camera) -> 
     try:
         timestamp, frame, *pose = numbers(where, words[: len(POSE)], len(POSE), ", ".join(POSE))
         if not 0 <= frame <= LAST_FRAME or frame != int(frame):
-            raise DataError(f"{where}: frame: expected 0 to {LAST_FRAME}, got {words[1].strip()[:SHOWN]!r}")
+            expected = f"expected an integer from 0 to {LAST_FRAME}"
+            raise DataError(f"{where}: frame: {expected}, got {words[1].strip()[:SHOWN]!r}")
         own = [word for word in words[len(POSE) :] if word.strip()]
         if own:
             values = numbers(where, own, len(INTRINSICS), ", ".join(INTRINSICS))
