@@ -185,7 +185,7 @@ def test_ply_written_file_is_read_by_open3d(tmp_path):
         (b"float y", b"float x", "line 5: .*'vertex'.*unique.*'x'"),
         (b"element face", b"element vertex", "line 8: .*unique.*'vertex'"),
         (b"list uchar int", b"list float int", "line 9: .*'vertex_indices'.*integer"),
-        (b"uchar int vertex", b"uchar float vertex", "vertex_indices: .*integers.*float32"),
+        (b"uchar int vertex", b"uchar float vertex", "vertex_indices: .*integer type.*float32"),
         (b"vertex_indices", b"corners", "'face'.*vertex_indices or vertex_index"),
         (b"end_header", b"end", "line 14: .*'end_header'.* 200 bytes"),
         (b"end_header", b"comment " + b"x" * 70000, "line 10: .*'end_header'.* 65536 bytes"),
