@@ -107,7 +107,10 @@ def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[flo
     without = [k for k in images if k not in times]
     if not without:
         return times
-    message = "%s: expected timestamps of all images, got none for %d of %d, first %d; using a frame rate of %g Hz"
+    message = (
+        "%s: expected timestamps of all images, got none for %d of %d images, first %d; "
+        "using a frame rate of %g Hz"
+    )
     log.warning(message, path, len(without), len(images), without[0], FRAME_RATE)
     return {}
 
