@@ -108,8 +108,7 @@ def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[flo
     if not without:
         return times
     message = (
-        "%s: expected timestamps of all images, got none for %d of %d images, first %d; "
-        "using a frame rate of %g Hz"
+        "%s: expected timestamps of all images, got none for %d of %d images, first %d; using a frame rate of %g Hz"
     )
     log.warning(message, path, len(without), len(images), without[0], FRAME_RATE)
     return {}
