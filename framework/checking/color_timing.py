@@ -23,7 +23,7 @@ def check_color_delay(matcher: Matcher) -> Finding:
         return Finding(Verdict.FINE, SUBJECT, f"{1e3 * delay:g} ms, as set; dataset.color_delay=AUTO estimates it")
     estimate = estimate_delay(matcher)
     if not is_usable(estimate):
-        text = "unknown, because the camera turns too slowly or at a constant rate, or depth has too few edges"
+        text = "unknown, because the camera rotates too slowly or at a constant rate, or depth has too few edges"
         if estimate.known:
             text += (
                 f" (estimate: {1e3 * estimate.seconds:.0f} ms, standard deviation {1e3 * estimate.deviation:.0f} ms)"

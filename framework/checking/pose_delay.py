@@ -39,7 +39,7 @@ class PoseDelay:
         frames = f"{count} frame{'s' * (count > 1)}"
         text = (
             f"{frames} {when} ({count * step:.3f} s): mean reprojection error of {self.pairs} pairs of frames is "
-            f"{self.error:.1f} px, and {self.delayed_error:.1f} px with the poses of {frames} {where}"
+            f"{self.error:.1f} px, and {self.delayed_error:.1f} px with the poses from {frames} {where}"
         )
         if self.alike:
             others = " or ".join(f"dataset.pose_delay={applied + other}" for other in self.alike)

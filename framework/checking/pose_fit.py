@@ -24,7 +24,7 @@ MAX_OTHER_RATIO = 0.5  # maximum ratio of the error of another convention to the
 # minimum uncertainty of the logarithm of the depth factor, due to inaccurate poses and depth in real recordings
 MIN_LOG_UNCERTAINTY = 0.07
 MAX_ERROR_INCREASE = 1.3  # maximum error ratio for a wrong scale; pure rotation hardly constrains the scale
-WRONG_SCALE = 2.5  # minimum ratio of a wrong scale; with rotation, the scale is uncertain by up to 1.6 times
+WRONG_SCALE = 2.5  # minimum ratio of a wrong scale; with rotation, the scale is uncertain by a factor of up to 1.6
 USUAL_SCALES = (1000.0, 5000.0, 10_000.0, 4000.0, 1.0, 100.0, 2000.0, 256.0)  # units per meter, common ones first
 PLAUSIBLE = (0.2, 12.0)  # m, plausible median depth of a room
 
@@ -67,12 +67,12 @@ def motion_of(pair: MatchedPair, reading: PoseReading) -> Float64:
 
 
 def motion_between(T_world_first: Float64, T_world_second: Float64, reading: PoseReading) -> Float64:
-    """Return T_second_first (4, 4) from two stored poses."""
+    """Return T_second_first (4, 4) from two stored poses (4, 4) in the convention `reading`."""
     return inverse(reading.pose(T_world_second)) @ reading.pose(T_world_first)
 
 
 def _depth_factor(pairs: Sequence[MatchedPair], motions: Sequence[Float64]) -> tuple[float, float]:
-    """Return the ratio of translations in the poses and in the images, and its uncertainty; both 1 if unknown."""
+    """Return the ratio of translations in the poses to those in the images, and its uncertainty; both 1 if unknown."""
     ratios = []
     for pair, T_second_first in zip(pairs, motions, strict=True):
         seen, moved = np.linalg.norm(pair.T_second_first[:3, 3]), np.linalg.norm(T_second_first[:3, 3])

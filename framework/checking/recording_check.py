@@ -68,7 +68,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     frames, errors = _read(sequence, chosen)
     findings = []
     if errors:
-        text = f"{len(errors)} of {len(chosen)} cannot be read; first error: {errors[0]}"
+        text = f"{len(errors)} of {len(chosen)} checked frames cannot be read; first error: {errors[0]}"
         findings.append(Finding(Verdict.NOTE, "frames", text))
     depth_finding, median_depth = _check_depth(frames, farthest, _scale_of(sequence))
     longest = registration.MAX_DELAY
@@ -201,7 +201,10 @@ def _read(sequence: RGBDSequence, chosen: Sequence[int]) -> tuple[list[Frame], l
 
 
 def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tuple[Finding, float]:
-    """Return the finding about depth and the median depth in m."""
+    """Return the finding about depth and the median depth in m.
+
+    `farthest` is the mapped range in m, and `scale` the depth units per meter.
+    """
     readings = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
     if not len(readings):
         return Finding(Verdict.ERROR, "depth", "no readings in any checked frame"), 0.0
@@ -225,7 +228,8 @@ def _check_depth(frames: Sequence[Frame], farthest: float, scale: float) -> tupl
 def _check_motion(steps: Float64, neighbors: int, width: int) -> Finding:
     """Return the finding about the motion between neighboring frames.
 
-    `steps` contains the motion of each matched pair as a fraction of `width` (px). `neighbors` is the number of pairs.
+    `steps` contains the motion of each matched pair as a fraction of `width` (px). `neighbors` is the number of all
+    pairs.
     """
     if not neighbors:
         return Finding(Verdict.UNKNOWN, "motion", "unknown with a single frame")

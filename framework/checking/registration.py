@@ -55,7 +55,7 @@ class EdgeComparison:
         self._edges = lru_cache(maxsize=None)(self._find_edges)
 
     def alignments(self, candidates: Iterable[tuple[int, float]]) -> list[EdgeAlignment]:
-        """Return the alignments of the candidates (delay, zoom) with enough edges."""
+        """Return the alignments of the candidates (delay in frames, zoom) with enough edges."""
         found = []
         for delay, zoom in candidates:
             pairs = [(k, k + delay) for k in self.chosen if 0 <= k + delay < len(self.sequence)]
@@ -122,7 +122,7 @@ def depth_edges(depth: Float32) -> Bool:
 def judge(
     by_delay: Sequence[EdgeAlignment], by_zoom: Sequence[EdgeAlignment], applied_delay: int, step: float
 ) -> tuple[Finding, int]:
-    """Return the finding and the delay of the depth images in frames.
+    """Return the finding and the delay of the depth images in frames; 0 = no detected delay.
 
     `by_zoom` contains the alignments at the best delay. `applied_delay` is the configured delay in frames. `step` is
     the image motion per frame as a fraction of the width. A shift of at most half of `step` may be due to a time

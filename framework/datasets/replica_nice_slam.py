@@ -1,11 +1,11 @@
 """Replica in NICE-SLAM's version (Straub et al., 2019; Zhu et al., CVPR 2022): rendered views of eight scanned rooms.
 
     cam_params.json                     for all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
-    room0/results/frame000000.jpg       8-bit color, from 0
+    room0/results/frame000000.jpg       8-bit color, numbered from 0
     room0/results/depth000000.png       uint16 along z, `scale` units per meter
     room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers row by row, m
 
-The camera axes are x right, y down, z forward. NICE-SLAM converts these axes when it reads the poses.
+The camera axes are x right, y down, z forward. NICE-SLAM converts the poses to OpenGL's axes when it reads them.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class ReplicaNiceSlam(Recording):
             raise DataError(f"{path}: {expected}; set dataset.scene to a scene folder, such as room0")
         content = read_json_object(path).get("camera")
         if not isinstance(content, dict):
-            expected = f'expected {{"camera": {{{", ".join(CAMERA_KEYS)}}}}}'
-            raise DataError(f"{path}: {expected}, got {type(content).__name__}")
+            expected = f"expected an object with the keys {', '.join(CAMERA_KEYS)}"
+            raise DataError(f"{path}: camera: {expected}, got {content!r:.60}")
         camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
         results, poses = self.folder / "results", read_matrix_lines(self.folder / "traj.txt")
         images = paired_images(numbered_images(results, (".jpg",)), numbered_images(results, (".png",)))

@@ -7,8 +7,8 @@
     depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw
     timestamps.txt      optional; color depth, one line per frame: timestamps of the two images, s
-    gravity.txt         optional; x y z, one line per frame: up direction in the camera, from a sensor; nan nan nan =
-                        unknown
+    gravity.txt         optional; x y z, one line per frame: up direction in the camera frame, from a sensor;
+                        nan nan nan = unknown
     instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class = a
                                             COCO name, or null = unknown
 
@@ -40,7 +40,7 @@ from framework.files.image_files import decode_uint16, read_image_file
 from framework.files.number_lines import read_gravity, read_image_times
 from framework.files.tum_trajectory import TumLine, read_tum_lines
 
-LARGEST_ID = 2**16 - 1  # of an instance, because instance images are uint16
+LARGEST_ID = 2**16 - 1  # maximum instance id; instance images are uint16
 
 Entry = TypeVar("Entry")
 log = logging.getLogger(__name__)
@@ -94,9 +94,9 @@ class RgbdFolder(Recording):
         return DeferredTruth(decode, self.camera.shape, self._class_names, origin, of_depth=False)
 
     def own_scene_truth(self) -> SceneTruth | None:
-        """Return the fused depth and instance ids of the selected frames, or None without instances or poses.
+        """Return the ground-truth points, fused from depth and instance ids of the selected frames.
 
-        Unreadable frames are skipped. The points are as accurate as the depth images.
+        None = no instances or no poses. Unreadable frames are skipped. The points are as accurate as the depth images.
         """
         if not self._instances or not self._has_poses:
             return None
@@ -135,7 +135,7 @@ def _recorded(
     """Return a frame with its pose and the timestamps of its images.
 
     `line` contains the pose, and `times` the timestamps of color and depth in s. A frame without a pose has the
-    timestamp of color.
+    timestamp of its color image.
     """
     color, depth = times or (None, None)
     if line is None:
@@ -160,7 +160,7 @@ def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
 
 
 def _read_optional(path: Path, read: Callable[[Path], list[Entry]], name: str, frames: int) -> list[Entry] | None:
-    """Return the entry of each frame, or None if the file does not exist."""
+    """Return one entry per frame, parsed by `read`, or None if the file does not exist."""
     if not path_exists(path):
         return None
     entries = read(path)

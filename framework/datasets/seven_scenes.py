@@ -5,7 +5,7 @@
     chess/seq-01/frame-000000.pose.txt      T_world_depthcamera, four lines of four numbers, m
 
 Color and depth are published unregistered, and only with the intrinsics of the depth camera. Without registration,
-masks are offset by 30 px or more.
+masks and depth are offset by 30 px or more.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ def _color_pose(path: Path) -> Float64:
 
 
 def register(raw: UInt16) -> UInt16:
-    """Return the depth (H, W) of the color camera in mm, with the nearest depth reading in each pixel.
+    """Return the depth (H, W), mm, registered to the color camera. The nearest of several readings in a pixel is kept.
 
-    An image of another size is returned unchanged, so that the reader rejects its size. The color camera has a wider
-    field of view. The border therefore has no readings, and the image shrinks without holes.
+    An image of another size is returned unchanged, so that the reader rejects its size. The color camera has a shorter
+    focal length and a wider field of view. The border therefore has no readings, and the interior has no holes.
     """
     if raw.shape != DEPTH_CAMERA.shape:
         return raw

@@ -112,7 +112,7 @@ class TumRgbd(Recording):
             if not named:
                 raise ConfigError(
                     f"dataset.intrinsics: expected freiburg1, freiburg2 or freiburg3 in the folder's name, got "
-                    f"{self.name}; set one of these in upper case or ROS_DEFAULT, or write {own} with "
+                    f"{self.name}; set FREIBURG1, FREIBURG2, FREIBURG3 or ROS_DEFAULT, or write {own} with "
                     f"{', '.join(CAMERA_KEYS)}"
                 )
             intrinsics = Intrinsics(named[0])
@@ -132,11 +132,11 @@ Timed = TypeVar("Timed", ListedImage, TumLine)
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Ground-truth poses, interpolated in time."""
+    """Stored poses, interpolated in time."""
 
     lines: Sequence[TumLine]  # in order of time; poses may be invalid
     timestamps: Float64  # (L,) s, of the lines
-    max_time_difference: float  # s, maximum time to the nearest pose
+    max_time_difference: float  # s, maximum time difference to the nearest pose
 
     @classmethod
     def of(cls, path: Path, lines: Sequence[TumLine], max_difference: float) -> Trajectory:
@@ -157,7 +157,7 @@ class Trajectory:
 
 
 def associate(first: Sequence[float], second: Sequence[float], max_difference: float) -> list[tuple[int, int]]:
-    """Return index pairs of times (s) that differ by at most `max_difference` s, in the order of the times in `first`.
+    """Return index pairs of times (s) that differ by at most `max_difference` s, sorted by the time in `first`.
 
     The closest pairs are matched first, as in the benchmark's own associate.py.
     """
@@ -187,7 +187,7 @@ def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]
     if len(at) < len(items):
         repeated = len(items) - len(at)
         log.warning(
-            "%s: expected unique timestamps, got repeated ones; skipped %d %s with a repeated timestamp",
+            "%s: expected unique timestamps, got repeated ones; skipped %d %s that repeat a timestamp",
             path,
             repeated,
             name,

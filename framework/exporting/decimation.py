@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, Int64
 
-OBJECTS_FRACTION = 0.5  # fraction of the triangles for objects
+OBJECTS_FRACTION = 0.5  # minimum fraction of the triangle limit that is reserved for objects
 MIN_TRIANGLES = 4  # minimum number of triangles of a closed surface
 QUADRIC_STEP = 2.5  # maximum reduction by quadric decimation alone, as a factor; its time is quadratic in the factor
 LEFT_TO_QUADRIC = 1.8  # ratio of the triangles after clustering to the triangles after quadric decimation
@@ -43,7 +43,7 @@ def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Return the decimated mesh, in which objects are finer than the background.
+    """Decimate a mesh to at most about `triangles` triangles. Objects are finer than the background.
 
     Objects and background are decimated separately to preserve their border. Vertices outside objects get the label 0.
     """
@@ -61,7 +61,7 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_of_triangle: int) -> InstanceMesh:
-    """Return the mesh, with vertices clustered until it has at most `most_bytes` bytes.
+    """Cluster the vertices of a mesh until its stored size is at most `most_bytes` bytes.
 
     Unlike edge collapse, clustering also merges triangles without a common edge.
     """
@@ -73,7 +73,10 @@ def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_o
 
 
 def triangle_labels(triangles: Int32, labels: Int32) -> Int32:
-    """Return the label (F,) of most corners, or of the first corner if all differ; triangles (F, 3), labels (V,)."""
+    """Return the majority label (F,) of the corners, or that of the first corner if all differ.
+
+    `triangles` (F, 3) contains vertex indices, and `labels` (V,) the label of each vertex.
+    """
     corners = labels[triangles]
     return np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])
 
@@ -133,14 +136,17 @@ def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
 
 
 def _nearest(places: Float32 | Float64, queries: Float32 | Float64) -> Int64:
-    """Return the index (N,) of the nearest position (M, 3) to each query position (N, 3)."""
+    """Return the indices (N,) of the positions (M, 3) that are nearest to the query positions (N, 3)."""
     if not len(queries):
         return np.zeros(0, np.int64)
     return np.asarray(cKDTree(places, balanced_tree=False).query(queries)[1])
 
 
 def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
-    """Return the mesh of the vertices in `kept` (V,) and of `triangles` (F,); None = all triangles between them."""
+    """Return the part of a mesh with the vertices in the mask `kept` (V,).
+
+    `triangles` is the mask (F,) of its triangles; None = all triangles between these vertices.
+    """
     number = np.cumsum(kept, dtype=np.int32) - 1
     chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
     return InstanceMesh(
@@ -154,14 +160,14 @@ def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> In
 
 
 def corners_of(mesh: InstanceMesh, triangles: Bool) -> Bool:
-    """Return the mask (V,) of the corners of the triangles in the mask (F,)."""
+    """Return the mask (V,) of the corners of the triangles in the mask `triangles` (F,)."""
     used = np.zeros(len(mesh.vertices), np.bool_)
     used[mesh.triangles[triangles]] = True
     return used
 
 
 def joined(meshes: Sequence[InstanceMesh]) -> InstanceMesh:
-    """Return the union of one or more meshes of a map."""
+    """Return the union of one or more meshes with the same classes."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return InstanceMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

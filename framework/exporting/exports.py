@@ -69,7 +69,7 @@ class Chosen:
 
     @classmethod
     def named(cls, objects: Sequence[str | int] = (), **choices: Any) -> Chosen:
-        """Return the options, given enumeration members by value, such as `coloring="class"`.
+        """Return the options. Enumeration members are given by value, such as `coloring="class"`.
 
         Raises ConfigError for unknown options or values.
         """
@@ -109,8 +109,8 @@ def export(
         formats: File formats.
         out: Output folder; None = `export` in the run directory.
         chosen: Options; None = defaults.
-        up: (3,) up direction; None = stored direction.
-        floor: Floor height, m along up; None = stored height.
+        up: (3,) up direction in the world frame; None = stored direction.
+        floor: Floor height along the up direction, m; None = stored height.
 
     Returns:
         The paths of the files.
@@ -155,7 +155,7 @@ def _check_known(run: Path, room: UprightRoom, formats: Sequence[ExportFormat]) 
 
 
 def _write_surfaces(room: UprightRoom, formats: Sequence[ExportFormat], directory: Path, chosen: Chosen) -> list[Path]:
-    """Write one file per object, and the scene unless objects are selected."""
+    """Write one file per object and format, and one file of the scene per format if no objects are selected."""
     files: dict[str, list[Part]] = {}
     if not chosen.objects:
         if not len(room.mesh.triangles):
@@ -195,7 +195,7 @@ def _placed(shown: Sequence[Part], coloring: Coloring) -> dict[str, InstanceMesh
 
 
 def _obj(meshes: Mapping[str, InstanceMesh]) -> str:
-    """Return an OBJ file with named meshes; `v` lines include an sRGB color: x y z r g b."""
+    """Return an OBJ file with named meshes. Its `v` lines contain x y z (m) and r g b (sRGB, in [0, 1])."""
     scene = trimesh.Scene()
     for name, mesh in meshes.items():
         if len(mesh.triangles):

@@ -54,7 +54,7 @@ def write_floor_plan(path: Path, room: UprightRoom, plan: Plan, robot_height: fl
 
 
 def tones(plan: Plan) -> UInt8:
-    """Return the RGB colors (H, W, 3) of the cells; row 0 has the lowest y."""
+    """Return the RGB colors (H, W, 3) of the cells, uint8; row 0 has the lowest y."""
     image = np.tile(np.array(UNSEEN, np.uint8), (*plan.shape, 1))
     for chosen, tone in ((plan.floor, FLOOR), (plan.free, FREE), (plan.occupied, OCCUPIED), (plan.wall, WALL)):
         image[chosen] = tone
@@ -91,7 +91,7 @@ def _draw_outlines(axes: Axes, room: UprightRoom) -> None:
 
 
 def _draw_names(axes: Axes, objects: Sequence[RoomObject]) -> None:
-    """Write class and id at each object, large objects first; in small spaces, only the id or nothing."""
+    """Write class and id at each object, large objects first. If they do not fit, write only the id, or nothing."""
     figure = axes.figure
     assert isinstance(figure, Figure)
     renderer = FigureCanvasAgg(figure).get_renderer()

@@ -1,7 +1,7 @@
 """Binary glTF 2.0: one node per object, with its data in `extras`, and one node for the rest of the room.
 
-y is up. Colors are linear. Appearance is unlit (KHR_materials_unlit), because image colors already contain the
-lighting. Instance and class colors are lit. The rest of the room is one-sided, so its inside is visible from outside.
+y is up. Colors are linear. Image colors are unlit (KHR_materials_unlit), because they already contain the lighting.
+Instance and class colors are lit. The rest of the room is one-sided, so that its inside is visible from outside.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Node:
 
 
 def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> bytes:
-    """Return parts of a room as a GLB file. The result is deterministic."""
+    """Return the content of a GLB file with parts of a room. The result is deterministic."""
     return glb_of(
         [_node(part, colors) for part, colors in zip(shown, part_colors(shown, coloring), strict=True)],
         lit=coloring is not Coloring.APPEARANCE,
@@ -46,7 +46,7 @@ def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> byte
 
 
 def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
-    """Return lit or unlit nodes as a GLB file. The result is deterministic."""
+    """Return the content of a GLB file with lit or unlit nodes. The result is deterministic."""
     scene: Any = trimesh.Scene(base_frame="world")
     for node in nodes:
         extras = dict(node.extras)
@@ -75,7 +75,7 @@ def _node(part: Part, colors: UInt8) -> Node:
 
 
 def extras(part: Part) -> dict[str, Any]:
-    """Return the data of an object; empty for the rest of the room."""
+    """Return the id, class, probability and confidence of an object; empty for the rest of the room."""
     one = part.object
     if one is None:
         return {}

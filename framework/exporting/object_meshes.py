@@ -69,7 +69,7 @@ def rest(room: UprightRoom) -> Part:
 
 
 def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
-    """Return the object number (V,) of each vertex, from 1; 0 = none."""
+    """Return for each vertex (V,) the 1-based position of its object in `objects`; 0 = no object."""
     owner = np.zeros(len(mesh.vertices), np.int32)
     for number, one in enumerate(objects, start=1):
         owner[one.vertices] = number

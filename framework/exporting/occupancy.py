@@ -53,7 +53,7 @@ class Plan:
         return self.free.shape[0], self.free.shape[1]
 
     def cells(self, xy: Float64) -> Int64:
-        """Return the row and column (P, 2) of points (P, 2) m. Points outside get the nearest cell."""
+        """Return the row and column (P, 2) of points (P, 2), m, room frame. Points outside get the nearest cell."""
         columns, rows = np.floor((xy - self.origin) / self.resolution).astype(np.int64).T
         return np.stack([np.clip(rows, 0, self.shape[0] - 1), np.clip(columns, 0, self.shape[1] - 1)], axis=1)
 
@@ -126,7 +126,7 @@ def looked_through(room: UprightRoom, places: Float64) -> Bool:
 
 
 def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
-    """Return the mask (cells,) of cells where vertical surfaces outside of objects have at least WALL_SPAN height."""
+    """Return the mask (cells,) of cells where vertical surfaces outside of objects are at least WALL_SPAN high."""
     chosen = found.upright & (found.owner == 0)
     step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)
     lowest, highest = step.min(initial=0), step.max(initial=0)
@@ -135,7 +135,7 @@ def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
 
 
 def _highest(found: SurfacePoints, number: Int64, cells: int) -> Int32:
-    """Return the id (cells,) of the object with the highest surface, 0 = none."""
+    """Return the id (cells,) of the object with the highest surface in each cell, 0 = none."""
     chosen = np.flatnonzero(found.owner > 0)
     rising = chosen[np.argsort(found.points[chosen, 2], kind="stable")]
     ids = np.zeros(cells, np.int32)
@@ -148,7 +148,7 @@ OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # of (255 - level) / 255; UNKN
 
 
 def write_ros_map(directory: Path, found: Plan) -> list[Path]:
-    """Write map.pgm and map.yaml for map_server and nav2_map_server of ROS, in the room frame."""
+    """Write map.pgm and map.yaml, in the room frame, for ROS (map_server and nav2_map_server)."""
     image, yaml = directory / "map.pgm", directory / "map.yaml"
     with atomic_write(image) as temporary:
         Image.fromarray(levels(found)).save(temporary)
@@ -168,6 +168,6 @@ def write_ros_map(directory: Path, found: Plan) -> list[Path]:
 
 
 def levels(found: Plan) -> UInt8:
-    """Return the gray image (H, W); the first row has the highest y."""
+    """Return the gray levels (H, W) of map.pgm; the first row has the highest y."""
     gray = np.where(found.occupied, OCCUPIED, np.where(found.free, FREE, UNKNOWN)).astype(np.uint8)
     return np.ascontiguousarray(gray[::-1])

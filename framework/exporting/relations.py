@@ -1,7 +1,7 @@
 """Spatial relations between objects by geometry alone: on, in, next to, attached to a wall.
 
 Contact surfaces are occluded: the table under a cup is not in the map. An object is therefore on another object in two
-cases: the top of the other object has the height of the base, or a level surface around the foot has this height.
+cases: the top of the other object is at the height of its base, or a level surface around its foot is at this height.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ TOUCHING = 0.05  # maximum distance of a base from its support, m: depth is nois
 ON_FLOOR = 0.10  # maximum height of the observed part of an object above the floor, m; thin legs are incomplete
 FOOT = 0.10  # height of the foot above the base, m
 AROUND = 2  # width of the ring around a foot, cells
-COVERED = 0.35  # minimum fraction of the ring with a level surface at the base
+COVERED = 0.35  # minimum fraction of the ring with a level surface at the height of the base
 STACKED = 0.5  # minimum fraction of the foot above the support
 WITHIN = 0.9  # minimum fraction of a surface in the box of its container
 SECTORS = 36  # number of sectors around an object; the legs of a table fill only a few
-ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in a bowl, and on a covered shelf
+ALL_ROUND, UNDER_ROOF = 30, 16  # minimum number of filled sectors in an open container, and on a covered shelf
 MAX_NEIGHBOR_DISTANCE = 0.3  # maximum distance of neighbors, m
 ON_WALL = 0.10  # maximum distance from a wall, m
 HANGING = 0.7  # minimum fraction of points near a wall
-STRAY = 2.0  # %, points ignored as noise at the lower and at the upper end of a surface
+STRAY = 2.0  # %, fraction of the points ignored as noise at the lower and at the upper end of a surface
 MAX_POINTS = 3000  # maximum number of points of an object for distances
 
 
 @dataclass(frozen=True)
 class Relation:
-    """A relation `name` of object `source` to `target`: an object id, "floor" or "walls"."""
+    """A relation of the object with id `source` to `target`, which is an object id, "floor" or "walls"."""
 
     source: int
     name: str  # "on", "in", "next_to", "attached_to"
@@ -175,6 +175,6 @@ def _hangs(thing: _Thing, plan: Plan) -> bool:
 
 
 def _cells(xy: Float32 | Float64) -> set[tuple[int, int]]:
-    """Return the footprint cells of points (P, 2) m."""
+    """Return the grid cells, with sides of CELL, that contain points (P, 2), m."""
     numbers: Int64 = np.unique(np.floor(xy / CELL).astype(np.int64), axis=0)
     return set(map(tuple, numbers.tolist()))

@@ -17,7 +17,7 @@ from framework.data import Bool, Float64, Int32
 from framework.exporting.occupancy import Plan
 
 DOOR = 1.0  # m, maximum width of an opening between rooms; most doors are 0.7 to 0.95 m wide
-GAP = 0.3  # maximum width of filled gaps, m
+GAP = 0.3  # maximum width of unknown gaps in the floor that are filled, m
 MIN_INSIDE = 0.5  # minimum interior area of a room, m^2
 
 
@@ -26,7 +26,7 @@ class Door:
     """The opening between two rooms."""
 
     rooms: tuple[int, int]
-    place: Float64  # (2,) m, center of the opening
+    place: Float64  # (2,) m, center of the opening in the room frame
     width: float  # m
 
 
@@ -47,11 +47,11 @@ class Rooms:
         return float(np.count_nonzero(self.labels == room)) * self.plan.resolution**2
 
     def center(self, room: int) -> Float64:
-        """Return the center (2,) of a room, m."""
+        """Return the center (2,) of a room, m, in the room frame."""
         return _place(self.plan, self.labels == room)
 
     def of(self, xy: Float64) -> int:
-        """Return the room that is nearest to most of the points (P, 2) m, P > 0; 0 = no rooms."""
+        """Return the number of the room nearest to most of the points (P, 2), m, P > 0; 0 = no rooms."""
         if not self.count:
             return 0
         nearest = ndimage.distance_transform_edt(self.labels == 0, return_distances=False, return_indices=True)
@@ -82,7 +82,7 @@ def rooms(plan: Plan) -> Rooms:
 
 
 def _grown(labels: Int32, domain: Bool) -> Int32:
-    """Return the labels (H, W) after growing them over the domain (H, W), cell by cell, until they meet."""
+    """Return the labels (H, W), grown over the domain (H, W) cell by cell until they meet."""
     cross = ndimage.generate_binary_structure(2, 1)
     while True:
         spread = np.where((labels == 0) & domain, ndimage.maximum_filter(labels, footprint=cross), labels)
@@ -106,7 +106,7 @@ def _doors(labels: Int32, plan: Plan) -> tuple[Door, ...]:
 
 
 def _place(plan: Plan, cells: Bool) -> Float64:
-    """Return the center (2,) of masked cells (H, W), m."""
+    """Return the center (2,) of masked cells (H, W), m, in the room frame."""
     rows, columns = np.nonzero(cells)
     return np.asarray((np.array([columns.mean(), rows.mean()]) + 0.5) * plan.resolution + plan.origin)
 

@@ -83,12 +83,12 @@ class RoomObject:
 class UprightRoom:
     """The surface and objects of a stored run."""
 
-    mesh: InstanceMesh  # in the room frame, with the labels of all objects, including objects not in `objects`
+    mesh: InstanceMesh  # in the room frame; labels of all objects of the run, including those not in `objects`
     objects: tuple[RoomObject, ...]  # sorted by id
     poses: Float64  # (F, 4, 4) T_room_camera of the mapped frames
     T_room_world: Float64  # (4, 4)
-    up_known: bool  # False: up is the world's z axis
-    floor_known: bool  # False: z = 0 as in the world frame
+    up_known: bool  # False = unknown; the world's z axis is used
+    floor_known: bool  # False = unknown; z = 0 as in the world frame
 
     @cached_property
     def surface(self) -> Surface:
@@ -152,7 +152,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
 
 
 def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple[RoomObject, ...]:
-    """Return the objects of a room's mesh, sorted by id, without connected components smaller than SPECK."""
+    """Return the objects of a room's mesh, sorted by id, without small connected components (see SPECK)."""
     pieces = _pieces(mesh)
     order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
     ids = mesh.instance_ids[order]
@@ -195,7 +195,7 @@ def _pieces(mesh: InstanceMesh) -> Int32:
 
 
 def facing(box: Box) -> Box:
-    """Return the upright box with permuted axes, such that its first axis is nearest to the room's x axis."""
+    """Return the upright box with permuted axes, so that its first axis is nearest to the room's x axis."""
     angle = float(np.arctan2(box.rotation[1, 0], box.rotation[0, 0]))
     turns = round(angle / (np.pi / 2))
     yaw = angle - turns * np.pi / 2
@@ -207,7 +207,10 @@ def facing(box: Box) -> Box:
 
 
 def upright(up: Float64, floor: float) -> Float64:
-    """Return the T_room_world (4, 4) that rotates `up` (unit) to z by the smallest angle and moves `floor` (m) to 0."""
+    """Return T_room_world (4, 4) for an up direction and a floor height in the world frame.
+
+    It rotates `up` (unit vector) to z by the smallest angle and moves the floor from height `floor` (m) to z = 0.
+    """
     T = np.eye(4)
     across, cosine = skew(np.cross(up, UP)), float(up @ UP)
     T[:3, :3] += across + across @ across / (1 + cosine) if cosine > -1 + 1e-9 else np.diag([0.0, -2.0, -2.0])
@@ -262,7 +265,7 @@ class SurfacePoints:
 
 
 def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
-    """Return the centers of a room's triangles, subdivided to sides of at most `spacing` m.
+    """Return the centers of a room's triangles, after subdivision until no side is longer than `spacing` m.
 
     Raises DataError for more than MAX_POINTS points.
     """

@@ -95,7 +95,7 @@ def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> 
     assert one is not None
     root = UsdGeom.Xform.Define(stage, f"/World/{part.name}")
     prim = root.GetPrim()
-    root.AddTransformOp().Set(Gf.Matrix4d(part.T_room_part.T.tolist()))  # USD transposes matrices
+    root.AddTransformOp().Set(Gf.Matrix4d(part.T_room_part.T.tolist()))  # USD uses row vectors
     Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
     UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr(Vt.TokenArray([one.class_name]))
     prim.SetCustomDataByKey("instancemap:id", one.id)
@@ -147,7 +147,7 @@ def _color(mesh: Any, colors: UInt8) -> None:
 
 
 def convex_hull(vertices: Float32) -> tuple[Float32, Int32] | None:
-    """Return the vertices (H, 3) and outward triangles of the convex hull of points (M, 3) m; None without volume."""
+    """Return the convex hull of points (M, 3), m: vertices (H, 3) and outward triangles (F, 3). None = no volume."""
     try:
         hull = ConvexHull(vertices.astype(np.float64))
     except (QhullError, ValueError):

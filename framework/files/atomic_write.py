@@ -12,7 +12,7 @@ from pathlib import Path
 
 from framework.errors import DataError
 
-MAX_TEXT = 2**28  # bytes of text or JSON; one hour of poses takes 10 MB
+MAX_TEXT = 2**28  # maximum size of text and JSON files, bytes; one hour of poses takes 10 MB
 _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # names of temporary files of `atomic_write`
 
 
@@ -42,7 +42,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if an optional file exists. Broken links and folders count, too, so that reading them fails."""
+    """Return True if the path of an optional file exists, even as a broken link, which then fails to be read."""
     return os.path.lexists(path)
 
 
@@ -54,7 +54,7 @@ def remove_left_over(directory: Path) -> None:
 
 
 def check_regular(path: Path) -> os.stat_result:
-    """Return the status of a regular file. Raises DataError for other types, because reading a pipe may never end."""
+    """Return the status of a regular file. Raises DataError for other types: reading a pipe may block forever."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:
@@ -81,4 +81,6 @@ def read_text(path: Path, most: int = MAX_TEXT) -> str:
     try:
         return read_bytes(path, most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{path}: expected UTF-8 text, got an error ({error})") from error
+        line = error.object.count(b"\n", 0, error.start) + 1
+        found = f"got byte {error.object[error.start]:#04x} in line {line}"
+        raise DataError(f"{path}: expected UTF-8 text, {found}") from error

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 def new_directory(wanted: str) -> str:
-    """Create a directory with the first unused name of `wanted`, `wanted`_2, ... and return the path.
+    """Create a directory with the first unused path among `wanted`, `wanted`_2, ..., and return this path.
 
     Raises DataError if the directory cannot be created.
     """
@@ -43,8 +43,9 @@ def new_directory(wanted: str) -> str:
 def locked(directory: Path, wait: bool = False) -> Iterator[None]:
     """Lock `directory` while the body of the `with` statement runs.
 
-    The lock ends with the process, even after `kill -9`. If another process holds the lock, wait for that process to
-    exit if `wait` is True; otherwise raise DataError. A warning is logged on file systems without locks.
+    The lock ends with the process, even after `kill -9`. If another process holds the lock, this function waits for
+    that process to exit if `wait` is True. Otherwise it raises DataError. A warning is logged on file systems without
+    locks.
     """
     directory.mkdir(parents=True, exist_ok=True)
     lock = FileLock(directory / LOCK, fallback_to_soft=False)
@@ -98,5 +99,5 @@ def holder(directory: Path) -> str:
 
 
 def holder_name(process: int | None) -> str:
-    """Return the name of a process in the format of `holder`."""
+    """Return the name of the process with this id, in the format of `holder`."""
     return f"process {process} on {socket.gethostname()}"

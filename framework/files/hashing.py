@@ -17,7 +17,7 @@ def add_values(digest: hashlib._Hash, array: Array) -> None:
 
 
 def add_array(digest: hashlib._Hash, array: Array) -> None:
-    """Update `digest` with the type, shape and bytes of an array."""
+    """Update `digest` with the type, shape and bytes of an array in C order."""
     digest.update(f"{array.dtype.str}{array.shape};".encode())
     add_values(digest, array)
 

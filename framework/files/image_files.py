@@ -49,7 +49,7 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
 
 
 def read_uint16(path: Path) -> UInt16:
-    """Return the uint16 values (H, W) of a PNG file. Raises FrameError if it is damaged or of another type."""
+    """Return the uint16 values (H, W) of a PNG file. Raises FrameError if the file is damaged or has another type."""
     return decode_uint16(path, read_image_file(path))
 
 
@@ -59,7 +59,7 @@ def decode_uint16(name: Path | str, data: bytes) -> UInt16:
 
 
 def read_uint8(path: Path) -> UInt8:
-    """Return the uint8 values (H, W) of a PNG file. Raises FrameError if it is damaged or of another type."""
+    """Return the uint8 values (H, W) of a PNG file. Raises FrameError if the file is damaged or has another type."""
     return np.asarray(_decode_channel(path, read_image_file(path), np.uint8), np.uint8)
 
 

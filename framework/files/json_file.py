@@ -8,16 +8,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from framework.errors import DataError, in_one_line
+from framework.errors import DataError, errors_of, in_one_line
 from framework.files.atomic_write import MAX_TEXT, atomic_write, read_bytes
 
 MAX_DEPTH = 50  # maximum depth of nested objects and lists
 TOO_DEEP = f"expected JSON with at most {MAX_DEPTH} nested lists and objects, got deeper nesting"
-MAX_BITS = 63  # maximum size of an integer, a limit of libraries; timestamps in ns have 61 bits
+MAX_BITS = 63  # maximum size of an integer, bits; libraries have this limit; timestamps in ns have 61 bits
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write `content` atomically, with floats in full precision."""
+    """Write `content` atomically, with floats in full precision; NaN and infinity become null."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
@@ -30,7 +30,8 @@ def read_json(path: Path, most: int = MAX_TEXT) -> Any:
 def parse_json(where: object, content: bytes | str) -> Any:
     """Parse JSON with or without a byte order mark. Raises DataError that names `where`."""
     try:
-        found = json.loads(content, parse_int=_whole, object_pairs_hook=_once)
+        with errors_of(where):
+            found = json.loads(content, parse_int=_whole, object_pairs_hook=_once)
     except RecursionError as error:
         raise DataError(f"{where}: {TOO_DEEP}") from error
     except (ValueError, MemoryError) as error:
@@ -42,16 +43,16 @@ def parse_json(where: object, content: bytes | str) -> Any:
 
 def _whole(digits: str) -> int:
     if len(digits) > MAX_BITS or (value := int(digits)).bit_length() > MAX_BITS:
-        raise ValueError(f"expected integers of at most {MAX_BITS} bits, got {digits[:20]}... of {len(digits)} digits")
+        raise DataError(f"expected integers of at most {MAX_BITS} bits, got {digits[:20]}... of {len(digits)} digits")
     return value
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the pairs as a dict. Raises ValueError for duplicate keys, because JSON does not define their meaning."""
+    """Return the pairs as a dict. Raises DataError for duplicate keys, because JSON does not define their meaning."""
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = next(key for k, (key, _) in enumerate(pairs) if key in {before for before, _ in pairs[:k]})
-        raise ValueError(f"expected unique keys, got {twice!r} twice")
+        raise DataError(f"expected unique keys, got {twice!r} twice")
     return found
 
 

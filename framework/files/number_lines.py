@@ -54,7 +54,7 @@ def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> li
 
 
 def read_gravity(path: Path) -> list[Float64 | None]:
-    """Read the up direction of each frame, in the camera: `x y z` per line, `nan nan nan` = unknown.
+    """Read the up direction of each frame in the camera frame: `x y z` per line, `nan nan nan` = unknown.
 
     Returns unit vectors (3,), None = unknown. Empty lines, and comments after `#`, are skipped. Raises DataError.
     """
@@ -63,7 +63,7 @@ def read_gravity(path: Path) -> list[Float64 | None]:
 
 
 def write_gravity(path: Path, ups: Sequence[Float64 | None]) -> None:
-    """Write the up direction (3,) of each frame, None = unknown, in the format of `read_gravity`."""
+    """Write the up direction (3,) of each frame in the format of `read_gravity`; None = unknown."""
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for up in ups:
             file.write("nan nan nan\n" if up is None else " ".join(f"{value:.9f}" for value in up) + "\n")
@@ -128,7 +128,7 @@ class PrintedMatrix:
 
 
 def read_matrix(path: Path) -> PrintedMatrix:
-    """Read a matrix from a file of four lines with four numbers. Raises DataError."""
+    """Read a 4x4 matrix from a file with four lines of four numbers. Raises DataError."""
     lines = _numbered_lines(path)
     if len(lines) != 4:
         raise DataError(f"{path}: expected 4 lines of 4 numbers, got {len(lines)} lines")
@@ -136,7 +136,7 @@ def read_matrix(path: Path) -> PrintedMatrix:
 
 
 def read_matrix_lines(path: Path) -> list[PrintedMatrix]:
-    """Read a file with one matrix, 16 numbers, per line. Raises DataError."""
+    """Read a file with one 4x4 matrix (16 numbers, row by row) per line. Raises DataError."""
     lines = _numbered_lines(path)
     return [PrintedMatrix(where, np.array(numbers(where, words, 16)).reshape(4, 4)) for where, words in lines]
 

@@ -101,10 +101,10 @@ def _vertices(path: Path, rows: Element) -> Float32:
 def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
     name = next((name for name in INDICES if name in rows.lists), None)
     if name is None:
-        raise DataError(f"{path}: element 'face': expected a list {' or '.join(INDICES)}, got none")
+        raise DataError(f"{path}: element 'face': expected a list property {' or '.join(INDICES)}, got none")
     indices, lengths = rows.lists[name]
     if indices.dtype.kind == "f":
-        raise DataError(f"{path}: {name}: expected integers, got {indices.dtype}")
+        raise DataError(f"{path}: {name}: expected an integer type, got {indices.dtype}")
     if (lengths < 3).any():
         k = int(np.argmax(lengths < 3))
         raise DataError(f"{path}, {rows.place(k)}: face {k}: expected at least 3 vertices, got {lengths[k]}")

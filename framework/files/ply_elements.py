@@ -144,7 +144,7 @@ def _dtype(name: str) -> np.dtype[Any]:
 
 
 def _check_size(path: Path, header: Header, body: int) -> None:
-    """Raise DataError if the rows do not fit into `body` bytes. This limits the size of arrays to the file size."""
+    """Raise DataError if the rows do not fit into the `body` bytes after the header. This limits the size of arrays."""
     least = 0
     for element in header.elements:
         if element.rows and not element.properties:
@@ -215,9 +215,8 @@ class _Body:
                 try:
                     words.extend(map(float, found))
                 except ValueError as error:
-                    raise DataError(
-                        f"{self._path}, line {number}: expected numbers, got {shown(str(error))}"
-                    ) from error
+                    text = shown(line.decode("latin-1").strip())
+                    raise DataError(f"{self._path}, line {number}: expected numbers, got {text}") from error
         self._data, self._end = np.array(words), len(words)
         self._line_starts = np.array([*starts, len(words)], np.int64)  # position of each line with numbers
         self._line_numbers = np.array([*numbers, before + len(lines)], np.int64)

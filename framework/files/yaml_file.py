@@ -57,7 +57,7 @@ def check_yaml(where: object, text: str) -> None:
     for event in _events(where, text):
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchors:
-                expected = f"expected an anchor &{event.anchor} that ends before its alias"
+                expected = f"expected a complete anchor &{event.anchor} before its alias"
                 raise DataError(f"{where}: {expected}, got none")
             counts[-1] += anchors[event.anchor]
         elif isinstance(event, yaml.ScalarEvent):

@@ -23,7 +23,7 @@ class DepthRegistration:
 
     @property
     def target(self) -> Camera:
-        """The color camera, at the resolution of the depth camera."""
+        """The color camera, at about the resolution of the depth camera."""
         return self.color.scaled(min(1.0, FINEST * min(self.depth.fx / self.color.fx, self.depth.fy / self.color.fy)))
 
     def apply(self, depth: Float32) -> Float32:
@@ -34,13 +34,14 @@ class DepthRegistration:
 
 
 def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, target_color: UInt8) -> Float32:
-    """Return the depth (H, W) m of the camera `target`, resampled from the depth (h, w) m of the view of `camera`.
+    """Return the depth (H, W), m, of the camera `target`, resampled from `depth` (h, w), m; 0 = no reading.
 
-    `color` and `target_color` are the color images (., ., 3) of `camera` and `target`, which have the same pose. If the
-    four depth readings around a pixel belong to one surface, their inverses are interpolated, which is exact for a
-    plane. Otherwise, the pixel gets the depth reading with the nearest and most similar color. No depth is therefore
-    between two surfaces. The weights are those of joint bilateral upsampling (Kopf et al., SIGGRAPH 2007). Pixels
-    without a reading remain without a reading.
+    `color` and `target_color` are the color images (., ., 3) of `camera` and `target`, which have the same pose.
+    `depth` has the field of view of `camera`. If the four depth readings around a pixel belong to one surface, their
+    inverses are interpolated, which is exact for a plane. Otherwise, the pixel gets the reading with the largest
+    weight, which decreases with the distance in the image and in color. No depth therefore lies between two surfaces.
+    The weights are those of joint bilateral upsampling (Kopf et al., SIGGRAPH 2007). If the nearest pixel of `depth`
+    has no reading, the result has none either.
     """
     height, width = depth.shape
     guide = np.asarray(cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

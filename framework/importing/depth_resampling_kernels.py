@@ -7,7 +7,7 @@ from numba import njit
 
 from framework.data import Float32, Float64, UInt8
 
-ONE_SURFACE = 0.05  # fraction of the nearest depth, maximum range of four depth readings of one surface
+ONE_SURFACE = 0.05  # maximum range of four depth readings on one surface, as a fraction of the nearest reading
 COLOR_SIGMA = 15.0  # RGB distance due to noise and shading of one object, with channels from 0 to 255
 
 
@@ -15,7 +15,8 @@ COLOR_SIGMA = 15.0  # RGB distance due to noise and shading of one object, with 
 def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, registered: Float32) -> None:
     """Fill `registered` (H, W) with `depth` (h, w), m, as seen by the target camera.
 
-    `T` (4, 4) maps the depth camera to the target camera. The nearest depth reading has precedence.
+    `T` (4, 4) maps coordinates in the depth camera to coordinates in the target camera. The nearest depth reading has
+    precedence.
     """
     height, width = registered.shape
     for v in range(depth.shape[0]):
@@ -40,7 +41,7 @@ def move_readings(depth: Float32, K: Float64, K_target: Float64, T: Float64, reg
 
 @njit(cache=True, nogil=True)
 def upsample(depth: Float32, guide: UInt8, u: Float64, v: Float64, color: UInt8, found: Float32) -> None:
-    """Fill `found` (H, W), m, with `depth` (h, w), m, at the coordinates u (W,), v (H,), px.
+    """Fill `found` (H, W), m, with `depth` (h, w), m, resampled at the pixel coordinates u (W,), v (H,) of `depth`.
 
     `guide` (h, w, 3) is the color at the resolution of `depth`, and `color` (H, W, 3) the color of the target.
     """

@@ -50,7 +50,7 @@ class Writing:
         return Turn(self.rotate // QUARTER)
 
     def camera(self, stored: Camera) -> Camera:
-        """Return the camera of the written images before rotation."""
+        """Return the camera of the written images before rotation, for the camera of the stored images."""
         factor = self.width / stored.width if self.width else LONGER_SIDE / max(stored.width, stored.height)
         return stored.scaled(min(1.0, factor))
 
@@ -61,9 +61,9 @@ class Written:
 
     timestamps: list[float] = field(default_factory=list)  # s, of the written frames
     poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of these frames; empty without poses
-    errors: list[str] = field(default_factory=list)  # message of each skipped frame
+    errors: list[str] = field(default_factory=list)  # error message of each skipped frame
     depth_timestamps: list[float | None] = field(default_factory=list)  # s; None = the timestamp of color
-    ups: list[Float64 | None] = field(default_factory=list)  # (3,) up in the camera before rotation; None = unknown
+    ups: list[Float64 | None] = field(default_factory=list)  # (3,) up direction in the unrotated camera frame
 
     def __str__(self) -> str:
         count = f"{len(self.timestamps)} frames"
@@ -71,11 +71,12 @@ class Written:
 
 
 def check_new(directory: Path) -> None:
-    """Raise DataError if the directory exists and is not empty."""
+    """Raise DataError if the path exists and is not an empty folder."""
     if directory.is_dir() and not any(directory.iterdir()):
         return
     if directory.exists() or directory.is_symlink():
-        raise DataError(f"{directory}: expected a new or empty folder, got an existing path; remove it or set another")
+        found = "got a file or non-empty folder; remove it or set another"
+        raise DataError(f"{directory}: expected a new or empty folder, {found}")
 
 
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:

@@ -38,7 +38,7 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
             if kind.has_topics:
                 return kind.open(place, topics or Topics())
             if topics and topics.given:
-                raise ConfigError(f"{', '.join(topics.given)}: expected a ROS bag for topics, got {path}")
+                raise ConfigError(f"{', '.join(topics.given)}: expected a ROS bag, got {path}; omit these options")
             return kind.open(place)
     known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
     raise DataError(f"{path}: expected a supported format, got an unknown format; supported: {known}")

@@ -1,4 +1,4 @@
-"""Recordings of devices for import. Depth often has a lower resolution than color."""
+"""Device recordings to import. Depth often has a lower resolution than color."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class DeviceFrame:
     timestamp: float  # s
     camera: Camera  # of the color image
     color: UInt8  # (H, W, 3) RGB
-    depth: Float32  # (h, w) m along z, 0 = no reading; with the field of view of color
+    depth: Float32  # (h, w) m along z, 0 = no reading; same field of view as color
     confidence: UInt8 | None = None  # (h, w), of the depth, from UNSURE to SURE; None = unknown
     T_world_camera: Float64 | None = None  # (4, 4), None = unknown
-    up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = unknown
+    up: Float64 | None = None  # (3,) unit up vector in the camera frame, from a sensor; None = unknown
     depth_timestamp: float | None = None  # s, of the depth image; None = `timestamp`
 
     def __post_init__(self) -> None:
@@ -83,7 +83,7 @@ def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
 
 
 def arkit_up(T_world_camera: Float64) -> Float64:
-    """Return the up direction (3,) in the camera of a pose in ARKit's world frame.
+    """Return the up direction (3,) in the camera frame for a pose (4, 4) in ARKit's world frame.
 
     The y axis of this world frame points against gravity, as in ARConfiguration.WorldAlignment.gravity, the default.
     """

@@ -45,7 +45,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Change:
-    """One object of the first visit, the second, or both."""
+    """The change of an object that exists in the first visit, the second visit, or both."""
 
     kind: Kind
     name: str  # name of its class
@@ -58,7 +58,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Visit:
-    """A map, and the poses (F, 4, 4) of its camera."""
+    """A map, and the poses T_world_camera (F, 4, 4) of its frames."""
 
     scene: SceneMap
     poses: Float64
@@ -76,7 +76,7 @@ class _Object:
     name: str  # name of its class
     seen: float  # observed fraction of the surface in the other visit
     gone: float  # probability of absence in the other visit
-    match: int | None  # object of the other visit at the same position
+    match: int | None  # id of the object of the other visit at the same position; None = no object
 
     @property
     def is_gone(self) -> bool:
@@ -129,9 +129,9 @@ def _observe(visit: Visit, other: Visit) -> list[_Object]:
 
 
 def look_for(visit: Visit, points: Float32) -> tuple[Bool, Bool]:
-    """Return two masks (P,) of world points (P, 3) m: points on an observed surface, and in observed free space.
+    """Return two masks (P,) of world points (P, 3), m: points on an observed surface, and in observed free space.
 
-    A point is free space if it is free from at least one pose, regardless of the other poses.
+    A point is in free space if it is observed as free from at least one pose, regardless of the other poses.
     """
     there, through = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
     for k in np.unique(np.linspace(0, len(visit.poses) - 1, LOOKS).round().astype(int)):

@@ -18,7 +18,7 @@ from framework.mapping.gravity import floor_height
 
 
 class Map:
-    """Thread-safe queries of a map, for all fusers."""
+    """Thread-safe queries of a map, independent of the fuser."""
 
     scene: SceneMap
     lock: threading.RLock  # held during a query and while a frame is mapped
@@ -96,7 +96,7 @@ class Map:
             T_world_camera: (4, 4) pose.
 
         Returns:
-            The view. Its instance ids are those of `instances` only.
+            The view, in which pixels of instances that are not in `instances` have instance 0 and class -1.
         """
         with self.lock:
             view = self.scene.render(camera, T_world_camera)

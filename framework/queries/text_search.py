@@ -104,7 +104,7 @@ def _model_of(run: Path | None) -> tuple[str, str]:
 
 
 def by_embedding(scene: Map, text: Float32) -> list[Match]:
-    """Return the objects with an embedding, ranked by the cosine with a text embedding (D,), largest first.
+    """Return the objects with an embedding, ranked by the cosine similarity to a text embedding (D,), largest first.
 
     Raises DataError if the map's embeddings have another length.
     """
@@ -141,7 +141,7 @@ def by_names(scene: Map, query: str) -> list[Match]:
 
 
 def color_fit(mesh: InstanceMesh, instance: Instance, colors: Sequence[str]) -> float:
-    """Return the fit of the best color to an object, in [0, 1], averaged over its vertices."""
+    """Return the highest fit, in [0, 1], of one of `colors` to an object, averaged over its vertices."""
     observed = _colors(mesh, instance)
     return max((float(fits(observed, name).mean()) for name in colors), default=0.0) if len(observed) else 0.0
 

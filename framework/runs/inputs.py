@@ -22,7 +22,7 @@ OUTPUTS = {"outputs", "multirun"}  # Hydra's output folders
 
 
 def inputs_sha256(config: Mapping[str, Any]) -> str:
-    """Return the SHA-256 (hex) of the files in a resolved config.
+    """Return the SHA-256 (hex) of the input files that a resolved config names.
 
     Files and folders are hashed by content. A recording is hashed by the names, sizes and modification times of the
     files in dataset.root and below dataset.scene, which is faster.
@@ -41,7 +41,7 @@ def inputs_sha256(config: Mapping[str, Any]) -> str:
 
 
 def _truth_files(value: str) -> list[str]:
-    """Return the files of a named ground truth; empty if one is missing, because the run itself reports the error."""
+    """Return the files of `dataset.ground_truth`; empty if one is missing, because the run itself reports the error."""
     try:
         return [str(path) for path in truth_files(Path(value))]
     except (ConfigError, DataError):

@@ -63,7 +63,7 @@ def run_metrics(result: RunResult) -> Metrics:
 
 
 def trajectory_metrics(result: RunResult) -> Metrics:
-    """Return the errors of the poses that are not lost; empty without ground-truth poses."""
+    """Return the trajectory errors over the poses that are not lost; empty without ground-truth poses."""
     reference: list[Float64 | None] = [None] * result.frames  # includes skipped frames, which interrupt relative poses
     estimated = [Pose(np.eye(4), lost=True)] * result.frames
     for frame in result.tracked:
@@ -91,7 +91,7 @@ def instance_metrics(
 ) -> Metrics:
     """Return the number of instances, and their metrics if the ground truth can be aligned to the map.
 
-    `trajectory` contains the times (F,) in s and poses (F, 4, 4) of the map.
+    `trajectory` contains the timestamps (F,) in s and the poses T_world_camera (F, 4, 4) of the map.
     """
     count: Metrics = {"instances.count": len(found)}
     truth = video.scene_truth()

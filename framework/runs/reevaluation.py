@@ -101,7 +101,7 @@ class Reevaluation:
         return [key for key in self.metrics if is_evaluation(key) and key not in self.record.metrics]
 
     def write(self) -> None:
-        """Replace metrics.json but keep its modification time, by which tables select the latest of several runs.
+        """Replace metrics.json but keep its modification time, which tables use to select the latest of several runs.
 
         Raises DataError if the run has been restarted.
         """
@@ -113,7 +113,7 @@ class Reevaluation:
                 before = None
             if before is None or before.st_mtime != self.record.written:
                 raise DataError(
-                    f"{path}: expected an unchanged file, got a modified file; the run was restarted, evaluate it later"
+                    f"{path}: expected an unchanged file, got a file of a restarted run; evaluate it when it ends"
                 )
             write_json(path, self.metrics)
             os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
@@ -131,5 +131,5 @@ def read_predictions(record: Record) -> PredictedInstances:
 
 
 def dataset_of(record: Record, ground_truth: str | None = None) -> dict[str, Any]:
-    """Return the dataset config of a run with `ground_truth`: "" = that of the dataset, None = that of the run."""
+    """Return the dataset config of a run with another `ground_truth`; "" = that of the dataset, None = unchanged."""
     return record.dataset | ({} if ground_truth is None else {"ground_truth": ground_truth or None})

@@ -173,7 +173,7 @@ class RunRecord:
 
 @dataclass
 class _Attempts:
-    """Function calls with logged errors. A failing call does not stop later calls."""
+    """Caller of functions that logs their errors, so that a failing call does not prevent later calls."""
 
     error: BaseException | None  # the first error
 

@@ -100,10 +100,11 @@ class RunRow:
 def rows_of(
     records: Sequence[Record], over: Sequence[str], overrides: Mapping[str, Sequence[str]] | None = None
 ) -> list[RunRow]:
-    """Return `records` grouped into rows: rows in `overrides` first, then other rows by name.
+    """Group `records` into rows: first the rows in `overrides`, then other rows by name.
 
-    A row is a `row` of an experiment. Other records are grouped by their differing options and parameters, except for
-    the keys `over` and keys that always have the same value as one of them, such as dataset.seed and seed.
+    Records of an experiment are grouped by their config key `row`. Other records are grouped by their differing options
+    and parameters, except for the averaged keys `over` and keys that always have the same value as one of them, such as
+    dataset.seed and seed. `overrides` contains the overrides of each row by name.
 
     A row of an experiment is split by differences within it, by data folder and by annotation. It is also split by
     differences between rows that no override causes, such as the pose source or the number of frames. The later of two
@@ -145,7 +146,7 @@ def _changed(override: str) -> tuple[str, ...]:
 
 
 def _kept(one: _Variant, changed: Collection[str]) -> Iterator[tuple[Any, Mapping[str, Any]]]:
-    """Yield the parameters unchanged by all rows, by stage and option."""
+    """Yield the parameters that no row changes, with their stage and its option."""
     for key, value in one.parameters.items():
         if not _is_below(key, changed):
             stage = key.partition(".")[0]
@@ -179,7 +180,10 @@ class _Variant:
 
 
 def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
-    """Return the keys with other names whose value equals that of a key in `over` in every record, even by chance."""
+    """Return the keys whose value equals that of a key in `over` in every record, even by chance.
+
+    Keys with the same last part as a key in `over`, such as dataset.seed for seed, are omitted.
+    """
     variants = [_Variant.of(record, over) for record in records]
     names = {key.rpartition(".")[2] for key in over}
     differing = set(_differing([("", one.parameters) for one in variants]))

@@ -72,7 +72,7 @@ def _without_hydra(sweep: Mapping[str, Any]) -> DictConfig:
 
 
 def _of_itself(node: Any) -> Any:
-    """Return the node with "???" in place of references that are not to its own keys, such as ${oc.env:...}."""
+    """Return the node with "???" in place of references to values outside the config, such as ${oc.env:...}."""
     if isinstance(node, Mapping):
         return {key: _of_itself(value) for key, value in node.items()}
     if isinstance(node, list):

@@ -45,7 +45,7 @@ def read_timings(path: Path) -> StageTimes:
     try:
         lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
     except csv.Error as error:
-        raise DataError(f"{path}: expected a readable file, got {error}") from error
+        raise DataError(f"{path}: expected valid CSV, got an error ({error})") from error
     if lines[:1] != [HEADER]:
         raise DataError(f"{path}, line 1: expected {','.join(HEADER)}, got {','.join(next(iter(lines), []))!r:.60}")
     taken: dict[tuple[int, str], float] = {}

@@ -31,8 +31,8 @@ def lower_priority() -> None:
 def parallel_kernels_are_thread_safe() -> bool:
     """Return True if two threads may run parallel kernels at the same time.
 
-    numba's workqueue layer ends the process in that case. numba selects a layer when it starts its threads, which this
-    function triggers.
+    numba's workqueue layer aborts the process if they do. numba selects a layer when it starts its threads, which
+    this function triggers.
     """
     numba.get_num_threads()
     return str(numba.threading_layer()) in ("omp", "tbb")
@@ -40,7 +40,7 @@ def parallel_kernels_are_thread_safe() -> bool:
 
 @contextmanager
 def kernel_threads(threads: int) -> Iterator[None]:
-    """Set the number of threads of the kernels that the calling thread runs in the body."""
+    """Set the number of threads for kernels that the calling thread runs in the body."""
     before = numba.get_num_threads()
     numba.set_num_threads(threads)
     try:
@@ -79,7 +79,7 @@ class CpuBudget:
 
     @contextmanager
     def prefetching(self, workers: int = 1) -> Iterator[None]:
-        """Run the body, the prefetching of one frame in one of `workers` threads, on the cores for prefetching."""
+        """Run the body on the cores for prefetching. The body prefetches one frame, in one of `workers` threads."""
         with kernel_threads(self.cores if self._alone else max(self.prefetch_cores() // workers, 1)):
             began = time.thread_time()
             yield
@@ -87,7 +87,7 @@ class CpuBudget:
 
     @contextmanager
     def mapping(self) -> Iterator[None]:
-        """Run the body, the mapping of one frame, on the cores for mapping."""
+        """Run the body on the cores for mapping. The body maps one frame."""
         threads = self.cores if self._alone else max(self.cores - self.prefetch_cores(), 1)
         with kernel_threads(threads):
             began = time.thread_time()
@@ -95,7 +95,7 @@ class CpuBudget:
             self._record(self._mapping, threads * (time.thread_time() - began))
 
     def prefetch_cores(self) -> int:
-        """Return the rounded number of cores for prefetching: 0 or all cores if one side has almost no work."""
+        """Return the number of cores for prefetching, rounded; 0 or all cores if one side has almost no work."""
         with self._lock:
             if not (self._prefetching and self._mapping):
                 return self.cores // 2

@@ -58,7 +58,7 @@ class RecordedFrames(FrameStream):
 class LiveFrames(FrameStream):
     """Stream of a live video. `take` returns the newest frame; older frames are dropped.
 
-    A thread receives the frames, so that no queue builds up in the video. Only one frame is prefetched.
+    A thread receives the frames, so that no queue builds up in the video source. Only one frame is prefetched.
     """
 
     max_prefetched = 1
@@ -150,7 +150,7 @@ class Turns:
 
     @contextmanager
     def turn(self, number: int) -> Iterator[None]:
-        """Wait for the end of all turns with smaller numbers."""
+        """Run the body after all turns with smaller numbers have ended."""
         with self._changed:
             self._changed.wait_for(lambda: self._next == number)
         try:

@@ -71,21 +71,27 @@ def configure_process(threads: int = 0, seed: int | None = None) -> None:
 
     `import instancemap`, `Mapper` and `Pipeline` do not change process-wide settings. Call this function at the start
     of your program if process-wide changes are acceptable. Detection then runs in parallel with mapping on every
-    platform, and frames take less time.
+    platform, and the time per frame is shorter.
 
         import instancemap
 
         instancemap.configure_process()
         from instancemap import Mapper
 
-    It sets environment variables (`NUMBA_THREADING_LAYER`, `OMP_WAIT_POLICY`, `GOMP_SPINCOUNT`,
-    `OPENBLAS_THREAD_TIMEOUT`, `OMP_NUM_THREADS`), the thread counts of numba, OpenCV, torch, OpenMP and BLAS, and the
-    malloc thresholds of glibc. Libraries read the environment when they are loaded, so call it before you import numpy
-    or numba. Otherwise a warning lists the variables without effect.
+    This function sets:
+
+    - environment variables: `NUMBA_THREADING_LAYER`, `OMP_WAIT_POLICY`, `GOMP_SPINCOUNT`, `OPENBLAS_THREAD_TIMEOUT` and
+      `OMP_NUM_THREADS`; existing values are kept, except for `OMP_NUM_THREADS`
+    - the thread counts of numba, OpenCV, torch, OpenMP and BLAS
+    - the malloc thresholds of glibc
+    - the global random generators, if `seed` is given
+
+    Libraries read environment variables when they are loaded. Therefore, call this function before you import numpy or
+    numba. Otherwise, a warning lists the variables that may have no effect.
 
     Args:
-        threads: Threads of each library; 0 = all cores of this process.
-        seed: Seed of the global generators of Python, numpy and torch (if loaded); None = leave them as they are.
+        threads: Number of threads of each library; 0 = number of cores available to this process.
+        seed: Seed of the global random generators of Python, numpy and torch (if loaded); None = not seeded.
 
     Raises:
         ConfigError: `threads` or `seed` is out of range.
@@ -162,7 +168,7 @@ class Settings:
             torch.set_num_threads(threads)
 
     def seed_generators(self) -> None:
-        """Seed Python, numpy and, if it is loaded, torch."""
+        """Seed the global random generators of Python, numpy and torch (if loaded)."""
         import numpy as np
 
         random.seed(self.seed)

@@ -13,7 +13,7 @@ MIN_INTERVAL, MAX_INTERVAL = 3.0, 60.0  # s, minimum and maximum interval of log
 
 
 class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
-    """Progress bar of `total` items (None = unknown), and timer of log lines without a bar."""
+    """Progress bar of `total` items (None = unknown), or timer of log lines if no bar is shown."""
 
     def __init__(self, total: int | None, unit: str, **options: Any) -> None:
         # tqdm ignores TQDM_DISABLE if `disable` is given; a program without a console has no stderr

@@ -66,9 +66,9 @@ class RunResult:
     frames_skipped: int  # number of frames that are unreadable, inconsistent or without a required pose
     tracked: tuple[TrackedFrame, ...]  # including lost frames
     timings: tuple[StageTime, ...]
-    seconds: float  # wall clock of the whole loop
+    seconds: float  # wall-clock time of the whole loop
     stopped_by: BaseException | None = None  # reason for an early end; None = completed
-    intervals: tuple[float, ...] = ()  # wall clock between frames, s
+    intervals: tuple[float, ...] = ()  # wall-clock time between frames, s
     pose_source: str = PoseTracker.pose_source
     live: LiveFigures | None = None  # None = a recording
     keyframes: Mapping[str, Array] = field(default_factory=dict)  # of the tracker
@@ -81,7 +81,7 @@ class RunResult:
 
     @property
     def fps(self) -> float:
-        """Return the frames per second of wall clock, including reading and detection."""
+        """Return the frames per second of wall-clock time, including reading and detection."""
         return self.frames / self.seconds
 
     @property
@@ -132,7 +132,7 @@ class Journal:
 
     @contextmanager
     def timed(self, frame: int, stage: str) -> Iterator[None]:
-        """Record the time of the body, if it succeeds."""
+        """Record the time of the body for a frame index and a stage, if the body succeeds."""
         started = time.perf_counter()
         yield
         self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
@@ -192,7 +192,7 @@ class Journal:
         return self.frames_skipped - self.without_pose
 
     def frame_tracked(self, frame: Frame, pose: Pose) -> None:
-        """Record a pose; log the depth sensor, and when tracking is lost and recovered."""
+        """Record a pose. Log a change of the depth sensor, and the loss and recovery of tracking."""
         if frame.sensor is not self.sensor:
             self.sensor = frame.sensor
             log.info("depth sensor: %s", frame.sensor)
@@ -206,7 +206,7 @@ class Journal:
             self.lost_for = 0
 
     def frame_fused(self, frame: Frame) -> None:
-        """Record the latency of a frame of a live video."""
+        """Record the latency of a frame if the video is live."""
         if self.frames_expected is None:
             self.latencies.append(time.time() - frame.timestamp)
 

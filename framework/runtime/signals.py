@@ -62,7 +62,7 @@ class Interruption:
     def second_ends_at_once(self, when: str) -> Iterator[None]:
         """Let the second signal raise Interrupted in the body. The message of the first signal contains `when`.
 
-        Between such bodies no signal raises, so that the result of one body reaches the next body.
+        Outside such bodies, signals do not raise, so that no result is lost between two bodies.
         """
         self._when, self._at_once = when, True
         try:
@@ -80,7 +80,7 @@ class Interruption:
 
 
 def _print(text: str) -> None:
-    """Write to stderr directly. The signal may have interrupted its buffer or the log."""
+    """Write to stderr directly, because the signal may have interrupted a buffered write or the log."""
     if sys.__stderr__ is not None:
         with suppress(OSError, ValueError):
             os.write(sys.__stderr__.fileno(), text.encode())
@@ -121,9 +121,9 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
 
 
 def received_from_sweep() -> Interruption:
-    """Return the Interruption of a worker process: a SIGTERM from the sweep since the first job of the worker.
+    """Return the Interruption of a worker process, which records a SIGTERM from the sweep since the first job.
 
-    A terminal sends other signals to all its processes. Only the sweep handles them.
+    A terminal sends the other signals to the sweep and to all workers. The workers ignore these signals.
     """
     for number in set(ENDING) - {signal.SIGTERM}:
         signal.signal(number, signal.SIG_IGN)

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 class StoredCamera(NamedTuple):
-    """Calibration of a recording."""
+    """Calibration of a recording: camera, depth scale, lens distortion and kind of the depth sensor."""
 
     camera: Camera
     depth_scale: float  # units per meter
@@ -50,9 +50,10 @@ def read_camera(path: Path) -> StoredCamera:
 
 
 def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:
-    """Return the camera and the depth scale (units per meter) under `keys`, in the order of CAMERA_KEYS.
+    """Return the camera and the depth scale (units per meter) from the values of `keys`.
 
-    Raises DataError that names the file and the key.
+    `keys` are the names of the CAMERA_KEYS in this file, in the same order. Raises DataError that names the file and
+    the key.
     """
     *camera, depth_scale = numbers_of(path, content, *keys)
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
@@ -64,7 +65,7 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
 
 
 def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Camera:
-    """Return the camera with these intrinsics. Raises DataError that names `where` if they are invalid."""
+    """Return the pinhole camera with this image size and these intrinsics, px. Raises DataError that names `where`."""
     if width != int(width) or height != int(height):
         raise DataError(f"{where}: width, height: expected whole numbers of px, got {width:g}x{height:g}")
     with errors_of(where):
@@ -83,31 +84,34 @@ def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> 
 
 
 def number_list(where: Path | str, values: Any, count: int) -> list[float]:
-    """Return `values` as a list of `count` finite numbers. Raises DataError that names `where`."""
+    """Return the numbers of a JSON list.
+
+    Raises DataError that names `where` if `values` is not a list of `count` finite numbers.
+    """
     if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
-        raise DataError(f"{where}: expected a list of {count} numbers, got {str(values)[:60]}")
+        raise DataError(f"{where}: expected a list of {count} numbers, got {values!r:.60}")
     return [float(value) for value in values]
 
 
 def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> list[float]:
-    """Return the finite numbers under `keys`. Raises DataError that names `where` and the key."""
+    """Return the finite numbers under `keys` in `content`. Raises DataError that names `where` and the key."""
     for key in keys:
         if key not in content:
             raise DataError(f"{where}: expected a key {key!r}, got none")
         if not _is_number(content[key]):
-            raise DataError(f"{where}: {key}: expected a number, got {str(content[key])[:40]}")
+            raise DataError(f"{where}: {key}: expected a number, got {content[key]!r:.40}")
     return [float(content[key]) for key in keys]
 
 
 def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
-    """Return the lens distortion in the content of a file, or None without distortion. Raises DataError."""
+    """Return the lens distortion in the content of a camera.json; None = pinhole camera. Raises DataError."""
     if DISTORTION not in content:
         return None
     return Distortion(*number_list(f"{path}: distortion [k1, k2, p1, p2, k3]", content[DISTORTION], 5))
 
 
 def sensor_of(path: Path, content: Mapping[str, Any]) -> SensorKind:
-    """Return the kind of the depth sensor in the content of a file, or KINECT_V1 without the key. Raises DataError."""
+    """Return the kind of the depth sensor in the content of a camera.json; KINECT_V1 if missing. Raises DataError."""
     name = content.get(SENSOR, SensorKind.KINECT_V1.name)
     if not isinstance(name, str) or name not in SensorKind.__members__:
         raise DataError(

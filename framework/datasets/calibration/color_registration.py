@@ -17,7 +17,7 @@ LONGEST_SIDE = 2**15 - 2  # px, limit of OpenCV's warp
 
 @dataclass(frozen=True)
 class ColorRegistration:
-    """Warp from the color camera to the depth camera. Raises DataError if the intermediate image is too large."""
+    """Warp of color images to the depth camera. Raises DataError if the intermediate image is too large."""
 
     color: Camera
     depth: Camera
@@ -37,7 +37,7 @@ class ColorRegistration:
         return max(1, round(min(self.color.fx / self.depth.fx, LONGEST_SIDE)))
 
     def apply(self, image: UInt8) -> UInt8:
-        """Return the colors (H, W, 3) of the depth camera from an image of the color camera.
+        """Return the color image (H, W, 3) of the depth camera, resampled from an image of the color camera.
 
         Each pixel is the mean color of its area. The image is resampled bilinearly at `fine` times the resolution of
         the depth camera, then averaged over fine x fine pixels. Outside the color image, the nearest color is repeated.
@@ -58,7 +58,7 @@ class ColorRegistration:
 
 
 def registered_images(images: StoredImages, registration: ColorRegistration) -> StoredImages:
-    """Return the images of a frame with color that is registered to the depth camera when it is read."""
+    """Return the images of a frame. Color is registered to the depth camera when it is read."""
     return replace(images, color=partial(_registered_color, images, registration))
 
 
@@ -72,6 +72,6 @@ def _registered_color(images: StoredImages, registration: ColorRegistration) -> 
 
 
 def _line(f_color: float, c_color: float, f_depth: float, c_depth: float, fine: int) -> tuple[float, float]:
-    """Return a and b such that the coordinate i of the fine image is a i + b in the color image."""
+    """Return (a, b): the pixel coordinate i in the fine image corresponds to a i + b in the color image."""
     slope = f_color / f_depth
     return slope / fine, slope * (0.5 / fine - 0.5 - c_depth) + c_color

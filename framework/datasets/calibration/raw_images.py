@@ -17,7 +17,7 @@ NO_READING = 65535  # uint16, written by some sensors instead of 0
 
 
 def check_max_depth(max_depth: float) -> None:
-    """Raise ConfigError for an invalid maximum depth."""
+    """Raise ConfigError for a maximum depth (m) that is negative or not finite."""
     require(
         math.isfinite(max_depth) and max_depth >= 0,
         "dataset.max_depth",
@@ -41,7 +41,7 @@ class Calibration:
         object.__setattr__(self, "lens", Undistortion(self.camera, self.distortion) if self.distortion else None)
 
     def color(self, raw: UInt8, name: Path | str) -> UInt8:
-        """Return the color (H, W, 3) of the pinhole camera. Raises FrameError that names an image of the wrong size."""
+        """Return the undistorted color (H, W, 3). Raises FrameError that names an image of the wrong size."""
         self.check_size(name, raw.shape)
         return self.lens.smooth(raw) if self.lens else raw
 

@@ -1,6 +1,6 @@
 """Lens undistortion.
 
-The lens model is Brown-Conrady, as in OpenCV. A point (x, y, 1) m in the camera projects to the pixel
+The lens model is Brown-Conrady, as in OpenCV. A point (x, y, 1) m in the camera frame projects to the pixel
 (fx x' + cx, fy y' + cy) of the recorded image. With r^2 = x^2 + y^2:
 
     x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
@@ -38,7 +38,7 @@ class Distortion:
             raise DataError(f"distortion (k1, k2, p1, p2, k3): expected finite coefficients, got {astuple(self)}")
 
     def distorted(self, camera: Camera, pixels: Float64) -> Float64:
-        """Return the positions (N, 2), px, in the recorded image of `pixels` (N, 2), px, of the pinhole camera."""
+        """Map `pixels` (N, 2), px, of the pinhole camera to positions (N, 2), px, in the recorded image."""
         x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -68,9 +68,9 @@ class Undistortion:
         self._u, self._v = source.T.reshape(2, *camera.shape).astype(np.float32)
 
     def smooth(self, image: UInt8) -> UInt8:
-        """Return the undistorted colors (H, W, 3), interpolated bilinearly."""
+        """Return the undistorted colors (H, W, 3), with bilinear interpolation."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR), np.uint8)
 
     def exact(self, image: NDArray[Value]) -> NDArray[Value]:
-        """Return the undistorted depth or labels (H, W), float32 or uint16, from the nearest pixels."""
+        """Return the undistorted depth or labels (H, W), float32 or uint16, with nearest-neighbor sampling."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_NEAREST), image.dtype)

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class DepthCamera(LiveVideo):
-    """A camera with factory calibration. The library registers depth to color."""
+    """A depth camera with factory calibration. The vendor's library registers depth to color."""
 
     brand: ClassVar[str]
     default_sensor: ClassVar[SensorKind]  # kind of the depth sensor in devices with unknown names
@@ -76,11 +76,11 @@ class DepthCamera(LiveVideo):
         """Return the model name of the streaming device, such as "Intel RealSense D435"."""
 
     def depth_after_color(self, images: Any) -> float | None:
-        """Return the time from the color image to the depth image in s, by the device's clock; None = unknown."""
+        """Return the time from the color image to the depth image in s, on the device's clock; None = unknown."""
         return None
 
     def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:
-        """Return the lens distortion, or None without distortion. Unsupported models are logged and ignored."""
+        """Return the lens distortion; None = pinhole camera. Unsupported models are logged and ignored."""
         if not any(coefficients):
             return None
         if model != brown_conrady or any(coefficients[5:]):
@@ -139,7 +139,7 @@ class DepthCamera(LiveVideo):
 
 
 def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images | None]:
-    """Yield the results of `wait`. Raises DataError after LONGEST_SILENCE without images."""
+    """Yield the results of `wait`. Raises DataError after LONGEST_SILENCE seconds without images."""
     last_time = time.monotonic()
     while True:
         images = wait()

@@ -88,7 +88,7 @@ class FolderWatch(LiveVideo):
             except DataError as error:
                 if time.monotonic() > deadline:
                     raise DataError(
-                        f"{error}; write it within dataset.camera_timeout={self.camera_timeout:g} s"
+                        f"{error}; write this file within dataset.camera_timeout={self.camera_timeout:g} s"
                     ) from error
             yield None
             time.sleep(self.poll_interval)
@@ -113,7 +113,7 @@ class Arrivals:
     def __init__(self, folder: Path) -> None:
         self._color, self._depth = NewImages(folder / "color", COLOR), NewImages(folder / "depth", DEPTH)
         self._last = -1  # number of the last complete or skipped frame
-        self._halves: set[int] = set()  # numbers of skipped frames with one image
+        self._halves: set[int] = set()  # numbers of skipped frames with only one image so far
 
     def look(self, to_the_end: bool) -> Iterator[tuple[int, StoredImages | str]]:
         """Yield new frames in ascending order, up to the newest complete frame, or all frames at the end.
@@ -154,7 +154,7 @@ class NewImages:
         self._first: Path | None = None
 
     def look(self) -> None:
-        """Add the new images. Raises DataError if their names have no unique order."""
+        """Add the new images. Raises DataError if their names differ in more than one number (ambiguous order)."""
         try:
             with os.scandir(self.folder) as entries:
                 names = {entry.name for entry in entries}
@@ -167,7 +167,8 @@ class NewImages:
                 continue
             number = number_of(path)
             if number is None or number >= LARGEST_NUMBER:
-                log.warning("%s: expected a frame number below 2^53 at the end of the name, got none; ignored", path)
+                message = "%s: expected a frame number below 2^53 at the end of the name, got %r; image ignored"
+                log.warning(message, self.folder, name)
                 continue
             self._first = self._first or path
             check_one_number([self._first, path])

@@ -13,7 +13,7 @@ from framework.datasets.cameras.device_frames import WAIT_MS, DepthCamera
 from framework.errors import import_optional
 from framework.sensors.noise_models import SensorKind
 
-MILLIMETERS = 1000.0  # per meter; the library's depth scale is in millimeters
+MILLIMETERS = 1000.0  # per meter; the library's depth scale is in millimeters per unit
 
 
 @dataclass
@@ -77,7 +77,7 @@ class Orbbec(DepthCamera):
 
 
 def _pixels(image: Any, dtype: np.dtype[Any], channels: tuple[int, ...]) -> Any:
-    """Return a copy (H, W, ...) of an image, or None without an image."""
+    """Return a copy (H, W) or (H, W, 3) of the pixels, or None if `image` is None."""
     if image is None:
         return None
     raw = np.frombuffer(image.get_data(), dtype)

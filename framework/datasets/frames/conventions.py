@@ -18,7 +18,7 @@ from framework.geometry import inverse
 
 COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # depth units per meter; most sensors have 1000
 LONGEST_DELAY = 1000  # frames, maximum absolute delay of poses and depth images
-AUTO = "AUTO"  # value of `dataset.color_delay`: estimated
+AUTO = "AUTO"  # value of `dataset.color_delay`: estimate the delay
 LONGEST_COLOR_DELAY = 0.2  # s, maximum absolute delay of color
 
 

@@ -12,7 +12,7 @@ from framework.errors import DataError, FrameError
 
 
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """Return the paths of the images in a folder by the number at the end of their names, in ascending order.
+    """Return the paths of the images in a folder, by the number at the end of the name, in ascending order.
 
     Raises DataError for a folder without images, a name without a number, or two names with the same number. Names
     that differ in other digits, such as the decimals of a timestamp, also raise DataError.
@@ -67,7 +67,7 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[in
 
 
 def number_of(path: Path) -> int | None:
-    """Return the number at the end of an image's name, or None if the name has no number."""
+    """Return the number at the end of an image's name, or None if the name does not end in a number."""
     digits = path.stem[len(_before_number(path)) :]
     return int(digits) if digits else None
 

@@ -75,7 +75,7 @@ class RecordedFrame:
     timestamp: float  # s
     T_world_camera: Float64 | None = None  # (4, 4), None = unknown
     error: str = ""  # reason why the frame is unusable; "" = usable
-    up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = unknown
+    up: Float64 | None = None  # (3,) unit up vector in the camera frame, from a sensor; None = unknown
     color_timestamp: float | None = None  # s, of the color image; None = `timestamp`
     depth_timestamp: float | None = None  # s, of the depth image; None = `timestamp`
 
@@ -104,8 +104,8 @@ class Contents:
 class Recording(RGBDSequence):
     """An RGB-D video on disk. A subclass lists the stored frames (`open`) and provides the recording's ground truth.
 
-    `ground_truth` replaces the recording's own ground truth. It is the whole mesh, independent of the frame selection.
-    The instances in a frame are rendered from this mesh.
+    `ground_truth` replaces the recording's own ground truth by a complete mesh, independent of the frame selection. The
+    ground-truth instances in a frame are rendered from this mesh.
 
     Errors of the whole recording raise DataError when the recording is opened. Errors of one frame raise FrameError
     when the frame is read. The pipeline counts and skips such frames.
@@ -158,7 +158,7 @@ class Recording(RGBDSequence):
         """Return the contents of `self.folder`. Raises DataError that names the file if the format is invalid."""
 
     def truth_in(self, index: int) -> FrameTruth | None:
-        """Return the recording's own ground-truth instances in stored frame `index`, or None if they are unknown."""
+        """Return the recording's own ground-truth instances in stored frame `index`; None = unknown."""
         return None
 
     def constant_color_delay(self) -> float | None:

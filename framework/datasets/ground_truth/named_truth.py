@@ -116,7 +116,7 @@ def read_class_names(path: Path, largest_id: int) -> dict[int, str | None]:
 
 def _class_of(where: str, entry: Any) -> str | None:
     if not isinstance(entry, dict) or "class" not in entry:
-        expected = '{"name": ..., "class": name, or null if unknown}'
+        expected = '{"name": "...", "class": a COCO name, or null if unknown}'
         raise DataError(f"{where}: expected {expected}, got {entry!r:.60}")
     name = entry["class"]
     if name is None or (isinstance(name, str) and name in COCO):
@@ -135,7 +135,7 @@ def _labels_of(path: Path, ply: PlyMesh) -> Int32:
     if not len(ply.triangles):
         raise DataError(f"{path}: expected faces to render masks from, got none; set {KEY} to a mesh with faces")
     if labels.min() < 0 or labels.max() > LARGEST_ID:
-        raise DataError(f"{path}: {LABELS}: expected 0 to {LARGEST_ID}, got {labels.min()} to {labels.max()}")
+        raise DataError(f"{path}: {LABELS}: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     return labels.astype(np.int32)
 
 

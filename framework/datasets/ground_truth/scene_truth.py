@@ -26,7 +26,7 @@ class LabeledDepth:
 
 
 def check_truth_voxel(size: float) -> None:
-    """Raise ConfigError for an implausible spacing of ground-truth points."""
+    """Raise ConfigError for an implausible spacing of ground-truth points, m."""
     require(1e-3 <= size <= 1, "dataset.ground_truth_spacing", size, "a value in [0.001, 1] m")
 
 

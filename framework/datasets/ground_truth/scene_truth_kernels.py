@@ -46,7 +46,7 @@ def _slot(slots: Slots, key: np.int64, instance: np.int32) -> np.int64:
 def vote(
     depth: Float32, instance_ids: Int32, intrinsics: Float64, T: Float64, scale: float, slots: Slots, taken: int
 ) -> int:
-    """Add the pixels of a view and return the number of occupied slots, or -1 if a point is too far away.
+    """Add the pixels of a view and return the number of occupied slots; -1 = a point is too far from the origin.
 
     `depth`: (H, W) m. `instance_ids`: (H, W). `intrinsics`: (fx, fy, cx, cy) px. `T`: T_world_camera (4, 4). `scale`:
     voxels per m. `taken`: number of slots occupied before.

@@ -1,17 +1,18 @@
 """ScanNet (Dai et al., CVPR 2017): rooms scanned with an iPad and an attached depth sensor, with labeled meshes.
 
     scene0000_00/scene0000_00.sens      the video in one file (`sens_file.py`), or the export of ScanNet's SensReader:
-    scene0000_00/color/0.jpg            8-bit color, from 0
+    scene0000_00/color/0.jpg            8-bit color, numbered from 0
     scene0000_00/depth/0.png            uint16, mm along z
     scene0000_00/pose/0.txt             T_world_camera, four lines of four numbers, m
-    scene0000_00/intrinsic/             intrinsic_color.txt, intrinsic_depth.txt and, optional, extrinsic_*.txt: 4x4
+    scene0000_00/intrinsic/             4x4 matrices: intrinsic_color.txt, intrinsic_depth.txt; optional
+                                        extrinsic_color.txt, extrinsic_depth.txt
     scene0000_00/scene0000_00_vh_clean_2.ply, _vh_clean_2.0.010000.segs.json, .aggregation.json
                                         optional: mesh, segments, and objects as sets of segments
     scannetv2-labels.combined.tsv       optional, in the folder of the scenes or in its parent: the class of each
                                         annotated name; without this file, fewer objects are evaluated
     scannet-labels.combined.tsv         optional, in the same folders: for annotations of the first release
 
-Frames are in the depth camera (640x480); color (1296x968) is registered to it.
+Frames have the camera of the depth images (640x480 px). Color (1296x968 px) is registered to this camera.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class ScanNet(LabeledRecording):
         if len(sens) > 1:
             raise DataError(f"{self.folder}: expected one .sens file, got {len(sens)}: {sens[0].name} and others")
         if sens and exported.is_dir():
-            log.info("%s: preferred to the images exported to %s, because of its timestamps", sens[0], exported.parent)
+            log.info("%s: preferred to the exported images in %s; it contains timestamps", sens[0], exported.parent)
         if sens:
             return _sens_contents(sens[0])
         if exported.is_dir():
@@ -143,7 +144,7 @@ def _camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _color_camera(path: Path, width: int, height: int) -> Camera:
-    """Return the camera of exported color images. SensReader may resize images without changing the intrinsics."""
+    """Return the camera of exported color images. SensReader may resize the images without scaling the intrinsics."""
     matrix = read_matrix(path)
     if _fits(matrix.camera(width, height)) or not _fits(camera := matrix.camera(*COLOR_SIZE)):
         return _camera(path, width, height)
@@ -153,7 +154,7 @@ def _color_camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _fits(camera: Camera) -> bool:
-    """Return True if the principal point is near the middle of the image."""
+    """Return True if the principal point is near the image center."""
     u, v = camera.cx / camera.width, camera.cy / camera.height
     return max(abs(u - 0.5), abs(v - 0.5)) <= 1 / 8
 
@@ -164,7 +165,8 @@ def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, 
         T_color_depth = inverse(color.pose()) @ depth.pose()
     except DataError:
         log.warning(
-            "%s: expected rigid extrinsics, got another matrix; color and depth cameras are assumed to coincide", source
+            "%s: expected rigid extrinsics, got a non-rigid matrix; color and depth are assumed to be registered",
+            source,
         )
         return
     baseline, angle = float(np.linalg.norm(T_color_depth[:3, 3])), rotation_angle(T_color_depth[:3, :3])

@@ -46,13 +46,14 @@ class SegGroup:
 def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[str, str]) -> LabeledMesh:
     """Return the mesh with object k as instance k + 1. If objects overlap, the later object has precedence.
 
-    Objects of a COCO class have its name. Objects of other known classes (wall, cabinet, ...) become instance 0:
-    detections of a COCO class there are false positives. Objects of unknown classes have the class None. All unlabeled
-    vertices form another instance of class None. Detections there are not evaluated, as in ScanNet's own benchmark.
+    Objects of a COCO class have the name of this class. Objects of other known classes (wall, cabinet, ...) become
+    instance 0: detections of a COCO class there are false positives. Objects of unknown classes have the class None.
+    All unlabeled vertices form another instance of class None. Detections there are not evaluated, as in ScanNet's own
+    benchmark.
 
-    `nyu40` is the result of `read_label_table`; empty = no table. Names may differ in spaces and punctuation, such as
-    trashcan and trash can. Raises DataError that names the file for invalid or inconsistent files, or for names that
-    are not in the table.
+    `nyu40` is the result of `read_label_table`; empty = no table. Names match even if they differ in spaces and
+    punctuation, such as trashcan and trash can. Raises DataError that names the file for invalid or inconsistent files,
+    or for names that are not in the table.
     """
     ply = read_ply(mesh)
     segments = _whole_numbers(f"{segs}: segIndices", _read_list(segs, "segIndices"))
@@ -93,7 +94,7 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     if unlabeled in instance_of_segment:
         class_names[unlabeled] = None
     if unknown:
-        log.info("%s: not evaluated because of an unknown class: %s", mesh.parent.name, ", ".join(sorted(unknown)))
+        log.info("%s: objects of unknown class are not evaluated: %s", mesh.parent.name, ", ".join(sorted(unknown)))
     return LabeledMesh(ply.vertices, ply.triangles, instance_of_segment[segment_of_vertex], class_names)
 
 
@@ -132,7 +133,7 @@ def read_label_table(path: Path) -> Mapping[str, str]:
 
 
 def _spellings(nyu40: Mapping[str, str]) -> dict[str, str]:
-    """Return the known name for each spelling: the name itself, and the name without spaces and punctuation."""
+    """Return the known name for each spelling: the name itself, and the name reduced to letters and digits."""
     names = {**nyu40, **MEANINGS, **dict.fromkeys(UNNAMED)}
     return {_letters(name): name for name in names} | {name: name for name in names}
 
@@ -169,5 +170,5 @@ def _read_list(path: Path, key: str) -> Sequence[Any]:
 def _whole_numbers(where: str, values: Sequence[Any]) -> Int64:
     wrong = [value for value in values if type(value) is not int]
     if wrong:
-        raise DataError(f"{where}: expected integers, got {type(wrong[0]).__name__}")
+        raise DataError(f"{where}: expected integers, got {wrong[0]!r:.60}")
     return np.array(values, np.int64)

@@ -6,7 +6,7 @@
     uint32[4]       width and height of color, width and height of depth
     float32         depth units per meter
     uint64          number of frames
-    for each frame: float32[16] camera to world, uint64[2] timestamps of color and depth (microseconds),
+    for each frame: float32[16] T_world_camera, uint64[2] timestamps of color and depth (microseconds),
                     uint64[2] sizes of color and depth (bytes), color image, depth image
     (IMU measurements at the end are not read)
 
@@ -213,7 +213,7 @@ def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) ->
 
 
 def _inflate(name: str, data: bytes, length: int) -> bytes:
-    """Decompress `data` to at most `length` bytes."""
+    """Decompress `data` to `length` bytes. Raises FrameError for another length or damaged data."""
     stream = zlib.decompressobj()
     try:
         unpacked = stream.decompress(data, length + 1)

@@ -91,7 +91,7 @@ def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
 def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
     """Yield frames from images in file order.
 
-    If the first color and depth images are too far apart in time, the earlier image is dropped. The published
+    If the next color and depth images are too far apart in time, the earlier image is dropped. The published
     trajectories use the frame numbers of SceneNN's playback, which drops the same images. Raises DataError if color
     and depth have different sizes.
     """
@@ -136,7 +136,7 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
 
 
 def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -> None:
-    """Send the images and a final None, or an error."""
+    """Send the images and then None, or an error, to the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the parent ends the child
     try:
         with closing(play(path, streams)) as images:
@@ -185,7 +185,8 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
         status = openni.oniWaitForAnyStream(waited, len(handles), ctypes.byref(which), PATIENCE)
         if status == TIME_OUT:
             reached = ", ".join(f"{stream.name.lower()} {last[stream]} of {streams[stream].last}" for stream in Stream)
-            raise DataError(f"expected an intact recording, got a stall of OpenNI 2 at {reached}; download it again")
+            found = f"got a stall of OpenNI 2 after images {reached}"
+            raise DataError(f"expected an intact recording, {found}; download it again")
         _check(status, openni, "play the recording")
         stream = list(Stream)[which.value]
         frame = ctypes.POINTER(_Frame)()

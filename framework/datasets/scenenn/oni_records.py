@@ -18,7 +18,7 @@ from typing import BinaryIO, NamedTuple
 from framework.errors import DataError
 from framework.files.atomic_write import check_regular
 
-FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic, version (four numbers), largest time, largest node
+FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic number, version (four numbers), largest time, largest node
 FILE_MAGIC = b"NI10"
 LARGEST_NODE_AT = FILE_HEADER.size - 4
 VERSIONS = (1, 0, 0, 4), (1, 0, 1, 0)  # first and last version that OpenNI 2 supports
@@ -30,7 +30,7 @@ LARGEST_FIELDS = 2**20  # bytes; OpenNI reads the fields into a buffer of 5.8 MB
 
 
 class OniRecord(IntEnum):
-    """Record types."""
+    """Record types of the format."""
 
     NODE_ADDED_1_0_0_4 = 0x02
     NEW_DATA = 0x0A
@@ -69,7 +69,7 @@ class OniContents:
 
 
 def read_contents(path: Path) -> OniContents:
-    """Return the streams and image counts of a recording, without pixels.
+    """Return the streams and image counts of a recording, without decoding the images.
 
     Raises DataError if the file is not a recording, or if it has no depth images or no color images.
     """
@@ -147,7 +147,7 @@ def _read_contents(path: Path, file: BinaryIO) -> OniContents:
 def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
     """Return the struct layouts of a file position and a record header.
 
-    A header contains the magic, kind, node, two sizes and a file position.
+    A header contains the magic number, kind, node, two sizes and a file position.
     """
     position = "Q" if wide else "I"
     return struct.Struct(f"<{position}"), struct.Struct(f"<4s4I{position}")

@@ -35,7 +35,7 @@ LARGEST_INTRINSICS = 2**20  # bytes; an intrinsics file has a few hundred
 
 @dataclass(frozen=True)
 class TrajectoryLog:
-    """Poses of a trajectory.log. Absent frames are in neither mapping."""
+    """Poses of a trajectory.log. Frames that are missing from the file are in neither mapping."""
 
     poses: Mapping[int, Float64]  # by frame, from 0: T_world_camera (4, 4), exactly rigid
     unusable: Mapping[int, str]  # by frame, from 0: reason (lost tracking, not finite, truncated, or repeated)
@@ -53,8 +53,8 @@ class _Line(NamedTuple):
 def read_trajectory_log(path: Path) -> TrajectoryLog:
     """Return the poses of a trajectory.log.
 
-    A frame with two poses is unusable, and so is a truncated last frame. Raises DataError that names the file and the
-    line for other invalid lines.
+    A frame with two different poses is unusable, and so is a truncated last frame. Raises DataError that names the file
+    and the line for other invalid lines.
     """
     content = read_bytes(path, MAX_TEXT).removeprefix(BOM_UTF8)
     numbered = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
@@ -69,7 +69,7 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
         if cut and len(header.words) == 1 and _is_frame(header.words[0]):
             break  # the frame number itself may be truncated
         if not 3 - cut <= len(header.words) <= 3 or not all(map(_is_frame, header.words)):
-            expected = f"expected the header of a frame, frame frame frame+1, got {header.shown}"
+            expected = f"expected a frame header `frame frame frame+1`, got {header.shown}"
             raise DataError(f"{path}, line {header.number}: {expected}")
         frame = int(header.words[0])
         matrix = _matrix(path, rows, at_end)
@@ -132,7 +132,7 @@ def _is_frame(word: str) -> bool:
 
 
 def read_timestamps(path: Path) -> Mapping[int, tuple[float, float]]:
-    """Return the timestamps of color and depth (s) of each image, by image number.
+    """Return the timestamps of color and depth (s) by image number.
 
     Raises DataError that names the file and the line for an invalid line or a repeated image number.
     """
@@ -157,7 +157,7 @@ def read_timestamps(path: Path) -> Mapping[int, tuple[float, float]]:
 def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mapping[int, float] | None = None) -> None:
     """Write the timestamps of color and depth (s) of each image number atomically.
 
-    `times` contains the timestamps of depth. If `color_times` is None, they are also written for color.
+    `times` contains the timestamps of depth. If `color_times` is None, these are also written for color.
     """
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for image, time in times.items():

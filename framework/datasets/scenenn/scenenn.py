@@ -1,6 +1,6 @@
 """SceneNN (Hua et al., 3DV 2016): rooms scanned with an Asus Xtion or a Kinect v2, with labeled meshes.
 
-    NNN/image/image00001.png    8-bit color, from 1
+    NNN/image/image00001.png    8-bit color, numbered from 1
     NNN/depth/depth00001.png    uint16, mm, registered to color
     NNN/timestamp.txt           optional: number, timestamps of color and depth (microseconds)
     NNN/trajectory.log          T_world_camera, m; the pose with id i belongs to image i + 1
@@ -82,7 +82,11 @@ class SceneNN(LabeledRecording):
 def _recorded(
     images: StoredImages, pose_id: int, poses: TrajectoryLog | None, times: tuple[float, float] | None
 ) -> RecordedFrame:
-    """Return a frame with its timestamps of color and depth (s); None = unknown."""
+    """Return a frame with its pose and timestamps.
+
+    `pose_id` is the id of its pose in trajectory.log. `times` contains the timestamps of color and depth (s); None =
+    unknown.
+    """
     color, depth = times or (None, None)
     timestamp = pose_id / FRAME_RATE if depth is None else depth
     T_world_camera = poses.poses.get(pose_id) if poses else None
@@ -95,7 +99,7 @@ def _recorded(
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[float, float]]:
     """Return the timestamps of color and depth (s) of all images, or no timestamps if any are missing.
 
-    This prevents a mix of clocks.
+    This prevents a mix of recorded timestamps and timestamps derived from the frame rate.
     """
     if not path_exists(path):
         return {}
@@ -103,7 +107,9 @@ def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, tuple[flo
     without = [k for k in images if k not in times]
     if not without:
         return times
-    message = "%s: expected timestamps of all images, got none for %d of %d images, first %d; using %g Hz"
+    message = (
+        "%s: expected timestamps of all images, got none for %d of %d images, first %d; using a frame rate of %g Hz"
+    )
     log.warning(message, path, len(without), len(images), without[0], FRAME_RATE)
     return {}
 
@@ -118,14 +124,15 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
     ply = read_ply(mesh)
     labels = ply.properties.get("label")
     if labels is None or labels.dtype.kind not in "iu":
-        raise DataError(f"{mesh}: expected a vertex property 'label' of integers, got {sorted(ply.properties)}")
+        found = f"got {', '.join(sorted(ply.properties)) or 'none'}"
+        raise DataError(f"{mesh}: expected a vertex property 'label' of integers, {found}")
     if len(labels) and (labels.min() < 0 or labels.max() > LARGEST_ID):
         raise DataError(f"{mesh}: label: expected values in [0, {LARGEST_ID}], got {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
     unlisted = set(present.tolist()) - names.keys() - {0}
     if unlisted:
-        message = "%s: expected an entry in %s for each label, got %d without an entry, such as %d; not evaluated"
+        message = "%s: expected an entry in %s for each label, got none for %d labels, such as %d; not evaluated"
         log.warning(message, mesh, annotation.name, len(unlisted), min(unlisted))
     class_names: dict[int, str | None] = {}
     ids = np.zeros(len(present), np.int32)

@@ -43,7 +43,7 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
     """Return the labels of an annotation in file order.
 
     Unknown elements and attributes are ignored. Raises DataError that names the line if the file is not XML or declares
-    a document type, which could define entities and default attributes. Raises DataError also for a file without
+    a document type, which could define entities and default attributes. It also raises DataError for a file without
     labels, a label without an integer id, or different labels with the same id.
     """
     content = read_bytes(path, LARGEST_FILE)

@@ -35,7 +35,7 @@ class Accelerometer:
     measured: Float64  # (N, 3) m/s^2
 
     def up(self, timestamp: float) -> Float64 | None:
-        """Return the up direction (3,) in the camera at a time in s, or None without measurements near this time."""
+        """Return the up direction (3,) in the camera frame at a time in s; None = no measurements near this time."""
         first, end = np.searchsorted(self.times, (timestamp - NEAR, timestamp + NEAR))
         if first == end:
             return None
@@ -45,7 +45,7 @@ class Accelerometer:
 
 
 def find_accelerometer(bag: RosBag, color: str, timestamps: Sequence[float]) -> Accelerometer | None:
-    """Return the first usable accelerometer of a bag in the order of topic names, or None.
+    """Return the first usable accelerometer of a bag in the order of topic names; None = no usable accelerometer.
 
     `color` is the topic of the color images, and `timestamps` are their times in s. A warning is logged if all
     accelerometers are unusable.
@@ -80,7 +80,7 @@ def _accelerometer(bag: RosBag, topic: str, color: str) -> Accelerometer | str:
         log.warning("%s", error)
         R_camera_imu = None
     if R_camera_imu is None:
-        return f"{topic}: expected its rotation to the camera of {color} in the bag, got none"
+        return f"{topic}: expected the rotation from this sensor to the camera of {color} in the bag, got none"
     order = np.argsort(times, kind="stable")
     return Accelerometer(times[order], measured[order] @ R_camera_imu.T)
 
@@ -98,7 +98,7 @@ def _rotation(bag: RosBag, topic: str, frame_id: str, color: str) -> Float64 | N
 
 
 def _read(bag: RosBag, topic: str) -> tuple[Float64, Float64, str]:
-    """Return the header times (N,) in s, the measurements (N, 3) in m/s^2 and their frame.
+    """Return the header times (N,) in s, the measurements (N, 3) in m/s^2 and their frame id.
 
     Damaged messages are skipped.
     """

@@ -152,7 +152,7 @@ def _associated(color_times: Sequence[float], depth_times: Sequence[float]) -> l
 
 
 def _frames(device: Device, pairs: Sequence[Pair]) -> Iterator[StoredFrame]:
-    """Yield the frames in the order of their second image."""
+    """Yield the frames. A frame is yielded as soon as both of its images are read."""
     topics = device.topics
     partner = {topics.color: {pair.color: pair for pair in pairs}, topics.depth: {pair.depth: pair for pair in pairs}}
     counts = {topics.color: 0, topics.depth: 0}
@@ -212,7 +212,7 @@ def _trajectory(bag: RosBag, topic: str) -> tuple[Trajectory | None, PoseReading
 
 
 def _registration(bag: RosBag, topics: Topics, color: Camera) -> DepthRegistration | None:
-    """Return the registration of depth to color, None = already registered.
+    """Return the registration of depth to color; None = depth is registered already, or its camera is unknown.
 
     Raises DataError if the bag has no extrinsics for the registration.
     """

@@ -174,7 +174,9 @@ def _pixels(where: str, message: Any, dtype: np.dtype[Any], channels: int) -> Ar
     height, width, step = int(message.height), int(message.width), int(message.step)
     row = width * channels * dtype.itemsize
     if not 0 < row <= step or height < 1 or len(message.data) != height * step:
-        size = f"{width}x{height} px of {message.encoding[:60]!r}, {step} bytes per row"
-        raise FrameError(f"{where}: expected data of {size}, got {len(message.data)} bytes")
+        layout = f"{width}x{height} px of {message.encoding[:60]!r} with {step} bytes per row"
+        raise FrameError(
+            f"{where}: expected {height * max(row, step)} bytes for {layout}, got {len(message.data)} bytes"
+        )
     rows = np.asarray(message.data, np.uint8).reshape(height, step)[:, :row]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)

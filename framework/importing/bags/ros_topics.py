@@ -31,7 +31,7 @@ class Topics:
 
     @property
     def given(self) -> list[str]:
-        """Command-line options of the given topics."""
+        """Command-line options of the topics that are set."""
         return [option for name, option in OPTIONS.items() if getattr(self, name)]
 
     @property

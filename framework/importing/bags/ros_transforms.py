@@ -19,7 +19,7 @@ SMALLEST_QUATERNION = 0.5  # minimum length of a valid quaternion
 def stream_motion(bag: RosBag, stream: str) -> Float64 | None:
     """Return T_stream_reference (4, 4) of a RealSense stream, such as /device_0/sensor_1/Color_0.
 
-    None = not in the bag. Raises DataError for an invalid rotation.
+    The reference frame is the same for all streams. None = not in the bag. Raises DataError for an invalid rotation.
     """
     stored = bag.first(f"{stream}/tf/0") if stream.startswith(REALSENSE) else None
     if stored is None:

@@ -1,7 +1,7 @@
 """Rotation of images, cameras, poses and lenses by quarter turns, because phones store images in sensor orientation.
 
-A clockwise quarter turn moves the pixel (u, v) of an image of height H to (H - 1 - v, u). It moves the point (x, y, z)
-of the camera to (-y, x, z).
+A clockwise quarter turn moves the pixel (u, v) of an image of height H to (H - 1 - v, u). A point
+(x, y, z) in the camera frame becomes (-y, x, z).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Turn:
 def upright(ups_camera: Sequence[Float64 | None]) -> Turn | None:
     """Return the rotation that makes the images upright, or None if it is unknown.
 
-    `ups_camera` contains the up direction (3,) in the camera of each frame, None = unknown.
+    `ups_camera` contains the up direction (3,) of each frame in its camera frame, None = unknown.
     """
     known = [up for up in ups_camera if up is not None]
     if not known:

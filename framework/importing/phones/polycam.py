@@ -49,7 +49,7 @@ def open_source(path: Path) -> Source:
     stems = [entry.stem for entry in (folder / "cameras").glob("*.json")]
     stems = sorted((stem for stem in stems if re.fullmatch("[0-9]{1,18}", stem)), key=int)
     if not (folder / "depth").is_dir() or not stems:
-        expected = "expected cameras and depth/, got none"
+        expected = "expected cameras/ with camera files, and depth/, got none"
         raise DataError(f"{path}: {expected}; record with a LiDAR device, and export with Polycam's developer mode on")
     frames = [partial(_read, folder, stem) for stem in stems]
     return Source("Polycam", frames, len(frames), posed=True, sensor=SensorKind.PHONE_LIDAR)

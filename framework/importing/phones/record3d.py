@@ -41,7 +41,7 @@ from framework.sensors.noise_models import SensorKind
 CHANNEL = "R"  # of the EXR files
 LZFSE_BLOCK = b"bvx"  # first bytes of each block of compressed data
 BYTES_A_BLOCK = 20_000  # minimum block size; blocks of data without repetitions have 40,000 bytes
-# sine of half the rotation angle; a hand-held phone is never aligned this exactly with the world axes
+# maximum sine of half the rotation angle of an unrotated pose; a hand-held phone is never aligned this exactly
 UNTURNED = 1e-3
 MAX_BLOCKS = 8  # number of additional blocks; limited, because a block may decompress to 27 MB
 
@@ -127,7 +127,8 @@ class R3dFile:
             raise FrameError(f"{self.path}: expected {name}, got no such member") from error
         except (OSError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, ValueError, RuntimeError) as error:
             if isinstance(error, NotImplementedError):
-                raise FrameError(f"{self.path}: {name}: expected a supported compression, got {error}") from error
+                kind = self._zip.getinfo(name).compress_type
+                raise FrameError(f"{self.path}: {name}: expected a supported compression, got type {kind}") from error
             reason = in_one_line(error)[:SHOWN]
             raise FrameError(f"{self.path}: {name}: expected a readable member, got an error ({reason})") from error
 
@@ -154,7 +155,7 @@ class R3dFile:
 def _source(where: Path | str, content: Mapping[str, Any], files: ExrFolder | R3dFile) -> Source:
     poses = content.get("poses")
     if not isinstance(poses, list) or not poses:
-        raise DataError(f"{where}: poses: expected a list of poses, got {str(poses)[:60]}")
+        raise DataError(f"{where}: poses: expected a list of poses, got {poses!r:.60}")
     size = numbers_of(where, content, "w", "h")
     cameras = [pinhole(where, *size, *of_frame) for of_frame in _intrinsics(where, content, len(poses))]
     shape = _depth_shape(where, content, cameras[0])

@@ -32,7 +32,7 @@ from framework.sensors.noise_models import SensorKind
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # first columns of odometry.csv
 INTRINSICS = ("fx", "fy", "cx", "cy")  # next columns, in newer versions
-# type of MP4 and QuickTime files; other types may make FFmpeg open other files
+# bytes that identify MP4 and QuickTime files; for other file types, FFmpeg might open further files
 KIND_AT, KIND = 4, b"ftyp"
 QUIET = "-8"  # FFmpeg's AV_LOG_QUIET; damage is reported by DataError instead
 LAST_FRAME = 10**6 - 1  # largest frame number of six digits
@@ -94,7 +94,8 @@ def _row_or_error(path: Path, number: int, words: list[str], camera: Camera) -> 
     try:
         timestamp, frame, *pose = numbers(where, words[: len(POSE)], len(POSE), ", ".join(POSE))
         if not 0 <= frame <= LAST_FRAME or frame != int(frame):
-            raise DataError(f"{where}: frame: expected 0 to {LAST_FRAME}, got {words[1].strip()[:SHOWN]!r}")
+            expected = f"expected an integer from 0 to {LAST_FRAME}"
+            raise DataError(f"{where}: frame: {expected}, got {words[1].strip()[:SHOWN]!r}")
         own = [word for word in words[len(POSE) :] if word.strip()]
         if own:
             values = numbers(where, own, len(INTRINSICS), ", ".join(INTRINSICS))

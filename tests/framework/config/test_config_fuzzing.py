@@ -95,7 +95,7 @@ def test_config_option_damaged_builds_or_raises_one_line_error(content: bytes, o
     [
         ("_target_: a.B\n\tpath: b\n", "found a tab character"),
         (BOMB, "expected at most 200000 keys and values"),
-        ("a: &a [*a]\n", "expected an anchor &a that ends before its alias"),
+        ("a: &a [*a]\n", "expected a complete anchor &a before its alias"),
         ("a: " + "[" * 1000 + "]" * 1000, "expected at most 50 nested mappings and lists"),
         ("a: " + "[" * 100_000, "expected at most 50 nested mappings and lists"),
         ("a: !!python/object/apply:os.abort []", "could not determine a constructor"),

@@ -39,9 +39,7 @@ def test_json_byte_order_mark_is_ignored(marked: bytes) -> None:
 def test_json_invalid_raises_one_line_error_with_source(content: bytes, message: str) -> None:
     with pytest.raises(DataError, match=message) as caught:
         parse_json("results.json", content)
-    assert str(caught.value).startswith(
-        ("results.json: expected valid JSON", "results.json: expected JSON with at most")
-    )
+    assert str(caught.value).startswith("results.json: expected ")
     assert len(str(caught.value)) < 300
 
 

@@ -95,7 +95,7 @@ def test_scannet_sens_file_takes_precedence_over_images(tmp_path: Path, caplog: 
     write_exported(tmp_path / SCENE, shots(2))
     with caplog.at_level(logging.INFO):
         assert len(ScanNet(tmp_path, SCENE)) == 3
-    assert f"{SCENE}.sens: preferred to the images exported" in caplog.text
+    assert f"{SCENE}.sens: preferred to the exported images" in caplog.text
 
 
 def test_scannet_timestamps_are_depth_times_if_increasing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

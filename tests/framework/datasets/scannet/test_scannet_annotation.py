@@ -149,7 +149,7 @@ def test_scannet_annotation_duplicate_object_is_merged(tmp_path: Path) -> None:
         ([group(0, "bed", 3) | {"objectId": True}], "objectId: expected an integer from 0"),
         ([group(0, "bed", 3) | {"label": None}], r"expected a label \(text\) and segments \(list\), got"),
         ([group(0, "bed", 3) | {"segments": "3"}], r"expected a label \(text\) and segments \(list\), got"),
-        ([group(0, "bed", 3) | {"segments": [3, 3.5]}], "segments: expected integers, got float"),
+        ([group(0, "bed", 3) | {"segments": [3, 3.5]}], r"segments: expected integers, got 3\.5"),
         ({}, "expected a list 'segGroups', got dict"),
     ],
 )
@@ -163,8 +163,8 @@ def test_scannet_annotation_invalid_object_raises(tmp_path: Path, groups: Any, m
     ("segments", "message"),
     [
         (SEGMENTS[:-1], r"segIndices: expected 10 ids, one for each vertex of s\.ply, got 9"),
-        ([*SEGMENTS[:-1], None], "segIndices: expected integers, got NoneType"),
-        ([SEGMENTS], "segIndices: expected integers, got list"),
+        ([*SEGMENTS[:-1], None], "segIndices: expected integers, got None"),
+        ([SEGMENTS], r"segIndices: expected integers, got \["),
         ("3", "expected a list 'segIndices', got str"),
     ],
 )
@@ -178,7 +178,7 @@ def test_scannet_annotation_invalid_segments_raise(tmp_path: Path, segments: Any
     [
         (b"", "expected valid JSON"),
         (b"[" * 100000, "expected JSON with at most 50 nested lists"),
-        (b'{"segGroups": [' + b"9" * 5000 + b"]}", "expected valid JSON"),
+        (b'{"segGroups": [' + b"9" * 5000 + b"]}", "expected integers of at most 63 bits"),
         (b"\xff\xfe", "expected valid JSON"),
         (b"[]", "expected a JSON object"),
     ],

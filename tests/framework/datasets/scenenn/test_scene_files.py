@@ -137,11 +137,11 @@ def test_trajectory_log_empty_file_has_no_poses(path):
 @pytest.mark.parametrize(
     ("line", "new", "message"),
     [
-        (1, "0 0", "line 1: expected the header of a frame, frame frame frame.1, got '0 0'"),
-        (1, "0 0 1 2", "line 1: expected the header"),
-        (1, "-1 -1 0", "line 1: expected the header"),
-        (6, "6.5 6 7", "line 6: expected the header"),
-        (6, "4294967296 6 7", "line 6: expected the header"),
+        (1, "0 0", "line 1: expected a frame header `frame frame frame.1`, got '0 0'"),
+        (1, "0 0 1 2", "line 1: expected a frame header"),
+        (1, "-1 -1 0", "line 1: expected a frame header"),
+        (6, "6.5 6 7", "line 6: expected a frame header"),
+        (6, "4294967296 6 7", "line 6: expected a frame header"),
         (2, "1 0 0", r"line 2: expected row 1 of a 4x4 matrix \(four numbers\), got '1 0 0'"),
         (3, "1", "line 3: expected row 2"),
         (4, "0 0 one 0", "line 4: expected row 3 .* got '0 0 one 0'"),

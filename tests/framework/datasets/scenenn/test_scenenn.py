@@ -105,7 +105,7 @@ def test_scenenn_truth_classes_are_the_nine_classes(root: Path) -> None:
 
 def test_scenenn_labels_missing_from_annotation_are_counted(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     SceneNN(root, "016")
-    warning = "016.ply: expected an entry in 016.xml for each label, got 1 without an entry, such as 55"
+    warning = "016.ply: expected an entry in 016.xml for each label, got none for 1 labels, such as 55"
     assert caplog.text.count(warning) == 1
     write_annotation(root / "016" / "016.xml", [*labels(), Annotated(UNLISTED, "x", "chair")])
     caplog.clear()

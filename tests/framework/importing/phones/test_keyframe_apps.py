@@ -90,7 +90,7 @@ def test_scanner_app_scan_without_times_uses_frame_number(tmp_path: Path) -> Non
 def test_polycam_export_without_depth_raises(tmp_path: Path) -> None:
     write_polycam(tmp_path / "export", FRAMES)
     (tmp_path / "export/keyframes/depth").rename(tmp_path / "depth")
-    with pytest.raises(DataError, match="expected cameras and depth/, got none; record with a LiDAR"):
+    with pytest.raises(DataError, match="expected cameras/ with camera files, and depth/, got none; record with"):
         open_source(tmp_path / "export")
 
 
@@ -114,7 +114,7 @@ SPOILT_CAMERAS = {
             lambda c: c.update(intrinsics=[0] * 9),
             "Camera: expected positive fx, fy and finite cx, cy, got fx, fy, cx, cy =",
         ),
-        (lambda c: c.update(time="now"), "time: expected a number, got now"),
+        (lambda c: c.update(time="now"), "time: expected a number, got 'now'"),
     ],
     "Polycam": [
         (lambda c: c.pop("fx"), "expected a key 'fx'"),

@@ -112,7 +112,7 @@ def test_record3d_damaged_pose_skips_one_frame(export: Path, tmp_path: Path, cha
         (lambda m: m.pop("poses"), "poses: expected a list of poses, got None"),
         (lambda m: m.update(poses=[]), "poses: expected a list of poses"),
         (lambda m: (m.pop("perFrameIntrinsicCoeffs"), m.pop("K")), "K: expected a list of 9 numbers"),
-        (lambda m: m.update(w="640"), "w: expected a number, got 640"),
+        (lambda m: m.update(w="640"), "w: expected a number, got '640'"),
         (lambda m: m.update(w=10**9), "Camera: expected an image of at most"),
         (lambda m: m.update(dw=0.5), "width, height: expected whole numbers of px"),
         (lambda m: m.update(dw=10**9), "Camera: expected an image of at most"),

@@ -71,7 +71,10 @@ def spoil_row(folder: Path, number: int, change) -> None:
             lambda words: [*words[:8], " 7.0", *words[9:]],
             r"odometry.csv, line 3: expected a quaternion .* of length 1, got 7",
         ),
-        (lambda words: [words[0], " 1.5", *words[2:]], r"odometry.csv, line 3: frame: expected 0 to 999999, got '1.5'"),
+        (
+            lambda words: [words[0], " 1.5", *words[2:]],
+            r"odometry.csv, line 3: frame: expected an integer from 0 to 999999, got '1.5'",
+        ),
         (
             lambda words: [words[0], " 000077", *words[2:]],
             r"rgb.mp4: expected frame 77, got the end of the readable video",
