@@ -27,7 +27,7 @@ def write_raycast(path: Path, view: View, names: Mapping[int, str], centers: Map
         path: PNG file.
         view: Ray-cast view.
         names: Class of each object, by id; all other ids are gray.
-        centers: Center (3,) m of each object, by id; determines the color.
+        centers: Center (3,), m, of each object, by id; it determines the color of the object.
         note: Note at the bottom of the page.
     """
     page = raycast_page(view, names, centers, note)
@@ -88,7 +88,7 @@ def position_colors(positions: Float64, low: Float64, high: Float64) -> UInt8:
 
 
 def index_colors(ids: Int32, centers: Mapping[int, Float64]) -> UInt8:
-    """Return RGB colors (H, W, 3) of object indices (H, W), 0 = none; `centers` (3,) m are given by index."""
+    """Return RGB colors (H, W, 3) of object indices (H, W), 0 = none. `centers` maps each index to a point (3,), m."""
     image = np.empty((*ids.shape, 3), np.uint8)
     image[...] = WITHOUT_OBJECT
     for key, color in object_colors(centers, set(centers)).items():

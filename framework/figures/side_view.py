@@ -40,11 +40,13 @@ class SideView:
     spacing: Float32  # (P,) m, distance between neighboring readings
     center: Float64  # (2,) m, x and y of the center of the view
     size: Float64  # (2,) m, width and height of the view
-    forward: float  # x component of the viewing direction of the frame's camera
+    forward: float  # x component of the camera's viewing direction, in the frame of the view
 
     @classmethod
     def of(cls, frame: Frame, before: ClusterMarks, after: ClusterMarks, aspect: float) -> SideView | None:
-        """Return the view, from the left or the right, that shows more changed points; None = no depth readings.
+        """Return the view from the left or from the right, whichever shows more changed points.
+
+        Returns None if the frame has no depth readings.
 
         Args:
             frame: Frame with depth.
@@ -79,7 +81,7 @@ class SideView:
 
 
 def draw_side(axes: Axes, frame: Frame, marks: ClusterMarks, side: SideView | None, height_in: float) -> None:
-    """Draw the readings as points with a scale bar; the colored clusters are in front."""
+    """Draw the readings as points, with a scale bar. Clusters are colored and drawn in front of all other readings."""
     axes.set_facecolor(np.array(NOTHING) / 255)
     axes.set(xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
@@ -136,7 +138,7 @@ def _up(frame: Frame) -> Float64:
 
 
 def _turned(up: Float64, azimuth: float) -> Float64:
-    """Return R_camera_view (3, 3), rotated by `azimuth` about the up direction, with a slight downward pitch."""
+    """Return R_camera_view (3, 3): a rotation by `azimuth`, rad, about `up` (3,), and a slight downward pitch."""
     forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
     if np.linalg.norm(forward) < 0.1:  # the camera looks straight down or up
         forward = np.array([0.0, -1.0, 0.0]) + up[1] * up
