@@ -28,7 +28,7 @@ from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, remove
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS, VoxelHashing
 
-OTHER_CLASS = 0.3  # largest Bhattacharyya coefficient of the distributions of objects of different classes
+OTHER_CLASS = 0.3  # maximum Bhattacharyya coefficient of the class distributions of objects of different classes
 EXACT_BITS = 16  # additional bits of class scores in exact storage
 
 
@@ -62,7 +62,7 @@ def floored_log(class_probabilities: Float32, floor: float) -> Float64:
 
 
 def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidence:
-    """Return votes of the clusters, with weights (N,), for their instances and most likely classes."""
+    """Return the votes of the clusters for their instances and most likely classes, with `weights` (N,)."""
     classes = np.zeros(clusters.class_probabilities.shape)
     if len(clusters):
         classes[np.arange(len(clusters)), clusters.class_probabilities.argmax(axis=1)] = weights
@@ -127,7 +127,7 @@ class LabeledVoxels:
     def measurement(
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
     ) -> Measurement:
-        """Return the evidence of a frame's clusters for the voxels by this rule."""
+        """Return the evidence of a frame's clusters in the form used by the voxel update."""
         updating = np.ones_like(matches.instance_ids) if self.update_unmatched else matches.instance_ids
         points = keep_on_top(points, updating, self.occlusion_area_ratio)
         supported = self.supported_instances(table, matches)
@@ -158,7 +158,7 @@ class LabeledVoxels:
         """Return an array (N, ids + 1), True if a cluster's object supports an instance, as a table supports a book.
 
         A supported instance is confirmed and of another class. Most of its visible part is inside the cluster's mask,
-        and it is at most half as large as the cluster. The mask of the large object covers the instance, but is no
+        and it is at most half as large as the cluster. The mask of the large object covers the instance, but is not
         evidence for its voxels.
         """
         overlaps, clusters = matches.overlaps, matches.clusters

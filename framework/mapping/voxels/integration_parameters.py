@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64
 
-BOUNDS = {  # bounds of the parameters of Tsdf and VoxelHashing
+BOUNDS = {  # bounds of the parameters of Tsdf and VoxelHashing, in the units given there
     "voxel_size": (1e-4, 1.0),
     "truncation": (1e-4, 100.0),
     "truncation_slope": (0.0, 1.0),
@@ -20,7 +20,7 @@ BOUNDS = {  # bounds of the parameters of Tsdf and VoxelHashing
 
 
 class Sensor(NamedTuple):
-    """The parameters of integration."""
+    """Parameters for integrating depth images."""
 
     truncation: np.float32  # truncation distance at depth 0, m
     truncation_slope: np.float32  # increase of the truncation distance with depth, m per m
