@@ -58,7 +58,7 @@ def find_seen(instance_ids, seen):
 
 @device
 def _add_run(count, list_id, label, offsets, clusters, column, votes):
-    """Add `count` pixels of an instance to votes (N + 1, M + 1): to the rows of a list's clusters and the last row."""
+    """Add `count` pixels of an instance to votes (N + 1, M + 1), in the rows of a list's clusters and the last row."""
     votes[votes.shape[0] - 1, column[label]] += count
     for entry in range(offsets[list_id], offsets[list_id + 1]):
         votes[clusters[entry], column[label]] += count

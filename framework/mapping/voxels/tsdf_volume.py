@@ -27,7 +27,7 @@ NO_BLOCKS = np.zeros(0, np.int32)
 
 
 class TsdfVolume:
-    """Voxels, their integrator and their surface, updated when blocks change."""
+    """A TSDF: voxels, their integrator and their cached surface."""
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
         self.sensor = sensor
@@ -44,7 +44,7 @@ class TsdfVolume:
 
     @property
     def voxel_size(self) -> float:
-        """Side of a voxel in m."""
+        """Side of a voxel, m."""
         return float(self.voxels.grid.voxel_size)
 
     @property
@@ -62,11 +62,11 @@ class TsdfVolume:
         return seen
 
     def renew_colors(self) -> None:
-        """Let the next observation of each voxel replace its color."""
+        """Mark all colors as outdated, so that the next observation of each voxel replaces its color."""
         mark_outdated(self.voxels.grid.color, self.voxels.block_count)
 
     def changed(self, blocks: Int32 | None = None) -> None:
-        """Invalidate derived data after a change of the voxels of `blocks` (A,); None = of any blocks."""
+        """Invalidate derived data after a change of the voxels in `blocks` (A,); None = in any block."""
         self._mesh = self._gravity = None
         if blocks is None:
             self._nets = None
@@ -126,7 +126,7 @@ class TsdfVolume:
         return volume
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Copy the arrays of a map file into an empty volume. Their types and shapes must be checked before."""
+        """Copy the arrays of a map file into an empty volume. The caller checks their types and shapes first."""
         coords = arrays["block_coords"]
         check_blocks(coords)
         self.voxels.allocate(coords)
