@@ -198,7 +198,7 @@ class Association:
     create_score: float = 0.3  # minimum score of a detection to create an instance, in [0, 1]; updates have no minimum
     # minimum cluster size to create an instance, px, >= 1; also the minimum denominator of the overlap
     create_points: int = 50
-    split_instances: bool = True  # True = create an instance for the second of two clusters that match an instance
+    split_instances: bool = True  # True = create an instance for the second of two clusters that match the same one
     merge_overlap: float = 1.0  # minimum overlap with one cluster to merge two instances, in [0, 1]; 1 = no merging
     # minimum number of frames with a joint cluster, minus frames with separate clusters, to merge, >= 1
     merge_frames: int = 3

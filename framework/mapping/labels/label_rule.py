@@ -75,8 +75,11 @@ class LabeledVoxels:
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    occlusion_area_ratio: float = 0.25  # maximum area ratio to assign pixels to the smaller cluster, in [0, 1]; 0 = off
-    support_overlap: float = 0.6  # minimum fraction of an instance inside a larger mask of another class; 1 = off
+    # maximum area ratio of overlapping clusters to assign pixels to the smaller cluster, in [0, 1]; 0 = off
+    occlusion_area_ratio: float = 0.25
+    # minimum fraction of an instance inside a larger mask of another class to apply the support rule, in [0, 1];
+    # 1 = off
+    support_overlap: float = 0.6
     update_unmatched: bool = False  # True = clusters without an instance also update class distributions
     instance_class: InstanceClass = InstanceClass.DETECTIONS  # source of an instance's class
     storage: Storage = Storage.COMPACT  # labels stored per voxel: COMPACT = top few labels, EXACT = all labels

@@ -34,7 +34,7 @@ MAX_SHIFT = 10.0  # maximum distance between a depth reading and the surface of 
 
 @device
 def _ray(view, scale, u, v):
-    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth step, m, of one voxel along it."""
+    """Return (d, step): the ray of pixel (u, v), voxels per m of depth, and the depth step, m, of a voxel along it."""
     dx, dy, dz = ray_direction(view, u, v)
     dx, dy, dz = dx * scale, dy * scale, dz * scale
     return (dx, dy, dz), np.float32(1.0) / np.sqrt(dx * dx + dy * dy + dz * dz)
