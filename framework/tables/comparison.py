@@ -107,7 +107,7 @@ class ComparisonTable:
 
     @classmethod
     def below(cls, directory: Path) -> ComparisonTable:
-        """Return the table of the runs in and below `directory`, as defined by its experiment or with the columns PLAIN.
+        """Return the table of the runs in and below `directory`, as set by its experiment, or with the columns PLAIN.
 
         Raises DataError if no run is complete, or if the experiment's config cannot be read.
         """
