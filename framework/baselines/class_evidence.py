@@ -1,6 +1,6 @@
 """Class evidence of the voxels of a semantic map, including the background, and its update from a frame.
 
-The update follows SemanticFusion (McCormac et al. 2017, eq. 2), which is eq. [7] with one distribution per pixel:
+The update follows SemanticFusion (McCormac et al. 2017, eq. 2). It is eq. (7) with one distribution per pixel:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t),   c = background or a class
 
@@ -40,13 +40,13 @@ MAX_EXPONENT = 700.0  # maximum log ratio; float64 can represent exp(700)
 class ClassEvidence(NamedTuple):
     """Class evidence of all voxels. The best class of a voxel is in slot 0."""
 
-    unmasked: UInt16  # (B, 512) number of frames with the voxel outside all masks; B as in the grid
+    unmasked: UInt16  # (B, 512) number of frames in which the voxel was outside all masks; B as in Grid
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
-    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames with the voxel under a mask
-    rest: Float32  # (R, 512) log_ratio of each unnamed class
-    masked: UInt16  # (R, 512) number of frames with the voxel under a mask
-    first_frame: Int32  # (R, 512) first frame with the voxel under a mask, -1 = none
-    last_frame: Int32  # (R, 512) last frame with the voxel under a mask, -1 = none
+    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames counted by `masked`
+    rest: Float32  # (R, 512) log_ratio of each unnamed class of the voxel
+    masked: UInt16  # (R, 512) number of frames in which the voxel was under a mask
+    first_frame: Int32  # (R, 512) first frame in which the voxel was under a mask, -1 = none
+    last_frame: Int32  # (R, 512) last frame in which the voxel was under a mask, -1 = none
 
 
 ROW_ARRAYS = ClassEvidence._fields[1:]

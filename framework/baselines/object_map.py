@@ -49,7 +49,7 @@ Part = tuple[Float32, Int32, UInt8, Int32]
 
 
 class ObjectMap(InstanceTableMap):
-    """The background, the volume of each object by id, and the instance table.
+    """A map with a background volume, one volume per object, and an instance table.
 
     The class distribution of an object is the mean over its detections.
     """
@@ -85,7 +85,7 @@ class ObjectMap(InstanceTableMap):
         return ObjectVolume(self.background.voxel_size, self.background.sensor, self.background.voxels.max_blocks)
 
     def remove(self, instance_id: int) -> None:
-        """Remove an object."""
+        """Remove an object and its volume."""
         del self.table.records[instance_id], self.volumes[instance_id]
         self.background.changed(NO_BLOCKS)
 

@@ -45,8 +45,8 @@ class ComponentStatistics(NamedTuple):
 
     probability_sums: Float64  # (K + 1, C) sums of P(class) over the vertices; the remainder is P(background)
     masked: Int32  # (K + 1,) maximum, over the voxels, of the number of frames under a mask
-    first_frame: Int32  # (K + 1,) first frame with any voxel under a mask, -1 = none
-    last_frame: Int32  # (K + 1,) last frame with any voxel under a mask, -1 = none
+    first_frame: Int32  # (K + 1,) first frame in which any of the voxels was under a mask, -1 = none
+    last_frame: Int32  # (K + 1,) last frame in which any of the voxels was under a mask, -1 = none
 
 
 class SemanticMap(SceneMap):
@@ -185,7 +185,7 @@ class SemanticMap(SceneMap):
 
 
 def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) -> Int32:
-    """Return the component (V,) of each vertex, numbered from 1 in the order of their first vertices.
+    """Return the component (V,) of each vertex. Components are numbered from 1 in the order of their first vertices.
 
     Components are connected by edges of the triangles (F, 3) within one class. 0 = no class, or a component with fewer
     than `min_vertices` vertices.

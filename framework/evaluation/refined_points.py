@@ -47,8 +47,9 @@ class Refinement:
     def origin(self) -> Int32:
         """Index (M,) of the original cluster of each refined cluster, -1 = none.
 
-        If the number of clusters is unchanged, their order is unchanged, too. Otherwise, a refined cluster is assigned
-        to the original cluster with which it shares the most pixels. Ties go to the smallest index.
+        If the refiner does not change the number of clusters, refined cluster k comes from original cluster k.
+        Otherwise, a refined cluster is assigned to the original cluster with which it shares the most pixels. Ties go
+        to the smallest index.
         """
         n, m = len(self.before), len(self.after)
         if n == m or n == 0:

@@ -2,8 +2,8 @@
 
 Q_i and P_i are the ground-truth and the estimated T_world_camera of frame i.
 
-- ATE (absolute trajectory error, Sturm et al. 2012): the RMSE of |trans E_i| with E_i = Q_i^-1 S P_i, where the rigid S
-  aligns the positions in the least-squares sense (Umeyama 1991, without scale).
+- ATE (absolute trajectory error, Sturm et al. 2012): the RMSE of |trans E_i| with E_i = Q_i^-1 S P_i, where the rigid
+  transform S aligns the positions in the least-squares sense (Umeyama 1991, without scale).
 - RPE (relative pose error) with delta = 1 frame: the RMSE of |trans E_i| and of the angle of rot E_i with
   E_i = (Q_i^-1 Q_{i+1})^-1 (P_i^-1 P_{i+1}).
 

@@ -32,7 +32,7 @@ logging.getLogger("fontTools").setLevel(logging.WARNING)  # fontTools logs a hun
 
 
 class Page:
-    """A white page with a note at the bottom. Coordinates: mm from the lower left corner of the area above the note."""
+    """A white page with a note at the bottom. Coordinates are in mm from the lower left corner above the note."""
 
     def __init__(self, width: float, height: float, note: str) -> None:
         lines = _wrapped(note, (width - 2 * MARGIN_MM) / HINTED)

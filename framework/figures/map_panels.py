@@ -53,7 +53,7 @@ class Window:
 
 @dataclass(frozen=True)
 class PanelLine:
-    """The maps of one scene."""
+    """Panels of one scene: its maps and its ground truth."""
 
     maps: Sequence[Panel | None]  # by column; None = no map
     truth: Panel | None  # None = no ground truth

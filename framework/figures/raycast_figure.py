@@ -82,7 +82,7 @@ def normal_colors(view: View) -> UInt8:
 
 
 def position_colors(positions: Float64, low: Float64, high: Float64) -> UInt8:
-    """Return RGB colors (H, W, 3) of positions (H, W, 3) m, from black at `low` (3,) to white at `high` (3,)."""
+    """Return RGB colors (H, W, 3) of positions (H, W, 3), m, from black at `low` (3,) to white at `high` (3,)."""
     scaled = (positions - low) / np.maximum(high - low, 1e-9)
     return np.asarray(np.rint(255 * np.clip(scaled, 0, 1)), np.uint8)
 

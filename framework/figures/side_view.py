@@ -16,7 +16,7 @@ from framework.rendering.lit_view import NOTHING
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import looking, upward
 
-AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(75), np.deg2rad(14)  # at 90 degrees, planes would become lines
+AZIMUTH_RAD, ELEVATION_RAD = np.deg2rad(75), np.deg2rad(14)  # side view; at 90 degrees, planes would become lines
 MARGIN = 0.09  # margin around the clusters, relative to the size of the view
 MIN_HEIGHT_M = 0.4  # minimum height of the view
 CELLS = 300  # number of grid cells across the view for counting visible points

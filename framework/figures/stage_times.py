@@ -25,7 +25,7 @@ COLUMNS = {
     "map integration": ("update", "integration"),
 }
 """Stages of each line, by its name in the paper. The assignment of stages to names is our interpretation."""
-COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # for color-blind readers
+COLORS = dict(zip(COLUMNS, ("#0072b2", "#8c6bb1", "#d55e00", "#b5830a"), strict=True))  # color-blind safe
 RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # names of the reference lines, by ms per frame
 PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights of a diagram, its heading and its axis labels
 LEFT_MM, RIGHT_MM = 9.5, 25.5  # margins of the diagram

@@ -1,6 +1,6 @@
 """Direction of gravity and height of the floor.
 
-If the sensor measures the direction of gravity, the mean over all frames is used. Otherwise the direction is estimated
+If the sensor measures the direction of gravity, the mean over all frames is used. Otherwise, the direction is estimated
 from the surface: most of the surface is perpendicular or parallel to the up direction. Two cues distinguish floors from
 walls: the mean direction of the upper edges of the images, and the surfaces that face up.
 """

@@ -181,7 +181,7 @@ def _connected(a: np.float32, b: np.float32, connection: Connection) -> bool:
 def _unite_near(
     readings: Float32, runs: Int32, cells: int, offset: int, connection: Connection, parents: Int32
 ) -> None:
-    """Unite the runs of each cell and the cell `offset` cells after it, if they are connected in depth."""
+    """Unite the run of each cell with the run `offset` cells after it if both cells are connected in depth."""
     for begin in range(0, cells, CHUNK):
         end = min(begin + CHUNK, cells)
         here, there = slice(begin, end), slice(begin + offset, end + offset)

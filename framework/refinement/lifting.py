@@ -1,4 +1,4 @@
-"""Lifting of detected masks to 3D point clusters (equation [5] of docs/method.md)."""
+"""Lifting of detected masks to 3D point clusters (eq. (5) of docs/method.md)."""
 
 from __future__ import annotations
 

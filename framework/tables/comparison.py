@@ -103,7 +103,7 @@ class ComparisonTable:
     incomplete: list[Incomplete]
     superseded: int  # number of older records of the same runs
     root: Path  # base of relative run names
-    left_out: Sequence[str] = ()  # omitted columns of PLAIN, without values in all runs
+    left_out: Sequence[str] = ()  # columns of PLAIN that are omitted, because no run has a value
 
     @classmethod
     def below(cls, directory: Path) -> ComparisonTable:

@@ -56,7 +56,7 @@ class ClassOnlyFusion(MapFuser):
             self.scene.labels.update(seen, masks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
-        """Return log P(O_u = c) / P(O_u = background) (N, C) of a pixel under each mask, for eq. [7], with a floor.
+        """Return log P(O_u = c) / P(O_u = background) (N, C) of a pixel under each mask, for eq. (7), with a floor.
 
         A score is the probability of the best class, but the distribution excludes the background. Therefore, the score
         divided by the best class's entry is the probability of all classes together.

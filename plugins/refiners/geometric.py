@@ -18,9 +18,9 @@ class Geometric(ClusterRefiner):
     """Clusters as unions of the convex depth segments covered by a mask.
 
     Voxblox++ (Grinvald et al., RA-L 2019) cuts the depth image at depth jumps and concave creases. It assigns each
-    segment to the mask with the largest overlap, if the mask covers more than `min_overlap` of the segment. A cluster
-    loses its points outside its segments. With `grow_to_segments`, it also gains the segments' pixels outside the mask,
-    if the cluster points determine the camera pose. A mask without a segment loses all points.
+    segment to the mask with the largest overlap, if the mask covers more than `min_overlap` of the segment. Points of a
+    cluster outside its segments are removed. With `grow_to_segments`, the segments' pixels outside the mask are added,
+    if the cluster points determine the camera pose. All points of a mask without a segment are removed.
     """
 
     cell_size: int = 2  # side of the cells of averaged readings, px, >= 1

@@ -33,8 +33,8 @@ class GmmFrame(ClusterRefiner):
 
     The refiner applies eqs. (1) to (4) to the points of all masks (section 3.2.2). A pixel in several masks is one
     point of the mask with the best score. There is no background, and the masks only initialize the mixture. Therefore,
-    clusters lose points only to other clusters. The paper does not specify the hierarchy. Levels, children and
-    initialization are our choice (J = 8 after Eckart et al., CVPR 2016).
+    a point leaves its cluster only if it fits another cluster better. The paper does not specify the hierarchy. Levels,
+    children and initialization are our choice (J = 8 after Eckart et al., CVPR 2016).
     """
 
     levels: int = 2  # number of levels of hierarchical EM, >= 1; 1 = flat

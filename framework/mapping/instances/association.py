@@ -3,7 +3,7 @@
 The pixels of a cluster vote for the instances of the map at these pixels. The instances come from the voxels at the
 measured surface or from the ray-cast view. The ray-cast view is our interpretation of section 3.3 of the paper.
 
-A cluster and an instance may match if their overlap is large enough. By default the overlap is relative to the smaller
+A cluster and an instance may match if their overlap is large enough. By default, the overlap is relative to the smaller
 of the two, so that a part of an object matches the whole. Matching is one to one, best IoU first, so that a table does
 not match the book on it. An unmatched cluster creates a new instance.
 """
@@ -29,7 +29,7 @@ from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed
 from framework.mapping.labels.pixel_lists import PixelLists, list_points_by_pixel
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
-VOTES_ACROSS = 320  # number of voting pixels per image row; more pixels take time without a benefit
+VOTES_ACROSS = 320  # number of voting pixels per image row; more pixels take longer without improving the result
 
 
 class InstanceSource(Enum):
@@ -56,7 +56,7 @@ class Overlaps:
     sizes: Int32  # (N,) number of pixels of each cluster
     votes: Int32  # (N, M) number of pixels shared by a cluster and an instance
     seen: Int32  # (h, w) instance at every stride-th pixel of every stride-th row, 0 = none
-    stride: int  # px
+    stride: int  # distance between the samples in `seen`, px
 
     def by(self, rule: OverlapRule, min_pixels: int) -> npt.NDArray[np.float64]:
         """Return the overlaps (N, M) in [0, 1] by a rule; see `over_smaller` for `min_pixels`."""
@@ -284,7 +284,7 @@ class Association:
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the label space of a map, set by its first frame; `known` is () before it.
+    """Return the label space of a map, set by its first frame; `known` is () before the first frame.
 
     Raises DataError if a later frame has a different label space.
     """

@@ -90,7 +90,7 @@ class InstanceTable:
         self.embedding_space = ""  # space of the instances' embeddings; "" = no embeddings
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
-        """Create an instance without observations, for a number of `classes`."""
+        """Create an instance without observations, with zero evidence for each of `classes` classes."""
         self.last_id += 1
         record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
         self.records[self.last_id] = record

@@ -60,7 +60,7 @@ def added(known: ObjectEmbedding | None, new: ObjectEmbedding | None) -> ObjectE
 
 
 def agreed_space(known: str, found: str) -> str:
-    """Return the embedding space of a map, set by its first embeddings; `known` is "" before them.
+    """Return the embedding space of a map, set by its first embeddings; `known` is "" before the first embeddings.
 
     Raises DataError if later embeddings are from another space.
     """

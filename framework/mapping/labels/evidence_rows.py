@@ -37,7 +37,7 @@ SLOTS = Evidence._fields[1:]
 
 
 class Storage(Enum):
-    """Number of labels that a voxel stores."""
+    """Labels that a voxel stores: the most likely labels, or all labels."""
 
     COMPACT = "compact"
     EXACT = "exact"

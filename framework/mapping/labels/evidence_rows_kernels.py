@@ -115,7 +115,7 @@ def number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_new(grid, seen, evidence, measurement, list_bits, row_bits, new, free_classes, evicted):
-    """Assign slots to the `new` voxels of each block and update them like update_rows().
+    """Assign slots to the `new` voxels of each block, and update them as update_rows() does.
 
     free_classes (T,) are the class slots of a voxel without evidence. Evictions are added to evicted (A,).
     """

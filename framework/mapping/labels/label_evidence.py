@@ -1,6 +1,6 @@
 """Label evidence of the voxels: the likelihood of each instance and class, and its update from a frame.
 
-The paper's rule is a voxel-wise Bayesian update by two independent recursions, eqs. [7] and [8]:
+The paper's rule is a voxel-wise Bayesian update by two independent recursions, eqs. (7) and (8) of docs/method.md:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t)
 
@@ -37,7 +37,7 @@ MAX_CLUSTER_SCORE = 2**15 - 1 - MAX_SCORE  # maximum score of a cluster; a large
 
 
 class Evidence(NamedTuple):
-    """Label evidence of all voxels, see the diagram above.
+    """Label evidence of all voxels; see the diagram in the module docstring.
 
     Voxels are visited in any order. Therefore, the slots of a voxel are contiguous: the arrays of slots are views of
     one structured array. In compact storage, the slots of a voxel take 80 bytes.
@@ -53,7 +53,7 @@ class Evidence(NamedTuple):
 class Measurement(NamedTuple):
     """Evidence of the N clusters of one frame for C classes."""
 
-    list_ids: Int32  # (H, W) list of clusters of each pixel, see PixelLists, 0 = no cluster
+    list_ids: Int32  # (H, W) list of clusters of each pixel, 0 = no cluster; see PixelLists
     offsets: Int32  # (L + 1,) start of each list in `clusters`
     clusters: Int32  # (offsets[L],) clusters that update voxels
     instance_id: Int32  # (N,) instance associated with each cluster, 0 = none
@@ -62,7 +62,7 @@ class Measurement(NamedTuple):
     matched: Bool  # (ids + 1,) True if an instance was matched in this frame, by id
     class_scores: Integers  # (N, NO_CLASS + 1) int32, in exact storage int64; see pack_class_scores()
     named_classes: UInt8  # (N, NEW_CLASSES) most likely classes of each cluster
-    combine: int  # Combine
+    combine: int  # value of Combine
     max_score: int  # maximum score of a class
 
 

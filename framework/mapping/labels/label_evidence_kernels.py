@@ -117,7 +117,7 @@ def best_first(labels, values, free):
 
 @device
 def best_class_first(classes, scores):
-    """Move the most likely class to slot 0, like best_first()."""
+    """Move the most likely class to slot 0, as best_first() does."""
     best = most_likely_slot(classes, scores)
     if best > 0:
         classes[0], classes[best] = classes[best], classes[0]
@@ -159,7 +159,7 @@ def sum_classes(classes, scores, measurement, k):
 
 @device
 def update_voxel(evidence, voxel, measurement, list_id):
-    """Apply both recursions to a labeled voxel at a pixel with the list `list_id`. Returns the number of evictions."""
+    """Apply both recursions to a labeled voxel at a pixel of list `list_id`. Returns the number of evictions."""
     start, end = measurement.offsets[list_id], measurement.offsets[list_id + 1]
     ids = evidence.instance_ids[voxel]
     id_values = evidence.instance_value[voxel]

@@ -53,7 +53,7 @@ class DetectionEvidence(NamedTuple):
 
 
 def floored_log(class_probabilities: Float32, floor: float) -> Float64:
-    """Return log P(O_u = c | I_t) (N, C) of eq. [7], mixed with a fraction `floor` of the uniform distribution.
+    """Return log P(O_u = c | I_t) (N, C) of eq. (7), mixed with a fraction `floor` of the uniform distribution.
 
     The mixture prevents a zero probability from the detector from ruling out a class.
     """

@@ -67,7 +67,7 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
 
 
 def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
-    """Return the arrays listed as `names` in the header of a file. Raises DataError like read_map()."""
+    """Return the arrays listed as `names` in the header of a file. Raises DataError as read_map() does."""
     with map_file_errors(path), _opened(path) as archive:
         names = _header(archive).items("names")
     return read_map(path, expected_format, [str(name) for name in names[:MAX_ARRAYS]])[1]

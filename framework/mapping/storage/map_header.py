@@ -92,7 +92,7 @@ class MapHeader:
 
 
 def whole(name: str, found: object, low: int = 0, high: int = LARGEST_COUNT) -> int:
-    """Return an integer in [low, high]. Raises DataError that names the key for other values."""
+    """Return an integer in [low, high]. For other values, raises a DataError that names the key."""
     if isinstance(found, bool) or not isinstance(found, int) or not low <= found <= high:
         raise DataError(f"{name}: expected an integer in [{low}, {high}], got {found!r:.60}")
     return found

@@ -26,7 +26,7 @@ GOLDEN = 0.6180339887498949  # equidistributed rounding offsets frac(k * GOLDEN)
 class SeenBlocks(NamedTuple):
     """The A blocks updated by a frame and their voxels near the measured surface, valid until the next frame.
 
-    The near voxels of a block are contiguous. There are gaps between GROUPs of blocks.
+    The near voxels of a block are contiguous. There are gaps between groups of GROUP blocks.
     """
 
     blocks: Int32  # (A,) block indices

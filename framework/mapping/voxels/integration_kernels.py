@@ -29,9 +29,10 @@ MIN_WEIGHT_BEHIND = 0.02
 
 @device
 def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
-    """Project the voxels of a block (eq. [6]). Write pixel indices to pixel (512,) and depths (m) to scratch[:512].
+    """Project the voxels of a block (eq. (6) of docs/method.md) to pixel indices and depths.
 
-    Voxels outside the image get pixel 0 and a depth larger than any reading.
+    Writes the indices to pixel (512,) and the depths, m, to scratch[:512]. Voxels outside the image get pixel 0 and a
+    depth larger than any reading.
     """
     zero, half, one = np.float32(0.0), np.float32(0.5), np.float32(1.0)
     seven, three = np.int32(7), np.int32(3)

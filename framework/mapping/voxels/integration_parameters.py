@@ -31,12 +31,12 @@ class Sensor(NamedTuple):
 
     @property
     def max_truncation(self) -> float:
-        """The largest truncation distance, m."""
+        """Maximum truncation distance, m."""
         return float(self.truncation + self.truncation_slope * self.max_depth)
 
     @property
     def depth_range(self) -> tuple[float, float]:
-        """The (nearest, farthest) integrated depth, m."""
+        """Minimum and maximum depth of integrated readings, m."""
         return float(self.min_depth), float(self.max_depth)
 
 
@@ -47,8 +47,8 @@ class Pinhole(NamedTuple):
     fy: np.float32
     cx: np.float32
     cy: np.float32
-    R: Float32  # (3, 3)
-    t: Float32  # (3,) m
+    R: Float32  # (3, 3) rotation of the pose
+    t: Float32  # (3,) m, translation of the pose
 
 
 def pinhole(camera: Camera, T: Float64) -> Pinhole:

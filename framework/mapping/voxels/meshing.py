@@ -8,9 +8,9 @@ Compared with dual contouring, the vertices are farther from sharp edges, and cl
 Few voxels are near the surface, so the search tests 64 voxels at once as bits of a word. Only cells with a vertex are
 visited individually. The index of a vertex is the number of set bits before its own bit.
 
-A block stores 192 bytes of words and 32 bytes of indices between updates. Its vertices are recomputed if its voxels
-change, or the voxels of adjacent blocks that its cells share. All other vertices are copied. The result
-depends on the grid alone.
+A block stores 192 bytes of words and 32 bytes of indices between updates. Its vertices are recomputed if voxels
+of its cells change, in the block itself or in adjacent blocks. All other vertices are copied. The result depends on the
+grid alone.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""TSDF volume with integration, surface extraction, ray-casting and serialization, and its parameters."""
+"""TSDF volume with integration, surface extraction, ray casting and serialization, and its parameters."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class TsdfVolume:
         return self.voxels.block_count * BLOCK_VOXELS
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near: float) -> SeenBlocks:
-        """Integrate one frame and return the voxels within `near` m of the measured surface.
+        """Integrate one frame, and return the updated blocks and their voxels within `near` m of the surface.
 
         Raises MapFullError if the block budget is reached; in this case the frame is not integrated.
         """
@@ -113,7 +113,7 @@ class TsdfVolume:
 
     @classmethod
     def load(cls, header: MapHeader, arrays: dict[str, Any], rows: int) -> TsdfVolume:
-        """Return the volume of a map file with `rows` label rows. Raises DataError if the file is invalid."""
+        """Return the volume of a map file with `rows` evidence rows. Raises DataError if the file is invalid."""
         saved = header.part("sensor")
         sensor = Sensor(**{name: np.float32(saved.number(name, BOUNDS[name])) for name in Sensor._fields})
         max_blocks = header.whole("max_blocks", 1, MAX_BLOCKS)

@@ -161,7 +161,7 @@ OUTDATED = np.uint32(1 << 31)  # marker bit of a color that the next observation
 
 @device
 def pack_color(red, green, blue):
-    """Return a packed color from channels in quarters of a level, 0 to 1020. Ten bits let averages converge."""
+    """Return a packed color from channels in quarters of an 8-bit level, 0 to 1020. Ten bits let averages converge."""
     return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
 
 
@@ -176,7 +176,7 @@ def mark_outdated(color, blocks):
 
 @device
 def unpack_color(packed):
-    """Return (red, green, blue), float32, in quarters of a level."""
+    """Return (red, green, blue), float32, in quarters of an 8-bit level."""
     bits = np.int32(packed)
     return (
         np.float32(np.int32(bits & _CHANNEL)),

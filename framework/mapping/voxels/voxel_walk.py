@@ -263,7 +263,7 @@ def gather_corners(grid, values, depth, points, missing, found):
 
 @device
 def step_to_surface(view, scale, v, found, points, converged, reach, limits, depth, normals):
-    """Move each depth (W,) m by one Newton step along its ray to the zero of the trilinear field.
+    """Move each depth (W,), m, by one Newton step along its ray to the zero of the trilinear field.
 
     `found` (8, W) holds the distances around `points` (3, W). A depth becomes 0 if the field is unknown, if it does not
     decrease along the ray, or if the zero is farther than `reach` voxels or beyond `limits` (W,), m. A depth is negated

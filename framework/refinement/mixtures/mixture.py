@@ -35,7 +35,7 @@ def fit(
     set's bounding box.
 
     `prior_log_odds` (S,) is the evidence of each point for the first `own_components`. Their densities at point i are
-    multiplied by exp(prior_log_odds[i]) in eq. [2]. The log-likelihood uses the weighted densities, so it is defined
+    multiplied by exp(prior_log_odds[i]) in eq. (2). The log-likelihood uses the weighted densities, so it is defined
     only up to a constant.
     """
     n = len(starts) - 1

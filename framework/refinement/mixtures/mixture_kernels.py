@@ -143,7 +143,10 @@ def _any_left(weights: Float64) -> bool:
 def _expect(
     xyz: Float32, odds: Float32, own_components: int, rows: Float32, log_outlier: np.float32, moments: Float64
 ) -> tuple[float, float]:
-    """Run the E-step [2] and add up the M-step's moments. Returns sum_i log p(x_i) and N_k of the uniform component."""
+    """Run the E-step, eq. (2), and sum the moments of the M-step.
+
+    Returns sum_i log p(x_i), and N_k of the uniform component.
+    """
     components = len(rows)
     densities = np.empty((components, BLOCK), np.float32)
     largest, evidence = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
@@ -175,7 +178,7 @@ def _maximize(
     moments: Float64, center: Float64, count: int, variance_floor: float, weights: Float64, means: Float64,
     covariances: Float64,
 ) -> None:  # fmt: skip
-    """Run the M-step [3, 4]."""
+    """Run the M-step, eqs. (3) and (4)."""
     for j in range(len(weights)):
         N_k = moments[j, 0]
         if N_k < MIN_SUPPORT:
