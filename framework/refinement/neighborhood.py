@@ -88,7 +88,7 @@ class Surroundings:
         return np.diff(self.windows.firsts)
 
     def of_at_least(self, min_points: int) -> Bool:
-        """Return an array (N,), True for clusters with at least `min_points` points in the mask and, if any, the ring."""
+        """Return an array (N,), True for clusters with at least `min_points` points in the mask and any ring."""
         return np.asarray(
             (self.mask_counts >= min_points) & ((self.ring_counts >= min_points) | (self.ring_widths == 0))
         )
